@@ -1,0 +1,181 @@
+"""The `fractaljax` command: design, stability, scene."""
+
+import argparse
+import csv
+import io
+import sys
+import tempfile
+from pathlib import Path
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message):
+        _refuse(message)
+
+
+def _refuse(message) -> None:
+    """One line on standard error, and exit status 2."""
+    line = " ".join(str(message).split())
+    print(f"fractaljax: {line}", file=sys.stderr)
+    raise SystemExit(2)
+
+
+def _parser() -> _Parser:
+    parser = _Parser(
+        prog="fractaljax", description="From a machined surface to a stable mechanism."
+    )
+    commands = parser.add_subparsers(dest="command", required=True, parser_class=_Parser)
+
+    design = commands.add_parser(
+        "design", help="find the nearest surface that does not squeal", description=_design.__doc__
+    )
+    _add_scene(design)
+    design.add_argument("--out", type=Path, default=Path("fractaljax-design"), metavar="FOLDER")
+    design.add_argument("--D", type=float, nargs=2, metavar=("LOW", "HIGH"), help="bounds on D")
+    design.add_argument("--G", type=float, nargs=2, metavar=("LOW", "HIGH"), help="on G [m]")
+    design.add_argument("--target", type=float, help="largest growth rate allowed [1/s]")
+    design.add_argument("--K-n-min", type=float, help="least normal stiffness allowed [N/m]")
+    design.add_argument("--area-ratio-min", type=float, default=2.0, help="least a_l/a_e")
+    design.add_argument("--slip-ratio-max", type=float, default=0.9, help="largest Q_e/(mu_s P)")
+    design.add_argument("--starts", type=int, default=128, help="surfaces improved side by side")
+    design.add_argument("--quiet", action="store_true", help="no progress bar")
+    design.set_defaults(run=_design)
+
+    stability = commands.add_parser(
+        "stability", help="print the stability of a scene", description=_stability.__doc__
+    )
+    _add_scene(stability)
+    stability.set_defaults(run=_stability)
+
+    scene = commands.add_parser(
+        "scene", help="print a scene file to start from", description=_scene.__doc__
+    )
+    scene.set_defaults(run=_scene)
+    return parser
+
+
+def _add_scene(parser) -> None:
+    parser.add_argument(
+        "scene", nargs="?", type=Path, help="a scene file; else the reference brake"
+    )
+    parser.add_argument(
+        "--constant-friction",
+        action="store_true",
+        help="leave out the slope of the friction law (the source's Eq. 43)",
+    )
+
+
+def _load(arguments):
+    from .scene import Scene, brake_scene
+
+    return brake_scene() if arguments.scene is None else Scene.load(arguments.scene)
+
+
+def _scene(arguments) -> int:
+    """Print the reference brake as a scene file."""
+    from .scene import brake_scene
+
+    print(brake_scene().to_toml(), end="")
+    return 0
+
+
+def _stability(arguments) -> int:
+    """Print the joint, the critical mode and the eigenvalues of a scene."""
+    from .report import stability_table
+
+    print(stability_table(_load(arguments), not arguments.constant_friction))
+    return 0
+
+
+def _design(arguments) -> int:
+    """Find the nearest stable surface; write design.toml, history.csv and design.png."""
+    from .design import DEFAULT_BOUNDS, design
+    from .scene_file import write_whole
+
+    scene = _load(arguments)
+    asked = {"D": arguments.D, "G": arguments.G}
+    bounds = DEFAULT_BOUNDS | {name: tuple(ends) for name, ends in asked.items() if ends}
+    created = _make_folder(arguments.out)
+    written = False
+    try:
+        best = design(
+            scene,
+            bounds,
+            target=arguments.target,
+            K_n_min=arguments.K_n_min,
+            area_ratio_min=arguments.area_ratio_min,
+            slip_ratio_max=arguments.slip_ratio_max,
+            friction_slope=not arguments.constant_friction,
+            starts=arguments.starts,
+            progress=not arguments.quiet,
+        )
+        files = {
+            "design.toml": _scene_text(best).encode(),
+            "history.csv": _history_text(best).encode(),
+            "design.png": _picture(best),
+        }
+        for name, content in files.items():
+            write_whole(arguments.out / name, content)
+        written = True
+    finally:
+        if not written:
+            for folder in created:
+                folder.rmdir()
+    print(best)
+    print(f"written to {arguments.out}: {', '.join(files)}")
+    return 1 if best.violated else 0
+
+
+def _make_folder(path: Path) -> list[Path]:
+    """Make sure that files can be written to a folder; returns those it made, innermost first."""
+    missing = [folder for folder in (path, *path.parents) if not folder.exists()]
+    path.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=path):
+        return missing
+
+
+def _scene_text(best) -> str:
+    lines = [f"# {best.outcome}", f"# growth rate {best.growth_rate:+.6g} 1/s"]
+    lines += [f"# not met: {name}" for name in best.violated]
+    return "\n".join([*lines, best.scene.to_toml()])
+
+
+_UNITS = {"G": "m", "growth_rate": "1/s", "K_n": "N/m", "K_t": "N/m"}
+
+
+def _history_text(best) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    titles = [f"{name} [{_UNITS[name]}]" if name in _UNITS else name for name in best.history]
+    writer.writerow(["step", *titles])
+    columns = [column.tolist() for column in best.history.values()]
+    writer.writerows([i, *row] for i, row in enumerate(zip(*columns, strict=True)))
+    return text.getvalue()
+
+
+def _picture(best) -> bytes:
+    from . import plot
+
+    content = io.BytesIO()
+    plot.design(best).figure.savefig(content, format="png", dpi=150)
+    return content.getvalue()
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; returns its exit status: 0, 1 for an infeasible design, 2 for bad input."""
+    arguments = _parser().parse_args(argv)
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    try:
+        return arguments.run(arguments)
+    except (ValueError, TypeError, OSError) as error:
+        _refuse(error)
+    except KeyboardInterrupt:
+        print("fractaljax: interrupted, nothing written", file=sys.stderr)
+        return 130
+    return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,118 @@
+"""Parts as TOML tables: every number beside its unit and meaning, every key accounted for."""
+
+import dataclasses
+import inspect
+import os
+import tempfile
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, cast
+
+from .parts import Part
+
+type_table = Mapping[str, Mapping[str, type[Part]]]
+
+
+def render(whole: Part, laws: type_table) -> str:
+    """The TOML text of the parts of `whole`; `laws` names the kinds each of them can be of."""
+    lines = ["# A fractaljax scene, in SI units."]
+    for name, kinds in laws.items():
+        part = getattr(whole, name)
+        lines += ["", f"[{name}]"]
+        if len(kinds) > 1:
+            law = next(law for law, kind in kinds.items() if kind is type(part))
+            others = ", ".join(f'"{other}"' for other in kinds if other != law)
+            lines.append(f'law = "{law}"  # or {others}')
+        lines += _rows(name, part)
+    return "\n".join(lines) + "\n"
+
+
+def _rows(name: str, part: Part) -> list[str]:
+    rows, tables = [], []
+    for field in dataclasses.fields(part):
+        value = getattr(part, field.name)
+        if isinstance(value, Part):
+            tables += ["", f"[{name}.{field.name}]", *_rows(f"{name}.{field.name}", value)]
+            continue
+        note = f"# {field.metadata['unit']}: {field.metadata['meaning']}"
+        rows.append(
+            f"# {field.name} =  {note}"
+            if value is None
+            else f"{field.name} = {float(value)!r}  {note}"
+        )
+    return rows + tables
+
+
+def parse(content: bytes, laws: type_table) -> dict[str, Part]:
+    """The parts written in a TOML file with this content, by name.
+
+    **Raises:** `ValueError` or `TypeError` naming the table and the key that is unknown, missing
+    or outside its domain, or the place where the file is no TOML.
+    """
+    try:
+        document = tomllib.loads(content.decode())
+    except UnicodeDecodeError as error:
+        raise ValueError(f"not a text in UTF-8: {error.reason} at byte {error.start}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"not a TOML file: {error}") from None
+    _refuse_unknown("the file", document, laws)
+    return {name: _part(name, _table(document, name), kinds) for name, kinds in laws.items()}
+
+
+def _part(name: str, table: dict[str, Any], kinds: Mapping[str, type[Part]]) -> Part:
+    if len(kinds) == 1:
+        return _build(name, table, *kinds.values())
+    law = table.pop("law", None)
+    if not isinstance(law, str) or law not in kinds:
+        choices = " or ".join(f'"{kind}"' for kind in kinds)
+        got = "nothing" if law is None else repr(law)
+        raise ValueError(f"[{name}] law must be {choices}, got {got}")
+    return _build(name, table, kinds[law])
+
+
+def _build(name: str, table: dict[str, Any], kind: type[Part]) -> Part:
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+    _refuse_unknown(f"[{name}]", table, fields)
+    optional = inspect.signature(kind.__init__).parameters
+    arguments = {}
+    for key, field in fields.items():
+        if not field.metadata:  # a part of its own, in a table of its own
+            inner = cast(type[Part], field.type)
+            arguments[key] = _build(f"{name}.{key}", _table(table, key, f"{name}."), inner)
+        elif key in table:
+            arguments[key] = table[key]
+        elif optional[key].default is inspect.Parameter.empty:
+            raise ValueError(f"[{name}] lacks the key {key!r}")
+    try:
+        return kind(**arguments)
+    except (ValueError, TypeError) as error:
+        raise type(error)(f"[{name}] {error}") from None
+
+
+def _table(document: dict[str, Any], key: str, inside: str = "") -> dict[str, Any]:
+    if key not in document:
+        raise ValueError(f"the table [{inside}{key}] is missing")
+    if not isinstance(document[key], dict):
+        raise ValueError(f"[{inside}{key}] must be a table, got {document[key]!r}")
+    return document[key]
+
+
+def _refuse_unknown(where: str, given, known) -> None:
+    for key in given:
+        if key not in known:
+            raise ValueError(f"{where} has the unknown key {key!r}; known are {', '.join(known)}")
+
+
+def write_whole(path: str | os.PathLike, content: bytes) -> None:
+    """Write a file through a temporary neighbour, so that it is there whole or not at all."""
+    target = Path(path)
+    handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}-")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+        os.chmod(temporary, 0o644)  # mkstemp makes it private
+        os.replace(temporary, target)
+    except BaseException:
+        os.unlink(temporary)
+        raise

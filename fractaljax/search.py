@@ -1,0 +1,181 @@
+"""Many constrained minimisations of few variables, walked side by side.
+
+minimise f(u) subject to c(u) <= 0, for u in [0, 1]^v with v of 1 or 2. Everything the two phases
+ask of the model is one function, values and Jacobian of a batch of points, so that it is compiled
+once. Adam on a quadratic penalty carries every start into a basin; sequential quadratic
+programming (damped BFGS, exact penalty, trust region) then lands on the constraints. With so few
+variables its subproblem is solved by trying every active set.
+"""
+
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+
+_ADAM_STEPS, _SQP_STEPS = 80, 40
+_PENALTY = 100.0  # weight of the constraints; above every multiplier of a well-scaled problem
+
+
+def search(model: Callable, starts: np.ndarray, slack: float, progress: bool):
+    """Improve every start; returns the end points (n, v) and a function giving the path to each.
+
+    `model(us)` gives f (n,), c (n, k), their Jacobians (n, v) and (n, k, v). Constraints are held
+    at c <= -slack, so that rounding cannot undo them.
+    """
+    from tqdm import tqdm
+
+    path = [starts]
+    with tqdm(
+        total=_ADAM_STEPS + _SQP_STEPS, desc="design", unit="step", disable=not progress
+    ) as bar:
+
+        def advance(us, excess):
+            path.append(us)
+            meeting = int((excess <= 0).all(axis=1).sum())
+            bar.set_postfix_str(f"{meeting} of {len(us)} meet every requirement", refresh=False)
+            bar.update()
+
+        us = _adam(model, starts, slack, advance)
+        ends = _sqp(model, us, slack, advance)
+    walked = np.stack(path, axis=1)
+
+    def path_to(i):
+        moving = np.flatnonzero((walked[i] != walked[i, -1]).any(axis=1))
+        return walked[i, : (moving[-1] if len(moving) else -1) + 2]
+
+    return ends, path_to
+
+
+def _adam(model, us, slack, advance):
+    import optax
+
+    rate = optax.exponential_decay(0.04, _ADAM_STEPS, 0.1)
+    optimiser = optax.adam(rate, b2=0.95)
+    state = optimiser.init(us)
+    for _ in range(_ADAM_STEPS):
+        _, excess, slope, jacobian = model(us)
+        pressed = _PENALTY * np.maximum(excess + slack, 0)
+        gradient = slope + np.einsum("nk,nkv->nv", pressed, jacobian)
+        # Beside an exceptional point or gross slip a derivative can be huge or overflow.
+        gradient = np.where(np.isfinite(gradient), gradient, 0)
+        norm = np.linalg.norm(gradient, axis=1, keepdims=True)
+        update, state = optimiser.update(gradient / np.maximum(norm, 1), state)
+        us = np.clip(us + np.asarray(update), 0, 1)
+        advance(us, excess)
+    return us
+
+
+def _evaluate(model, us):
+    """Points with everything known of them: places, values, excesses, slopes and Jacobians."""
+    us = np.clip(us, 0, 1)
+    values, excess, slope, jacobian = model(us)
+    return us, values, excess, slope, np.nan_to_num(jacobian)
+
+
+def _merit(points, slack):
+    _, values, excess, _, _ = points
+    merit = values + _PENALTY * np.maximum(excess + slack, 0).sum(axis=1)
+    return np.where(np.isfinite(merit), merit, np.inf)
+
+
+def _choose(mask, points, others):
+    return tuple(
+        np.where(mask.reshape(-1, *[1] * (x.ndim - 1)), x, y)
+        for x, y in zip(points, others, strict=True)
+    )
+
+
+def _sqp(model, us, slack, advance):
+    n, v = us.shape
+    hessian = np.tile(np.eye(v), (n, 1, 1))
+    radius = np.full(n, 0.05)
+    points = _evaluate(model, us)
+    for _ in range(_SQP_STEPS):
+        us, _, excess, slope, jacobian = points
+        low = np.maximum(-radius[:, None], -us)
+        high = np.minimum(radius[:, None], 1 - us)
+        step, weights = _quadratic_step(slope, hessian, excess + slack, jacobian, low, high)
+        trial = _evaluate(model, us + step)
+        # Along a curved constraint the exact penalty refuses full steps (the Maratos effect):
+        # a second step, with the constraints shifted to what they were at the first one.
+        shifted = trial[2] - np.einsum("nkv,nv->nk", jacobian, step)
+        step, _ = _quadratic_step(slope, hessian, shifted + slack, jacobian, low, high)
+        corrected = _evaluate(model, us + step)
+        trial = _choose(_merit(corrected, slack) < _merit(trial, slack), corrected, trial)
+
+        better = _merit(trial, slack) < _merit(points, slack)
+        step = trial[0] - us
+        change = trial[3] - slope + np.einsum("nk,nkv->nv", weights, trial[4] - jacobian)
+        hessian = np.where(better[:, None, None], _bfgs(hessian, step, change), hessian)
+        full = np.abs(step).max(axis=1) > 0.9 * radius
+        radius = np.where(better, np.where(full, 2 * radius, radius), radius / 3)
+        radius = np.clip(radius, 1e-14, 0.3)
+        points = _choose(better, trial, points)
+        advance(points[0], points[2])
+    return points[0]
+
+
+def _bfgs(hessian, step, change):
+    """Powell's damped update, which keeps every matrix positive definite."""
+    image = np.einsum("nij,nj->ni", hessian, step)
+    along = np.einsum("ni,ni->n", step, image)
+    curvature = np.einsum("ni,ni->n", step, change)
+    short = curvature < 0.2 * along
+    with np.errstate(divide="ignore", invalid="ignore"):
+        theta = np.where(short, 0.8 * along / (along - curvature), 1)[:, None]
+        mixed = theta * change + (1 - theta) * image
+        updated = (
+            hessian
+            - image[:, :, None] * image[:, None, :] / along[:, None, None]
+            + mixed[:, :, None]
+            * mixed[:, None, :]
+            / np.einsum("ni,ni->n", step, mixed)[:, None, None]
+        )
+    # Steps of no length and multipliers at their limit can spoil it: then start over.
+    identity = np.broadcast_to(np.eye(step.shape[1]), updated.shape)
+    finite = np.isfinite(updated).all(axis=(1, 2), keepdims=True)
+    spectrum = np.linalg.eigvalsh(np.where(finite, updated, identity))
+    sound = finite[:, 0, 0] & (spectrum[:, 0] > 1e-4) & (spectrum[:, -1] < 1e3)
+    return np.where(sound[:, None, None], updated, identity)
+
+
+def _quadratic_step(slope, hessian, excess, jacobian, low, high):
+    """The step of the quadratic model with linear constraints that has the least exact penalty.
+
+    Every set of at most v constraints, the faces of low <= p <= high (n, v) among them, is tried
+    as the active one; those faces are never left.
+    Returns steps (n, v) and the multipliers of the requirements (n, k).
+    """
+    n, k, v = jacobian.shape
+    faces = np.concatenate([np.eye(v), -np.eye(v)])
+    rows = np.concatenate([jacobian, np.tile(faces, (n, 1, 1))], axis=1)
+    bounds = np.concatenate([-excess, high, -low], axis=1)
+    # Active set A: p = -B^-1 (g + A' w) with A B^-1 A' w = -(b + A B^-1 g).
+    inverse = np.linalg.inv(hessian)
+    free = -np.einsum("nij,nj->ni", inverse, slope)
+    steps, weights = [free], [np.zeros((n, k))]
+    for size in range(1, v + 1):
+        for active in map(list, itertools.combinations(range(k + 2 * v), size)):
+            A = rows[:, active]
+            image = A @ inverse
+            schur = image @ A.transpose(0, 2, 1)
+            # Parallel or vanishing rows: their steps come out huge, and lose below.
+            trace = np.einsum("nii->n", schur)[:, None, None]
+            schur = schur + (1e-12 * trace + 1e-200) * np.eye(size)
+            right = np.einsum("nij,nj->ni", A, free) - bounds[:, active]
+            active_weights = np.linalg.solve(schur, right[..., None])[..., 0]
+            steps.append(free - np.einsum("nij,ni->nj", image, active_weights))
+            weight = np.zeros((n, k + 2 * v))
+            weight[:, active] = active_weights
+            weights.append(weight[:, :k])
+    steps, weights = np.stack(steps, axis=1), np.stack(weights, axis=1)
+    steps = np.clip(np.nan_to_num(steps), low[:, None], high[:, None])
+    model = (
+        np.einsum("nv,nsv->ns", slope, steps)
+        + np.einsum("nsi,nij,nsj->ns", steps, hessian, steps) / 2
+        + _PENALTY
+        * np.maximum(excess[:, None] + np.einsum("nkv,nsv->nsk", jacobian, steps), 0).sum(axis=2)
+    )
+    best = np.where(np.isfinite(model), model, np.inf).argmin(axis=1)
+    chosen = np.arange(n), best
+    return steps[chosen], np.clip(np.nan_to_num(weights[chosen]), 0, _PENALTY)

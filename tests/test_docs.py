@@ -1,0 +1,38 @@
+"""The generated pages say what their scripts say now."""
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).parents[1] / "docs"
+MEASURED = re.compile(r"\d\.?\d*e[+-]\d\d")
+FACTOR = 3  # rounding differs from machine to machine
+
+
+def _script(name):
+    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def pages():
+    """The committed page and the one generated now."""
+    script = _script("make_float32")
+    return script.PAGE.read_text(encoding="utf-8"), script.page()
+
+
+def test_float32_page_has_the_text_that_its_script_generates(pages):
+    committed, now = (MEASURED.sub("#", page) for page in pages)
+    assert committed == now
+
+
+def test_float32_page_has_the_numbers_that_are_measured_now(pages):
+    committed, now = ([float(x) for x in MEASURED.findall(page)] for page in pages)
+    assert len(committed) == len(now) > 50
+    assert now == pytest.approx(committed, rel=FACTOR - 1, abs=0)
+    assert committed == pytest.approx(now, rel=FACTOR - 1, abs=0)

@@ -1,0 +1,198 @@
+"""The command: what it prints and writes, and how it refuses."""
+
+import csv
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fractaljax as fj
+from fractaljax.__main__ import main
+
+
+@pytest.fixture(autouse=True)
+def somewhere_else(tmp_path, monkeypatch):
+    """Every test runs in an empty folder of its own."""
+    monkeypatch.chdir(tmp_path)
+
+
+def run(capsys, *arguments):
+    """Exit status, standard output and standard error of one call of the command."""
+    try:
+        status = main([str(argument) for argument in arguments])
+    except SystemExit as stop:
+        status = stop.code
+    return status, *capsys.readouterr()
+
+
+def test_design_without_arguments(capsys, tmp_path):
+    """The main job: a progress bar, a table, and three files that hold what was found."""
+    status, out, err = run(capsys, "design")
+    assert status == 0 and "120/120" in err
+    rows = ["D ", "G [m]", "K_n [N/m]", "K_t [N/m]", "K_t/K_n", "regime", "a_l/a_e"]
+    rows += ["Q_e/(mu_s P)", "growth rate [1/s]", "frequency [Hz]", "damping ratio"]
+    rows += ["active constraints", "found: ", "written to fractaljax-design: "]
+    lines = out.splitlines()
+    assert lines[0].split() == ["before", "after"]
+    assert [
+        line for line, row in zip(lines[1:], rows, strict=True) if not line.startswith(row)
+    ] == []
+    assert "+22.0801" in out and "growth_rate <= target" in out
+
+    folder = tmp_path / "fractaljax-design"
+    assert sorted(p.name for p in folder.iterdir()) == ["design.png", "design.toml", "history.csv"]
+    scene = fj.Scene.load(folder / "design.toml")
+    assert fj.growth_rate(scene) <= -np.pi
+    with open(folder / "history.csv", newline="") as file:
+        history = list(csv.DictReader(file))
+    assert float(history[0]["D"]) == pytest.approx(2.4)
+    assert float(history[-1]["G [m]"]) == pytest.approx(float(scene.contact.surface.G), rel=1e-12)
+    assert float(history[0]["growth_rate [1/s]"]) == pytest.approx(22.0801103, rel=1e-8)
+    assert [int(row["step"]) for row in history] == list(range(len(history)))
+    assert (folder / "design.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_design_of_a_users_scene(capsys, tmp_path):
+    """A scene file, bounds, options and an output folder of the user's own, made if missing."""
+    fj.brake_scene().replace(P=3000.0).save(tmp_path / "mine.toml")
+    arguments = ["--out", "a/b", "--D", 2.3, 2.8, "--G", 1e-11, 1e-9, "--target", -1, "--quiet"]
+    status, _, err = run(capsys, "design", "mine.toml", *arguments)
+    assert (status, err) == (0, "")
+    scene = fj.Scene.load("a/b/design.toml")
+    assert fj.growth_rate(scene) == pytest.approx(-1, abs=1e-4)
+    assert scene.contact.P == 3000
+
+
+def test_design_again_replaces_its_own_files_only(capsys, tmp_path):
+    """What else lies in the output folder stays."""
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "notes.txt").write_text("mine")
+    for _ in range(2):
+        assert run(capsys, "design", "--out", "out", "--quiet")[0] == 0
+    names = sorted(p.name for p in (tmp_path / "out").iterdir())
+    assert names == ["design.png", "design.toml", "history.csv", "notes.txt"]
+
+
+def test_infeasible_design_is_no_success(capsys):
+    """Exit status 1; table, comment and picture say that it is not a solution."""
+    status, out, _ = run(capsys, "design", "--K-n-min", 1e14, "--quiet")
+    assert status == 1
+    assert "not met: K_n >= K_n_min" in out and "infeasible" in out
+    text = Path("fractaljax-design/design.toml").read_text()
+    assert text.startswith("# infeasible") and "# not met: K_n >= K_n_min" in text
+
+
+def test_stability(capsys, tmp_path):
+    """The table of the reference brake, and of a file; the slope of the friction law left out."""
+    status, out, err = run(capsys, "stability")
+    assert (status, err) == (0, "")
+    assert "+22.0801  (it squeals)" in out and out.count("eigenvalue") == 4
+    fixed = fj.brake_scene().replace(contact=fj.FixedContact(0.0, 0.0), friction=fj.Coulomb(0.3))
+    fixed.save(tmp_path / "fixed.toml")
+    status, out, _ = run(capsys, "stability", "fixed.toml")
+    assert status == 0 and "(stable)" in out and "regime" not in out
+    status, out, _ = run(capsys, "stability", "--constant-friction")
+    assert status == 0 and "+23.311" in out
+
+
+def test_scene_is_a_scene_file(capsys, tmp_path):
+    """What `fractaljax scene` prints is the reference brake, to the last bit."""
+    status, out, _ = run(capsys, "scene")
+    (tmp_path / "scene.toml").write_text(out)
+    assert status == 0
+    assert fj.Scene.load("scene.toml").to_toml() == fj.brake_scene().to_toml() == out
+
+
+EDITS = [
+    ("D = 2.4", "D = 2.0", "[contact.surface] D must be above 2 and below 3, got 2.0"),
+    ("D = 2.4", "D = 3", "[contact.surface] D must be above 2 and below 3, got 3.0"),
+    ("G = 1.342e-10", "G = 0.0", "[contact.surface] G must be above 0, got 0.0"),
+    ("P = 1907.3", "P = -5.0", "[contact] P must be above 0, got -5.0"),
+    ("H = 994000000.0", "H = 3e8", "H must be at least sigma_y = 355000000.0, got 300000000.0"),
+    ("mu_m = 0.25", "mu_m = nan", "[friction] mu_m must be at least 0, got nan"),
+    ("mu_s = 0.4 ", "mu_s = '0.4' ", "[friction] mu_s must be a number, got '0.4'"),
+    ("v_m = 0.5", "v_n = 0.5", "[friction] has the unknown key 'v_n'"),
+    ("v_m = 0.5", "", "[friction] lacks the key 'v_m'"),
+    ("[oscillator]", "[oscilator]", "the file has the unknown key 'oscilator'"),
+    ("[friction]", "[friction", "bad.toml: "),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "message"), EDITS)
+@pytest.mark.parametrize("command", ["design", "stability"])
+def test_bad_scene_files(capsys, tmp_path, command, old, new, message):
+    """One line with file, table, bound and value; exit status 2; nothing written."""
+    text = fj.brake_scene().to_toml()
+    assert old in text
+    (tmp_path / "bad.toml").write_text(text.replace(old, new, 1))
+    status, out, err = run(capsys, command, "bad.toml")
+    assert (status, out) == (2, "")
+    assert err.startswith("fractaljax: bad.toml: ") and message in err and err.count("\n") == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["bad.toml"]
+
+
+def test_friction_beyond_its_law(capsys, tmp_path):
+    """mu_m above 0.9 is beyond Eq. 19."""
+    text = fj.brake_scene().to_toml().replace("mu_s = 0.4", "mu_s = 1.0")
+    (tmp_path / "bad.toml").write_text(text.replace("mu_m = 0.25", "mu_m = 0.95"))
+    status, _, err = run(capsys, "stability", "bad.toml")
+    assert status == 2 and "mu_m must be at most 0.9, got 0.95" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["design", "--out", "file/below", "--quiet"], "Not a directory"),
+        (["design", "--out", "file", "--quiet"], "File exists"),
+        (["design", "nowhere.toml"], "No such file"),
+        (["stability", "."], "Is a directory"),
+        (["design", "--D", 2.5, 2.3], "bounds on D must be (lower, upper), got (2.5, 2.3)"),
+        (["design", "--D", 2.5, 2.9], "D must lie inside its bounds [2.5, 2.9], got 2.4"),
+        (["design", "--starts", 0], "starts must be a whole number of at least 1, got 0"),
+        (["design", "--target", "low"], "invalid float value: 'low'"),
+        (["polish"], "invalid choice: 'polish'"),
+        ([], "required: command"),
+    ],
+)
+def test_bad_arguments(capsys, tmp_path, arguments, message):
+    """One line, exit status 2, and no folder left behind."""
+    (tmp_path / "file").write_text("in the way")
+    status, out, err = run(capsys, *arguments)
+    assert (status, out) == (2, "")
+    assert err.startswith("fractaljax: ") and message in err and err.count("\n") == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_interrupted_design_writes_nothing(capsys, tmp_path, monkeypatch):
+    """Ctrl-C: one line, exit status 130, the new folder gone."""
+
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("fractaljax.search._sqp", interrupt)
+    status, out, err = run(capsys, "design", "--quiet")
+    assert (status, out) == (130, "") and "interrupted, nothing written" in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_picture_that_fails_leaves_no_half_result(capsys, tmp_path, monkeypatch):
+    """All three files are ready before the first is written."""
+
+    def fail(*_, **__):
+        raise OSError("disk full")
+
+    monkeypatch.setattr("fractaljax.__main__._picture", fail)
+    status, _, err = run(capsys, "design", "--quiet", "--out", "a/b")
+    assert status == 2 and "disk full" in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_runs_as_a_module_in_double_precision():
+    """`python -m fractaljax` is the same command, and chooses float64 itself."""
+    done = subprocess.run(
+        [sys.executable, "-m", "fractaljax", "stability"], capture_output=True, text=True
+    )
+    assert done.returncode == 0 and done.stderr == ""
+    assert "+22.0801" in done.stdout
