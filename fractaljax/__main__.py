@@ -1,14 +1,21 @@
-"""The `fractaljax` command: design, stability, scene."""
+"""The `fractaljax` command: design, stability, cycle, scene."""
 
 import argparse
+import contextlib
 import csv
 import io
+import re
 import sys
 import tempfile
 from pathlib import Path
 
 
 class _Parser(argparse.ArgumentParser):
+    def __init__(self, *arguments, **options):
+        super().__init__(*arguments, **options)
+        # Older Pythons take -1e-5 for an option.
+        self._negative_number_matcher = re.compile(r"-\.?\d")
+
     def error(self, message):
         _refuse(message)
 
@@ -30,6 +37,7 @@ def _parser() -> _Parser:
         "design", help="find the nearest surface that does not squeal", description=_design.__doc__
     )
     _add_scene(design)
+    _add_constant_friction(design)
     design.add_argument("--out", type=Path, default=Path("fractaljax-design"), metavar="FOLDER")
     design.add_argument("--D", type=float, nargs=2, metavar=("LOW", "HIGH"), help="bounds on D")
     design.add_argument("--G", type=float, nargs=2, metavar=("LOW", "HIGH"), help="on G [m]")
@@ -45,7 +53,26 @@ def _parser() -> _Parser:
         "stability", help="print the stability of a scene", description=_stability.__doc__
     )
     _add_scene(stability)
+    _add_constant_friction(stability)
     stability.set_defaults(run=_stability)
+
+    cycle = commands.add_parser(
+        "cycle", help="find the stick-slip limit cycle", description=_cycle.__doc__
+    )
+    _add_scene(cycle)
+    cycle.add_argument("--out", type=Path, default=Path("fractaljax-cycle"), metavar="FOLDER")
+    cycle.add_argument(
+        "--start",
+        type=float,
+        nargs=4,
+        metavar=("X1", "X2", "V1", "V2"),
+        help="where the motion starts [m, m, m/s, m/s]; else near the sliding equilibrium",
+    )
+    cycle.add_argument("--rtol", type=float, default=1e-9, help="of period and states")
+    cycle.add_argument(
+        "--max-turns", type=int, default=1000, help="turns of the motion after which to give up"
+    )
+    cycle.set_defaults(run=_cycle)
 
     scene = commands.add_parser(
         "scene", help="print a scene file to start from", description=_scene.__doc__
@@ -58,6 +85,9 @@ def _add_scene(parser) -> None:
     parser.add_argument(
         "scene", nargs="?", type=Path, help="a scene file; else the reference brake"
     )
+
+
+def _add_constant_friction(parser) -> None:
     parser.add_argument(
         "--constant-friction",
         action="store_true",
@@ -89,15 +119,13 @@ def _stability(arguments) -> int:
 
 def _design(arguments) -> int:
     """Find the nearest stable surface; write design.toml, history.csv and design.png."""
+    from . import plot
     from .design import DEFAULT_BOUNDS, design
-    from .scene_file import write_whole
 
     scene = _load(arguments)
     asked = {"D": arguments.D, "G": arguments.G}
     bounds = DEFAULT_BOUNDS | {name: tuple(ends) for name, ends in asked.items() if ends}
-    created = _make_folder(arguments.out)
-    written = False
-    try:
+    with _output(arguments.out) as write:
         best = design(
             scene,
             bounds,
@@ -112,18 +140,60 @@ def _design(arguments) -> int:
         files = {
             "design.toml": _scene_text(best).encode(),
             "history.csv": _history_text(best).encode(),
-            "design.png": _picture(best),
+            "design.png": _picture(plot.design(best).figure),
         }
-        for name, content in files.items():
-            write_whole(arguments.out / name, content)
-        written = True
-    finally:
-        if not written:
-            for folder in created:
-                folder.rmdir()
+        write(files)
     print(best)
     print(f"written to {arguments.out}: {', '.join(files)}")
     return 1 if best.violated else 0
+
+
+def _cycle(arguments) -> int:
+    """Find the limit cycle that the motion ends in; write cycle.png and cycle.csv."""
+    from . import plot
+    from .limit_cycle import CycleResult, limit_cycle
+    from .report import cycle_table
+
+    scene = _load(arguments)
+    with _output(arguments.out) as write:
+        cycle = limit_cycle(
+            scene,
+            arguments.start,
+            rtol=arguments.rtol,
+            max_turns=arguments.max_turns,
+            throw=False,
+        )
+        found = cycle.result in (CycleResult.converged, CycleResult.inaccurate)
+        files = {}
+        if found:
+            files["cycle.png"] = _picture(plot.cycle(cycle))
+            files["cycle.csv"] = _orbit_text(cycle).encode()
+            write(files)
+    print(cycle_table(scene, cycle))
+    if found:
+        print(f"written to {arguments.out}: {', '.join(files)}")
+    return 0 if found else 1
+
+
+@contextlib.contextmanager
+def _output(folder: Path):
+    """Make sure that files can be written to `folder`, and offer to write {name: content} there.
+
+    Where nothing has been written at the end, folders made for it are removed.
+    """
+    from .scene_file import write_whole
+
+    def write(files):
+        for name, content in files.items():
+            write_whole(folder / name, content)
+
+    created = _make_folder(folder)
+    try:
+        yield write
+    finally:
+        with contextlib.suppress(OSError):  # no longer empty
+            for made in created:
+                made.rmdir()
 
 
 def _make_folder(path: Path) -> list[Path]:
@@ -140,29 +210,44 @@ def _scene_text(best) -> str:
     return "\n".join([*lines, best.scene.to_toml()])
 
 
+_SAMPLES = 512  # of one period
 _UNITS = {"G": "m", "growth_rate": "1/s", "K_n": "N/m", "K_t": "N/m"}
 
 
 def _history_text(best) -> str:
+    titles = [f"{name} [{_UNITS[name]}]" if name in _UNITS else name for name in best.history]
+    columns = [column.tolist() for column in best.history.values()]
+    return _csv_text(
+        ["step", *titles], ([i, *row] for i, row in enumerate(zip(*columns, strict=True)))
+    )
+
+
+def _orbit_text(cycle) -> str:
+    t, states = cycle.orbit(_SAMPLES)
+    titles = ["time [s]", "x1 [m]", "x2 [m]", "v1 [m/s]", "v2 [m/s]"]
+    rows = zip(t.tolist(), states.tolist(), strict=True)
+    return _csv_text(titles, ([time, *state] for time, state in rows))
+
+
+def _csv_text(titles, rows) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    titles = [f"{name} [{_UNITS[name]}]" if name in _UNITS else name for name in best.history]
-    writer.writerow(["step", *titles])
-    columns = [column.tolist() for column in best.history.values()]
-    writer.writerows([i, *row] for i, row in enumerate(zip(*columns, strict=True)))
+    writer.writerow(titles)
+    writer.writerows(rows)
     return text.getvalue()
 
 
-def _picture(best) -> bytes:
-    from . import plot
-
+def _picture(figure) -> bytes:
     content = io.BytesIO()
-    plot.design(best).figure.savefig(content, format="png", dpi=150)
+    figure.savefig(content, format="png", dpi=150)
     return content.getvalue()
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command; returns its exit status: 0, 1 for an infeasible design, 2 for bad input."""
+    """Run the command; returns its exit status.
+
+    0, or 1 for an infeasible design or no limit cycle, or 2 for bad input.
+    """
     arguments = _parser().parse_args(argv)
     import jax
 

@@ -19,9 +19,16 @@ class Friction(Part):
     mu_s: eqx.AbstractVar[jax.Array]
     mu_m: eqx.AbstractVar[jax.Array]
 
-    @abc.abstractmethod
     def coefficient(self, v) -> jax.Array:
         """mu at sliding velocity v [m/s], with the sign of v; any shape."""
+        return self.branch(v, jnp.sign(v))
+
+    @abc.abstractmethod
+    def branch(self, v, sign) -> jax.Array:
+        """mu with `sign` (+1 or -1, or any number between) in place of sgn v, smooth in v.
+
+        branch(0, +-1) = +-mu_s: the law of one sliding direction, continued through v = 0.
+        """
 
     @abc.abstractmethod
     def slope(self, v) -> jax.Array:
@@ -50,8 +57,8 @@ class Coulomb(Friction):
     def mu_m(self):
         return self.mu
 
-    def coefficient(self, v):
-        return self.mu * jnp.sign(v)
+    def branch(self, v, sign):
+        return self.mu * sign
 
     def slope(self, v):
         return jnp.zeros_like(v)
@@ -78,9 +85,9 @@ class Stribeck(Friction):
         self.mu_s = ordered("mu_s", self.mu_s, "mu_m", self.mu_m)
         self.v_m = number("v_m", v_m, above=0)
 
-    def coefficient(self, v):
+    def branch(self, v, sign):
         drop, u = self.mu_s - self.mu_m, v / self.v_m
-        return self.mu_s * jnp.sign(v) + drop * u * (u**2 - 3) / 2
+        return self.mu_s * sign + drop * u * (u**2 - 3) / 2
 
     def slope(self, v):
         drop, u = self.mu_s - self.mu_m, v / self.v_m

@@ -1,12 +1,14 @@
-"""Scenes and designs as tables that people read."""
+"""Scenes, designs and limit cycles as tables that people read."""
 
 import jax.numpy as jnp
 
 from .contact import Regime
+from .limit_cycle import CycleResult, LimitCycle
 from .scene import Scene, stiffness
 from .stability import stability
 
 _ABSENT = "-"
+_MODES = {"+": "slips, dx/dt < V", "-": "slips, dx/dt > V", "stick": "sticks"}
 
 
 def scene_rows(scene: Scene, friction_slope: bool = True) -> dict[str, str]:
@@ -40,14 +42,67 @@ def scene_rows(scene: Scene, friction_slope: bool = True) -> dict[str, str]:
 def stability_table(scene: Scene, friction_slope: bool = True) -> str:
     """The rows of one scene, its verdict, and every eigenvalue."""
     modes = stability(scene, friction_slope)
-    verdict = "it squeals" if modes.growth_rate > 0 else "stable"
-    rows = scene_rows(scene, friction_slope)
-    rows["growth rate [1/s]"] += f"  ({verdict})"
+    rows = scene_rows(scene, friction_slope) | _verdict(modes)
     rows |= {
         f"eigenvalue {i} [1/s]": f"{s.real:+.6g} {s.imag:+.6g}i"
         for i, s in enumerate(modes.eigenvalues.tolist(), start=1)
     }
     return table([""], [rows])
+
+
+def _verdict(modes) -> dict[str, str]:
+    verdict = "it squeals" if modes.growth_rate > 0 else "stable"
+    return {"growth rate [1/s]": f"{modes.growth_rate:+.6g}  ({verdict})"}
+
+
+def cycle_table(scene: Scene, cycle: LimitCycle) -> str:
+    """What became of the search for one limit cycle, its numbers, and its changes of mode."""
+    found = {"result": str(CycleResult[cycle.result])} | _verdict(stability(scene))
+    if not jnp.isfinite(cycle.period):
+        return table([""], [found])
+    whole = found | {
+        "period [ms]": f"{cycle.period * 1e3:.6g}",
+        "frequency [Hz]": f"{cycle.frequency:.6g}",
+        "turns in a period": f"{cycle.turns}",
+        "contact pulls": f"{cycle.tension_fraction:.2%} of the period",
+        "estimated error": f"{cycle.error:.1e}",
+    }
+    regularised = cycle.regularisation_error != 0
+    if regularised:
+        whole["off the exact law by"] = f"{cycle.regularisation_error:.1e}"
+    # Rounded first: one of them may be zero up to rounding, with a sign that says nothing.
+    multipliers = (jnp.round(cycle.multipliers, 6) + 0).tolist()
+    whole |= {
+        f"Floquet multiplier {i}": f"{s.real:+.6f} {s.imag:+.6f}i  (modulus {abs(s):.6f})"
+        for i, s in enumerate(multipliers, start=1)
+    }
+    directions = [
+        {
+            "peak to peak [m]": f"{cycle.amplitude[i]:.6g}",
+            "least dx/dt [m/s]": f"{cycle.velocity_min[i]:+.6g}",
+            "largest dx/dt [m/s]": f"{cycle.velocity_max[i]:+.6g}",
+            "sticks": f"{cycle.stick_fraction[i]:.2%} of the period",
+        }
+        for i in range(2)
+    ]
+    tables = [table([""], [whole]), table(["x1, along the belt", "x2, normal to it"], directions)]
+    switches = [] if regularised else cycle.switches()
+    if switches:
+        tables.append(_switching(switches, cycle.period))
+    return "\n\n".join(tables)
+
+
+def _switching(switches, period) -> str:
+    columns = {
+        "time [ms]": [f"{at.time * 1e3:.6f}" for at in switches],
+        "of the period": [f"{at.time / period:.2%}" for at in switches],
+        "direction": [f"x{at.direction}" for at in switches],
+        "before": [_MODES[at.before] for at in switches],
+        "after": [_MODES[at.after] for at in switches],
+    }
+    names = [f"switch {i}" for i in range(1, len(switches) + 1)]
+    rows = [dict(zip(names, cells, strict=True)) for cells in columns.values()]
+    return table(list(columns), rows) + "\ntime 0: x1 is largest"
 
 
 def comparison_table(before: Scene, after: Scene, friction_slope: bool, active) -> str:

@@ -1,0 +1,117 @@
+"""A coarse step that stops where the first guard of a mode reaches zero."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from .stick_slip import SECTION, StickSlip
+
+NONE = SECTION + 1  # in place of a guard's number: no guard ended the step
+
+
+class Cubic(eqx.Module):
+    """k_0 + k_1 x + k_2 x^2 + k_3 x^3 on 0 <= x <= 1, elementwise."""
+
+    k_0: jax.Array
+    k_1: jax.Array
+    k_2: jax.Array
+    k_3: jax.Array
+
+    @classmethod
+    def through(cls, g_0, g_1, d_0, d_1) -> "Cubic":
+        """With values g and slopes d at 0 and at 1."""
+        return cls(g_0, d_0, 3 * (g_1 - g_0) - 2 * d_0 - d_1, d_0 + d_1 - 2 * (g_1 - g_0))
+
+    def __call__(self, x):
+        return self.k_0 + x * (self.k_1 + x * (self.k_2 + x * self.k_3))
+
+    def slope(self, x):
+        """Its derivative at x."""
+        return self.k_1 + x * (2 * self.k_2 + 3 * x * self.k_3)
+
+    def minimum(self) -> tuple[jax.Array, jax.Array]:
+        """Where it is lowest strictly inside, and whether it is so anywhere; else 0."""
+        below = self.k_2 + jnp.sqrt(jnp.maximum(self.k_2**2 - 3 * self.k_1 * self.k_3, 0))
+        x = jnp.where(below == 0, 0, -self.k_1 / jnp.where(below == 0, 1, below))
+        inside = (x > 0) & (x < 1)
+        return jnp.where(inside, x, 0), inside
+
+    def root_before(self, end) -> jax.Array:
+        """Where it falls through zero in (0, end], if it does: Newton steps from the secant."""
+        at_end = self(end)
+        x = end * self.k_0 / jnp.where(self.k_0 == at_end, 1, self.k_0 - at_end)
+        for _ in range(3):
+            slope = self.slope(x)
+            x = jnp.clip(x - self(x) / jnp.where(slope == 0, 1, slope), 0, end)
+        return x
+
+
+def without_start(cubic: Cubic, fresh) -> Cubic:
+    """The cubic, divided by x where it starts at zero: `fresh`, a guard that has just left zero.
+
+    Its root at the start is not found again then, and a short excursion is not missed.
+    """
+    k_0, k_1, k_2, k_3 = cubic.k_0, cubic.k_1, cubic.k_2, cubic.k_3
+    return Cubic(
+        jnp.where(fresh, jnp.maximum(k_1, 0), k_0),
+        jnp.where(fresh, k_2, k_1),
+        jnp.where(fresh, k_3, k_2),
+        jnp.where(fresh, 0, k_3),
+    )
+
+
+def first_root(g_0, g_1, d_0, d_1) -> jax.Array:
+    """Where in (0, 1] a cubic falls through zero first, or 2 if it does not; any shape.
+
+    Given are its values and slopes at 0 and 1. One that starts at zero has just left it, and that
+    root does not count. One that starts below zero is late: its root is 0.
+    """
+    fresh = g_0 == 0
+    cubic = without_start(Cubic.through(g_0, g_1, d_0, d_1), fresh)
+    # A minimum inside that is below zero hides a root before it even if the end is above.
+    lowest, dips = cubic.minimum()
+    dips &= cubic(lowest) < 0
+    end = jnp.where(dips, lowest, 1)
+    x = cubic.root_before(end)
+    # A step of no length would be tried for ever.
+    x = jnp.where(fresh, jnp.maximum(x, 1e-6), x)
+    return jnp.where(g_0 < 0, 0, jnp.where(cubic(end) < 0, x, 2))
+
+
+def guards_and_rates(system: StickSlip, y, s, h, f) -> tuple[jax.Array, jax.Array]:
+    """The guards at y and their changes over a step h, where dy/dt = f."""
+    return system.guards(y, s), h * system.guards(f, s, 0.0)
+
+
+def armed(guards) -> jax.Array:
+    """Which guards can end a step that starts with these: all, but the section only from above."""
+    return jnp.concatenate([jnp.ones(guards[:SECTION].shape, bool), guards[SECTION:] > 0], axis=0)
+
+
+def step(system: StickSlip, y, s, h):
+    """A step h, or less, in mode s by the classical fourth-order method.
+
+    Returns the state and mode after it, its length, and the number of the guard that ended it or
+    `NONE`. States inside the step come from the cubic through its ends.
+    """
+    f_0 = system.field(y, s)
+    f_b = system.field(y + h / 2 * f_0, s)
+    f_c = system.field(y + h / 2 * f_b, s)
+    f_d = system.field(y + h * f_c, s)
+    y_1 = y + h / 6 * (f_0 + 2 * f_b + 2 * f_c + f_d)
+    f_1 = system.field(y_1, s)
+
+    g_0, d_0 = guards_and_rates(system, y, s, h, f_0)
+    g_1, d_1 = guards_and_rates(system, y_1, s, h, f_1)
+    roots = jnp.where(armed(g_0), first_root(g_0, g_1, d_0, d_1), 2)
+    theta = jnp.min(roots, axis=0)
+    hit = theta <= 1
+    guard = jnp.where(hit, jnp.argmin(roots, axis=0), NONE)
+    left, right = 1 - theta, theta
+    between = (
+        left**2 * (1 + 2 * theta) * y
+        + right**2 * (3 - 2 * theta) * y_1
+        + h * left * right * (left * f_0 - right * f_1)
+    )
+    y_end, s_end = system.switch(jnp.where(hit, between, y_1), s, guard)
+    return y_end, s_end, jnp.where(hit, theta, 1) * h, guard
