@@ -225,7 +225,8 @@ def design(
     request, us = _choose_starts(problem, request, starts)
     ends, path_to = search(_model(problem, request, starts), us, _slack(request), progress)
     values, excess, _, _ = _model(problem, request, starts)(ends)
-    worst = np.nan_to_num(excess.max(axis=1), nan=np.inf)
+    # Without a value, as where an objective of the limit cycle finds none, a surface is no answer.
+    worst = np.where(np.isnan(values), np.inf, np.nan_to_num(excess.max(axis=1), nan=np.inf))
     if (worst <= 0).any():
         values = np.where(worst <= 0, values, np.inf)
         least = values.min()

@@ -79,13 +79,16 @@ def first_root(g_0, g_1, d_0, d_1) -> jax.Array:
 
 
 def guards_and_rates(system: StickSlip, y, s, h, f) -> tuple[jax.Array, jax.Array]:
-    """The guards at y and their changes over a step h, where dy/dt = f."""
-    return system.guards(y, s), h * system.guards(f, s, 0.0)
+    """The guards at y (4, ...) and their changes over a step h (...), where dy/dt = f."""
+    return system.guards(y, s), jnp.asarray(h)[None] * system.guards(f, s, 0.0)
 
 
-def armed(guards) -> jax.Array:
-    """Which guards can end a step that starts with these: all, but the section only from above."""
-    return jnp.concatenate([jnp.ones(guards[:SECTION].shape, bool), guards[SECTION:] > 0], axis=0)
+def _nearest(guards, rates, of) -> tuple[jax.Array, jax.Array]:
+    """Of the two guards of each direction the lower one according to `of`; and the section's."""
+    return tuple(
+        jnp.stack([*(jnp.where(of[k] <= of[k + 1], x[k], x[k + 1]) for k in (0, 2)), x[SECTION]])
+        for x in (guards, rates)
+    )
 
 
 def step(system: StickSlip, y, s, h):
@@ -94,24 +97,31 @@ def step(system: StickSlip, y, s, h):
     Returns the state and mode after it, its length, and the number of the guard that ended it or
     `NONE`. States inside the step come from the cubic through its ends.
     """
+    h = h / jnp.maximum(1, 2 * system.stiffness(y))
+    step = h[None]
     f_0 = system.field(y, s)
-    f_b = system.field(y + h / 2 * f_0, s)
-    f_c = system.field(y + h / 2 * f_b, s)
-    f_d = system.field(y + h * f_c, s)
-    y_1 = y + h / 6 * (f_0 + 2 * f_b + 2 * f_c + f_d)
+    f_b = system.field(y + step / 2 * f_0, s)
+    f_c = system.field(y + step / 2 * f_b, s)
+    f_d = system.field(y + step * f_c, s)
+    y_1 = y + step / 6 * (f_0 + 2 * f_b + 2 * f_c + f_d)
     f_1 = system.field(y_1, s)
 
-    g_0, d_0 = guards_and_rates(system, y, s, h, f_0)
-    g_1, d_1 = guards_and_rates(system, y_1, s, h, f_1)
-    roots = jnp.where(armed(g_0), first_root(g_0, g_1, d_0, d_1), 2)
+    at_0, at_1 = guards_and_rates(system, y, s, h, f_0), guards_and_rates(system, y_1, s, h, f_1)
+    (g_0, d_0), (g_1, d_1) = _nearest(*at_0, at_1[0]), _nearest(*at_1, at_1[0])
+    roots = first_root(g_0, g_1, d_0, d_1)
+    # The section counts only where it is approached from above.
+    roots = jnp.stack([roots[0], roots[1], jnp.where(g_0[2] > 0, roots[2], 2)])
     theta = jnp.min(roots, axis=0)
     hit = theta <= 1
-    guard = jnp.where(hit, jnp.argmin(roots, axis=0), NONE)
-    left, right = 1 - theta, theta
+    first = jnp.argmin(roots, axis=0)
+    second = jnp.stack([at_1[0][k + 1] < at_1[0][k] for k in (0, 2)])
+    guard = jnp.where(first == 2, SECTION, 2 * first + jnp.where(first == 1, second[1], second[0]))
+    guard = jnp.where(hit, guard, NONE)
+    left, right = 1 - theta[None], theta[None]
     between = (
-        left**2 * (1 + 2 * theta) * y
-        + right**2 * (3 - 2 * theta) * y_1
-        + h * left * right * (left * f_0 - right * f_1)
+        left**2 * (1 + 2 * right) * y
+        + right**2 * (3 - 2 * right) * y_1
+        + step * left * right * (left * f_0 - right * f_1)
     )
-    y_end, s_end = system.switch(jnp.where(hit, between, y_1), s, guard)
+    y_end, s_end = system.switch(jnp.where(hit[None], between, y_1), s, guard)
     return y_end, s_end, jnp.where(hit, theta, 1) * h, guard

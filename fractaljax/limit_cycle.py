@@ -159,9 +159,9 @@ def _extremes(system: StickSlip, segments: Segments) -> jax.Array:
     y, h, s = segments.y, segments.duration, segments.s
     ends = next_start(y)
     sign = jnp.array([1.0, -1.0], y.dtype)[:, None, None]
-    d_0, d_1 = (sign * h * system.field(at, s) for at in (y, ends))
+    d_0, d_1 = (sign * (h[None] * system.field(at, s))[None] for at in (y, ends))
     # Where the cubic through the ends of each segment is lowest.
-    cubic = Cubic.through(sign * y, sign * ends, d_0, d_1)
+    cubic = Cubic.through(sign * y[None], sign * ends[None], d_0, d_1)
     theta, inside = cubic.minimum()
     low = cubic(theta)
     k = jnp.argmin(low, axis=-1)
@@ -173,7 +173,7 @@ def _extremes(system: StickSlip, segments: Segments) -> jax.Array:
     def refine(_, t):
         along = flow(system, y, t, s)
         rate, change = jax.jvp(lambda at: system.field(at, s), (along,), (system.field(along, s),))
-        rate, change = jnp.sum(own * rate, axis=0), jnp.sum(own * change, axis=0)
+        rate, change = (jnp.sum(own * x, axis=0) for x in (rate, change))
         step = rate / jnp.where(change == 0, 1, change)
         return jnp.where(inside, jnp.clip(t - step, -0.1 * h, 1.1 * h), t)
 
@@ -196,7 +196,7 @@ def _time_below_zero(system: StickSlip, segments: Segments, component: int) -> j
     last = 1 - first_root(turned * g_1, turned * g_0, -turned * d_1, -turned * d_0)
     (k,) = jnp.nonzero(first <= 1, size=_CROSSINGS, fill_value=-1)
     y, s, h, sign = y[:, k], s[:, k], h[k], sign[k]
-    t = jnp.stack([first[k], last[k]]) * h
+    t = jnp.stack([first[k], last[k]]) * h[None]
     y, s = y[:, None], s[:, None]
 
     def refine(_, t):
@@ -221,7 +221,7 @@ def _monodromy(system: StickSlip, segments: Segments, local) -> jax.Array:
     before, after = system.field(ends, s), system.field(ends, jnp.roll(s, -1, axis=-1))
     used = segments.guard != UNUSED
     speed = jnp.where(used, jnp.sum(local.c * before, axis=0), 1)
-    jump = jnp.where(used, (after - before) / speed, 0)
+    jump = jnp.where(used[None], (after - before) / speed[None], 0)
     eye = jnp.eye(4, dtype=ends.dtype)
     M = jnp.einsum("ijn,jkn->nik", eye[:, :, None] + jump[:, None] * local.c[None], local.A)
     while len(M) > 1:
@@ -279,7 +279,7 @@ def _limit_cycle(scene: Scene, start, max_turns, *, segments: int, rtol: float) 
 
     period = only(period)
     scale = units(system)
-    low, high = _extremes(system, loop) * scale
+    low, high = _extremes(system, loop) * scale[None]
     time_pulling = _time_below_zero(system, loop, 1)
     return LimitCycle(
         period=period / system.omega,
@@ -313,7 +313,7 @@ def _regularised_cycle(
     )
     times, states = regularised.nodes(solution)
     rates = jax.vmap(lambda y: regularised.field(0.0, y, (system, eps)))(states)
-    low, high = regularised.extremes(times, states, rates) * units(system)
+    low, high = regularised.extremes(times, states, rates) * units(system)[None]
 
     def end(y):
         # Tangents are less accurate than states at the same tolerance.
@@ -361,7 +361,7 @@ def _regularised_cycle(
 
 
 def _segments_for(rtol: float) -> int:
-    # 40 resolve a turn to some 1e-11 in 64 bits; the method is of order eight.
+    # 40 resolve a turn to some 1e-12 in 64 bits; the method is of order eight.
     return int(np.clip(round(40 * (1e-9 / rtol) ** 0.125), 24, 256))
 
 
@@ -472,7 +472,7 @@ def _spread(scene: Scene) -> jax.Array:
     first, second = 2 * jnp.pi * k / 32, 2 * jnp.pi * ((k * 0.618034) % 1)
     size = jnp.array([0.5, 1.0, 2.0])[k % 3]
     away = jnp.stack([jnp.cos(first), jnp.cos(second), jnp.sin(first), jnp.sin(second)], axis=1)
-    return (still + size[:, None] * away) * units(system)
+    return (still[None] + size[:, None] * away) * units(system)[None]
 
 
 def _same(one: LimitCycle, other: LimitCycle) -> bool:

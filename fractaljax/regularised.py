@@ -108,7 +108,7 @@ def close(system: StickSlip, eps, y, solver, rtol, max_steps: int) -> Periodic:
     times, states = nodes(window)
     times = _turns(times, states[:, 2])
     ends = jax.vmap(window.evaluate)(jnp.nan_to_num(times))
-    distances = jnp.max(jnp.abs(ends[1 : _LONGEST + 1] - ends[0]), axis=1)
+    distances = jnp.max(jnp.abs(ends[1 : _LONGEST + 1] - ends[:1]), axis=1)
     distances = jnp.where(jnp.isnan(times[1 : _LONGEST + 1]), jnp.inf, distances)
     closest = jnp.min(distances)
     turns = 1 + jnp.argmax(distances <= 2 * closest + 1e-6)
@@ -136,10 +136,10 @@ def close(system: StickSlip, eps, y, solver, rtol, max_steps: int) -> Periodic:
 
 def extremes(times, states, rates) -> jax.Array:
     """Smallest and largest value of each component (2, 4) over the steps of a solution."""
-    h = jnp.diff(times)[:, None]
+    change = jnp.diff(times)[None, :, None] * jnp.stack([rates[:-1], rates[1:]])
     sign = jnp.array([1.0, -1.0], states.dtype)[:, None, None]
     cubic = Cubic.through(
-        sign * states[:-1], sign * states[1:], sign * h * rates[:-1], sign * h * rates[1:]
+        sign * states[None, :-1], sign * states[None, 1:], sign * change[:1], sign * change[1:]
     )
     theta, _ = jax.lax.stop_gradient(cubic.minimum())
     return sign[:, 0] * jnp.min(cubic(theta), axis=1)

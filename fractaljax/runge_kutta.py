@@ -12,12 +12,13 @@ import numpy as np
 
 
 def runge_kutta(tableau, field: Callable, y, h, *, written_out: bool = False) -> jax.Array:
-    """The state after a step h of dy/dt = field(y); y of any shape, h broadcasts to it.
+    """The state after a step h of dy/dt = field(y); y of any shape, h broadcasts with it.
 
     `tableau` is that of an explicit diffrax solver. A loop over the stages compiles several times
     faster; `written_out`, a batch of steps runs several times faster.
     """
-    y = jnp.broadcast_to(y, jnp.broadcast_shapes(y.shape, jnp.shape(h)))
+    shape = jnp.broadcast_shapes(y.shape, jnp.shape(h))
+    y, h = jnp.broadcast_to(y, shape), jnp.broadcast_to(h, shape)
     if written_out:
         slopes = [field(y)]
         for row in tableau.a_lower:

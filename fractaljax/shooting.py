@@ -44,8 +44,8 @@ def _tableau():
 
 
 def flow(system: StickSlip, y, duration, s) -> jax.Array:
-    """The state after `duration` in mode s, by one eighth-order step."""
-    return runge_kutta(_tableau(), lambda y: system.field(y, s), y, duration)
+    """The state (4, ...) after `duration` (...) in mode s (2, ...), by one eighth-order step."""
+    return runge_kutta(_tableau(), lambda y: system.field(y, s), y, jnp.asarray(duration)[None])
 
 
 def next_start(y) -> jax.Array:
@@ -86,7 +86,7 @@ def maps(system: StickSlip, segments: Segments, written_out=False) -> tuple[jax.
         jnp.moveaxis(units, 1, 0)
     )
     along = system.field(next_start(segments.y), segments.s)
-    return ends, Maps(A, b, jnp.where(segments.guard == NONE, along, c))
+    return ends, Maps(A, b, jnp.where(segments.guard[None] == NONE, along, c))
 
 
 def corrections(local: Maps, used, gap, guard):
@@ -95,12 +95,12 @@ def corrections(local: Maps, used, gap, guard):
     dy_next = A dy + b dt + gap with c dy_next = -guard on every segment, round the whole chain.
     """
     speed = jnp.where(used, jnp.sum(local.c * local.b, axis=0), 1)
-    b = jnp.where(used, local.b, 0) / speed  # no duration to change where unused
+    b = jnp.where(used[None], local.b, 0) / speed[None]  # no duration to change where unused
     P = jnp.eye(4, dtype=b.dtype)[:, :, None] - b[:, None] * local.c[None]
     # M dy + q of every segment, then chained from the first. Apart, as only q is linear in the
     # arguments, which reverse mode needs to see.
     M = jnp.einsum("ijn,jkn->ikn", P, local.A)
-    q = (jnp.einsum("ijn,jn->in", P, gap) - b * guard)[:, None]
+    q = (jnp.einsum("ijn,jn->in", P, gap) - b * guard[None])[:, None]
 
     def chain(first, second):
         (M_1, q_1), (M_2, q_2) = first, second
@@ -144,15 +144,15 @@ def equalise(system: StickSlip, segments: Segments) -> Segments:
     used = guard != UNUSED
     ends_phase = used & (guard != NONE)
     phase = jnp.cumsum(ends_phase) - ends_phase
-    together = (phase[:, None] == phase) & used[:, None] & used
+    together = (phase[:, None] == phase[None]) & used[:, None] & used[None]
     count = jnp.maximum(jnp.sum(together, axis=1), 1)
-    equal = jnp.where(used, jnp.sum(jnp.where(together, h, 0), axis=1) / count, 0)
+    equal = jnp.where(used, jnp.sum(jnp.where(together, h[None], 0), axis=1) / count, 0)
     old, new = jnp.cumsum(h) - h, jnp.cumsum(equal) - equal
     # From the nearest known state in the same phase.
-    away = new[:, None] - old
+    away = new[:, None] - old[None]
     k = jnp.argmin(jnp.where(together, jnp.abs(away), jnp.inf), axis=1)
     after = jnp.where(used, jnp.take_along_axis(away, k[:, None], axis=1)[:, 0], 0)
-    y = jnp.where(used, flow(system, segments.y[:, k], after, s), segments.y)
+    y = jnp.where(used[None], flow(system, segments.y[:, k], after, s), segments.y)
     return Segments(y, equal, s, guard)
 
 

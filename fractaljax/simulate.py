@@ -50,14 +50,14 @@ class Trajectory(Record):
         times = jnp.asarray(times)
         if self._solution is not None:
             states = jax.vmap(self._solution.evaluate)(times * self._system.omega)
-            return states * units(self._system)
+            return states * units(self._system)[None]
         k = jnp.searchsorted(
             jax.lax.stop_gradient(self.times), jax.lax.stop_gradient(times), side="right"
         )
         k = jnp.clip(k - 1, 0, len(self.times) - 1)
         scale = units(self._system)
         after = (times - self.times[k]) * self._system.omega
-        y = flow(self._system, (self.states[k] / scale).T, after, self.modes[k].T)
+        y = flow(self._system, (self.states[k] / scale[None]).T, after, self.modes[k].T)
         return (y * scale[:, None]).T
 
     def switches(self) -> list[tuple[float, int, int, int]]:
@@ -130,6 +130,7 @@ def _event(system: StickSlip, y, s, h, y_1):
 
 def _step(system: StickSlip, y, s, h):
     """A step h, or less, in mode s: state, mode, length and the guard that ended it."""
+    h = h / jnp.maximum(1, 2 * system.stiffness(y))
     y_1 = flow(system, y, h, s)
     g_0, d_0 = guards_and_rates(system, y, s, h, system.field(y, s))
     g_1, d_1 = guards_and_rates(system, y_1, s, h, system.field(y_1, s))
@@ -199,7 +200,7 @@ def _run(system: StickSlip, y, end, h, *, max_steps: int) -> _Steps:
     y, s, t, count, duration, modes, guards = jax.lax.while_loop(running, body, start)
     status = jnp.where(t >= end, 0, jnp.where(count >= max_steps, 1, 2))
     # The steps that were not needed keep the last mode.
-    modes = jnp.where(jnp.arange(max_steps) < count, modes, s[:, None])
+    modes = jnp.where(jnp.arange(max_steps)[None] < count, modes, s[:, None])
     return _Steps(duration, modes, guards, jnp.asarray(count), status)
 
 
@@ -231,7 +232,7 @@ def _repeat(system: StickSlip, y, end, steps: _Steps) -> Trajectory:
         result = SimulationResult.where(steps.status == outcome, member, result)
     return Trajectory(
         times=jnp.concatenate([jnp.zeros(1, y.dtype), times]) / system.omega,
-        states=jnp.concatenate([y[None], states]) * scale,
+        states=jnp.concatenate([y[None], states]) * scale[None],
         modes=jnp.concatenate([steps.s[:, :1].T, modes]),
         result=result,
         _system=system,
@@ -259,7 +260,7 @@ def _regularised(system: StickSlip, y, end, eps, solver, rtol, max_steps: int) -
     result = SimulationResult.where(far, SimulationResult.diverged, result)
     return Trajectory(
         times=times / system.omega,
-        states=states * units(system),
+        states=states * units(system)[None],
         modes=jnp.where(jnp.abs(sliding) < eps, 0, jnp.sign(sliding)),
         result=result,
         _system=system,

@@ -57,6 +57,19 @@ class StickSlip(eqx.Module):
         slipping = zip(self.accelerations(y, s), s, strict=True)
         return jnp.stack([y[2], y[3], *(jnp.where(s_i == 0, 0, a) for a, s_i in slipping)])
 
+    def stiffness(self, y) -> jax.Array:
+        """The rate at which friction alone changes sliding velocities; far out it is the largest.
+
+        Zero of shape (...) for a law without slope.
+        """
+        if not self.friction.velocity_dependent:
+            return jnp.zeros_like(y[0])
+        rates = [
+            jnp.abs(self.V * self.friction.slope(self.V * (1 - u)) * load)
+            for load, u in zip(self.loads(y), y[2:], strict=True)
+        ]
+        return jnp.maximum(*rates)
+
     def guards(self, y, s, one=1.0) -> jax.Array:
         """Five functions that are positive while mode s lasts, affine in y; shape (5, ...).
 

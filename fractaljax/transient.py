@@ -51,7 +51,11 @@ class _Run(eqx.Module):
 
 
 def _where(condition, new, old):
-    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), new, old)
+    def choose(x, y):
+        # The scenes are the last axes of every leaf.
+        return jnp.where(condition[(None,) * (x.ndim - condition.ndim)], x, y)
+
+    return jax.tree.map(choose, new, old)
 
 
 def _turn(system: StickSlip, y, s, h, active):
@@ -64,7 +68,7 @@ def _turn(system: StickSlip, y, s, h, active):
     def body(carry):
         y, s, duration, switches, going, count = carry
         y_new, s_new, dt, guard = step(system, y, s, h)
-        y, s = jnp.where(going, y_new, y), jnp.where(going, s_new, s)
+        y, s = _where(going, (y_new, s_new), (y, s))
         duration = duration + jnp.where(going, dt, 0)
         switches = switches + jnp.where(going & (guard < SECTION), 1, 0)
         going = going & (guard != SECTION) & (jnp.max(jnp.abs(y), axis=0) < jnp.inf)
@@ -94,7 +98,7 @@ def _next_turn(system: StickSlip, run: _Run, h, rest, growth) -> _Run:
     turns_ahead = jnp.minimum(0.25 / jnp.maximum(jnp.abs(rate), 1e-12), 200)
     leap = steady & (jnp.abs(rate) < 0.02) & (status == RUNNING)
     factor = jnp.where(leap, jnp.exp(rate * turns_ahead), 1)
-    y_on = rest + factor * (y - rest)
+    y_on = rest + factor[None] * (y - rest)
     y_on = y_on.at[2].set(jnp.where(leap, 0, y[2]))
     size = size * factor
     new = _Run(
@@ -134,12 +138,15 @@ def keeps_itinerary(system: StickSlip, segments: Segments) -> jax.Array:
     y, s, h, ends = segments.y, segments.s, segments.duration, next_start(segments.y)
     g_0, d_0 = guards_and_rates(system, y, s, h, system.field(y, s))
     g_1, d_1 = guards_and_rates(system, ends, s, h, system.field(ends, s))
-    # The lowest point of the cubic through each guard, then the guards themselves there.
-    theta, _ = Cubic.through(g_0, g_1, d_0, d_1).minimum()
-    theta = theta[:SECTION]
-    inside = flow(system, y[:, None], theta * h, s[:, None])
-    own = jnp.eye(SECTION, dtype=bool)[:, :, None]
-    lowest = jnp.where(own, system.guards(inside, s[:, None])[:SECTION], jnp.inf)
+    # The lowest point of the cubic through each guard, then the guards themselves there: of the
+    # two of each direction, the one that comes lower.
+    cubic = Cubic.through(g_0, g_1, d_0, d_1)
+    theta, _ = cubic.minimum()
+    low = cubic(theta)
+    theta = jnp.stack([jnp.where(low[k] < low[k + 1], theta[k], theta[k + 1]) for k in (0, 2)])
+    inside = flow(system, y[:, None], theta * h[None], s[:, None])
+    within = system.guards(inside, s[:, None])
+    lowest = jnp.minimum(within[0:2, 0], within[2:4, 1])
     least = -1e4 * eps * (1 + jnp.max(jnp.abs(y)))
     holds = jnp.all(jnp.minimum(g_0, g_1)[:SECTION] > least) & jnp.all(lowest > least)
     _, after = system.switch(ends, s, segments.guard)
@@ -231,7 +238,7 @@ def _find(system: StickSlip, start, rest, growth, max_turns, length: int) -> Fou
         scale = 1 + jnp.max(jnp.abs(run.y), axis=0)
 
         def distance_from(y):
-            return jnp.max(jnp.abs(run.past - y), axis=(0, 1))
+            return jnp.max(jnp.abs(run.past - y[None]), axis=(0, 1))
 
         # An orbit found some rounds ago stands if the motion has come closer to it in each.
         now = distance_from(segments.y[:, 0])
@@ -240,10 +247,10 @@ def _find(system: StickSlip, start, rest, growth, max_turns, length: int) -> Fou
         distance = jnp.where(closer, now, jnp.inf)
         ok = approach >= _APPROACHES
 
-        apart = jnp.max(jnp.abs(run.past[1:] - run.past[0]), axis=1)
+        apart = jnp.max(jnp.abs(run.past[1:] - run.past[:1]), axis=1)
         closest = jnp.min(apart, axis=0)
         # By turns the simplest orbit and the one that the motion seems to repeat.
-        repeated = 1 + jnp.argmax(apart <= 2 * closest + 1e-6, axis=0)
+        repeated = 1 + jnp.argmax(apart <= 2 * closest[None] + 1e-6, axis=0)
         turns = jnp.where(rounds % 2 == 0, 1, repeated)
         gap = jnp.where(turns == 1, apart[0], closest)
         ready = (run.status == RUNNING) & ~closer & (gap < 0.15 * scale)
@@ -300,7 +307,9 @@ def find(system: StickSlip, start, rest, growth, max_turns, length: int) -> Foun
             arguments,
             in_batched[0],
         )
-        together = _TOGETHER_ON_CPU if jax.default_backend() == "cpu" else axis_size
+        together = axis_size
+        if jax.default_backend() == "cpu":
+            together = min(_TOGETHER_ON_CPU, axis_size)
         chunks = -(-axis_size // together)
 
         def chunked(x):
