@@ -5,7 +5,7 @@ from pathlib import Path
 
 import jax
 
-from . import growth_rate
+from . import growth_rate, limit_cycle
 
 
 def main() -> None:
@@ -15,8 +15,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    for path in growth_rate.run(arguments.out, arguments.quick):
-        print(path)
+    for benchmark in (growth_rate, limit_cycle):
+        for path in benchmark.run(arguments.out, arguments.quick):
+            print(path)
 
 
 if __name__ == "__main__":

@@ -83,12 +83,10 @@ def guards_and_rates(system: StickSlip, y, s, h, f) -> tuple[jax.Array, jax.Arra
     return system.guards(y, s), jnp.asarray(h)[None] * system.guards(f, s, 0.0)
 
 
-def _nearest(guards, rates, of) -> tuple[jax.Array, jax.Array]:
+def _nearest(guards, of) -> jax.Array:
     """Of the two guards of each direction the lower one according to `of`; and the section's."""
-    return tuple(
-        jnp.stack([*(jnp.where(of[k] <= of[k + 1], x[k], x[k + 1]) for k in (0, 2)), x[SECTION]])
-        for x in (guards, rates)
-    )
+    lower = [jnp.where(of[k] <= of[k + 1], guards[k], guards[k + 1]) for k in (0, 2)]
+    return jnp.stack([*lower, guards[SECTION]])
 
 
 def step(system: StickSlip, y, s, h):
@@ -107,14 +105,15 @@ def step(system: StickSlip, y, s, h):
     f_1 = system.field(y_1, s)
 
     at_0, at_1 = guards_and_rates(system, y, s, h, f_0), guards_and_rates(system, y_1, s, h, f_1)
-    (g_0, d_0), (g_1, d_1) = _nearest(*at_0, at_1[0]), _nearest(*at_1, at_1[0])
-    roots = first_root(g_0, g_1, d_0, d_1)
+    of = at_1[0]
+    values, rates = zip(at_0, at_1, strict=True)
+    roots = first_root(*(_nearest(x, of) for x in (*values, *rates)))
     # The section counts only where it is approached from above.
-    roots = jnp.stack([roots[0], roots[1], jnp.where(g_0[2] > 0, roots[2], 2)])
+    roots = jnp.stack([roots[0], roots[1], jnp.where(y[2] > 0, roots[2], 2)])
     theta = jnp.min(roots, axis=0)
     hit = theta <= 1
     first = jnp.argmin(roots, axis=0)
-    second = jnp.stack([at_1[0][k + 1] < at_1[0][k] for k in (0, 2)])
+    second = jnp.stack([of[k + 1] < of[k] for k in (0, 2)])
     guard = jnp.where(first == 2, SECTION, 2 * first + jnp.where(first == 1, second[1], second[0]))
     guard = jnp.where(hit, guard, NONE)
     left, right = 1 - theta[None], theta[None]

@@ -41,7 +41,9 @@ class CycleResult(eqx.Enumeration):
     equilibrium = "the motion dies out: the sliding equilibrium attracts it"
     diverged = "the motion grows beyond all bounds"
     not_periodic = "the motion does not repeat within four turns (a longer period, or none)"
-    exhausted = "the motion still drifts at the end of max_turns: allow more, or start closer"
+    exhausted = (
+        "the motion nearly repeats, but has not settled within max_turns: allow more of them"
+    )
 
 
 # In the order of the numbers in `transient`.
@@ -99,15 +101,23 @@ class LimitCycle(Record):
     velocity_min: jax.Array  # (2,) of dx/dt [m/s]
     velocity_max: jax.Array  # (2,) [m/s]
     stick_fraction: jax.Array  # (2,) share of the period in stick (regularised: abs(v) < eps)
-    multipliers: jax.Array  # (4,) complex: Floquet multipliers, largest modulus first
     tension_fraction: jax.Array  # share of the period with K_n x2 < 0: the contact pulls
     state: jax.Array  # (4,) [x1, x2, v1, v2] on the cycle, where x1 is largest [m, m/s]
     error: jax.Array  # estimated relative error of period and states
     turns: jax.Array  # maxima of x1 in one period
     regularisation_error: jax.Array  # largest relative difference from the exact law's cycle
     result: CycleResult
+    _monodromy: jax.Array = eqx.field(repr=False)  # (4, 4)
     _system: StickSlip = eqx.field(repr=False)
     _motion: Any = eqx.field(repr=False)  # Closed, or Smooth if regularised
+
+    @property
+    def multipliers(self) -> jax.Array:
+        """(4,) complex: the Floquet multipliers, largest modulus first; one of them is 1."""
+        # Worked out when asked for: eigenvalues have no second derivative in JAX.
+        values = jnp.linalg.eigvals(self._monodromy)
+        order = jnp.argsort(-jnp.abs(jax.lax.stop_gradient(values)), axis=-1)
+        return jnp.take_along_axis(values, order, axis=-1)
 
     @property
     def frequency(self) -> jax.Array:
@@ -230,11 +240,6 @@ def _monodromy(system: StickSlip, segments: Segments, local) -> jax.Array:
     return M[0]
 
 
-def _sorted_eigenvalues(matrix) -> jax.Array:
-    values = jnp.linalg.eigvals(matrix)
-    return values[jnp.argsort(-jnp.abs(jax.lax.stop_gradient(values)))]
-
-
 def _estimated_error(system: StickSlip, segments: Segments, ends, local) -> jax.Array:
     """Relative error of period and states, from the difference that half the steps make."""
     y, h, s = segments.y, segments.duration, segments.s
@@ -287,13 +292,13 @@ def _limit_cycle(scene: Scene, start, max_turns, *, segments: int, rtol: float) 
         velocity_min=only(low[2:]),
         velocity_max=only(high[2:]),
         stick_fraction=jnp.sum(jnp.where(loop.s == 0, duration, 0), axis=1) / period,
-        multipliers=only(_sorted_eigenvalues(_monodromy(system, loop, local))),
         tension_fraction=time_pulling / period,
         state=only(y[:, 0] * scale),
         error=only(error),
         turns=found.period_turns,
         regularisation_error=only(jnp.zeros_like(error)),
         result=status,
+        _monodromy=only(_monodromy(system, loop, local)),
         _system=system,
         _motion=Closed(loop),
     )
@@ -348,13 +353,13 @@ def _regularised_cycle(
         velocity_min=only(low[2:]),
         velocity_max=only(high[2:]),
         stick_fraction=only(jnp.stack(stuck)),
-        multipliers=only(_sorted_eigenvalues(jax.jacfwd(end)(closed.y))),
         tension_fraction=only(share(states[:, 1], rates[:, 1])),
         state=only(closed.y * units(system)),
         error=only(jnp.asarray(rtol, y.dtype)),
         turns=closed.turns,
         regularisation_error=only(error),
         result=status,
+        _monodromy=only(jax.jacfwd(end)(closed.y)),
         _system=system,
         _motion=Smooth(solution),
     )
@@ -459,7 +464,11 @@ def attractors(
     for i in range(len(starts)):
         cycle = jax.tree.map(lambda x, i=i: x[i], cycles)
         if not any(_same(cycle, other) for other in distinct):
-            distinct.append(cycle)
+            if bool(cycle.result == CycleResult.inaccurate):
+                # On its own it gets the segments it needs, and may turn out to be known.
+                cycle = limit_cycle(scene, cycle.state, rtol=rtol, throw=False)
+            if not any(_same(cycle, other) for other in distinct):
+                distinct.append(cycle)
     return distinct
 
 

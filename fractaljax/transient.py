@@ -88,7 +88,8 @@ def _next_turn(system: StickSlip, run: _Run, h, rest, growth) -> _Run:
     smooth = jnp.where(switches == 0, run.smooth + 1, 0)
     steady = (smooth > 3) & (jnp.abs(rate - run.rate) < 0.1 * jnp.abs(rate))
 
-    diverged = ~(size < 1e3 * (1 + jnp.max(jnp.abs(rest), axis=0)))
+    # Where V is small, motions of many times V are ordinary.
+    diverged = ~(size < 1e6 * (1 + jnp.max(jnp.abs(rest), axis=0)))
     # Small and dying out as the linear system says, or very small.
     linear = steady & (size < 0.5) & (rate < 0.7 * growth * duration)
     equilibrium = (growth < 0) & (linear | ((size < 1e-2) & (smooth > 3) & (rate < 0)))
@@ -273,7 +274,8 @@ def _find(system: StickSlip, start, rest, growth, max_turns, length: int) -> Fou
 
         late = run.turns > max_turns / 2
         widest = jnp.where(late, jnp.maximum(widest, closest / scale), widest)
-        over = jnp.where(widest < 0.02, EXHAUSTED, NOT_PERIODIC)
+        dying = (run.switches == 0) & (growth < 0)
+        over = jnp.where((widest < 0.02) | dying, EXHAUSTED, NOT_PERIODIC)
         over = jnp.where(run.turns >= max_turns, over, RUNNING)
         status = jnp.where(run.status == RUNNING, jnp.where(ok, CONVERGED, over), run.status)
         run = eqx.tree_at(lambda r: r.status, run, status)

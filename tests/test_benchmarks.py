@@ -19,7 +19,7 @@ def results(tmp_path_factory):
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=600,
     )
     assert done.returncode == 0, done.stderr
     return folder
@@ -27,8 +27,10 @@ def results(tmp_path_factory):
 
 def test_benchmark_writes_its_numbers_its_table_and_its_picture(results):
     names = {path.name for path in results.iterdir()}
-    assert names == {"growth_rate.json", "growth_rate.md", "growth_rate.png"}
-    assert (results / "growth_rate.png").read_bytes().startswith(b"\x89PNG")
+    stems = "growth_rate", "limit_cycle"
+    assert names == {f"{stem}.{end}" for stem in stems for end in ("json", "md", "png")}
+    for stem in stems:
+        assert (results / f"{stem}.png").read_bytes().startswith(b"\x89PNG")
     numbers = json.loads((results / "growth_rate.json").read_text())
     table = (results / "growth_rate.md").read_text()
     assert f"wanted >= {numbers['headline']['wanted']}" in table
@@ -49,3 +51,33 @@ def test_benchmark_reports_ratios_and_its_errors_are_small(results):
         assert method["error_to_loop"]["growth_rate"]["worst"] < 1e-11
         if method["gradient"]:
             assert method["error_to_40_digits"]["gradient"]["worst"] < 1e-7
+
+
+def test_limit_cycle_benchmark_lists_every_method_with_its_error(results):
+    numbers = json.loads((results / "limit_cycle.json").read_text())
+    table = (results / "limit_cycle.md").read_text()
+    for row in numbers["methods"] + numbers["extreme"]:
+        assert f"| {row['name']} |" in table
+    assert {m["group"] for m in numbers["methods"]} >= {"package", "tanh"}
+    for method in numbers["methods"]:
+        assert method["seconds"] > 0
+        if method["group"] == "package":
+            assert method["error"] < 1e-8
+            assert method["gradient_error"] is None or method["gradient_error"] < 1e-8
+        elif method["group"] == "tanh":  # of a wide layer here
+            assert method["error"] < 0.3
+        elif method["periods"] == 120:  # by events
+            assert method["error"] < 1e-11
+
+
+def test_limit_cycle_benchmark_counts_its_batch_and_explains_what_is_not_finite(results):
+    numbers = json.loads((results / "limit_cycle.json").read_text())
+    batch = numbers["batch"]
+    assert batch["cycles_per_second"] > 0
+    assert sum(batch["results"].values()) == batch["cycles"]
+    assert batch["not_converged"] == 0
+    assert batch["error"]["worst"] < 1e-9
+    for row in numbers["extreme"]:
+        assert (row["result"] in ("converged", "inaccurate")) == (row["non_finite"] is None)
+        if row["non_finite"] is None:
+            assert row["trivial_multiplier_off"] < 1e-9

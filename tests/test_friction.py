@@ -1,4 +1,6 @@
-"""Friction laws: Eq. 38 and its slope, symmetry, refusals."""
+"""Friction laws: Eq. 38, its branches and slope, symmetry, refusals."""
+
+import functools
 
 import equinox as eqx
 import jax
@@ -8,6 +10,7 @@ import pytest
 from mpmath import mp, mpf
 
 import fractaljax as fj
+from fractaljax.friction import Friction
 
 GOOD = {"mu_s": 0.4, "mu_m": 0.25, "v_m": 0.5}
 VELOCITIES = np.array([1e-300, 1e-9, 0.01, 0.15, 0.3, 0.4999, 0.5, 0.75, 1.0, 3.0])
@@ -92,6 +95,48 @@ def test_stribeck_without_drop_is_coulomb():
         flat.coefficient(VELOCITIES), fj.Coulomb(0.4).coefficient(VELOCITIES)
     )
     np.testing.assert_array_equal(flat.slope(VELOCITIES), 0)
+
+
+@pytest.mark.parametrize("friction", [fj.Stribeck(**GOOD), fj.Coulomb(0.4)])
+def test_branch(friction):
+    """coefficient(v) = branch(v, sgn v) to the last bit, and branch(0, +-1) = +-mu_s."""
+    v = np.concatenate([-VELOCITIES, [0.0], VELOCITIES])
+    np.testing.assert_array_equal(friction.coefficient(v), friction.branch(v, np.sign(v)))
+    np.testing.assert_array_equal(friction.branch(0.0, np.array([1.0, -1.0])), [0.4, -0.4])
+    # Linear in the sign, as a regularised one between -1 and 1 needs it.
+    middle, ends = friction.branch(v, 0.25), (friction.branch(v, 1.0), friction.branch(v, -1.0))
+    np.testing.assert_allclose(middle, 0.625 * ends[0] + 0.375 * ends[1], rtol=0, atol=2e-15)
+
+
+@MODES
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_branch_goes_on_through_rest(mode, sign):
+    """One side's law is one cubic on both sides of v = 0: values and slope are the law's own."""
+    friction = fj.Stribeck(**GOOD)
+    v = np.concatenate([-VELOCITIES[::-1], [0.0], VELOCITIES])
+    truth = np.polynomial.Polynomial([sign * 0.4, -1.5 * 0.15 / 0.5, 0, 0.5 * 0.15 / 0.5**3])
+    one_side = functools.partial(friction.branch, sign=sign)
+    np.testing.assert_allclose(one_side(v), truth(v), rtol=1e-15, atol=3e-16)
+    slope = jax.vmap(mode(one_side))(v)
+    np.testing.assert_allclose(slope, truth.deriv()(v), rtol=1e-15, atol=1e-15)
+    np.testing.assert_allclose(slope, friction.slope(v), rtol=1e-15, atol=1e-15)
+    assert mode(functools.partial(fj.Coulomb(0.4).branch, sign=sign))(0.0) == 0
+
+
+def test_a_law_without_branch_is_none():
+    """`branch` is what a friction law must bring: without it there is nothing to build."""
+
+    class Lawless(Friction):
+        mu_s: jax.Array
+        mu_m: jax.Array
+        velocity_dependent = False
+        lowest = "mu_m"
+
+        def slope(self, v):
+            return v
+
+    with pytest.raises(TypeError, match="abstract method '?branch"):
+        Lawless(jnp.array(0.4), jnp.array(0.3))  # pyright: ignore[reportAbstractUsage]
 
 
 def test_float32():

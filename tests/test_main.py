@@ -5,11 +5,15 @@ import subprocess
 import sys
 from pathlib import Path
 
+import equinox as eqx
 import numpy as np
 import pytest
+from tools import motionless_scene, reference_cycle, reference_scene
 
 import fractaljax as fj
+import fractaljax.scene_file
 from fractaljax.__main__ import main
+from fractaljax.report import cycle_table
 
 
 @pytest.fixture(autouse=True)
@@ -97,6 +101,71 @@ def test_stability(capsys, tmp_path):
     assert status == 0 and "+23.311" in out
 
 
+def test_cycle(capsys, tmp_path):
+    """The table, the picture, and one period as numbers that are those of the orbit."""
+    reference_scene().save("mine.toml")
+    status, out, err = run(capsys, "cycle", "mine.toml")
+    table = cycle_table(reference_scene(), reference_cycle())
+    assert (status, err) == (0, "")
+    assert out == f"{table}\nwritten to fractaljax-cycle: cycle.png, cycle.csv\n"
+
+    folder = tmp_path / "fractaljax-cycle"
+    assert sorted(p.name for p in folder.iterdir()) == ["cycle.csv", "cycle.png"]
+    with open(folder / "cycle.csv", newline="") as file:
+        titles, *rows = csv.reader(file)
+    assert titles == ["time [s]", "x1 [m]", "x2 [m]", "v1 [m/s]", "v2 [m/s]"]
+    t, states = reference_cycle().orbit(512)
+    np.testing.assert_array_equal(np.array(rows, float), np.column_stack([t, states]))
+    assert (folder / "cycle.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_cycle_with_options(capsys, tmp_path):
+    """Negative numbers with an exponent are numbers; other files in the folder stay."""
+    reference_scene().save("mine.toml")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "notes.txt").write_text("mine")
+    start = ["--start", "-1e-5", "-2.5e-6", "0", "-1.5E-1"]
+    options = ["--out", "out", "--rtol", 1e-9, "--max-turns", 500]
+    status, out, err = run(capsys, "cycle", "mine.toml", *start, *options)
+    assert (status, err) == (0, "") and "3092.41" in out
+    assert sorted(p.name for p in Path("out").iterdir()) == ["cycle.csv", "cycle.png", "notes.txt"]
+
+
+def test_cycle_options_reach_the_search(capsys, monkeypatch):
+    """Scene, start, rtol and max_turns as given; an inaccurate cycle is one, with a warning."""
+    asked = {}
+
+    def search(scene, start, **options):
+        asked.update(options, V=float(scene.oscillator.V), start=start)
+        return eqx.tree_at(lambda c: c.result, reference_cycle(), fj.CycleResult.inaccurate)
+
+    monkeypatch.setattr(sys.modules["fractaljax.limit_cycle"], "limit_cycle", search)
+    options = ["--start", 1, "-2e-3", 3, 4, "--rtol", 1e-6, "--max-turns", 7]
+    status, out, _ = run(capsys, "cycle", *options)
+    start = [1.0, -0.002, 3.0, 4.0]
+    assert asked == {"V": 0.15, "start": start, "rtol": 1e-6, "max_turns": 7, "throw": False}
+    assert status == 0 and "but not to rtol" in out
+    assert sorted(p.name for p in Path("fractaljax-cycle").iterdir()) == ["cycle.csv", "cycle.png"]
+
+
+@pytest.mark.parametrize(
+    ("scene", "start", "message"),
+    [
+        (motionless_scene, [], "the motion dies out"),
+        (reference_scene, ["--start", "6e-4", 0, 0, 0], "the motion grows beyond all bounds"),
+    ],
+)
+def test_no_cycle_is_no_success(capsys, tmp_path, scene, start, message):
+    """Exit status 1, the reason, and nothing written: a new folder is gone, an old one as was."""
+    scene().save("mine.toml")
+    (tmp_path / "old").mkdir()
+    for folder in ["a/b", "old"]:
+        status, out, err = run(capsys, "cycle", "mine.toml", *start, "--out", folder)
+        assert (status, err) == (1, "")
+        assert out.startswith("result  ") and message in out and "written" not in out
+    assert sorted(p.name for p in tmp_path.rglob("*")) == ["mine.toml", "old"]
+
+
 def test_scene_is_a_scene_file(capsys, tmp_path):
     """What `fractaljax scene` prints is the reference brake, to the last bit."""
     status, out, _ = run(capsys, "scene")
@@ -121,7 +190,7 @@ EDITS = [
 
 
 @pytest.mark.parametrize(("old", "new", "message"), EDITS)
-@pytest.mark.parametrize("command", ["design", "stability"])
+@pytest.mark.parametrize("command", ["design", "stability", "cycle"])
 def test_bad_scene_files(capsys, tmp_path, command, old, new, message):
     """One line with file, table, bound and value; exit status 2; nothing written."""
     text = fj.brake_scene().to_toml()
@@ -152,6 +221,15 @@ def test_friction_beyond_its_law(capsys, tmp_path):
         (["design", "--D", 2.5, 2.9], "D must lie inside its bounds [2.5, 2.9], got 2.4"),
         (["design", "--starts", 0], "starts must be a whole number of at least 1, got 0"),
         (["design", "--target", "low"], "invalid float value: 'low'"),
+        (["cycle", "nowhere.toml"], "No such file"),
+        (["cycle", "--out", "file/below"], "Not a directory"),
+        (["cycle", "--rtol", 0], "rtol must be above 0 and at most 0.1, got 0.0"),
+        (["cycle", "--rtol", "nan"], "rtol must be above 0 and at most 0.1, got nan"),
+        (["cycle", "--max-turns", 0], "max_turns must be at least 1, got 0"),
+        (["cycle", "--max-turns", 1.5], "invalid int value: '1.5'"),
+        (["cycle", "--start", 1, 2, 3], "--start: expected 4 arguments"),
+        (["cycle", "--start", 0, 0, "nan", 0], "start must be finite, got nan"),
+        (["cycle", "--constant-friction"], "unrecognized arguments: --constant-friction"),
         (["polish"], "invalid choice: 'polish'"),
         ([], "required: command"),
     ],
@@ -187,6 +265,22 @@ def test_picture_that_fails_leaves_no_half_result(capsys, tmp_path, monkeypatch)
     status, _, err = run(capsys, "design", "--quiet", "--out", "a/b")
     assert status == 2 and "disk full" in err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_second_file_that_fails_says_why(capsys, tmp_path, monkeypatch):
+    """The reason is that of the file, not that the folder could not be removed."""
+    write_whole = fractaljax.scene_file.write_whole
+
+    def fail(path, content):
+        if path.name == "cycle.csv":
+            raise OSError("disk full")
+        write_whole(path, content)
+
+    reference_scene().save("mine.toml")
+    monkeypatch.setattr("fractaljax.scene_file.write_whole", fail)
+    status, out, err = run(capsys, "cycle", "mine.toml")
+    assert (status, out, err) == (2, "", "fractaljax: disk full\n")
+    assert [p.name for p in (tmp_path / "fractaljax-cycle").iterdir()] == ["cycle.png"]
 
 
 def test_runs_as_a_module_in_double_precision():

@@ -13,23 +13,32 @@ ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
 
 
-def block(language):
-    """The text of the one fenced block of a language."""
-    (text,) = re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
-    return text
+def blocks(language):
+    """The texts of the fenced blocks of a language."""
+    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
 
 
-def test_example_prints_what_is_printed(capsys):
-    """The example runs as it stands and its output is the one shown, digit for digit."""
-    code = block("python")
-    assert len([line for line in code.splitlines() if line.strip()]) <= 15
-    exec(compile(code, "README.md", "exec"), {})
-    assert capsys.readouterr().out == block("text")
+def assert_same_picture(drawn, name):
+    """Equal to the one in docs, up to the rendering of type."""
+    drawn, shown = (matplotlib.image.imread(path) for path in (drawn, ROOT / "docs" / name))
+    assert drawn.shape == shown.shape
+    assert np.abs(drawn - shown).mean() < 0.01
+
+
+def test_examples_print_what_is_printed(capsys, tmp_path, monkeypatch):
+    """They run one after the other, and output and picture are those shown, digit for digit."""
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    for code, text in zip(blocks("python"), blocks("text"), strict=True):
+        assert len([line for line in code.splitlines() if line.strip()]) <= 15
+        exec(compile(code, "README.md", "exec"), names)
+        assert capsys.readouterr().out == text
+    assert_same_picture("cycle.png", "cycle.png")
 
 
 def test_scene_file_is_the_one_the_command_writes():
     """The scene file shown is that of `fractaljax scene`."""
-    assert block("toml") == fj.brake_scene().to_toml()
+    assert blocks("toml") == [fj.brake_scene().to_toml()]
 
 
 def test_commands_are_those_that_ci_runs():
@@ -49,7 +58,4 @@ def test_links_lead_somewhere():
 def test_picture_is_the_one_the_command_writes(tmp_path, capsys):
     """The committed picture is what `fractaljax design` draws, up to the rendering of type."""
     assert main(["design", "--quiet", "--out", str(tmp_path)]) == 0
-    drawn = matplotlib.image.imread(tmp_path / "design.png")
-    shown = matplotlib.image.imread(ROOT / "docs" / "design.png")
-    assert drawn.shape == shown.shape
-    assert np.abs(drawn - shown).mean() < 0.01
+    assert_same_picture(tmp_path / "design.png", "design.png")

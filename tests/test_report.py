@@ -1,7 +1,14 @@
-"""Tables of scenes and designs."""
+"""Tables of scenes, designs and limit cycles."""
+
+import re
+
+import equinox as eqx
+import numpy as np
+import pytest
+from tools import motionless_scene, reference_cycle, reference_scene
 
 import fractaljax as fj
-from fractaljax.report import comparison_table, scene_rows, stability_table, table
+from fractaljax.report import comparison_table, cycle_table, scene_rows, stability_table, table
 
 
 def test_rows_of_every_regime():
@@ -47,3 +54,80 @@ def test_columns_are_aligned():
     """Titles stand above their columns."""
     text = table(["a", "b"], [{"row": "1", "longer row": "22"}, {"row": "3", "longer row": "4"}])
     assert text == "            a   b\nrow         1   3\nlonger row  22  4"
+
+
+def cells(text):
+    """The lines of a table, cut where two or more spaces stand."""
+    return [re.split(r"  +", line.strip()) for line in text.splitlines()]
+
+
+def test_cycle_table_agrees_with_the_cycle():
+    """Three blocks: the whole cycle, its two directions, its switches."""
+    scene, cycle = reference_scene(), reference_cycle()
+    whole, directions, switches = cycle_table(scene, cycle).split("\n\n")
+    rows = {name: values for name, *values in cells(whole)}
+    assert rows["result"] == ["a limit cycle was found"]
+    assert rows["growth rate [1/s]"] == [f"{fj.growth_rate(scene):+.6g}", "(it squeals)"]
+    assert float(rows["period [ms]"][0]) == pytest.approx(1e3 * float(cycle.period), rel=1e-5)
+    assert float(rows["frequency [Hz]"][0]) == pytest.approx(float(cycle.frequency), rel=1e-5)
+    assert rows["turns in a period"] == ["1"]
+    assert rows["contact pulls"] == [f"{cycle.tension_fraction:.2%} of the period"]
+    assert float(rows["estimated error"][0]) == pytest.approx(float(cycle.error), rel=0.05)
+    for i, value in enumerate(cycle.multipliers.tolist(), start=1):
+        shown, modulus = rows[f"Floquet multiplier {i}"]
+        assert complex(shown.replace(" ", "").replace("i", "j")) == pytest.approx(value, abs=1e-6)
+        assert float(modulus[9:-1]) == pytest.approx(abs(value), abs=1e-6)
+    assert "-0.000000" not in whole
+
+    titles, *lines = cells(directions)
+    assert titles == ["x1, along the belt", "x2, normal to it"]
+    rows = {name: values for name, *values in lines}
+    for name, wanted in [
+        ("peak to peak [m]", cycle.amplitude),
+        ("least dx/dt [m/s]", cycle.velocity_min),
+        ("largest dx/dt [m/s]", cycle.velocity_max),
+    ]:
+        np.testing.assert_allclose([float(cell) for cell in rows[name]], wanted, rtol=1e-5)
+    assert rows["sticks"] == ["9.69% of the period", "0.00% of the period"]
+
+    _, *lines, note = cells(switches)
+    period = float(cycle.period)
+    words = {"+": "slips, dx/dt < V", "-": "slips, dx/dt > V", "stick": "sticks"}
+    assert len(lines) == len(cycle.switches()) == 5 and note == ["time 0: x1 is largest"]
+    for (_, time, share, *rest), at in zip(lines, cycle.switches(), strict=True):
+        assert float(time) == pytest.approx(1e3 * at.time, abs=1e-6)
+        assert float(share[:-1]) == pytest.approx(100 * at.time / period, abs=0.01)
+        assert rest == [f"x{at.direction}", words[at.before], words[at.after]]
+
+
+def test_cycle_table_without_a_cycle():
+    """Why there is none, and no row of NaN."""
+    scene = motionless_scene()
+    text = cycle_table(scene, fj.limit_cycle(scene, throw=False))
+    assert cells(text) == [
+        ["result", "the motion dies out: the sliding equilibrium attracts it"],
+        ["growth rate [1/s]", f"{fj.growth_rate(scene):+.6g}", "(stable)"],
+    ]
+
+
+def test_cycle_table_of_an_inaccurate_cycle():
+    """All the numbers, and the warning."""
+    poor = eqx.tree_at(lambda c: c.result, reference_cycle(), fj.CycleResult.inaccurate)
+    text = cycle_table(reference_scene(), poor)
+    assert text.startswith("result                a limit cycle was found, but not to rtol")
+    assert "Floquet multiplier 4" in text and "switch 5" in text
+
+
+def test_cycle_table_without_switches(monkeypatch):
+    """A cycle that never reaches the belt's velocity has no list of switches."""
+    monkeypatch.setattr(fj.LimitCycle, "switches", lambda _: [])
+    text = cycle_table(reference_scene(), reference_cycle())
+    assert "switch" not in text and text.splitlines()[-1].startswith("sticks")
+
+
+def test_cycle_table_of_the_regularised_law():
+    """It has no switches, and a difference from the exact law."""
+    moved = eqx.tree_at(lambda c: c.regularisation_error, reference_cycle(), 0.0123)
+    text = cycle_table(reference_scene(), moved)
+    assert "off the exact law by  1.2e-02" in text and "switch" not in text
+    assert "off the exact" not in cycle_table(reference_scene(), reference_cycle())

@@ -1,4 +1,4 @@
-"""The contact table and the derivatives that several test files share."""
+"""What several test files share: the contact table, its derivatives, a limit cycle."""
 
 import functools
 import json
@@ -17,6 +17,27 @@ MEMBERS = {
     "elastic_plastic": fj.Regime.elastic_plastic,
     "gross_slip": fj.Regime.gross_slip,
 }
+
+
+def reference_scene() -> fj.Scene:
+    """The brake of the source's section 3.3, with its middle stiffness: direction 1 sticks."""
+    pi = np.pi
+    return fj.Scene(
+        fj.FixedContact(4e8, 2e8),
+        fj.Stribeck(0.4, 0.25, 0.5),
+        fj.Oscillator(1.0, 2000 * pi, 1600 * pi, xi_1=0.001, xi_2=0.007, F=5.0, V=0.15),
+    )
+
+
+def motionless_scene() -> fj.Scene:
+    """The same with little friction and much damping: steady sliding attracts."""
+    return reference_scene().replace(mu_s=0.05, mu_m=0.04, xi_1=0.05, xi_2=0.05)
+
+
+@functools.cache
+def reference_cycle() -> fj.LimitCycle:
+    """The limit cycle of the reference scene, computed once."""
+    return fj.limit_cycle(reference_scene())
 
 
 @functools.cache
