@@ -8,29 +8,35 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
+ENDINGS = "json", "md", "png"
 
 
-@pytest.fixture(scope="module")
-def results(tmp_path_factory):
-    """The folder that `python -m benchmarks --quick` fills."""
-    folder = tmp_path_factory.mktemp("benchmarks")
+def quick(name, folder):
+    """What `python -m benchmarks NAME --quick` writes to a folder."""
     done = subprocess.run(
-        [sys.executable, "-m", "benchmarks", "--quick", "--out", str(folder)],
+        [sys.executable, "-m", "benchmarks", name, "--quick", "--out", str(folder)],
         cwd=ROOT,
         capture_output=True,
         text=True,
         timeout=600,
     )
     assert done.returncode == 0, done.stderr
+    assert {path.name for path in folder.iterdir()} == {f"{name}.{end}" for end in ENDINGS}
+    assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     return folder
 
 
-def test_benchmark_writes_its_numbers_its_table_and_its_picture(results):
-    names = {path.name for path in results.iterdir()}
-    stems = "growth_rate", "limit_cycle"
-    assert names == {f"{stem}.{end}" for stem in stems for end in ("json", "md", "png")}
-    for stem in stems:
-        assert (results / f"{stem}.png").read_bytes().startswith(b"\x89PNG")
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    return quick("growth_rate", tmp_path_factory.mktemp("growth_rate"))
+
+
+@pytest.fixture(scope="module")
+def cycle_results(tmp_path_factory):
+    return quick("limit_cycle", tmp_path_factory.mktemp("limit_cycle"))
+
+
+def test_benchmark_writes_its_numbers_and_its_table(results):
     numbers = json.loads((results / "growth_rate.json").read_text())
     table = (results / "growth_rate.md").read_text()
     assert f"wanted >= {numbers['headline']['wanted']}" in table
@@ -53,9 +59,10 @@ def test_benchmark_reports_ratios_and_its_errors_are_small(results):
             assert method["error_to_40_digits"]["gradient"]["worst"] < 1e-7
 
 
-def test_limit_cycle_benchmark_lists_every_method_with_its_error(results):
-    numbers = json.loads((results / "limit_cycle.json").read_text())
-    table = (results / "limit_cycle.md").read_text()
+@pytest.mark.slow
+def test_limit_cycle_benchmark_lists_every_method_with_its_error(cycle_results):
+    numbers = json.loads((cycle_results / "limit_cycle.json").read_text())
+    table = (cycle_results / "limit_cycle.md").read_text()
     for row in numbers["methods"] + numbers["extreme"]:
         assert f"| {row['name']} |" in table
     assert {m["group"] for m in numbers["methods"]} >= {"package", "tanh"}
@@ -70,8 +77,9 @@ def test_limit_cycle_benchmark_lists_every_method_with_its_error(results):
             assert method["error"] < 1e-11
 
 
-def test_limit_cycle_benchmark_counts_its_batch_and_explains_what_is_not_finite(results):
-    numbers = json.loads((results / "limit_cycle.json").read_text())
+@pytest.mark.slow
+def test_limit_cycle_benchmark_counts_its_batch_and_explains_what_is_not_finite(cycle_results):
+    numbers = json.loads((cycle_results / "limit_cycle.json").read_text())
     batch = numbers["batch"]
     assert batch["cycles_per_second"] > 0
     assert sum(batch["results"].values()) == batch["cycles"]

@@ -135,7 +135,7 @@ def test_a_law_without_branch_is_none():
         def slope(self, v):
             return v
 
-    with pytest.raises(TypeError, match="abstract method '?branch"):
+    with pytest.raises(TypeError, match=r"abstract method '?branch"):
         Lawless(jnp.array(0.4), jnp.array(0.3))  # pyright: ignore[reportAbstractUsage]
 
 

@@ -95,7 +95,7 @@ def test_what_a_cycle_holds(eps):
     """Amplitudes, velocities and shares are those of the motion through one period."""
     found = cycle(eps)
     motion = period_later(found, eps)
-    times = np.linspace(0, float(found.period), 4001)
+    times = np.linspace(0, float(found.period), 20_001)
     x = np.asarray(motion.at(times))
     low, high = x.min(axis=0), x.max(axis=0)
     size = high - low
@@ -104,8 +104,8 @@ def test_what_a_cycle_holds(eps):
     np.testing.assert_allclose(found.velocity_min, low[2:], rtol=0, atol=1e-4 * size[2:].max())
     middle = (x[1:] + x[:-1]) / 2
     slow = (abs(0.15 - middle[:, 2:]) < eps).mean(axis=0)
-    np.testing.assert_allclose(found.stick_fraction, slow, rtol=0, atol=1e-3)
-    np.testing.assert_allclose(found.tension_fraction, (middle[:, 1] < 0).mean(), atol=1e-3)
+    np.testing.assert_allclose(found.stick_fraction, slow, rtol=0, atol=2e-4)
+    np.testing.assert_allclose(found.tension_fraction, (middle[:, 1] < 0).mean(), atol=2e-4)
     # `state` is where x1 is largest.
     np.testing.assert_allclose(x[0, 0], high[0], rtol=1e-12)
     np.testing.assert_allclose(found.state[2], 0, atol=1e-10)
@@ -214,7 +214,7 @@ def test_no_motion():
     assert np.isfinite(still).all()
 
 
-def cosine(n, eps=1.0):
+def cosine(n):
     """Nodes of a cosine with its rate, unevenly over one period, the last ones repeated."""
     t = np.linspace(0, 2 * np.pi, n)
     t = np.concatenate([t + 0.3 * np.sin(t) * 2 * np.pi / n, [2 * np.pi] * 5])
@@ -230,16 +230,24 @@ def test_extremes():
     np.testing.assert_allclose(found, [-abs(factors), abs(factors)], rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("level", [-0.7, 0.0, 0.99])
-def test_share(level):
+def test_share():
     """How long a quantity is below zero, as a share of the time, with the derivative of that."""
     t, x, rate = (jnp.asarray(c) for c in cosine(60))
 
+    @jax.jit
+    @jax.vmap
     def share(level):
-        return regularised.share(t, x - level, rate)
+        def at(level):
+            return regularised.share(t, x - level, rate)
 
-    np.testing.assert_allclose(share(level), 1 - np.arccos(level) / np.pi, rtol=0, atol=1e-5)
-    truth = 1 / (np.pi * np.sqrt(1 - level**2))
-    for mode in (jax.jacfwd, jax.jacrev):
-        np.testing.assert_allclose(mode(share)(level), truth, rtol=2e-3)
-    assert regularised.share(t, x + 2, rate) == 0 and regularised.share(t, x - 2, rate) == 1
+        return at(level), jax.jacfwd(at)(level), jax.jacrev(at)(level)
+
+    levels = np.array([-0.7, 0.0, 0.99, -2.0, 2.0])
+    found, *slopes = share(levels)
+    np.testing.assert_array_equal(found[3:], [0, 1])
+    truth = 1 - np.arccos(levels[:3]) / np.pi
+    np.testing.assert_allclose(found[:3], truth, rtol=0, atol=1e-5)
+    for slope in slopes:
+        truth = 1 / (np.pi * np.sqrt(1 - levels[:3] ** 2))
+        np.testing.assert_allclose(slope[:3], truth, rtol=2e-3)
+        np.testing.assert_array_equal(slope[3:], 0)
