@@ -31,9 +31,10 @@ class Cubic(eqx.Module):
 
     def minimum(self) -> tuple[jax.Array, jax.Array]:
         """Where it is lowest strictly inside, and whether it is so anywhere; else 0."""
-        below = self.k_2 + jnp.sqrt(jnp.maximum(self.k_2**2 - 3 * self.k_1 * self.k_3, 0))
+        square = self.k_2**2 - 3 * self.k_1 * self.k_3
+        below = self.k_2 + jnp.sqrt(jnp.maximum(square, 0))
         x = jnp.where(below == 0, 0, -self.k_1 / jnp.where(below == 0, 1, below))
-        inside = (x > 0) & (x < 1)
+        inside = (square >= 0) & (x > 0) & (x < 1)
         return jnp.where(inside, x, 0), inside
 
     def root_before(self, end) -> jax.Array:

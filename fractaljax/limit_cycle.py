@@ -314,7 +314,16 @@ def _regularised_cycle(
     y = _start(scene, system, start)
     closed = regularised.close(system, eps, y, solver, rtol, max_steps)
     solution = regularised.solve(
-        system, eps, closed.y, closed.period, solver, rtol, max_steps, steps=True, dense=True
+        system,
+        eps,
+        closed.y,
+        closed.period,
+        solver,
+        rtol,
+        max_steps,
+        t0=True,
+        steps=True,
+        dense=True,
     )
     times, states = regularised.nodes(solution)
     rates = jax.vmap(lambda y: regularised.field(0.0, y, (system, eps)))(states)

@@ -105,13 +105,16 @@ def _event(system: StickSlip, y, s, h, y_1):
         _, rate, curve = at(t)
         return jnp.clip(t - rate / jnp.where(curve == 0, 1, curve), 0, h)
 
-    bottom = jnp.where(inside, jax.lax.fori_loop(0, 2, lower, theta * h), 0)
-    depth, _, _ = at(bottom)
+    bottom = jnp.where(inside, jax.lax.fori_loop(0, 3, lower, theta * h), 0)
+    depth, _, curve = at(bottom)
     dips = inside & (depth < 0)
     end = jnp.where(dips, bottom, h)
     below = dips | (g_1 < 0)
     t = cubic.root_before(end / h) * h
-    # A shallow dip has its first root beside its bottom, where the cubic may have none.
+    # A shallow dip is a parabola, with two roots that Newton's method cannot tell apart from afar.
+    half = jnp.sqrt(2 * jnp.maximum(-depth, 0) / jnp.where(curve > 0, curve, 1))
+    shallow = dips & (curve > 0) & (depth > -1e-2)
+    t = jnp.where(shallow, jnp.clip(bottom - half, 0, bottom), t)
     t = jnp.where(dips & (t >= bottom), bottom / 2, t)
 
     def refine(_, t):
@@ -303,6 +306,8 @@ def simulate(
     require_scalar(scene)
     start = start_state(start)
     t1 = number("t1", t1, above=0)
+    if t1.ndim:
+        raise ValueError(f"t1 must be a scalar, got shape {t1.shape}; use jax.vmap for many")
     check_rtol(rtol)
     if not isinstance(max_steps, int) or max_steps < 1:
         raise ValueError(f"max_steps must be a whole number of at least 1, got {max_steps!r}")

@@ -78,20 +78,29 @@ def test_through(shape):
     np.testing.assert_allclose(np.reshape(cubic.slope(x), -1), truth, rtol=0, atol=50 * EPS)
 
 
+def has_minimum(k):
+    """Whether the slope of the polynomial rises through zero strictly between 0 and 1."""
+    slope = Polynomial(k).deriv()
+    if abs(k[3]) < 1e-9:  # as good as a parabola, whose far turning point no root finder gives
+        return slope(0.0) < 0 < slope(1.0)
+    turns: Any = slope.roots()
+    turns = turns[turns.imag == 0].real
+    return any(0 < x < 1 and slope.deriv()(x) > 0 for x in turns)
+
+
 def test_minimum():
     """The local minimum strictly inside, if there is one, of cubics, parabolas and lines."""
     k = coefficients(*cubics("any", 1000))
     k[3, 400:600] = 0
     k[2:, 600:700] = 0
     k[3, 700:900] *= 1e-13
-    at, inside = jax.jit(lambda k: Cubic(*k).minimum())(k)
-    for column, x, is_inside in zip(k.T, np.asarray(at), np.asarray(inside), strict=True):
-        curve = Polynomial(np.trim_zeros(column, "b"))
-        turns = curve.deriv().roots()
-        turns = turns[abs(turns.imag) < 1e-12].real
-        lowest = [x for x in turns if 0 < x < 1 and curve.deriv(2)(x) > 0]
-        assert is_inside == bool(lowest), (column, x)
-        assert x == pytest.approx(lowest[0] if lowest else 0, rel=0, abs=1e-7)
+    at, inside = (np.asarray(x) for x in jax.jit(lambda k: Cubic(*k).minimum())(k))
+    np.testing.assert_array_equal(inside, [has_minimum(column) for column in k.T])
+    assert 200 < inside.sum() < 800
+    np.testing.assert_array_equal(at[~inside], 0)
+    for column, x in zip(k.T[inside], at[inside], strict=True):
+        slope = Polynomial(column).deriv()
+        assert 0 < x < 1 and abs(slope(x)) < 1e-12 and slope.deriv()(x) > 0
 
 
 @pytest.mark.parametrize("kind", ["any", "guards"])
