@@ -392,3 +392,27 @@ def test_single_precision():
     cycle = fj.limit_cycle(scene, throw=False)
     assert cycle.period.dtype == jnp.float32
     assert float(cycle.period * OMEGA) == pytest.approx(6.467446, rel=1e-4)
+
+
+@pytest.mark.slow
+def test_design_for_a_quiet_cycle():
+    """`design` takes an amplitude as its objective, and does no worse than a fine sweep."""
+    scene = fj.brake_scene()
+
+    def amplitude(scene):
+        return 1e6 * fj.limit_cycle(scene, throw=False).amplitude[0]
+
+    best = fj.design(
+        scene,
+        {"D": (2.39, 2.41)},
+        objective=amplitude,
+        target=1e4,
+        K_n_min=0.0,
+        starts=2,
+        progress=False,
+    )
+    sweep = jax.jit(jax.vmap(lambda D: amplitude(substitute(scene, {"D": D}))))
+    sizes = sweep(jnp.linspace(2.39, 2.41, 65))
+    assert not best.violated
+    assert best.value <= float(jnp.nanmin(sizes)) * (1 + 1e-6)
+    assert best.value < 0.99 * float(amplitude(scene))
