@@ -1,8 +1,4 @@
-"""Pictures: each function takes a result and an optional Axes, and returns the Axes.
-
-Without an Axes a new figure is made, outside pyplot and its global state; it is `ax.figure`.
-`cycle` fills a figure of its own, and returns that.
-"""
+"""Growth rate over D and G, and the path of a design."""
 
 import functools
 from collections.abc import Mapping
@@ -12,16 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .design import DEFAULT_BOUNDS, Design
-from .limit_cycle import CycleResult, LimitCycle
-from .parts import substitute
-from .scene import Scene
-from .stability import growth_rate_of
+from ..design import DEFAULT_BOUNDS, Design
+from ..parts import substitute
+from ..scene import Scene
+from ..stability import growth_rate_of
+from .axes import legend_above, new_axes
 
 _POINTS = 240  # a side
-_HARMONICS = 20  # for every turn of a period
-_FLOOR = 1e-6  # of the strongest harmonic; what is weaker is below the axis
-_DIRECTIONS = ("along the belt", "normal to the belt")
 
 
 @functools.partial(jax.jit, static_argnames="friction_slope")
@@ -58,7 +51,7 @@ def stability_map(
 
     if not scene.contact.fractal:
         raise ValueError("a stability map needs a FractalContact: a FixedContact has no surface")
-    ax = _axes() if ax is None else ax
+    ax = new_axes() if ax is None else ax
     bounds = dict(DEFAULT_BOUNDS) | dict(bounds or {})
     Ds = jnp.linspace(*bounds["D"], _POINTS)
     Gs = jnp.geomspace(*bounds["G"], _POINTS)
@@ -102,7 +95,7 @@ def stability_map(
     ax.set_ylim(*bounds["G"])
     ax.set_xlabel("fractal dimension D [-]")
     ax.set_ylabel("fractal roughness G [m]")
-    _legend(ax, handles)
+    legend_above(ax, handles)
     return ax
 
 
@@ -123,93 +116,8 @@ def design(result: Design, ax: Any = None) -> Any:
     (given,) = _mark(ax, result.initial, "o", 6, "white", "given surface")
     words = "designed surface" if not result.violated else "best found, not a solution"
     (final,) = _mark(ax, result.scene, "*", 11, "tab:cyan", words)
-    _legend(ax, [*ax.get_legend().legend_handles, walk, given, final])
+    legend_above(ax, [*ax.get_legend().legend_handles, walk, given, final])
     return ax
-
-
-def phase_portrait(cycle: LimitCycle, ax: Any = None, *, direction: int = 1) -> Any:
-    """The orbit of one direction, x_i [um] against dx_i/dt [m/s], and where it sticks.
-
-    **Raises:** `ValueError` if there is no limit cycle, for a batch, or a direction not 1 or 2.
-    """
-    i = _component(cycle, direction)
-    ax = _axes() if ax is None else ax
-    period, V = float(cycle.period), float(cycle._system.V)
-    t, states = (np.asarray(x) for x in cycle.orbit())
-    x, v = states[:, i] * 1e6, states[:, 2 + i]
-    belt = ax.axhline(V, color="0.35", ls="dashed", lw=1.1, label=f"belt velocity {V:.4g} m/s")
-    closed = np.append(x, x[0]), np.append(v, v[0])
-    style: dict[str, Any] = {"color": "tab:blue", "lw": 1.4, "solid_capstyle": "round"}
-    handles = [*ax.plot(*closed, label="limit cycle", **style), belt]
-    label = f"sticks, {cycle.stick_fraction[i]:.1%} of the period"
-    style = {"color": "tab:orange", "lw": 4.5, "solid_capstyle": "butt"}
-    for begin, end in _sticking(cycle, direction):
-        ends = np.interp([begin, end], t, x, period=period)
-        handles[2:] = ax.plot(ends, [V, V], label=label, **style)
-    ax.set_xlabel(f"x{direction}, {_DIRECTIONS[i]} [µm]")
-    ax.set_ylabel(f"dx{direction}/dt [m/s]")
-    _legend(ax, handles)
-    return ax
-
-
-def _sticking(cycle, direction):
-    """Times [s] at which each sticking begins and ends; the last may end in the next period."""
-    if cycle.regularisation_error != 0:  # the regularised law creeps instead
-        return
-    own = [switch for switch in cycle.switches() if switch.direction == direction]
-    for switch, following in zip(own, own[1:] + own[:1], strict=True):
-        if switch.after == "stick":
-            yield switch.time, following.time
-
-
-def spectrum(cycle: LimitCycle, ax: Any = None, *, direction: int = 1) -> Any:
-    """Peak amplitudes [um] of the harmonics of x_i over frequency [kHz], from the fundamental on.
-
-    **Raises:** `ValueError` if there is no limit cycle, for a batch, or a direction not 1 or 2.
-    """
-    i = _component(cycle, direction)
-    ax = _axes() if ax is None else ax
-    frequencies, amplitudes = (np.asarray(x) for x in cycle.spectrum())
-    shown = _HARMONICS * int(cycle.turns)
-    f, a = frequencies[:shown] / 1e3, amplitudes[:shown, i] * 1e6
-    bottom = max(a.min() / 2, a.max() * _FLOOR)
-    ax.vlines(f, bottom, a, color="tab:blue", lw=1.4)
-    (rest,) = ax.plot(f[1:], a[1:], "o", ms=3.5, color="tab:blue", label="harmonics")
-    (first,) = ax.plot(
-        f[:1], a[:1], "D", ms=6, mfc="tab:orange", mec="k", label=f"fundamental {f[0]:.4g} kHz"
-    )
-    ax.set_yscale("log")
-    ax.set_ylim(bottom, a.max() * 3)
-    ax.set_xlim(0, f[-1] + f[0])
-    ax.set_xlabel("frequency [kHz]")
-    ax.set_ylabel(f"peak amplitude of x{direction} [µm]")
-    _legend(ax, [first, rest])
-    return ax
-
-
-def cycle(result: LimitCycle) -> Any:
-    """Phase portraits and spectra, a row for each direction; returns the figure.
-
-    **Raises:** `ValueError` if there is no limit cycle, or for a batch.
-    """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10.4, 7.6), layout="constrained")
-    for row, direction in zip(figure.subplots(2, 2), (1, 2), strict=True):
-        phase_portrait(result, row[0], direction=direction)
-        spectrum(result, row[1], direction=direction)
-    return figure
-
-
-def _component(cycle, direction):
-    """The index of a direction, checked together with the cycle."""
-    if direction not in (1, 2):
-        raise ValueError(f"direction must be 1 or 2, got {direction!r}")
-    if cycle.period.ndim:
-        raise ValueError("a picture shows one cycle: index the batch first")
-    if not np.isfinite(cycle.period):
-        raise ValueError(f"there is no limit cycle to draw: {CycleResult[cycle.result]}")
-    return direction - 1
 
 
 def _mark(ax, scene, marker, size, colour, label):
@@ -225,21 +133,4 @@ def _mark(ax, scene, marker, size, colour, label):
         label=label,
         clip_on=False,
         zorder=5,
-    )
-
-
-def _axes():
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(8.4, 6.4), layout="constrained").add_subplot()
-
-
-def _legend(ax, handles):
-    ax.legend(
-        handles=handles,
-        loc="lower center",
-        bbox_to_anchor=(0.5, 1.01),
-        ncols=3,
-        fontsize="small",
-        frameon=False,
     )
