@@ -24,6 +24,9 @@ _STEPS_A_TURN = 1600
 _TURNS_A_ROUND = 8
 _APPROACHES = 3  # rounds in which the motion must come closer to an orbit that is not at hand
 _LONGEST = 4  # turns that one period may have
+# Scenes that run together on a CPU, where all wait for the slowest, and of those that are closed
+# together, which keeps within the caches.
+_TOGETHER, _ATTEMPTS_TOGETHER = 64, 8
 
 RUNNING, CONVERGED, EQUILIBRIUM, DIVERGED, NOT_PERIODIC, EXHAUSTED = range(6)
 
@@ -95,10 +98,12 @@ def _next_turn(system: StickSlip, run: _Run, h, rest, growth) -> _Run:
     equilibrium = (growth < 0) & (linear | ((size < 1e-2) & (smooth > 3) & (rate < 0)))
     status = jnp.where(diverged, DIVERGED, jnp.where(equilibrium, EQUILIBRIUM, RUNNING))
 
-    # A slow, steady change of a motion without switches goes on: many turns in one.
-    turns_ahead = jnp.minimum(0.25 / jnp.maximum(jnp.abs(rate), 1e-12), 200)
+    # A slow, steady change of a motion without switches goes on: many turns in one, but no more
+    # than half of what is left to go if it slows down geometrically.
+    left = jnp.abs(rate * run.rate) / jnp.maximum(jnp.abs(run.rate) - jnp.abs(rate), 1e-300)
     leap = steady & (jnp.abs(rate) < 0.02) & (status == RUNNING)
-    factor = jnp.where(leap, jnp.exp(rate * turns_ahead), 1)
+    ahead = jnp.minimum(jnp.minimum(0.25, left / 2), 200 * jnp.abs(rate))
+    factor = jnp.where(leap, jnp.exp(jnp.sign(rate) * ahead), 1)
     y_on = rest + factor[None] * (y - rest)
     y_on = y_on.at[2].set(jnp.where(leap, 0, y[2]))
     size = size * factor
@@ -145,7 +150,7 @@ def keeps_itinerary(system: StickSlip, segments: Segments) -> jax.Array:
     theta, _ = cubic.minimum()
     low = cubic(theta)
     theta = jnp.stack([jnp.where(low[k] < low[k + 1], theta[k], theta[k + 1]) for k in (0, 2)])
-    inside = flow(system, y[:, None], theta * h[None], s[:, None])
+    inside = flow(system, y[:, None], theta * h[None], s[:, None], written_out=True)
     within = system.guards(inside, s[:, None])
     lowest = jnp.minimum(within[0:2, 0], within[2:4, 1])
     least = -1e4 * eps * (1 + jnp.max(jnp.abs(y)))
@@ -192,6 +197,36 @@ def _attempt(system: StickSlip, y, s, duration, switches, turns, wanted, *, leng
     moves = jnp.max(jnp.abs(closed.y[2:])) > 1e-4
     ok = converged & near & moves & _attracts(once_round) & keeps_itinerary(system, closed)
     return *_once(closed, turns), ok
+
+
+def _on_cpu() -> bool:
+    return jax.default_backend() == "cpu"
+
+
+def _attempts(*arguments, length: int):
+    """`_attempt` where the last but one argument asks for it; the last argument elsewhere.
+
+    On a CPU a few scenes at a time: more fill the vector units no better.
+    """
+    *given, nothing = arguments
+    ready = given[-1]
+    function = _many(functools.partial(_attempt, length=length), ready.ndim)
+
+    def few(arguments):
+        given, nothing = arguments
+        return jax.lax.cond(jnp.any(given[-1]), lambda: function(*given), lambda: nothing)
+
+    together = _ATTEMPTS_TOGETHER if _on_cpu() else ready.size
+    if ready.size <= together or ready.size % together:
+        return few((given, nothing))
+
+    def split(x):
+        return jnp.moveaxis(x.reshape(*x.shape[:-1], -1, together), -2, 0)
+
+    def join(x):
+        return jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1)
+
+    return jax.tree.map(join, jax.lax.map(few, jax.tree.map(split, (given, nothing))))
 
 
 def _many(function, batch_axes: int):
@@ -256,15 +291,9 @@ def _find(system: StickSlip, start, rest, growth, max_turns, length: int) -> Fou
         gap = jnp.where(turns == 1, apart[0], closest)
         ready = (run.status == RUNNING) & ~closer & (gap < 0.15 * scale)
 
-        def attempt(_):
-            return _many(functools.partial(_attempt, length=length), len(shape))(
-                system, run.y, run.s, run.duration, run.switches, turns, ready
-            )
-
-        def wait(_):
-            return segments, period_turns, jnp.zeros(shape, bool)
-
-        closed, closed_turns, new = jax.lax.cond(jnp.any(ready), attempt, wait, None)
+        nothing = segments, period_turns, jnp.zeros(shape, bool)
+        wanted = system, run.y, run.s, run.duration, run.switches, turns, ready
+        closed, closed_turns, new = _attempts(*wanted, nothing, length=length)
         new = new & ready
         segments, period_turns = _where(new, (closed, closed_turns), (segments, period_turns))
         now = distance_from(segments.y[:, 0])
@@ -287,10 +316,6 @@ def _find(system: StickSlip, start, rest, growth, max_turns, length: int) -> Fou
     return Found(segments, run.status, run.turns, period_turns)
 
 
-# Scenes that run together: more fill the vector units no better, and all wait for the slowest.
-_TOGETHER_ON_CPU = 8
-
-
 def find(system: StickSlip, start, rest, growth, max_turns, length: int) -> Found:
     """The attractor that the motion from `start` ends in, on `length` segments.
 
@@ -309,10 +334,10 @@ def find(system: StickSlip, start, rest, growth, max_turns, length: int) -> Foun
             arguments,
             in_batched[0],
         )
-        together = axis_size
-        if jax.default_backend() == "cpu":
-            together = min(_TOGETHER_ON_CPU, axis_size)
-        chunks = -(-axis_size // together)
+        chunks = -(-axis_size // _TOGETHER) if _on_cpu() else 1
+        together = -(-axis_size // chunks)
+        if chunks > 1:
+            together += -together % _ATTEMPTS_TOGETHER
 
         def chunked(x):
             # The last chunk is filled up with copies of the last scene.
