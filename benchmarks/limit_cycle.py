@@ -48,7 +48,15 @@ PERIODS = 120  # the slowest multiplier is 0.797: from the 30th period on, 90 mo
 CAP = 8  # longest step of the tanh law, in eps: dv/dt is of order 1, so that no layer is jumped
 FINE = 96  # segments of the truth in the batch
 RANGE = (2e8, 6e8)  # of K_n in the batch
-MEMBERS = ("converged", "inaccurate", "not_periodic", "exhausted", "equilibrium", "diverged")
+MEMBERS = (
+    "converged",
+    "inaccurate",
+    "not_periodic",
+    "too_stiff",
+    "exhausted",
+    "equilibrium",
+    "diverged",
+)
 
 
 @dataclasses.dataclass(frozen=True)

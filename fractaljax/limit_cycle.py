@@ -41,6 +41,10 @@ class CycleResult(eqx.Enumeration):
     equilibrium = "the motion dies out: the sliding equilibrium attracts it"
     diverged = "the motion grows beyond all bounds"
     not_periodic = "the motion does not repeat within four turns (a longer period, or none)"
+    too_stiff = (
+        "the regularised law takes more than max_steps steps: allow more, choose a solver such as "
+        "diffrax.Kvaerno5, or leave the regularisation out"
+    )
     exhausted = (
         "the motion nearly repeats, but has not settled within max_turns: allow more of them"
     )
@@ -351,7 +355,8 @@ def _regularised_cycle(
     status = CycleResult.where(
         error <= REGULARISATION_TOLERANCE, CycleResult.converged, CycleResult.depends_on_eps
     )
-    status = CycleResult.where(closed.found, status, CycleResult.not_periodic)
+    lost = CycleResult.where(closed.followed, CycleResult.not_periodic, CycleResult.too_stiff)
+    status = CycleResult.where(closed.found, status, lost)
 
     def only(value):
         return jnp.where(closed.found, value, jnp.nan)
@@ -395,7 +400,7 @@ def limit_cycle(
     regularisation: Any = None,
     solver: Any = None,
     rtol: float = 1e-9,
-    max_turns: int = 1000,
+    max_turns: int = 5000,
     max_steps: int = 4096,
     segments: int | None = None,
     throw: bool = True,
@@ -450,7 +455,7 @@ def limit_cycle(
 
 
 def attractors(
-    scene: Scene, starts: Any = None, *, rtol: float = 1e-9, max_turns: int = 1000
+    scene: Scene, starts: Any = None, *, rtol: float = 1e-9, max_turns: int = 5000
 ) -> list[LimitCycle]:
     """Every distinct motion that the starts end in, those without a cycle among them.
 

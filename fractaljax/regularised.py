@@ -69,6 +69,7 @@ class Periodic(eqx.Module):
     period: jax.Array
     turns: jax.Array
     found: jax.Array
+    followed: jax.Array  # False where max_steps ended the integration
 
 
 def _turns(times, u):
@@ -131,7 +132,8 @@ def close(system: StickSlip, eps, y, solver, rtol, max_steps: int) -> Periodic:
     y, period = root.value
     near = jnp.max(jnp.abs(y - guess[0])) < 0.2 * (1 + jnp.max(jnp.abs(guess[0])))
     found = (root.result == optimistix.RESULTS.successful) & near & (period > 0)
-    return Periodic(y, period, turns, found & jnp.any(jnp.abs(y) > 0))
+    followed = window.result == diffrax.RESULTS.successful
+    return Periodic(y, period, turns, found & jnp.any(jnp.abs(y) > 0), followed)
 
 
 def extremes(times, states, rates) -> jax.Array:

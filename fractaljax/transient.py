@@ -169,26 +169,20 @@ def _attracts(once_round) -> jax.Array:
     return jnp.max(jnp.abs(power)) < 1e3
 
 
-def _once(closed: Segments, turns) -> tuple[Segments, jax.Array]:
-    """The orbit and its turns, cut down to one period if it was closed after several."""
-    ends = next_start(closed.y)
+def _closes_early(closed: Segments, turns) -> jax.Array:
+    """Whether the orbit is back at its start before its last turn: it has a shorter period."""
     start = closed.y[:, :1]
-    turn = jnp.cumsum(closed.guard == SECTION)
-    back = jnp.max(jnp.abs(ends - start), axis=0) < 1e-5 * (1 + jnp.max(jnp.abs(start)))
-    period = jnp.min(jnp.where(back & (closed.guard == SECTION), turn, turns))
-    # The segments of the first period are those before that many turns have ended.
-    unused = (turn > period) | ((turn == period) & (closed.guard != SECTION))
-    once = Segments(
-        y=jnp.where(unused, start, closed.y),
-        duration=jnp.where(unused, 0, closed.duration),
-        s=jnp.where(unused, closed.s[:, :1], closed.s),
-        guard=jnp.where(unused, UNUSED, closed.guard),
-    )
-    return once, period.astype(turns.dtype)
+    away = jnp.max(jnp.abs(next_start(closed.y) - start), axis=0)
+    ends_turn = closed.guard == SECTION
+    early = ends_turn & (jnp.cumsum(ends_turn) < turns)
+    return jnp.any(early & (away < 1e-5 * (1 + jnp.max(jnp.abs(start)))))
 
 
 def _attempt(system: StickSlip, y, s, duration, switches, turns, wanted, *, length: int):
-    """An orbit of so many turns near y: its segments and turns, and whether it may stand."""
+    """An orbit of so many turns near y: its segments and turns, and whether it may stand.
+
+    One of a shorter period may not: cut into as many pieces, it is had more exactly.
+    """
     # Every switch cuts a step; one turn may have a switch more than the last.
     whole_steps = jnp.maximum(length - 2 - turns * (switches + 2), length // 4)
     segments, enough = _record(system, y, s, 1.02 * turns * duration / whole_steps, turns, length)
@@ -196,7 +190,7 @@ def _attempt(system: StickSlip, y, s, duration, switches, turns, wanted, *, leng
     near = jnp.max(jnp.abs(closed.y[:, 0] - y)) < 0.2 * (1 + jnp.max(jnp.abs(y)))
     moves = jnp.max(jnp.abs(closed.y[2:])) > 1e-4
     ok = converged & near & moves & _attracts(once_round) & keeps_itinerary(system, closed)
-    return *_once(closed, turns), ok
+    return closed, turns, ok & ~_closes_early(closed, turns)
 
 
 def _on_cpu() -> bool:
@@ -264,7 +258,7 @@ def _find(system: StickSlip, start, rest, growth, max_turns, length: int) -> Fou
         return jnp.any(carry[0].status == RUNNING)
 
     def body(carry):
-        run, segments, period_turns, distance, approach, widest, rounds = carry
+        run, segments, period_turns, distance, approach, widest, tried, rounds = carry
         # Who has not settled by then may be choosing between attractors.
         finer = jnp.where(rounds < 4, 1, jnp.where(rounds < 12, 2, 4))
         h = (_STEP / finer).astype(start.dtype)
@@ -290,12 +284,15 @@ def _find(system: StickSlip, start, rest, growth, max_turns, length: int) -> Fou
         turns = jnp.where(rounds % 2 == 0, 1, repeated)
         gap = jnp.where(turns == 1, apart[0], closest)
         ready = (run.status == RUNNING) & ~closer & (gap < 0.15 * scale)
+        # After a failure, again when the motion has come closer, or after a while.
+        ready = ready & ((gap < 0.7 * tried) | (rounds % 8 < 2))
 
         nothing = segments, period_turns, jnp.zeros(shape, bool)
         wanted = system, run.y, run.s, run.duration, run.switches, turns, ready
         closed, closed_turns, new = _attempts(*wanted, nothing, length=length)
         new = new & ready
         segments, period_turns = _where(new, (closed, closed_turns), (segments, period_turns))
+        tried = jnp.where(ready, gap, tried)
         now = distance_from(segments.y[:, 0])
         # This close, whether it attracts is decided by its multipliers.
         ok = ok | (new & (jnp.max(jnp.abs(run.y - segments.y[:, 0]), axis=0) < 0.03 * scale))
@@ -308,10 +305,11 @@ def _find(system: StickSlip, start, rest, growth, max_turns, length: int) -> Fou
         over = jnp.where(run.turns >= max_turns, over, RUNNING)
         status = jnp.where(run.status == RUNNING, jnp.where(ok, CONVERGED, over), run.status)
         run = eqx.tree_at(lambda r: r.status, run, status)
-        return run, segments, period_turns, distance, approach, widest, rounds + 1
+        return run, segments, period_turns, distance, approach, widest, tried, rounds + 1
 
     none = jnp.zeros(shape, int)
-    start_carry = run, empty, none, jnp.full(shape, jnp.inf, start.dtype), none, zero, 0
+    far = jnp.full(shape, jnp.inf, start.dtype)
+    start_carry = run, empty, none, far, none, zero, far, 0
     run, segments, period_turns, *_ = jax.lax.while_loop(running, body, start_carry)
     return Found(segments, run.status, run.turns, period_turns)
 

@@ -155,6 +155,27 @@ def test_cycles_of_several_turns():
         check(row, np.asarray(jacobian), cycle)
 
 
+@pytest.mark.slow
+def test_every_scene_in_one_batch():
+    """More scenes than go through the machine together, of every outcome: each as on its own."""
+    numbers = jax.tree.map(lambda *x: jnp.stack(x), *map(numbers_of, ROWS))
+    starts = jnp.array([row["start"] for row in ROWS])
+
+    def one(numbers, start):
+        cycle = fj.limit_cycle(scene_of(numbers), start, segments=40, throw=False)
+        return cycle.period, cycle.amplitude, cycle.result._value
+
+    batch = jax.jit(jax.vmap(one))(numbers, starts)
+    single = jax.jit(one)
+    assert len(ROWS) > 64 and len(set(batch[2].tolist())) >= 4
+    for i in range(len(ROWS)):
+        period, amplitude, result = (np.asarray(x[i]) for x in batch)
+        alone = single(jax.tree.map(lambda x, i=i: x[i], numbers), starts[i])
+        assert result == alone[2], ROWS[i]
+        np.testing.assert_allclose(period, alone[0], rtol=1e-9)
+        np.testing.assert_allclose(amplitude, alone[1], rtol=1e-9)
+
+
 def test_motions_without_a_cycle():
     """The equilibrium attracts, the motion diverges, or it never repeats: each is told apart."""
     seen = set()
@@ -164,7 +185,7 @@ def test_motions_without_a_cycle():
         _, cycle = everything(numbers_of(row), jnp.array(row["start"]), 40)
         allowed = {
             "equilibrium": [fj.CycleResult.equilibrium],
-            # Two of these take more than the 1000 turns allowed here to leave.
+            # Two of these wander for thousands of turns.
             "diverged": [fj.CycleResult.diverged, fj.CycleResult.exhausted],
             "not periodic": [fj.CycleResult.not_periodic, fj.CycleResult.exhausted],
         }[row["kind"]]
@@ -409,6 +430,7 @@ def test_design_for_a_quiet_cycle():
         target=1e4,
         K_n_min=0.0,
         starts=2,
+        lattice=32,
         progress=False,
     )
     sweep = jax.jit(jax.vmap(lambda D: amplitude(substitute(scene, {"D": D}))))

@@ -203,6 +203,17 @@ def test_field():
     np.testing.assert_allclose(mu, 0.4 * np.tanh(0.5) - drop, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
+def test_too_few_steps_are_told():
+    """Where max_steps ends the integration the result says so, and what to do."""
+    stiff = {"regularisation": 1e-5, "max_steps": 64}
+    found = fj.limit_cycle(reference_scene(), throw=False, **stiff)
+    assert found.result == fj.CycleResult.too_stiff
+    assert np.isnan([found.period, *found.amplitude, found.regularisation_error]).all()
+    with pytest.raises(RuntimeError, match="Kvaerno5"):
+        fj.limit_cycle(reference_scene(), **stiff)
+
+
 def test_no_motion():
     """Where steady sliding attracts there is no cycle of either law, and nothing is made up."""
     quiet = reference_scene().replace(mu_s=0.05, mu_m=0.04, xi_1=0.05, xi_2=0.05)
