@@ -150,7 +150,7 @@ def keeps_itinerary(system: StickSlip, segments: Segments) -> jax.Array:
     theta, _ = cubic.minimum()
     low = cubic(theta)
     theta = jnp.stack([jnp.where(low[k] < low[k + 1], theta[k], theta[k + 1]) for k in (0, 2)])
-    inside = flow(system, y[:, None], theta * h[None], s[:, None], written_out=True)
+    inside = flow(system, y[:, None], theta * h[None], s[:, None])
     within = system.guards(inside, s[:, None])
     lowest = jnp.minimum(within[0:2, 0], within[2:4, 1])
     least = -1e4 * eps * (1 + jnp.max(jnp.abs(y)))
