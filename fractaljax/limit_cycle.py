@@ -15,7 +15,6 @@ from .scene import Scene
 from .shooting import (
     UNUSED,
     Segments,
-    corrections,
     flow,
     maps,
     next_start,
@@ -244,16 +243,6 @@ def _monodromy(system: StickSlip, segments: Segments, local) -> jax.Array:
     return M[0]
 
 
-def _estimated_error(system: StickSlip, segments: Segments, ends, local) -> jax.Array:
-    """Relative error of period and states, from the difference that half the steps make."""
-    y, h, s = segments.y, segments.duration, segments.s
-    fine = flow(system, flow(system, y, h / 2, s), h / 2, s)
-    used = segments.guard != UNUSED
-    dy, dt, _ = corrections(local, used, fine - ends, jnp.zeros_like(h))
-    period = jnp.sum(h)
-    return jnp.maximum(jnp.abs(jnp.sum(dt)) / period, jnp.max(jnp.abs(dy)) / jnp.max(jnp.abs(y)))
-
-
 def _start(scene: Scene, system: StickSlip, start) -> jax.Array:
     """The start (4,) in scaled units, constant: by default the equilibrium with x1 displaced."""
     y = rest(scene, system).at[0].add(1.0) if start is None else start / units(system)
@@ -273,8 +262,8 @@ def _limit_cycle(scene: Scene, start, max_turns, *, segments: int, rtol: float) 
     y, duration = orbit(system, found.segments)
     loop = Segments(y, duration, found.segments.s, found.segments.guard)
     period = jnp.sum(duration)
-    ends, local = maps(system, loop)
-    error = jax.lax.stop_gradient(_estimated_error(system, loop, ends, local))
+    _, local = maps(system, loop)
+    error = found.error
     status = CycleResult.exhausted
     for outcome, result in enumerate(_RESULTS):
         status = CycleResult.where(found.status == outcome, result, status)

@@ -175,10 +175,17 @@ def equalise(system: StickSlip, segments: Segments) -> Segments:
     return Segments(y, equal, s, guard)
 
 
-def close(
-    system: StickSlip, segments: Segments, wanted: jax.Array
-) -> tuple[Segments, jax.Array, jax.Array]:
-    """The closed orbit, whether Newton's method reached it, and its projected monodromy matrix.
+class Closing(eqx.Module):
+    """A closed orbit, where Newton's method reached one."""
+
+    segments: Segments
+    converged: jax.Array
+    local: Maps
+    once_round: jax.Array  # (4, 4), the projected monodromy matrix
+
+
+def close(system: StickSlip, segments: Segments, wanted: jax.Array) -> Closing:
+    """The closed orbit near those segments.
 
     Nothing is done where not `wanted`: in a batch, a member without an orbit costs no iterations.
     """
@@ -189,17 +196,16 @@ def close(
 
     def stage(k, carry):
         # Switches move away from the planes about them: the rough orbit is divided anew.
-        segments, going, once_round = carry
-        segments = equalise(system, segments)
+        found, going = carry.segments, carry.converged
+        found = equalise(system, found)
         tolerance = jnp.where(k == 0, 1e-4, 1e3 * eps * scale)
 
         def running(carry):
-            _, change, _, count = carry
+            *_, change, count = carry
             return (count < _ITERATIONS) & ~(change <= tolerance) & (change < jnp.inf)
 
         def body(carry):
-            # A second step with the same maps costs half as much and gains as many digits.
-            segments, _, _, count = carry
+            segments, *_, count = carry
             # To get near, tangents of fifth order are enough, for less than half the price.
             local = jax.lax.cond(
                 k == 0,
@@ -210,15 +216,29 @@ def close(
             def step(_, carry):
                 return newton_step(system, carry[0], local)
 
-            carry = jax.lax.fori_loop(0, 2, step, (segments, big, once_round))
-            return *carry, count + 1
+            # A second step with the same maps costs half as much and gains as many digits.
+            segments, change, once_round = jax.lax.fori_loop(0, 2, step, (segments, big, eye))
+            return segments, local, once_round, change, count + 1
 
-        start = segments, jnp.where(going, big, 0), once_round, 0
-        segments, change, once_round, _ = jax.lax.while_loop(running, body, start)
+        start = found, carry.local, carry.once_round, jnp.where(going, big, 0), 0
+        found, local, once_round, change, _ = jax.lax.while_loop(running, body, start)
         enough = jnp.where(k == 0, 1e-2, 10 * tolerance)
-        return segments, going & (change <= enough), once_round
+        return Closing(found, going & (change <= enough), local, once_round)
 
-    return jax.lax.fori_loop(0, 2, stage, (segments, wanted, jnp.zeros((4, 4), dtype)))
+    N = segments.duration.shape[-1]
+    eye = jnp.eye(4, dtype=dtype)
+    nothing = Maps(*(jnp.zeros((*shape, N), dtype) for shape in ((4, 4), (4,), (4,))))
+    return jax.lax.fori_loop(0, 2, stage, Closing(segments, wanted, nothing, eye))
+
+
+def estimated_error(system: StickSlip, closed: Closing) -> jax.Array:
+    """Relative error of period and states, from the difference that half the steps make."""
+    y, h, s = closed.segments.y, closed.segments.duration, closed.segments.s
+    fine = jax.lax.fori_loop(0, 2, lambda _, y: flow(system, y, h / 2, s), y)
+    used = closed.segments.guard != UNUSED
+    dy, dt, _ = corrections(closed.local, used, fine - next_start(y), jnp.zeros_like(h))
+    period = jnp.sum(h)
+    return jnp.maximum(jnp.abs(jnp.sum(dt)) / period, jnp.max(jnp.abs(dy)) / jnp.max(jnp.abs(y)))
 
 
 @jax.custom_jvp

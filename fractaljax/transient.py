@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 
 from .events import Cubic, guards_and_rates, step
-from .shooting import UNUSED, Segments, close, flow, next_start
+from .shooting import UNUSED, Segments, close, estimated_error, flow, next_start
 from .stick_slip import SECTION, StickSlip
 
 _STEP = 0.25  # of the coarse run, in units of 1/omega; no eigenfrequency exceeds 1
@@ -38,6 +38,7 @@ class Found(eqx.Module):
     status: jax.Array
     turns: jax.Array  # of the run
     period_turns: jax.Array  # of one period
+    error: jax.Array  # of the closed orbit, relative
 
 
 class _Run(eqx.Module):
@@ -179,18 +180,20 @@ def _closes_early(closed: Segments, turns) -> jax.Array:
 
 
 def _attempt(system: StickSlip, y, s, duration, switches, turns, wanted, *, length: int):
-    """An orbit of so many turns near y: its segments and turns, and whether it may stand.
+    """An orbit of so many turns near y: its segments, turns and error, and whether it may stand.
 
     One of a shorter period may not: cut into as many pieces, it is had more exactly.
     """
     # Every switch cuts a step; one turn may have a switch more than the last.
     whole_steps = jnp.maximum(length - 2 - turns * (switches + 2), length // 4)
     segments, enough = _record(system, y, s, 1.02 * turns * duration / whole_steps, turns, length)
-    closed, converged, once_round = close(system, segments, wanted & enough)
+    closing = close(system, segments, wanted & enough)
+    closed = closing.segments
     near = jnp.max(jnp.abs(closed.y[:, 0] - y)) < 0.2 * (1 + jnp.max(jnp.abs(y)))
     moves = jnp.max(jnp.abs(closed.y[2:])) > 1e-4
-    ok = converged & near & moves & _attracts(once_round) & keeps_itinerary(system, closed)
-    return closed, turns, ok & ~_closes_early(closed, turns)
+    ok = closing.converged & near & moves & _attracts(closing.once_round)
+    ok = ok & keeps_itinerary(system, closed) & ~_closes_early(closed, turns)
+    return closed, turns, estimated_error(system, closing), ok
 
 
 def _on_cpu() -> bool:
@@ -258,7 +261,7 @@ def _find(system: StickSlip, start, rest, growth, max_turns, length: int) -> Fou
         return jnp.any(carry[0].status == RUNNING)
 
     def body(carry):
-        run, segments, period_turns, distance, approach, widest, tried, rounds = carry
+        run, segments, period_turns, error, distance, approach, widest, tried, rounds = carry
         # Who has not settled by then may be choosing between attractors.
         finer = jnp.where(rounds < 4, 1, jnp.where(rounds < 12, 2, 4))
         h = (_STEP / finer).astype(start.dtype)
@@ -287,11 +290,12 @@ def _find(system: StickSlip, start, rest, growth, max_turns, length: int) -> Fou
         # After a failure, again when the motion has come closer, or after a while.
         ready = ready & ((gap < 0.7 * tried) | (rounds % 8 < 2))
 
-        nothing = segments, period_turns, jnp.zeros(shape, bool)
+        known = segments, period_turns, error
         wanted = system, run.y, run.s, run.duration, run.switches, turns, ready
-        closed, closed_turns, new = _attempts(*wanted, nothing, length=length)
+        nothing = *known, jnp.zeros(shape, bool)
+        *closed, new = _attempts(*wanted, nothing, length=length)
         new = new & ready
-        segments, period_turns = _where(new, (closed, closed_turns), (segments, period_turns))
+        segments, period_turns, error = _where(new, tuple(closed), known)
         tried = jnp.where(ready, gap, tried)
         now = distance_from(segments.y[:, 0])
         # This close, whether it attracts is decided by its multipliers.
@@ -305,13 +309,13 @@ def _find(system: StickSlip, start, rest, growth, max_turns, length: int) -> Fou
         over = jnp.where(run.turns >= max_turns, over, RUNNING)
         status = jnp.where(run.status == RUNNING, jnp.where(ok, CONVERGED, over), run.status)
         run = eqx.tree_at(lambda r: r.status, run, status)
-        return run, segments, period_turns, distance, approach, widest, tried, rounds + 1
+        return run, segments, period_turns, error, distance, approach, widest, tried, rounds + 1
 
     none = jnp.zeros(shape, int)
     far = jnp.full(shape, jnp.inf, start.dtype)
-    start_carry = run, empty, none, far, none, zero, far, 0
-    run, segments, period_turns, *_ = jax.lax.while_loop(running, body, start_carry)
-    return Found(segments, run.status, run.turns, period_turns)
+    start_carry = run, empty, none, zero, far, none, zero, far, 0
+    run, segments, period_turns, error, *_ = jax.lax.while_loop(running, body, start_carry)
+    return Found(segments, run.status, run.turns, period_turns, error)
 
 
 def find(system: StickSlip, start, rest, growth, max_turns, length: int) -> Found:
