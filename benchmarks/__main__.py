@@ -5,9 +5,9 @@ from pathlib import Path
 
 import jax
 
-from . import growth_rate, limit_cycle
+from . import eigenvalues, growth_rate, limit_cycle
 
-BENCHMARKS = {"growth_rate": growth_rate, "limit_cycle": limit_cycle}
+BENCHMARKS = {"eigenvalues": eigenvalues, "growth_rate": growth_rate, "limit_cycle": limit_cycle}
 
 
 def main() -> None:

@@ -1,6 +1,13 @@
 """From a machined surface to a stable mechanism, with gradients all the way back."""
 
-from . import plot as plot
+from . import constraints as constraints, plot as plot
+from .boundary import (
+    Boundary as Boundary,
+    Branch as Branch,
+    BranchEnd as BranchEnd,
+    hopf_boundary as hopf_boundary,
+)
+from .complex_modes import ComplexModes as ComplexModes, assemble as assemble
 from .contact import (
     ContactState as ContactState,
     FixedContact as FixedContact,
@@ -10,7 +17,10 @@ from .contact import (
     dimensionless_normal_stiffness as dimensionless_normal_stiffness,
     dimensionless_tangential_stiffness as dimensionless_tangential_stiffness,
 )
+from .critical_friction import critical_friction as critical_friction
 from .design import Design as Design, DesignResult as DesignResult, design as design
+from .design_file import repeat_design as repeat_design
+from .envelope import Envelope as Envelope
 from .friction import Coulomb as Coulomb, Stribeck as Stribeck
 from .limit_cycle import (
     CycleResult as CycleResult,
@@ -18,8 +28,11 @@ from .limit_cycle import (
     attractors as attractors,
     limit_cycle as limit_cycle,
 )
+from .maps import Modes as Modes, modes_over as modes_over
+from .margin import margin as margin
 from .materials import Material as Material
 from .oscillator import Oscillator as Oscillator, equilibrium as equilibrium
+from .pareto import Front as Front, pareto as pareto
 from .scene import Scene as Scene, brake_scene as brake_scene, stiffness as stiffness
 from .simulate import (
     SimulationResult as SimulationResult,
@@ -30,5 +43,11 @@ from .stability import (
     Stability as Stability,
     growth_rate as growth_rate,
     stability as stability,
+)
+from .structure import (
+    Joint as Joint,
+    Structure as Structure,
+    modal_damping as modal_damping,
+    rayleigh_damping as rayleigh_damping,
 )
 from .surfaces import Surface as Surface

@@ -43,9 +43,16 @@ def _parser() -> _Parser:
     design.add_argument("--G", type=float, nargs=2, metavar=("LOW", "HIGH"), help="on G [m]")
     design.add_argument("--target", type=float, help="largest growth rate allowed [1/s]")
     design.add_argument("--K-n-min", type=float, help="least normal stiffness allowed [N/m]")
-    design.add_argument("--area-ratio-min", type=float, default=2.0, help="least a_l/a_e")
-    design.add_argument("--slip-ratio-max", type=float, default=0.9, help="largest Q_e/(mu_s P)")
-    design.add_argument("--starts", type=int, default=128, help="surfaces improved side by side")
+    design.add_argument("--area-ratio-min", type=float, help="least a_l/a_e")
+    design.add_argument("--slip-ratio-max", type=float, help="largest Q_e/(mu_s P)")
+    _add_conditions(design)
+    _add_constraints(design)
+    design.add_argument("--starts", type=int, help="surfaces improved side by side")
+    design.add_argument("--lattice", type=int, help="surfaces a side that starts are chosen from")
+    design.add_argument("--seed", type=int, help="of the surfaces drawn as machined; default 0")
+    design.add_argument(
+        "--repeat", type=Path, metavar="FILE", help="run again what a run.toml holds, nothing else"
+    )
     design.add_argument("--quiet", action="store_true", help="no progress bar")
     design.set_defaults(run=_design)
 
@@ -70,7 +77,7 @@ def _parser() -> _Parser:
     )
     cycle.add_argument("--rtol", type=float, default=1e-9, help="of period and states")
     cycle.add_argument(
-        "--max-turns", type=int, default=1000, help="turns of the motion after which to give up"
+        "--max-turns", type=int, default=5000, help="turns of the motion after which to give up"
     )
     cycle.set_defaults(run=_cycle)
 
@@ -84,6 +91,35 @@ def _parser() -> _Parser:
 def _add_scene(parser) -> None:
     parser.add_argument(
         "scene", nargs="?", type=Path, help="a scene file; else the reference brake"
+    )
+
+
+def _add_conditions(parser) -> None:
+    parser.add_argument(
+        "--envelope",
+        nargs="+",
+        metavar="NAME=LOW:HIGH",
+        help="ranges, or NAME=V1,V2,V3 measured together, that the design withstands",
+    )
+    parser.add_argument("--risk", help="worst (the default), smooth, smooth:T or cvar:ALPHA")
+    parser.add_argument(
+        "--tolerance",
+        nargs="+",
+        metavar="NAME=SIGMA",
+        help="standard deviations of D and lnG as machined",
+    )
+    parser.add_argument("--quantile", type=float, help="of the scatter; default 0.95")
+
+
+def _add_constraints(parser) -> None:
+    for name, meaning in _LIMITS.items():
+        parser.add_argument(f"--{name}", metavar="LOW:HIGH", help=f"{meaning}; one may be absent")
+    parser.add_argument(
+        "--sq-lengths",
+        type=float,
+        nargs=2,
+        metavar=("L", "L_S"),
+        help="longest and shortest wavelength that --sq counts [m]; default 1e-3 1e-6",
     )
 
 
@@ -110,35 +146,42 @@ def _scene(arguments) -> int:
 
 
 def _stability(arguments) -> int:
-    """Print the joint, the critical mode and the eigenvalues of a scene."""
-    from .report import stability_table
+    """Print the joint, the critical mode and the eigenvalues of a scene.
 
-    print(stability_table(_load(arguments), not arguments.constant_friction))
+    Of a structure (a file with a table of that name): the joints, and the modes that are unstable
+    or least damped.
+    """
+    from .report import stability_table, structure_table
+    from .scene import brake_scene
+    from .structure import Structure, load
+
+    subject = brake_scene() if arguments.scene is None else load(arguments.scene)
+    slope = not arguments.constant_friction
+    if isinstance(subject, Structure):
+        print(structure_table(subject, slope))
+    else:
+        print(stability_table(subject, slope))
     return 0
 
 
 def _design(arguments) -> int:
-    """Find the nearest stable surface; write design.toml, history.csv and design.png."""
+    """Find the nearest stable surface; write design.toml, run.toml, history.csv and design.png."""
     from . import plot
-    from .design import DEFAULT_BOUNDS, design
+    from .design import design
+    from .design_file import design_text, read_design
 
-    scene = _load(arguments)
-    asked = {"D": arguments.D, "G": arguments.G}
-    bounds = DEFAULT_BOUNDS | {name: tuple(ends) for name, ends in asked.items() if ends}
+    if arguments.repeat is None:
+        scene, options = _load(arguments), _options(arguments)
+    else:
+        given = [name for name in _OWN if getattr(arguments, name) not in (None, False)]
+        if given:
+            raise ValueError(f"--repeat takes everything from its file, got {', '.join(given)} too")
+        scene, options = read_design(arguments.repeat)
     with _output(arguments.out) as write:
-        best = design(
-            scene,
-            bounds,
-            target=arguments.target,
-            K_n_min=arguments.K_n_min,
-            area_ratio_min=arguments.area_ratio_min,
-            slip_ratio_max=arguments.slip_ratio_max,
-            friction_slope=not arguments.constant_friction,
-            starts=arguments.starts,
-            progress=not arguments.quiet,
-        )
+        best = design(scene, **options, progress=not arguments.quiet)
         files = {
             "design.toml": _scene_text(best).encode(),
+            "run.toml": design_text(best).encode(),
             "history.csv": _history_text(best).encode(),
             "design.png": _picture(plot.design(best).figure),
         }
@@ -146,6 +189,118 @@ def _design(arguments) -> int:
     print(best)
     print(f"written to {arguments.out}: {', '.join(files)}")
     return 1 if best.violated else 0
+
+
+_LIMITS = {
+    "sq": "Sq of the surface [m]",
+    "elastic-share": "share of the load on elastic contacts",
+    "real-area": "real contact area [m^2]",
+    "damping-ratio": "least damping ratio",
+    "frequency": "frequencies of both modes [Hz]",
+}
+_OPTIONS = (
+    "target",
+    "K_n_min",
+    "area_ratio_min",
+    "slip_ratio_max",
+    "quantile",
+    "starts",
+    "lattice",
+    "seed",
+)
+_OWN = (  # arguments that leave nothing to repeat
+    "scene",
+    "D",
+    "G",
+    "constant_friction",
+    "envelope",
+    "risk",
+    "tolerance",
+    "sq_lengths",
+    *_OPTIONS,
+    *(name.replace("-", "_") for name in _LIMITS),
+)
+
+
+def _options(arguments) -> dict:
+    """The arguments of `design` that a command asks for."""
+    from .task import DEFAULT_BOUNDS
+
+    asked = {"D": arguments.D, "G": arguments.G}
+    bounds = DEFAULT_BOUNDS | {name: tuple(ends) for name, ends in asked.items() if ends}
+    options = {name: getattr(arguments, name) for name in _OPTIONS}
+    options = {name: value for name, value in options.items() if value is not None}
+    options |= {"bounds": bounds, "friction_slope": not arguments.constant_friction}
+    options["constraints"] = _constraints(arguments)
+    if arguments.risk is not None:
+        kind, _, number = arguments.risk.partition(":")
+        options["risk"] = (kind, _float("--risk", number)) if number else kind
+    if arguments.envelope is not None:
+        options["envelope"] = _envelope(arguments.envelope)
+    if arguments.tolerance is not None:
+        pairs = [_pair("--tolerance", text, "NAME=SIGMA") for text in arguments.tolerance]
+        options["tolerance"] = {
+            "ln G" if name == "lnG" else name: _float("--tolerance", text) for name, text in pairs
+        }
+    return options
+
+
+def _constraints(arguments) -> list:
+    from . import constraints
+
+    limits = {
+        name: _limits(f"--{name}", getattr(arguments, name.replace("-", "_"))) for name in _LIMITS
+    }
+    if arguments.sq_lengths is not None and limits["sq"] is None:
+        raise ValueError("--sq-lengths needs --sq")
+    L, L_s = arguments.sq_lengths or (1e-3, 1e-6)
+    kinds = {
+        "sq": lambda low, high: constraints.Roughness(low, high, L=L, L_s=L_s),
+        "elastic-share": lambda low, high: constraints.ElasticShare(low),
+        "real-area": constraints.RealContactArea,
+        "damping-ratio": lambda low, high: constraints.DampingRatio(
+            low, friction_slope=not arguments.constant_friction
+        ),
+        "frequency": lambda low, high: constraints.Frequency(
+            low, high, friction_slope=not arguments.constant_friction
+        ),
+    }
+    for name in ("elastic-share", "damping-ratio"):
+        if (limits[name] or (None, None))[1] is not None:
+            raise ValueError(f"--{name} has a lower limit only: LOW:")
+    return [kinds[name](*ends) for name, ends in limits.items() if ends is not None]
+
+
+def _limits(option, text):
+    """LOW:HIGH as two numbers, either of them None where it is absent; LOW alone is LOW:."""
+    if text is None:
+        return None
+    low, _, high = text.partition(":")
+    return tuple(_float(option, end) if end else None for end in (low, high))
+
+
+def _envelope(texts):
+    from .envelope import Envelope
+
+    ranges, samples = {}, {}
+    for name, values in (_pair("--envelope", text, "NAME=LOW:HIGH") for text in texts):
+        into, separator = (ranges, ":") if ":" in values else (samples, ",")
+        into[name] = [_float(f"--envelope {name}", value) for value in values.split(separator)]
+    return Envelope(ranges, samples)
+
+
+def _pair(option, text, form):
+    name, equals, value = text.partition("=")
+    if not (name and equals and value):
+        raise ValueError(f"{option} must be {form}, got {text!r}")
+    return name, value
+
+
+def _float(option, text) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"{option} must be numbers, got {text!r}") from None
 
 
 def _cycle(arguments) -> int:

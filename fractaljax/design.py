@@ -5,11 +5,13 @@ is at most 0 where it is met, continuous and informative on both sides of every 
 a fully plastic joint knows by ln(a_l/a_e) how far it is from carrying load elastically. A lattice
 of surfaces is judged at once; the most promising and an even spread of the others walk together,
 first by Adam on a penalty, then by sequential quadratic programming (`search.py`), and the best
-of all that meet every requirement, evaluated afresh, is the answer.
+of all that meet every requirement, evaluated afresh, is the answer. With an envelope or a
+tolerance fewer of them walk, and for longer where the worst condition moves (`worst_case.py`).
 """
 
 import dataclasses
 import functools
+import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -18,16 +20,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .parts import number, require_scalar, substitute
-from .report import comparison_table
+from . import tolerance as scatter
+from .envelope import Envelope, condition_text
+from .report import comparison_table, table
 from .scene import Scene
 from .search import search
 from .stability import growth_rate, growth_rate_of
+from .task import DEFAULT_BOUNDS, Task, pose
+from .worst_case import Verdict
 
-DEFAULT_BOUNDS: dict[str, tuple[float, float]] = {"D": (2.1, 2.9), "G": (1e-12, 1e-8)}
-
-_LATTICE = {1: 1024, 2: 48}  # surfaces a side, judged to choose the starts
+_STEPS, _ROBUST_STEPS = (80, 40), (30, 25)
 _ACTIVE = 100  # a requirement met by less than this many times the slack is called active
+_SAMPLES = 100_000  # surfaces drawn for the probability of squeal
+_ROWS = 64  # of a history, described at once
 
 
 class DesignResult(eqx.Enumeration):
@@ -45,131 +50,67 @@ class Design:
     scene: Scene  # with the designed surface; if infeasible, with the best one found
     initial: Scene
     value: float  # the objective at `scene`: by default d^2, the squared scaled distance
-    growth_rate: float  # [1/s]
+    growth_rate: float  # [1/s], of `scene` itself
     active: tuple[str, ...]  # requirements met with nothing to spare
     violated: tuple[str, ...]  # requirements not met, none unless infeasible
     result: DesignResult  # a member of DesignResult
-    history: Mapping[str, np.ndarray]  # one row a step on the way to `scene`
+    history: Mapping[str, np.ndarray]  # one row a step on the way to `scene`, as `initial` is
     bounds: Mapping[str, tuple[float, float]]
     target: float  # largest growth rate allowed [1/s]
     K_n_min: float  # least normal stiffness allowed [N/m]
     friction_slope: bool
+    starts: int  # surfaces improved side by side, 0 if unchanged
+    failed_starts: int  # how many of them ended without meeting every requirement
+    options: Mapping[str, Any]  # the arguments of `design`, for another run
+    growth_rates: tuple[float, float] | None = None  # as required, before and after [1/s]
+    worst: Mapping[str, float] | None = None  # condition of the most pressing requirement
+    worst_of: Mapping[str, Mapping[str, float]] | None = None  # of every requirement
+    squeal_probability: float | None = None  # of surfaces as machined
+    squeal_probability_error: float | None = None  # its standard error
+    initial_squeal_probability: float | None = None
 
     @property
     def outcome(self) -> str:
         """The result in words."""
         return DesignResult[self.result]
 
+    def save(self, path: str | os.PathLike) -> None:
+        """Write scenes, options, results and history to a TOML file, for `repeat_design`.
+
+        **Raises:** `OSError` if the file cannot be written.
+        """
+        from .design_file import save_design
+
+        save_design(self, path)
+
     def __repr__(self) -> str:
         lines = [comparison_table(self.initial, self.scene, self.friction_slope, self.active)]
+        lines += self._under_conditions()
         lines += [f"not met: {name}" for name in self.violated]
         return "\n".join([*lines, self.outcome])
 
-
-class _Request(eqx.Module):
-    """The numbers of a design, so that one compiled program serves every scene of a kind."""
-
-    scene: Scene
-    low: jax.Array  # bounds of the variables: D, ln G
-    high: jax.Array
-    start: jax.Array  # the scene's own surface, scaled
-    target: jax.Array
-    growth_scale: jax.Array
-    K_n_min: jax.Array
-    area_ratio_min: jax.Array
-    slip_ratio_max: jax.Array
-    value_shift: jax.Array
-    value_scale: jax.Array
-
-
-@dataclasses.dataclass(frozen=True)
-class _Problem:
-    """What a design asks, hashable: the structure its programs are compiled for."""
-
-    variables: tuple[str, ...]
-    objective: Callable[[Scene], Any] | None
-    constraints: tuple[Callable[[Scene], Any], ...]
-    tangential_law: bool
-    friction_slope: bool
-
-    @property
-    def model_requirements(self) -> int:
-        """How many requirements, the first, keep the joint inside the model."""
-        return 1 + self.tangential_law
-
-    def scene(self, request: _Request, u) -> Scene:
-        x = request.low + u * (request.high - request.low)
-        values = {n: jnp.exp(x[i]) if n == "G" else x[i] for i, n in enumerate(self.variables)}
-        return substitute(request.scene, values)
-
-    def value(self, request: _Request, u):
-        """The objective; without one, the squared distance from the scene's own surface."""
-        if self.objective is None:
-            return jnp.sum((u - request.start) ** 2)
-        return self.objective(self.scene(request, u))
-
-    def requirements(self, request: _Request, u) -> dict[str, jax.Array]:
-        """Each at most 0 where it is met, of order one, and continuous everywhere.
-
-        Those that keep the joint inside the model come first and weigh ten times the others, so
-        that a request that cannot be met ends where the model holds.
-        """
-        scene = self.scene(request, u)
-        state = scene.contact.state(scene.friction.mu_s, scene.friction.mu_m)
-        growth = growth_rate_of(scene, state.K_n, state.K_t, self.friction_slope)
-        wanted = {
-            "a_l >= area_ratio_min a_e": 2
-            * (jnp.log(request.area_ratio_min) - state.log_area_ratio)
-        }
-        if self.tangential_law:
-            wanted["Q_e <= slip_ratio_max mu_s P"] = 10 * (
-                state.slip_ratio - request.slip_ratio_max
+    def _under_conditions(self) -> list[str]:
+        """What the envelope and the tolerance make of it, before and after, and the worst."""
+        if self.growth_rates is None:
+            return []
+        envelope, tolerance = self.options["envelope"], self.options["tolerance"]
+        words, rows = [], [{}, {}]
+        if envelope is not None:
+            words.append(f"over {Envelope.of(envelope)}")
+        if tolerance is not None:
+            words.append(
+                "where " + ", ".join(f"{n} scatters by {s:g}" for n, s in tolerance.items())
             )
-        wanted["growth_rate <= target"] = jnp.arcsinh(
-            (growth - request.target) / request.growth_scale
-        )
-        wanted["K_n >= K_n_min"] = (request.K_n_min - state.K_n) / jnp.where(
-            request.K_n_min > 0, request.K_n_min, 1
-        )
-        for constraint in self.constraints:
-            wanted[_name(constraint)] = jnp.asarray(constraint(scene))
-        return wanted
-
-
-def _name(function) -> str:
-    return getattr(function, "__name__", repr(function))
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _linearise(problem: _Problem, request: _Request, us):
-    """Objective and requirements (n, 1 + k) of the surfaces us (n, v), and their Jacobian."""
-
-    def both(u):
-        value = (problem.value(request, u) - request.value_shift) / request.value_scale
-        stacked = jnp.stack([value, *problem.requirements(request, u).values()])
-        return stacked, stacked
-
-    def one(u):
-        jacobian, stacked = jax.jacfwd(both, has_aux=True)(u)
-        return stacked, jacobian
-
-    return jax.vmap(one)(us)
-
-
-def _model(problem: _Problem, request: _Request, batch: int):
-    """`_linearise` as a function of NumPy arrays of any length, through one compiled shape."""
-
-    def linearise(us):
-        pieces = []
-        for i in range(0, len(us), batch):
-            piece = us[i : i + batch]
-            padded = np.concatenate([piece, np.repeat(piece[-1:], batch - len(piece), axis=0)])
-            both = _linearise(problem, request, jnp.asarray(padded, request.low.dtype))
-            pieces.append([np.asarray(x, float)[: len(piece)] for x in both])
-        stacked, jacobian = (np.concatenate(x) for x in zip(*pieces, strict=True))
-        return stacked[:, 0], stacked[:, 1:], jacobian[:, 0], jacobian[:, 1:]
-
-    return linearise
+        for row, growth in zip(rows, self.growth_rates, strict=True):
+            row["growth rate as required [1/s]"] = f"{growth:+.6g}"
+        if self.squeal_probability is not None:
+            error = f" +- {self.squeal_probability_error:.1g}"
+            rows[0]["probability of squeal"] = f"{self.initial_squeal_probability:.3g}"
+            rows[1]["probability of squeal"] = f"{self.squeal_probability:.3g}{error}"
+        lines = ["", "; ".join(words), table(["before", "after"], rows)]
+        if self.worst is not None:
+            lines.append(f"worst at {condition_text(self.worst)}")
+        return lines
 
 
 def design(
@@ -180,10 +121,16 @@ def design(
     K_n_min: float | None = None,
     constraints: Sequence[Callable[[Scene], Any]] = (),
     *,
+    envelope: Envelope | Mapping[str, Any] | None = None,
+    risk: str | tuple[str, float] = "worst",
+    tolerance: Mapping[str, float] | None = None,
+    quantile: float = 0.95,
     area_ratio_min: float = 2.0,
     slip_ratio_max: float = 0.9,
     friction_slope: bool = True,
-    starts: int = 128,
+    starts: int | None = None,
+    lattice: int | None = None,
+    seed: int = 0,
     progress: bool = True,
 ) -> Design:
     """Find by gradients the surface inside `bounds` that is best and meets every requirement.
@@ -195,40 +142,56 @@ def design(
     The requirements: growth rate <= `target` [1/s], by default -min(xi_i omega_i)/2; K_n >=
     `K_n_min` [N/m], by default the scene's own; a_l >= `area_ratio_min` a_e; Q_e <=
     `slip_ratio_max` mu_s P (not with a given stiffness ratio); every function of a scene in
-    `constraints` <= 0, of order one; and the bounds, on D and G [m] or on one of them, the other
-    then staying as it is. `starts` surfaces are improved side by side.
+    `constraints` <= 0, of order one, as those of `fractaljax.constraints` are; and the bounds, on
+    D and G [m] or on one of them, the other then staying as it is.
 
-    The same arguments give the same design. A request that cannot be met is a result, not an
-    error: see `Design.result`, `Design.violated`.
+    With an `envelope`, a range (lower, upper) or samples of any quantities of the scene by name
+    (see `Envelope`), every requirement holds, and an objective is taken, over all its conditions:
+    `risk="worst"`, at the worst; `"smooth"` or ("smooth", T), a log-sum-exp of temperature T
+    that is at least the worst; ("cvar", alpha), the mean of the worst 1 - alpha of them.
+    With a `tolerance`, the standard deviations of {"D": ..., "ln G": ...} as machined, every
+    requirement holds, and an objective is taken, at its `quantile`, at each condition of the
+    envelope by itself. `Design.squeal_probability` counts 100,000 surfaces drawn with `seed`,
+    each at a condition drawn evenly from the envelope.
+
+    `starts` surfaces, by default 128, or 12 with an envelope or a tolerance, are improved side by
+    side. They are chosen from `lattice` surfaces a side, by default 48 (1024 for one variable), or
+    24 (256): fewer where an objective is expensive. The same arguments give the same design. A
+    request that cannot be met is a result, not an error: see `Design.result`, `Design.violated`.
 
     **Raises:** `ValueError` for a contact that is not fractal, for bounds on anything else, empty,
-    inverted or without the scene's own surface, and for options outside their domain.
+    inverted or without the scene's own surface, for an envelope of anything that the scene lacks
+    or the design moves, and for options outside their domain.
     """
-    request, problem, bounds = _pose(
-        scene,
-        DEFAULT_BOUNDS if bounds is None else bounds,
-        objective,
-        target,
-        K_n_min,
-        tuple(constraints),
-        area_ratio_min,
-        slip_ratio_max,
-        friction_slope,
+    options = dict(
+        bounds=dict(DEFAULT_BOUNDS if bounds is None else bounds),
+        objective=objective,
+        target=target,
+        K_n_min=K_n_min,
+        constraints=tuple(constraints),
+        envelope=None if envelope is None else Envelope.of(envelope),
+        risk=risk,
+        tolerance=None if tolerance is None else dict(tolerance),
+        quantile=quantile,
+        area_ratio_min=area_ratio_min,
+        slip_ratio_max=slip_ratio_max,
+        friction_slope=bool(friction_slope),
+        starts=starts,
+        lattice=lattice,
+        seed=seed,
     )
-    if int(starts) != starts or starts < 1:
-        raise ValueError(f"starts must be a whole number of at least 1, got {starts!r}")
-    starts = int(starts)
-    own = np.asarray(request.start, float)[None]
-    _, excess, _, _ = _model(problem, request, starts)(own)
-    if objective is None and excess.max() <= 0:
-        return _conclude(problem, request, bounds, own, DesignResult.unchanged)
-    request, us = _choose_starts(problem, request, starts)
-    ends, path_to = search(_model(problem, request, starts), us, _slack(request), progress)
-    values, excess, _, _ = _model(problem, request, starts)(ends)
-    # Without a value, as where an objective of the limit cycle finds none, a surface is no answer.
-    worst = np.where(np.isnan(values), np.inf, np.nan_to_num(excess.max(axis=1), nan=np.inf))
-    if (worst <= 0).any():
-        values = np.where(worst <= 0, values, np.inf)
+    task = pose(scene, options)
+    own = np.asarray(task.request.start, float)[None]
+    before = task.judge(1).verdict(own)
+    if objective is None and before.worst[0] <= 0:
+        return _conclude(task, before, before, own, DesignResult.unchanged, 0, 0)
+    task, us = _choose_starts(task)
+    judge = task.judge(len(us))
+    steps = _ROBUST_STEPS if task.robust else _STEPS
+    ends, path_to = search(judge.linearise, us, task.slack, progress, steps, judge.refine)
+    after = judge.verdict(ends)
+    if (after.worst <= 0).any():
+        values = np.where(after.worst <= 0, after.values, np.inf)
         least = values.min()
         # Many starts end in one place: show the walk from the scene's own surface, the first of
         # them, if it is among those, so that the path begins where the reader does.
@@ -236,96 +199,28 @@ def design(
         result = DesignResult.found
     else:
         # Inside the model if that is possible, and there as close as can be to all the rest.
-        inside = np.nan_to_num(excess[:, : problem.model_requirements].max(axis=1), nan=np.inf)
-        best = int(np.lexsort((worst, np.maximum(inside, 0)))[0])
+        inside = after.excess[:, : task.problem.model_requirements].max(axis=1)
+        inside = np.maximum(np.nan_to_num(inside, nan=np.inf), 0)
+        best = int(np.lexsort((after.worst, inside))[0])
         result = DesignResult.infeasible
-    return _conclude(problem, request, bounds, path_to(best), result)
+    failed = int((after.worst > 0).sum())
+    return _conclude(task, before, after.of(best), path_to(best), result, len(us), failed)
 
 
-def _pose(
-    scene,
-    bounds,
-    objective,
-    target,
-    K_n_min,
-    constraints,
-    area_ratio_min,
-    slip_ratio_max,
-    friction_slope,
-):
-    """Check the arguments of `design` and turn them into numbers and structure."""
-    require_scalar(scene)
-    if not scene.contact.fractal:
-        raise ValueError("design needs a FractalContact: a FixedContact has no surface to change")
-    if not bounds or not set(bounds) <= set(DEFAULT_BOUNDS):
-        raise ValueError(f"bounds must be on D, G or both, got {', '.join(bounds) or 'none'}")
-    surface = scene.contact.surface
-    low, high, own, checked = [], [], [], {}
-    for name in sorted(bounds):
-        scale = jnp.log if name == "G" else jnp.asarray
-        ends = [float(number(f"{name} bound", end)) for end in bounds[name]]
-        for end in ends:
-            scene.replace(**{name: end})  # refuses an end outside the domain of the model
-        value = float(getattr(surface, name))
-        if not (len(ends) == 2 and ends[0] < ends[1]):
-            raise ValueError(f"bounds on {name} must be (lower, upper), got {bounds[name]!r}")
-        if not ends[0] <= value <= ends[1]:
-            raise ValueError(
-                f"{name} must lie inside its bounds [{ends[0]:g}, {ends[1]:g}], got {value:g}"
-            )
-        low.append(scale(ends[0]))
-        high.append(scale(ends[1]))
-        own.append(scale(getattr(surface, name)))
-        checked[name] = (ends[0], ends[1])
-    low, high, own = jnp.stack(low), jnp.stack(high), jnp.stack(own)
-
-    oscillator = scene.oscillator
-    decay = jnp.minimum(oscillator.xi_1 * oscillator.omega_1, oscillator.xi_2 * oscillator.omega_2)
-    slowest = jnp.minimum(oscillator.omega_1, oscillator.omega_2)
-    state = scene.contact.state(scene.friction.mu_s, scene.friction.mu_m)
-    numbers = dict(
-        low=low,
-        high=high,
-        start=(own - low) / (high - low),
-        target=-decay / 2 if target is None else number("target", target),
-        growth_scale=jnp.maximum(decay, 1e-4 * slowest),
-        K_n_min=state.K_n if K_n_min is None else number("K_n_min", K_n_min, at_least=0),
-        area_ratio_min=number("area_ratio_min", area_ratio_min, at_least=1),
-        slip_ratio_max=number("slip_ratio_max", slip_ratio_max, above=0, at_most=1),
-        value_shift=jnp.zeros_like(low[0]),
-        value_scale=jnp.ones_like(low[0]),
-    )
-    # In the precision of the scene, whatever that of the arguments.
-    dtype = surface.D.dtype
-    request = _Request(scene, **{name: jnp.asarray(x, dtype) for name, x in numbers.items()})
-    problem = _Problem(
-        tuple(checked),
-        objective,
-        constraints,
-        scene.contact.stiffness_ratio is None,
-        bool(friction_slope),
-    )
-    return request, problem, checked
-
-
-def _slack(request: _Request) -> float:
-    """By how much requirements are overfulfilled, so that rounding cannot undo them."""
-    return max(1e-6, 10 * float(jnp.finfo(request.low.dtype).eps) ** 0.5)
-
-
-def _lattice(variables: int):
-    per_side = _LATTICE[variables]
+def _lattice(variables: int, per_side: int):
     side = (np.arange(per_side) + 0.5) / per_side
     axes = np.meshgrid(*[side] * variables, indexing="ij")
     return np.stack([axis.ravel() for axis in axes], axis=1)
 
 
-def _choose_starts(problem, request, starts):
+def _choose_starts(task: Task) -> tuple[Task, np.ndarray]:
     """The scene's own surface, the most promising of a lattice, and an even spread of the rest."""
-    lattice = _lattice(len(problem.variables))
-    values, excess, _, _ = _model(problem, request, starts)(lattice)
+    request, starts, variables = task.request, task.starts, len(task.problem.variables)
+    lattice = _lattice(variables, task.lattice)
+    surveyed = task.judge(starts).survey(lattice)
+    values, excess = surveyed[:, 0], surveyed[:, 1:]
     finite = np.isfinite(values)
-    if problem.objective is not None and finite.any():
+    if task.problem.objective is not None and finite.any():
         low, shift, high = np.quantile(values[finite], [0.1, 0.5, 0.9])
         scale = (high - low) or 1.0
         values = (values - shift) / scale
@@ -336,15 +231,30 @@ def _choose_starts(problem, request, starts):
         )
     merit = np.where(finite, values + 10 * np.maximum(excess, 0).sum(axis=1), np.inf)
     ranked = np.argsort(merit, kind="stable")
+    if task.robust:
+        # With few starts, one for each basin comes first.
+        basins = _least_of_neighbours(merit.reshape((task.lattice,) * variables)).ravel()
+        ranked = np.concatenate([ranked[basins[ranked]], ranked[~basins[ranked]]])
     promising, rest = ranked[: starts // 2], np.sort(ranked[starts // 2 :])
     even = rest[np.linspace(0, len(rest) - 1, starts - starts // 2).astype(int)][1:]
     own = np.asarray(request.start, float)[None]
-    return request, np.concatenate([own, lattice[promising], lattice[even]])[:starts]
+    us = np.concatenate([own, lattice[promising], lattice[even]])[:starts]
+    return dataclasses.replace(task, request=request), us
+
+
+def _least_of_neighbours(merit):
+    """Where a table is finite and no neighbour, diagonals included, has less."""
+    padded = np.pad(merit, 1, constant_values=np.inf)
+    shifts = np.ndindex(*(3,) * merit.ndim)
+    around = [
+        padded[tuple(slice(i, i + n) for i, n in zip(s, merit.shape, strict=True))] for s in shifts
+    ]
+    return np.isfinite(merit) & (merit <= np.min(around, axis=0))
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _describe(problem, request, us):
-    """The rows of a history: what each of the surfaces us (n, variables) is worth."""
+    """The rows of a history: what each of the surfaces us (n, variables) is worth as it is."""
 
     def row(u):
         scene = problem.scene(request, u)
@@ -365,33 +275,85 @@ def _describe(problem, request, us):
     return jax.vmap(row)(us)
 
 
-def _conclude(problem, request, bounds, path, result) -> Design:
-    """Evaluate the end of `path` afresh and say what became of every requirement."""
+@functools.partial(jax.jit, static_argnums=0)
+def _squeals(problem, request, u, conditions, shifts):
+    """How many of the surfaces shifted from u squeal, each at its condition (n, names)."""
+
+    def one(condition, shift):
+        scene = problem.scene(request, u, condition, shift)
+        return growth_rate(scene, problem.friction_slope) > 0
+
+    return jnp.sum(jax.vmap(one)(conditions, shifts))
+
+
+def _squeal_probability(task: Task, u) -> tuple[float, float]:
+    """Of surfaces as machined, at conditions drawn evenly; and its standard error."""
+    envelope, seed = task.options["envelope"], task.options["seed"]
+    dtype = task.request.low.dtype
+    conditions = (
+        np.zeros((_SAMPLES, 0))
+        if envelope is None
+        else envelope.values(envelope.drawn(_SAMPLES, seed))
+    )
+    shifts = scatter.draw(task.tolerance, _SAMPLES, seed)
+    drawn = jax.tree.map(lambda x: jnp.asarray(x, dtype), (conditions, shifts))
+    hits = _squeals(task.problem, task.request, jnp.asarray(u, dtype), *drawn)
+    return scatter.proportion(int(hits), _SAMPLES)
+
+
+def _conclude(
+    task: Task, before: Verdict, after: Verdict, path, result, starts: int, failed: int
+) -> Design:
+    """Say what became of every requirement at the end of `path`."""
+    problem, request = task.problem, task.request
     path = jnp.asarray(path, request.low.dtype)
-    history = {
-        name: np.asarray(column) for name, column in _describe(problem, request, path).items()
-    }
+    # Padded, or every length would be compiled anew.
+    padding = jnp.repeat(path[-1:], -len(path) % _ROWS, axis=0)
+    described = _describe(problem, request, jnp.concatenate([path, padding]))
+    history = {name: np.asarray(column)[: len(path)] for name, column in described.items()}
     final = request.scene
     if result != DesignResult.unchanged:
         # exp(ln G) and the scaling back may end a rounding beyond a bound.
-        ends = {name: np.clip(history[name][-1], *bounds[name]) for name in problem.variables}
+        ends = {name: np.clip(history[name][-1], *task.bounds[name]) for name in problem.variables}
         final = final.replace(**ends)
-    requirements = problem.requirements(request, path[-1])
-    excess = {name: float(value) for name, value in requirements.items()}
+    names = problem.names(request)
+    excess = dict(zip(names, after.excess[0].tolist(), strict=True))
     for name, place in zip(problem.variables, path[-1].tolist(), strict=True):
         excess |= {f"{name} >= lower bound": -place, f"{name} <= upper bound": place - 1}
-    violated = tuple(name for name, value in excess.items() if value > 0)
+    violated = tuple(name for name, value in excess.items() if not value <= 0)
+    shift, scale = float(request.value_shift), float(request.value_scale)
+    more = {}
+    if task.robust:
+        growth = names.index("growth_rate <= target")
+        more["growth_rates"] = tuple(
+            float(request.target + request.growth_scale * np.sinh(verdict.excess[0, growth]))
+            for verdict in (before, after)
+        )
+    if after.places is not None:
+        envelope = task.options["envelope"]
+        at = [envelope.condition(place) for place in after.places[0, 1:]]
+        more["worst_of"] = dict(zip(names, at, strict=True))
+        more["worst"] = at[int(np.argmax(after.excess[0]))]
+    if task.tolerance:
+        ends = request.start, path[-1]
+        (first, _), (last, error) = (_squeal_probability(task, u) for u in ends)
+        more["initial_squeal_probability"] = first
+        more |= {"squeal_probability": last, "squeal_probability_error": error}
     return Design(
         scene=final,
         initial=request.scene,
-        value=float(history["objective"][-1]),
+        value=float(after.values[0]) * scale + shift,
         growth_rate=float(growth_rate(final, problem.friction_slope)),
-        active=tuple(n for n, x in excess.items() if -_ACTIVE * _slack(request) <= x <= 0),
+        active=tuple(n for n, x in excess.items() if -_ACTIVE * task.slack <= x <= 0),
         violated=violated,
         result=result if not violated else DesignResult.infeasible,
         history=history,
-        bounds=bounds,
+        bounds=task.bounds,
         target=float(request.target),
         K_n_min=float(request.K_n_min),
         friction_slope=problem.friction_slope,
+        starts=starts,
+        failed_starts=failed,
+        options=task.options,
+        **more,
     )

@@ -81,3 +81,15 @@ def linearise(
         c_2=c_2,
         g=mu**2 * (K_n / m) * (K_t / m),
     )
+
+
+def dimensionless(lin: Linearised) -> tuple[jax.Array, Linearised]:
+    """omega = sqrt(a + b), and the system in its units: no power leaves the range of a float32."""
+    omega = jnp.sqrt(lin.a + lin.b)
+    return omega, Linearised(
+        a=lin.a / omega**2,
+        b=lin.b / omega**2,
+        c_1=lin.c_1 / omega,
+        c_2=lin.c_2 / omega,
+        g=lin.g / omega**4,
+    )

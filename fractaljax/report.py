@@ -2,12 +2,16 @@
 
 import jax.numpy as jnp
 
+from .complex_modes import UNSUPPORTED, assemble
 from .contact import Regime
+from .critical_friction import critical_friction, sliding_friction
 from .limit_cycle import CycleResult, LimitCycle
 from .scene import Scene, stiffness
 from .stability import stability
+from .structure import Joint, Structure
 
 _ABSENT = "-"
+_LEAST_DAMPED = 10  # stable modes of a structure that its table lists
 _MODES = {"+": "slips, dx/dt < V", "-": "slips, dx/dt > V", "stick": "sticks"}
 
 
@@ -43,6 +47,12 @@ def stability_table(scene: Scene, friction_slope: bool = True) -> str:
     """The rows of one scene, its verdict, and every eigenvalue."""
     modes = stability(scene, friction_slope)
     rows = scene_rows(scene, friction_slope) | _verdict(modes)
+    critical = critical_friction(scene, friction_slope)
+    rows |= {
+        "margin": f"{modes.margin:+.6g}",
+        "friction at V": f"{sliding_friction(scene):.6g}",
+        "critical friction": f"{critical:.6g}" if jnp.isfinite(critical) else "none",
+    }
     rows |= {
         f"eigenvalue {i} [1/s]": f"{s.real:+.6g} {s.imag:+.6g}i"
         for i, s in enumerate(modes.eigenvalues.tolist(), start=1)
@@ -53,6 +63,63 @@ def stability_table(scene: Scene, friction_slope: bool = True) -> str:
 def _verdict(modes) -> dict[str, str]:
     verdict = "it squeals" if modes.growth_rate > 0 else "stable"
     return {"growth rate [1/s]": f"{modes.growth_rate:+.6g}  ({verdict})"}
+
+
+def structure_table(structure: Structure, friction_slope: bool = True) -> str:
+    """The joints of a structure, its verdict, and its unstable and its least damped modes.
+
+    **Raises:** `ValueError` as `assemble`, and if the structure has no equilibrium under F.
+    """
+    try:
+        assemble(structure, friction_slope)
+    except RuntimeError:  # of many lines, from inside a compiled program
+        raise ValueError(UNSUPPORTED) from None
+    modes = stability(structure, friction_slope)
+    unstable = modes.unstable()
+    least = modes.least_damped(_LEAST_DAMPED + len(unstable))
+    listed = unstable + [mode for mode in least if mode.growth_rate <= modes.resolution]
+    whole = {
+        "degrees of freedom": f"{structure.n}",
+        "unstable modes": f"{len(unstable)}  ({'it squeals' if unstable else 'stable'})",
+        "growth rate [1/s]": f"{modes.growth_rate:+.6g}",
+        "least damping ratio": f"{modes.margin:+.6g}",
+    }
+    tables = [table([""], [whole])]
+    if structure.joints:
+        columns = [_joint_rows(joint) for joint in structure.joints]
+        names = [name for name in columns[0] if any(column[name] != _ABSENT for column in columns)]
+        columns = [{name: column[name] for name in names} for column in columns]
+        tables.append(table(list(structure.joint_names), columns))
+    if listed:
+        columns = {
+            "frequency [Hz]": [f"{mode.frequency:.6g}" for mode in listed],
+            "growth rate [1/s]": [f"{mode.growth_rate:+.6g}" for mode in listed],
+            "damping ratio": [f"{mode.damping_ratio:+.6g}" for mode in listed],
+            "moves most": [f"{mode.largest}" for mode in listed],
+            "": ["unstable"] * len(unstable) + [""] * (len(listed) - len(unstable)),
+        }
+        titles = [f"mode {i}" for i in range(1, len(listed) + 1)]
+        rows = [dict(zip(titles, cells, strict=True)) for cells in columns.values()]
+        tables.append(table(list(columns), rows))
+    return "\n\n".join(tables)
+
+
+def _joint_rows(joint: Joint) -> dict[str, str]:
+    K_n, K_t = (float(K) for K in joint.stiffness())
+    surface = joint.contact.surface if joint.contact.fractal else None
+    rows = {
+        "D": f"{surface.D:.6g}" if surface else _ABSENT,
+        "G [m]": f"{surface.G:.6g}" if surface else _ABSENT,
+        "K_n [N/m]": f"{K_n:.6g}",
+        "K_t [N/m]": f"{K_t:.6g}",
+        "K_t/K_n": f"{K_t / K_n:.6g}" if K_n > 0 else _ABSENT,
+        "friction coefficient": f"{joint.coefficient():.6g}",
+        "regime": _ABSENT,
+    }
+    if joint.contact.fractal:
+        state = joint.contact.state(joint.friction.mu_s, joint.friction.mu_m)
+        rows["regime"] = Regime[state.regime].split(":")[0]
+    return rows
 
 
 def cycle_table(scene: Scene, cycle: LimitCycle) -> str:

@@ -68,6 +68,11 @@ class Scene(Part):
         except (ValueError, TypeError) as error:
             raise ValueError(f"{path}: {error}") from None
 
+    @classmethod
+    def from_toml(cls, text: str) -> "Scene":
+        """The scene of which `to_toml` gives this text; errors as `load`, without a file."""
+        return cls(**parse(text.encode(), _LAWS))
+
     def to_toml(self) -> str:
         """The text of the scene's file, with the unit and the meaning beside each number.
 

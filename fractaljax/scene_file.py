@@ -16,16 +16,22 @@ type_table = Mapping[str, Mapping[str, type[Part]]]
 
 def render(whole: Part, laws: type_table) -> str:
     """The TOML text of the parts of `whole`; `laws` names the kinds each of them can be of."""
-    lines = ["# A fractaljax scene, in SI units."]
-    for name, kinds in laws.items():
-        part = getattr(whole, name)
+    lines = ["# A fractaljax scene, in SI units.", *tables_of(whole, laws)]
+    return "\n".join(lines) + "\n"
+
+
+def tables_of(whole: Part, laws: type_table, inside: str = "") -> list[str]:
+    """The lines of `render`, each table named below the table `inside` ("joints.left.", say)."""
+    lines = []
+    for key, kinds in laws.items():
+        part, name = getattr(whole, key), f"{inside}{key}"
         lines += ["", f"[{name}]"]
         if len(kinds) > 1:
             law = next(law for law, kind in kinds.items() if kind is type(part))
             others = ", ".join(f'"{other}"' for other in kinds if other != law)
             lines.append(f'law = "{law}"  # or {others}')
         lines += _rows(name, part)
-    return "\n".join(lines) + "\n"
+    return lines
 
 
 def _rows(name: str, part: Part) -> list[str]:
@@ -50,14 +56,30 @@ def parse(content: bytes, laws: type_table) -> dict[str, Part]:
     **Raises:** `ValueError` or `TypeError` naming the table and the key that is unknown, missing
     or outside its domain, or the place where the file is no TOML.
     """
+    document = read(content)
+    refuse_unknown("the file", document, laws)
+    return parts_of(document, laws)
+
+
+def read(content: bytes) -> dict[str, Any]:
+    """The tables of a TOML file with this content.
+
+    **Raises:** `ValueError` with the place where it is no TOML.
+    """
     try:
-        document = tomllib.loads(content.decode())
+        return tomllib.loads(content.decode())
     except UnicodeDecodeError as error:
         raise ValueError(f"not a text in UTF-8: {error.reason} at byte {error.start}") from None
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"not a TOML file: {error}") from None
-    _refuse_unknown("the file", document, laws)
-    return {name: _part(name, _table(document, name), kinds) for name, kinds in laws.items()}
+
+
+def parts_of(document: dict[str, Any], laws: type_table, inside: str = "") -> dict[str, Part]:
+    """The parts in the tables `document`, which lie below the table `inside` of the file."""
+    return {
+        key: _part(f"{inside}{key}", table_of(document, key, inside), kinds)
+        for key, kinds in laws.items()
+    }
 
 
 def _part(name: str, table: dict[str, Any], kinds: Mapping[str, type[Part]]) -> Part:
@@ -73,13 +95,13 @@ def _part(name: str, table: dict[str, Any], kinds: Mapping[str, type[Part]]) -> 
 
 def _build(name: str, table: dict[str, Any], kind: type[Part]) -> Part:
     fields = {field.name: field for field in dataclasses.fields(kind)}
-    _refuse_unknown(f"[{name}]", table, fields)
+    refuse_unknown(f"[{name}]", table, fields)
     optional = inspect.signature(kind.__init__).parameters
     arguments = {}
     for key, field in fields.items():
         if not field.metadata:  # a part of its own, in a table of its own
             inner = cast(type[Part], field.type)
-            arguments[key] = _build(f"{name}.{key}", _table(table, key, f"{name}."), inner)
+            arguments[key] = _build(f"{name}.{key}", table_of(table, key, f"{name}."), inner)
         elif key in table:
             arguments[key] = table[key]
         elif optional[key].default is inspect.Parameter.empty:
@@ -90,7 +112,8 @@ def _build(name: str, table: dict[str, Any], kind: type[Part]) -> Part:
         raise type(error)(f"[{name}] {error}") from None
 
 
-def _table(document: dict[str, Any], key: str, inside: str = "") -> dict[str, Any]:
+def table_of(document: dict[str, Any], key: str, inside: str = "") -> dict[str, Any]:
+    """The table `key` of `document`, which lies below the table `inside` of the file."""
     if key not in document:
         raise ValueError(f"the table [{inside}{key}] is missing")
     if not isinstance(document[key], dict):
@@ -98,7 +121,8 @@ def _table(document: dict[str, Any], key: str, inside: str = "") -> dict[str, An
     return document[key]
 
 
-def _refuse_unknown(where: str, given, known) -> None:
+def refuse_unknown(where: str, given, known) -> None:
+    """Refuse a key in `given` that is not in `known`; `where` says what has it."""
     for key in given:
         if key not in known:
             raise ValueError(f"{where} has the unknown key {key!r}; known are {', '.join(known)}")

@@ -4,30 +4,38 @@ minimise f(u) subject to c(u) <= 0, for u in [0, 1]^v with v of 1 or 2. Everythi
 ask of the model is one function, values and Jacobian of a batch of points, so that it is compiled
 once. Adam on a quadratic penalty carries every start into a basin; sequential quadratic
 programming (damped BFGS, exact penalty, trust region) then lands on the constraints. With so few
-variables its subproblem is solved by trying every active set.
+variables its subproblem is solved by trying every active set. L-BFGS on a growing penalty ends in
+the same optima, later and beside the constraints more often (docs/model.md).
 """
 
-import itertools
 from collections.abc import Callable
 
 import numpy as np
 
-_ADAM_STEPS, _SQP_STEPS = 80, 40
+_ROUND_STEPS, _ROUNDS = 15, 8  # of quadratic programming, against harder constraints each time
+_SETTLED = 1e-9  # size of the steps that are not worth taking
+_TRIED = 10  # constraints that the active sets of one step are drawn from
 _PENALTY = 100.0  # weight of the constraints; above every multiplier of a well-scaled problem
 
 
-def search(model: Callable, starts: np.ndarray, slack: float, progress: bool):
+def search(
+    model: Callable,
+    starts: np.ndarray,
+    slack: float,
+    progress: bool,
+    steps: tuple[int, int] = (80, 40),
+    refine: Callable = lambda us: False,
+):
     """Improve every start; returns the end points (n, v) and a function giving the path to each.
 
     `model(us)` gives f (n,), c (n, k), their Jacobians (n, v) and (n, k, v). Constraints are held
-    at c <= -slack, so that rounding cannot undo them.
+    at c <= -slack, so that rounding cannot undo them. `steps` are those of the two phases. Where
+    `refine(us)` says that it has changed the model, the second goes on from there.
     """
     from tqdm import tqdm
 
     path = [starts]
-    with tqdm(
-        total=_ADAM_STEPS + _SQP_STEPS, desc="design", unit="step", disable=not progress
-    ) as bar:
+    with tqdm(total=sum(steps), desc="design", unit="step", disable=not progress) as bar:
 
         def advance(us, excess):
             path.append(us)
@@ -35,8 +43,14 @@ def search(model: Callable, starts: np.ndarray, slack: float, progress: bool):
             bar.set_postfix_str(f"{meeting} of {len(us)} meet every requirement", refresh=False)
             bar.update()
 
-        us = _adam(model, starts, slack, advance)
-        ends = _sqp(model, us, slack, advance)
+        us = _adam(model, starts, slack, steps[0], advance)
+        ends = _sqp(model, us, slack, steps[1], advance)
+        for _ in range(_ROUNDS):
+            if not refine(ends):
+                break
+            bar.total += _ROUND_STEPS
+            ends = _sqp(model, ends, slack, _ROUND_STEPS, advance)
+        bar.update(bar.total - bar.n)
     walked = np.stack(path, axis=1)
 
     def path_to(i):
@@ -46,13 +60,13 @@ def search(model: Callable, starts: np.ndarray, slack: float, progress: bool):
     return ends, path_to
 
 
-def _adam(model, us, slack, advance):
+def _adam(model, us, slack, steps, advance):
     import optax
 
-    rate = optax.exponential_decay(0.04, _ADAM_STEPS, 0.1)
+    rate = optax.exponential_decay(0.04, steps, 0.1)
     optimiser = optax.adam(rate, b2=0.95)
     state = optimiser.init(us)
-    for _ in range(_ADAM_STEPS):
+    for _ in range(steps):
         _, excess, slope, jacobian = model(us)
         pressed = _PENALTY * np.maximum(excess + slack, 0)
         gradient = slope + np.einsum("nk,nkv->nv", pressed, jacobian)
@@ -85,12 +99,12 @@ def _choose(mask, points, others):
     )
 
 
-def _sqp(model, us, slack, advance):
+def _sqp(model, us, slack, steps, advance):
     n, v = us.shape
     hessian = np.tile(np.eye(v), (n, 1, 1))
     radius = np.full(n, 0.05)
     points = _evaluate(model, us)
-    for _ in range(_SQP_STEPS):
+    for _ in range(steps):
         us, _, excess, slope, jacobian = points
         low = np.maximum(-radius[:, None], -us)
         high = np.minimum(radius[:, None], 1 - us)
@@ -112,6 +126,8 @@ def _sqp(model, us, slack, advance):
         radius = np.clip(radius, 1e-14, 0.3)
         points = _choose(better, trial, points)
         advance(points[0], points[2])
+        if radius.max() < _SETTLED:
+            break
     return points[0]
 
 
@@ -143,33 +159,39 @@ def _quadratic_step(slope, hessian, excess, jacobian, low, high):
     """The step of the quadratic model with linear constraints that has the least exact penalty.
 
     Every set of at most v constraints, the faces of low <= p <= high (n, v) among them, is tried
-    as the active one; those faces are never left.
+    as the active one; those faces are never left. Of many constraints only those that can come
+    closest to being violated inside the faces are tried, but all of them are judged.
     Returns steps (n, v) and the multipliers of the requirements (n, k).
     """
     n, k, v = jacobian.shape
+    tried = min(k, _TRIED)
+    reach = excess + np.einsum("nkv,nv->nk", np.abs(jacobian), np.maximum(high, -low))
+    near = np.sort(np.argpartition(-reach, tried - 1, axis=1)[:, :tried], axis=1)
+    chosen_rows = np.take_along_axis(jacobian, near[..., None], axis=1)
     faces = np.concatenate([np.eye(v), -np.eye(v)])
-    rows = np.concatenate([jacobian, np.tile(faces, (n, 1, 1))], axis=1)
-    bounds = np.concatenate([-excess, high, -low], axis=1)
+    rows = np.concatenate([chosen_rows, np.tile(faces, (n, 1, 1))], axis=1)
+    bounds = np.concatenate([-np.take_along_axis(excess, near, axis=1), high, -low], axis=1)
     # Active set A: p = -B^-1 (g + A' w) with A B^-1 A' w = -(b + A B^-1 g).
     inverse = np.linalg.inv(hessian)
     free = -np.einsum("nij,nj->ni", inverse, slope)
-    steps, weights = [free], [np.zeros((n, k))]
-    for size in range(1, v + 1):
-        for active in map(list, itertools.combinations(range(k + 2 * v), size)):
-            A = rows[:, active]
-            image = A @ inverse
-            schur = image @ A.transpose(0, 2, 1)
-            # Parallel or vanishing rows: their steps come out huge, and lose below.
-            trace = np.einsum("nii->n", schur)[:, None, None]
-            schur = schur + (1e-12 * trace + 1e-200) * np.eye(size)
-            right = np.einsum("nij,nj->ni", A, free) - bounds[:, active]
-            active_weights = np.linalg.solve(schur, right[..., None])[..., 0]
-            steps.append(free - np.einsum("nij,ni->nj", image, active_weights))
-            weight = np.zeros((n, k + 2 * v))
-            weight[:, active] = active_weights
-            weights.append(weight[:, :k])
-    steps, weights = np.stack(steps, axis=1), np.stack(weights, axis=1)
-    steps = np.clip(np.nan_to_num(steps), low[:, None], high[:, None])
+    image = rows @ inverse
+    schur = image @ rows.transpose(0, 2, 1)
+    right = np.einsum("nri,ni->nr", rows, free) - bounds
+
+    # Parallel or vanishing rows: their steps come out huge, and lose below.
+    own = np.einsum("nrr->nr", schur)
+    single = right / (own * (1 + 1e-12) + 1e-200)
+    steps = [free[:, None], free[:, None] - image * single[..., None]]
+    i, j = np.triu_indices(tried + 2 * v, 1) if v == 2 else (np.arange(0), np.arange(0))
+    guard = 1e-12 * (own[:, i] + own[:, j]) + 1e-200
+    p, q, r = own[:, i] + guard, own[:, j] + guard, schur[:, i, j]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first = (q * right[:, i] - r * right[:, j]) / (p * q - r**2)
+        second = (p * right[:, j] - r * right[:, i]) / (p * q - r**2)
+        steps.append(
+            free[:, None] - image[:, i] * first[..., None] - image[:, j] * second[..., None]
+        )
+    steps = np.clip(np.nan_to_num(np.concatenate(steps, axis=1)), low[:, None], high[:, None])
     model = (
         np.einsum("nv,nsv->ns", slope, steps)
         + np.einsum("nsi,nij,nsj->ns", steps, hessian, steps) / 2
@@ -177,5 +199,16 @@ def _quadratic_step(slope, hessian, excess, jacobian, low, high):
         * np.maximum(excess[:, None] + np.einsum("nkv,nsv->nsk", jacobian, steps), 0).sum(axis=2)
     )
     best = np.where(np.isfinite(model), model, np.inf).argmin(axis=1)
-    chosen = np.arange(n), best
-    return steps[chosen], np.clip(np.nan_to_num(weights[chosen]), 0, _PENALTY)
+
+    every = np.arange(n)
+    members = tried + 2 * v
+    pair = best - 1 - members
+    weight = np.zeros((n, members))
+    alone = (best > 0) & (pair < 0)
+    weight[alone, best[alone] - 1] = single[alone, best[alone] - 1]
+    both = pair >= 0
+    weight[both, i[pair[both]]] = first[both, pair[both]]
+    weight[both, j[pair[both]]] = second[both, pair[both]]
+    weights = np.zeros((n, k))
+    np.put_along_axis(weights, near, weight[:, :tried], axis=1)
+    return steps[every, best], np.clip(np.nan_to_num(weights), 0, _PENALTY)

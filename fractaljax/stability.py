@@ -14,12 +14,26 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .oscillator import Linearised, linearise
+from .complex_modes import ComplexModes, complex_modes, growth_rate_of_structure
+from .margin import margin_of
+from .oscillator import Linearised, dimensionless, linearise
 from .parts import Record
 from .scene import Scene, stiffness
 from .singular import positive_sqrt, safe_divide
+from .structure import Structure
 
 _NEWTON_STEPS = 2
+_SMALL = 1e-3
+# cos(2/3 arccos x) on [0, 1], highest power first; 2e-7 off at most.
+_COSINE_OF_THIRD = [
+    -0.00214345,
+    0.01062305,
+    -0.02653822,
+    0.05154791,
+    -0.11082304,
+    0.57733346,
+    0.50000016,
+]
 
 
 class Stability(Record):
@@ -29,7 +43,7 @@ class Stability(Record):
     growth_rate: jax.Array  # largest real part [1/s]; > 0: it squeals
     frequency: jax.Array  # of the eigenvalue with the largest real part [Hz]
     damping_ratio: jax.Array  # of the same eigenvalue, -Re/|lambda|
-    margin: jax.Array  # least damping ratio over all eigenvalues; > 0: stable
+    margin: jax.Array  # smooth in the scene; > 0 exactly where stable, see `margin`
 
 
 class _Quadratic(eqx.Module):
@@ -39,6 +53,21 @@ class _Quadratic(eqx.Module):
     v: jax.Array
 
 
+def _cosine_of_third(x):
+    """cos(arccos(x)/3) to 2e-7, for -1 <= x <= 1: a polynomial in cos(arccos(x)/2)."""
+    half = jnp.sqrt((1 + x) / 2)
+    value = jnp.full_like(half, _COSINE_OF_THIRD[0])
+    for coefficient in _COSINE_OF_THIRD[1:]:
+        value = value * half + coefficient
+    return value
+
+
+def _rough_cbrt(x):
+    """Cube root of x >= 0 to 1e-5, by functions that compilers vectorise."""
+    x = x.astype(jnp.float32)
+    return jnp.where(x > 0, jnp.exp(jnp.log(jnp.where(x > 0, x, 1)) / 3), 0)
+
+
 def _alpha(p, q, e):
     """The largest alpha >= 0 with alpha^6 + 2 p alpha^4 + e alpha^2 - q^2 = 0, roughly.
 
@@ -46,28 +75,28 @@ def _alpha(p, q, e):
     """
     # Without its cubic term, when that is small: the usual, lightly damped case.
     root = positive_sqrt(e**2 + 8 * p * q**2)
-    light = jnp.where(
-        e > 0,
-        safe_divide(2 * q**2, e + root, jnp.zeros_like(e)),
-        safe_divide(root - e, 4 * p, jnp.zeros_like(e)),
+    light = safe_divide(
+        jnp.where(e > 0, 2 * q**2, root - e), jnp.where(e > 0, e + root, 4 * p), jnp.zeros_like(e)
     )
-    # Else in closed form, trigonometric or Cardano's.
+    # Else in closed form, trigonometric or Cardano's, to a third of the digits.
     P, Q = e - 4 * p**2 / 3, 16 * p**3 / 27 - 2 * p * e / 3 - q**2
     discriminant = Q**2 / 4 + (P / 3) ** 3
     radius = positive_sqrt(-P / 3)
     cosine = jnp.clip(safe_divide(-Q / 2, radius**3, jnp.ones_like(Q)), -1, 1)
-    three = 2 * radius * jnp.cos(jnp.arccos(cosine) / 3)
-    # Much faster than cbrt, which calls the C library for one number at a time.
+    three = 2 * radius * _cosine_of_third(cosine)
     cube = jnp.abs(Q / 2) + positive_sqrt(discriminant)
-    u = jnp.where(Q > 0, -1, 1) * cube ** (1 / 3)
+    u = jnp.where(Q > 0, -1, 1) * _rough_cbrt(cube).astype(Q.dtype)
     one = u - safe_divide(P / 3, u, jnp.zeros_like(u))
     closed = jnp.where(discriminant > 0, one, three) - 2 * p / 3
-    # Where alpha^2 is of this size, either of the two has a quarter of its digits right at least.
-    limit = jnp.finfo(light.dtype).eps ** 0.25
-    small = (p > 0) & (light <= limit * p)
+    # Where alpha^2 is of this size, either of the two has three digits right at least.
+    small = (p > 0) & (light <= _SMALL * p)
     # The same where it is the only root, whatever the sign of p.
-    small |= (discriminant > 0) & (2 * root > e) & (light**2 <= limit * e)
-    return positive_sqrt(jnp.where(small, light, closed))
+    small |= (discriminant > 0) & (2 * root > e) & (light**2 <= _SMALL * e)
+    square = jnp.maximum(jnp.where(small, light, closed), 0)
+    # One of Newton's steps doubles them.
+    value = ((square + 2 * p) * square + e) * square - q**2
+    slope = (3 * square + 4 * p) * square + e
+    return positive_sqrt(square - safe_divide(value, slope, jnp.zeros_like(value)))
 
 
 class _Division(eqx.Module):
@@ -114,21 +143,9 @@ def _newton_step(lin: Linearised, old: _Quadratic, division: _Division):
     return jax.tree.map(lambda x, y: jnp.where(better, x, y), (new, new_division), (old, division))
 
 
-def _scaled(lin: Linearised) -> tuple[jax.Array, Linearised]:
-    """omega = sqrt(a + b), and the system in its units: no power leaves the range of a float32."""
-    omega = jnp.sqrt(lin.a + lin.b)
-    return omega, Linearised(
-        a=lin.a / omega**2,
-        b=lin.b / omega**2,
-        c_1=lin.c_1 / omega,
-        c_2=lin.c_2 / omega,
-        g=lin.g / omega**4,
-    )
-
-
 def _split(lin: Linearised) -> tuple[jax.Array, _Quadratic, _Quadratic]:
     """omega = sqrt(a + b) and two quadratics in its units; the second has the larger damping."""
-    omega, lin = _scaled(lin)
+    omega, lin = dimensionless(lin)
     sigma, d = (lin.c_1 + lin.c_2) / 4, (lin.c_1 - lin.c_2) / 2
     # Shifted by the mean damping: (z^2 + d z + A)(z^2 - d z + B) + g.
     A, B = lin.a - sigma**2 - d * sigma, lin.b - sigma**2 + d * sigma
@@ -174,7 +191,7 @@ def _roots(quadratic: _Quadratic):
 
 def _eigenvalue_tangents(lin: Linearised, dlin: Linearised, s):
     """ds = -dchi/chi'(s) for the roots s of chi = (s^2 + c_1 s + a)(s^2 + c_2 s + b) + g."""
-    omega, lin = _scaled(lin)
+    omega, lin = dimensionless(lin)
     z = s / omega
     first = z * (z + lin.c_1) + lin.a
     second = z * (z + lin.c_2) + lin.b
@@ -213,9 +230,26 @@ def _eigenvalues(lin: Linearised):
     omega, *quadratics = _split(lin)
     s = []
     for high, low, imag in map(_roots, quadratics):
-        s += [jax.lax.complex(high, imag), jax.lax.complex(low, -imag)]
-    s = omega * jnp.stack(s)
-    return s[jnp.argsort(-s.real)]
+        s += [(high, imag), (low, -imag)]
+    # Two sorted pairs are merged by three comparisons.
+    for i, j in ((0, 2), (1, 3), (1, 2)):
+        s[i], s[j] = _larger_first(s[i], s[j])
+    # Not stacked: XLA then computes all of the above again for every element.
+    place = jnp.arange(4)
+    real, imag = (
+        jnp.where(place == 0, a, jnp.where(place == 1, b, jnp.where(place == 2, c, d)))
+        for a, b, c, d in zip(*s, strict=True)
+    )
+    return omega * jax.lax.complex(real, imag)
+
+
+def _larger_first(s, other):
+    """Two eigenvalues (real, imaginary), the larger real part first; of conjugates the upper."""
+    conjugate = (s[0] == other[0]) & (s[1] == -other[1])
+    swap = (other[0] > s[0]) | (conjugate & (other[1] > 0))
+    first = tuple(jnp.where(swap, y, x) for x, y in zip(s, other, strict=True))
+    second = tuple(jnp.where(swap, x, y) for x, y in zip(s, other, strict=True))
+    return first, second
 
 
 @_eigenvalues.defjvp
@@ -226,15 +260,18 @@ def _eigenvalues_jvp(primals, tangents):
 
 
 @functools.partial(jax.jit, static_argnames="friction_slope")
-def growth_rate(scene: Scene, friction_slope: bool = True) -> jax.Array:
+def growth_rate(scene: Scene | Structure, friction_slope: bool = True) -> jax.Array:
     """Largest real part of the eigenvalues [1/s], a scalar; above 0 the scene squeals.
 
     `friction_slope=False` leaves out the slope of the friction law, as the source's Eq. 43 does.
     Towards coalescing eigenvalues the derivative grows without bound, as it must; exactly there,
-    where it is infinite, some finite number stands for it.
+    where it is infinite, some finite number stands for it. A `Structure` takes LAPACK's route.
 
-    **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`.
+    **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`; or if a structure without F
+    has friction with a slope.
     """
+    if isinstance(scene, Structure):
+        return growth_rate_of_structure(scene, friction_slope)
     K_n, K_t = stiffness(scene)
     return growth_rate_of(scene, K_n, K_t, friction_slope)
 
@@ -242,20 +279,26 @@ def growth_rate(scene: Scene, friction_slope: bool = True) -> jax.Array:
 def growth_rate_of(scene: Scene, K_n, K_t, friction_slope: bool) -> jax.Array:
     """`growth_rate` where the stiffness of the contact is known already."""
     lin = linearise(scene.oscillator, scene.friction, K_n, K_t, friction_slope)
+    return growth_rate_of_linearised(lin)
+
+
+def growth_rate_of_linearised(lin: Linearised) -> jax.Array:
+    """Largest real part of the roots of a characteristic polynomial [1/s], a scalar."""
     return _critical_eigenvalue(lin).real
 
 
 @functools.partial(jax.jit, static_argnames="friction_slope")
-def stability(scene: Scene, friction_slope: bool = True) -> Stability:
+def stability(scene: Scene | Structure, friction_slope: bool = True) -> Stability | ComplexModes:
     """Eigenvalues of Eq. 43 and what follows from them; arguments and errors as `growth_rate`."""
+    if isinstance(scene, Structure):
+        return complex_modes(scene, friction_slope)
     K_n, K_t = stiffness(scene)
     lin = linearise(scene.oscillator, scene.friction, K_n, K_t, friction_slope)
     eigenvalues = _eigenvalues(lin)
-    damping_ratios = -eigenvalues.real / jnp.abs(eigenvalues)
     return Stability(
         eigenvalues=eigenvalues,
         growth_rate=eigenvalues[0].real,
         frequency=jnp.abs(eigenvalues[0].imag) / (2 * jnp.pi),
-        damping_ratio=damping_ratios[0],
-        margin=jnp.min(damping_ratios),
+        damping_ratio=-eigenvalues[0].real / jnp.abs(eigenvalues[0]),
+        margin=margin_of(lin),
     )

@@ -32,6 +32,11 @@ def results(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
+def eigenvalue_results(tmp_path_factory):
+    return quick("eigenvalues", tmp_path_factory.mktemp("eigenvalues"))
+
+
+@pytest.fixture(scope="module")
 def cycle_results(tmp_path_factory):
     return quick("limit_cycle", tmp_path_factory.mktemp("limit_cycle"))
 
@@ -57,6 +62,22 @@ def test_benchmark_reports_ratios_and_its_errors_are_small(results):
         assert method["error_to_loop"]["growth_rate"]["worst"] < 1e-11
         if method["gradient"]:
             assert method["error_to_40_digits"]["gradient"]["worst"] < 1e-7
+
+
+def test_eigenvalue_benchmark_is_no_less_accurate_than_lapack(eigenvalue_results):
+    numbers = json.loads((eigenvalue_results / "eigenvalues.json").read_text())
+    table = (eigenvalue_results / "eigenvalues.md").read_text()
+    assert f"wanted >= {numbers['headline']['wanted']}" in table
+    assert "no larger in any family" in table
+    for method in numbers["methods"]:
+        assert f"| {method['name']} |" in table and method["ratio_to_numpy"] > 0
+    families = {row["family"]: row for row in numbers["families"]}
+    assert len(families) == 6 and families["random"]["unstable"] > 0
+    for name, row in families.items():
+        assert f"| {name} |" in table and row["wrong_signs"] == 0
+        worst = row["errors"]["closed form"]["worst"]
+        assert worst <= row["errors"]["numpy.linalg.eigvals"]["worst"]
+        assert worst < (1e-8 if "coalescence" in name else 1e-15)
 
 
 @pytest.mark.slow

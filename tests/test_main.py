@@ -15,6 +15,8 @@ import fractaljax.scene_file
 from fractaljax.__main__ import main
 from fractaljax.report import cycle_table
 
+_WRITTEN = ["design.png", "design.toml", "history.csv", "run.toml"]
+
 
 @pytest.fixture(autouse=True)
 def somewhere_else(tmp_path, monkeypatch):
@@ -46,7 +48,7 @@ def test_design_without_arguments(capsys, tmp_path):
     assert "+22.0801" in out and "growth_rate <= target" in out
 
     folder = tmp_path / "fractaljax-design"
-    assert sorted(p.name for p in folder.iterdir()) == ["design.png", "design.toml", "history.csv"]
+    assert sorted(p.name for p in folder.iterdir()) == _WRITTEN
     scene = fj.Scene.load(folder / "design.toml")
     assert fj.growth_rate(scene) <= -np.pi
     with open(folder / "history.csv", newline="") as file:
@@ -76,7 +78,24 @@ def test_design_again_replaces_its_own_files_only(capsys, tmp_path):
     for _ in range(2):
         assert run(capsys, "design", "--out", "out", "--quiet")[0] == 0
     names = sorted(p.name for p in (tmp_path / "out").iterdir())
-    assert names == ["design.png", "design.toml", "history.csv", "notes.txt"]
+    assert names == sorted([*_WRITTEN, "notes.txt"])
+
+
+def test_robust_design_and_its_repetition(capsys):
+    """Envelope, tolerance and limits as given; the file of the run gives the same files again."""
+    options = ["--envelope", "P=1800:2000", "mu_s=0.39,0.4,0.41", "--tolerance", "D=0.002"]
+    options += ["--sq", ":2e-6", "--sq-lengths", 1e-3, 1e-5, "--elastic-share", 0.2, "--seed", 5]
+    options += ["--quantile", 0.9, "--starts", 4, "--lattice", 8, "--quiet"]
+    status, out, err = run(capsys, "design", "--out", "first", *options)
+    assert (status, err) == (0, "")
+    assert "over P 1800 to 2000, 3 samples of mu_s; where D scatters by 0.002" in out
+    assert "probability of squeal" in out and "worst at P = " in out
+    text = Path("first/run.toml").read_text()
+    assert "seed = 5" in text and "at_most = 2e-06, L = 0.001, L_s = 1e-05" in text
+    repeated = run(capsys, "design", "--repeat", "first/run.toml", "--out", "again", "--quiet")
+    assert repeated == (0, out.replace("to first", "to again"), "")
+    for name in _WRITTEN:
+        assert Path("first", name).read_bytes() == Path("again", name).read_bytes()
 
 
 def test_infeasible_design_is_no_success(capsys):
@@ -221,6 +240,19 @@ def test_friction_beyond_its_law(capsys, tmp_path):
         (["design", "--D", 2.5, 2.9], "D must lie inside its bounds [2.5, 2.9], got 2.4"),
         (["design", "--starts", 0], "starts must be a whole number of at least 1, got 0"),
         (["design", "--target", "low"], "invalid float value: 'low'"),
+        (["design", "--envelope", "P"], "--envelope must be NAME=LOW:HIGH, got 'P'"),
+        (["design", "--envelope", "P=1:x"], "--envelope P must be numbers, got 'x'"),
+        (["design", "--envelope", "P=2:1"], "envelope of P must be (lower, upper), got (2, 1)"),
+        (["design", "--envelope", "Q=1:2"], "envelope names 'Q', which the scene does not have"),
+        (["design", "--tolerance", "D"], "--tolerance must be NAME=SIGMA, got 'D'"),
+        (["design", "--tolerance", "D=-1"], "tolerance of D must be at least 0, got -1.0"),
+        (["design", "--risk", "cvar:x"], "--risk must be numbers, got 'x'"),
+        (["design", "--sq", "2:1"], "Sq at_least must be below at_most, got 2.0, 1.0"),
+        (["design", "--sq-lengths", 1, 2], "--sq-lengths needs --sq"),
+        (["design", "--damping-ratio", "0:1"], "--damping-ratio has a lower limit only: LOW:"),
+        (["design", "--repeat", "nowhere.toml"], "No such file"),
+        (["design", "--repeat", "file"], "file: "),
+        (["design", "--repeat", "file", "--seed", 1], "takes everything from its file, got seed"),
         (["cycle", "nowhere.toml"], "No such file"),
         (["cycle", "--out", "file/below"], "Not a directory"),
         (["cycle", "--rtol", 0], "rtol must be above 0 and at most 0.1, got 0.0"),

@@ -42,6 +42,16 @@ def test_fixed_contact_has_no_surface_rows():
     assert "D " not in text and "regime" not in text and "K_n [N/m]" in text
 
 
+def test_stability_table_has_the_friction_that_starts_to_squeal():
+    """As the library says; none where no friction does."""
+    scene = fj.brake_scene().replace(contact=fj.FixedContact(4e8, 6e7), friction=fj.Coulomb(0.4))
+    lines = stability_table(scene).splitlines()
+    assert ["critical friction", "0.754017"] in [re.split("  +", line) for line in lines]
+    assert f"{fj.margin(scene):+.6g}" in stability_table(scene)
+    lines = stability_table(scene.replace(K_t=0.0)).splitlines()
+    assert ["critical friction", "none"] in [re.split("  +", line) for line in lines]
+
+
 def test_every_active_constraint_has_a_line():
     """Several active constraints stand below each other."""
     scene = fj.brake_scene()

@@ -1,0 +1,156 @@
+"""Structures to test with, and an independent analysis of them in many digits.
+
+The oracle knows nothing of Eq. 43: it writes down the forces of each joint as functions of
+displacement and velocity, differentiates them by differences in 50 digits, and finds eigenvalues
+as roots of the determinant.
+"""
+
+from typing import Any
+
+import mpmath as mp
+import numpy as np
+
+import fractaljax as fj
+
+DIGITS = 50
+
+
+def matrices(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """M, C, K of a structure with frequencies of about a thousand hertz and a little damping."""
+    rng = np.random.default_rng(seed)
+    A, B = rng.standard_normal((2, n, n))
+    M = 0.1 * (A @ A.T / n + np.eye(n))
+    K = 4e6 * (B @ B.T / n + np.diag(np.linspace(1, 3, n)))
+    return M, 2.0 * M + 2e-7 * K, K
+
+
+def two_joints(n: int, seed: int = 0) -> fj.Structure:
+    """A structure with a joint between two bodies and another to the ground; it has friction."""
+    M, C, K = matrices(n, seed)
+    return fj.Structure(
+        M,
+        C,
+        K,
+        joints={
+            "left": fj.Joint(
+                fj.FixedContact(3e6, 1.4e6), fj.Stribeck(0.5, 0.3, 0.6), (0, 2), (1, 3), V=0.2
+            ),
+            "right": fj.Joint(fj.FixedContact(5e6, 2e6), fj.Stribeck(0.4, 0.2, 0.8), 2, 0, V=0.3),
+        },
+        F=np.linspace(200.0, -150.0, n),
+    )
+
+
+def beam(elements: int, free: bool = False, height: float = 0.01):
+    """(M, K) of a steel beam 1 m long, 20 mm wide: Euler and Bernoulli, consistent mass.
+
+    Degrees of freedom are deflection and rotation of each node, without those of the clamped end
+    unless `free`.
+    """
+    E, rho, width, h = 2.1e11, 7800.0, 0.02, 1 / elements
+    EI, mass = E * width * height**3 / 12, rho * width * height * h / 420
+    stiffness = np.array([[12, 6 * h, -12, 6 * h], [0, 4 * h**2, -6 * h, 2 * h**2]])
+    k = np.zeros((4, 4))
+    k[:2], k[2, 2:], k[3, 3] = stiffness, (12, -6 * h), 4 * h**2
+    m = np.zeros((4, 4))
+    m[0], m[1, 1:], m[2, 2:], m[3, 3] = (
+        (156, 22 * h, 54, -13 * h),
+        (4 * h**2, 13 * h, -3 * h**2),
+        (156, -22 * h),
+        4 * h**2,
+    )
+    k, m = (np.triu(x) + np.triu(x, 1).T for x in (EI / h**3 * k, mass * m))
+    M, K = np.zeros((2, 2 * elements + 2, 2 * elements + 2))
+    for i in range(elements):
+        element = slice(2 * i, 2 * i + 4)
+        M[element, element] += m
+        K[element, element] += k
+    return (M, K) if free else (M[2:, 2:], K[2:, 2:])
+
+
+def numbers_of(structure: fj.Structure) -> dict[str, Any]:
+    """The numbers of a structure whose friction is Stribeck's, for `linearised`."""
+    joints = []
+    for joint in structure.joints:
+        K_n, K_t = joint.stiffness()
+        law = joint.friction
+        assert isinstance(law, fj.Stribeck)
+        assert joint.V is not None
+        quantities = {"K_n": K_n, "K_t": K_t, "V": joint.V}
+        quantities |= {"mu_s": law.mu_s, "mu_m": law.mu_m, "v_m": law.v_m}
+        joints.append(
+            {name: mp.mpf(float(x)) for name, x in quantities.items()}
+            | {"t": joint.tangential, "n": joint.normal}
+        )
+    arrays = {name: mp.matrix(np.asarray(getattr(structure, name)).tolist()) for name in "MCKF"}
+    return arrays | {"joints": joints}
+
+
+def _mu(joint, v):
+    drop = joint["mu_s"] - joint["mu_m"]
+    u = v / joint["v_m"]
+    return joint["mu_s"] + drop * (u**3 - 3 * u) / 2
+
+
+def _forces(numbers, x, v):
+    """What the joints push with, (n,), at displacements x and velocities v."""
+    force = mp.matrix(len(x), 1)
+
+    def along(dofs, z):
+        return z[dofs[0]] - (z[dofs[1]] if len(dofs) == 2 else 0)
+
+    def push(dofs, f):
+        force[dofs[0]] += f
+        if len(dofs) == 2:
+            force[dofs[1]] -= f
+
+    for joint in numbers["joints"]:
+        t, n = joint["t"], joint["n"]
+        tangential, normal = joint["K_t"] * along(t, x), joint["K_n"] * along(n, x)
+        push(t, -tangential + _mu(joint, joint["V"] - along(t, v)) * normal)
+        push(n, -normal - _mu(joint, joint["V"] - along(n, v)) * tangential)
+    return force
+
+
+def _jacobian(function, at):
+    columns, h = [], mp.mpf(10) ** (-DIGITS // 3)
+    for i in range(len(at)):
+        ahead, behind = at.copy(), at.copy()
+        ahead[i] += h
+        behind[i] -= h
+        columns.append((function(ahead) - function(behind)) / (2 * h))
+    return mp.matrix([[column[i] for column in columns] for i in range(len(at))])
+
+
+def linearised(numbers, friction_slope: bool):
+    """(M, C, K) about the equilibrium."""
+    n = numbers["M"].rows
+    rest = mp.matrix(n, 1)
+    K = numbers["K"] - _jacobian(lambda x: _forces(numbers, x, rest), rest)
+    C = numbers["C"]
+    if friction_slope:
+        x_0 = mp.lu_solve(K, numbers["F"])
+        C = C - _jacobian(lambda v: _forces(numbers, x_0, v), rest)
+    return numbers["M"], C, K
+
+
+def eigenvalue_near(numbers, friction_slope: bool, start: complex):
+    """The eigenvalue of the quadratic problem near `start`, in many digits: Newton on its det."""
+    with mp.workdps(DIGITS):
+        M, C, K = linearised(numbers, friction_slope)
+        s = mp.mpmathify(start)
+        for _ in range(8):
+            inverse_times_slope = mp.inverse(s**2 * M + s * C + K) * (2 * s * M + C)
+            step = 1 / mp.fsum(inverse_times_slope[i, i] for i in range(M.rows))
+            s -= step
+            if abs(step) < mp.mpf(10) ** (-DIGITS // 2 - 5) * abs(s):  # the next is exact
+                return s
+        raise AssertionError(f"no eigenvalue near {start}")
+
+
+def slope_of(change, start: complex, scale: float, friction_slope: bool = True) -> float:
+    """d(growth rate)/dp: `change(dp)` gives the numbers with a parameter moved by dp."""
+    with mp.workdps(DIGITS):
+        h = mp.mpf(scale) * mp.mpf(10) ** -12
+        ends = [eigenvalue_near(change(sign * h), friction_slope, start) for sign in (1, -1)]
+        return float((ends[0].real - ends[1].real) / (2 * h))
