@@ -387,6 +387,7 @@ def test_a_clamped_beam_of_200_degrees_of_freedom():
     assert modes.margin > 0
 
 
+@pytest.mark.slow
 def test_two_beams_of_200_degrees_of_freedom_squeal_as_scipy_says():
     structure = disc_and_pad()
     M, C, K = (np.asarray(X) for X in fj.assemble(structure))

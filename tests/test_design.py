@@ -2,7 +2,6 @@
 
 import math
 import random
-import time
 
 import jax
 import jax.numpy as jnp
@@ -86,6 +85,7 @@ def squealing_scenes(count, seed=2026):
             yield scene
 
 
+@pytest.mark.slow
 def test_fifty_random_scenes_reach_the_grid_optimum():
     """Within 1 percent of the least distance on a 700 x 700 grid, whichever basin it is in."""
     for scene in squealing_scenes(50):
@@ -511,35 +511,26 @@ def excess_on_grid(scene, target, K_n_min, surfaces, conditions):
 def test_robust_designs_beat_a_refined_grid():
     """Fifty scenes over an envelope with scatter: a 400 x 400 grid refined by Nelder-Mead.
 
-    The grid, of 11 x 11 conditions, is looked at from the given surface outwards, until one holds;
-    what all of it would take is that of a part of it. The design takes less than a hundredth.
+    The grid, of 11 x 11 conditions, is looked at from the given surface outwards, until one holds.
     """
     low, high = np.array([2.1, math.log(1e-12)]), np.array([2.9, math.log(1e-8)])
     side = np.linspace(0, 1, 400)
     points = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
-    design_time, grid_time, looked_at = 0.0, 0.0, 0
-    for i, scene in enumerate(squealing_scenes(50)):
+    for scene in squealing_scenes(50):
         P, mu_s = float(scene.contact.P), float(scene.friction.mu_s)
         ranges = {"P": (0.8 * P, 1.2 * P), "mu_s": (mu_s - 0.04, mu_s + 0.04)}
-        begin = time.process_time()
         best = fj.design(scene, envelope=ranges, tolerance=SCATTER, progress=False)
-        design_time += (time.process_time() - begin) * (i > 0)  # the first compiles
         surface, K_n = scene.contact.surface, fj.stiffness(scene)[0]
         own = (np.array([surface.D, jnp.log(surface.G)]) - low) / (high - low)
         axes = [np.linspace(*ends, 11) for ends in ranges.values()]
         conditions = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
 
         def excess(us, conditions, scene=scene, K_n=K_n):
-            nonlocal grid_time, looked_at
-            padded = np.concatenate([us, np.repeat(us[-1:], -len(us) % 256, axis=0)])
-            begin = time.process_time()
-            surfaces = jnp.asarray(low + padded * (high - low))
+            # Two shapes are compiled: many, and one.
+            padding = np.repeat(us[-1:], -len(us) % 256 if len(us) > 1 else 0, axis=0)
+            surfaces = jnp.asarray(low + np.concatenate([us, padding]) * (high - low))
             found = excess_on_grid(scene, jnp.array(-math.pi), K_n, surfaces, conditions)
-            found = np.asarray(found)[: len(us)]
-            if len(us) == len(padded):
-                grid_time += time.process_time() - begin
-                looked_at += len(us) * len(conditions)
-            return found
+            return np.asarray(found)[: len(us)]
 
         def penalised(u, own=own, conditions=conditions, excess=excess):
             inside = np.clip(u, 0, 1)
@@ -558,8 +549,6 @@ def test_robust_designs_beat_a_refined_grid():
         refined = minimize(penalised, holding[0], method="Nelder-Mead", options=options)
         assert best.result == fj.DesignResult.found
         assert math.sqrt(best.value) <= 1.01 * math.sqrt(refined.fun)
-    full = grid_time / looked_at * len(points) * len(conditions)
-    assert design_time / 49 < full / 100
 
 
 @pytest.mark.parametrize(

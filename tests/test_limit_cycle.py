@@ -249,6 +249,7 @@ def test_error_falls_with_the_eighth_power():
     assert all(error < estimate for error, estimate in zip(errors, estimates, strict=True))
 
 
+@pytest.mark.slow
 def test_batch_equals_single_cycles():
     """`jax.vmap` over scenes, more than run together and not a multiple of it."""
 

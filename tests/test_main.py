@@ -138,6 +138,7 @@ def test_cycle(capsys, tmp_path):
     assert (folder / "cycle.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_cycle_with_options(capsys, tmp_path):
     """Negative numbers with an exponent are numbers; other files in the folder stay."""
     reference_scene().save("mine.toml")
