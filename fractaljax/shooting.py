@@ -262,5 +262,11 @@ def _orbit_jvp(primals, tangents):
 
     _, (gap, off) = jax.jvp(equations, (system,), (tangents[0],))
     _, local = maps(system, Segments(y, duration, s, guard))
-    dy, dt, _ = corrections(local, guard != UNUSED, gap, off)
+
+    def closing(gap, off):
+        return corrections(local, guard != UNUSED, gap, off)[:2]
+
+    # Linear, so its own derivative: older versions of jax transpose a scan only in that form.
+    nothing = jax.tree.map(jnp.zeros_like, (gap, off))
+    _, (dy, dt) = jax.jvp(closing, nothing, (gap, off))
     return (y, duration), (dy, dt)

@@ -96,7 +96,7 @@ def test_values_and_signs(scene):
     frequencies = np.abs(np.asarray(modes.eigenvalues.imag)) / (2 * math.pi)
     share = 1 - float(state.plastic_share)
     eigenvalues = np.asarray(modes.eigenvalues)
-    damping = (-eigenvalues.real / np.abs(eigenvalues)).min()
+    damping = float(np.min(-np.real(eigenvalues) / np.abs(eigenvalues)))
     expected = [
         1 - float(state.K_n) / 4e8,
         1 - share / 0.3,
