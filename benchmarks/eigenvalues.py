@@ -8,7 +8,6 @@ family.
 
 import dataclasses
 import io
-import json
 import os
 import platform
 import statistics
@@ -26,10 +25,10 @@ from tqdm import tqdm
 
 import fractaljax as fj
 from fractaljax.oscillator import Linearised
-from fractaljax.scene_file import write_whole
 from fractaljax.stability import growth_rate_of_linearised
 
 from .growth_rate import cpu_model, others_running, seconds
+from .page import write
 
 mp: Any = mpmath.mp  # it makes its functions at run time
 
@@ -376,12 +375,4 @@ def picture(result: dict[str, Any]) -> bytes:
 def run(out: Path, quick: bool = False) -> list[Path]:
     """Measure, and write eigenvalues.json, .md and .png into a folder; returns their paths."""
     result = measure(quick)
-    files = {
-        "eigenvalues.json": (json.dumps(result, indent=1) + "\n").encode(),
-        "eigenvalues.md": table(result).encode(),
-        "eigenvalues.png": picture(result),
-    }
-    out.mkdir(parents=True, exist_ok=True)
-    for name, content in files.items():
-        write_whole(out / name, content)
-    return [out / name for name in files]
+    return write(out, "eigenvalues", result, table(result), picture(result))

@@ -8,7 +8,6 @@ runs are taken to 40 digits.
 
 import dataclasses
 import io
-import json
 import math
 import os
 import platform
@@ -27,10 +26,10 @@ import scipy
 from tqdm import tqdm
 
 import fractaljax as fj
-from fractaljax.scene_file import write_whole
 
 from .exact import exact_rows
 from .loops import STEP, brake, loop_gradient, loop_value, plain_loop, tuned_loop
+from .page import write
 
 WANTED = 1000  # ratio of the rates of value and gradient
 D_RANGE, G_RANGE = (2.35, 2.6), (3e-11, 3e-9)
@@ -364,12 +363,4 @@ def picture(result: dict[str, Any]) -> bytes:
 def run(out: Path, quick: bool = False) -> list[Path]:
     """Measure, and write growth_rate.json, .md and .png into a folder; returns their paths."""
     result = measure(quick)
-    files = {
-        "growth_rate.json": (json.dumps(result, indent=1) + "\n").encode(),
-        "growth_rate.md": table(result).encode(),
-        "growth_rate.png": picture(result),
-    }
-    out.mkdir(parents=True, exist_ok=True)
-    for name, content in files.items():
-        write_whole(out / name, content)
-    return [out / name for name in files]
+    return write(out, "growth_rate", result, table(result), picture(result))

@@ -33,9 +33,9 @@ from scipy.optimize import brentq
 from tqdm import tqdm
 
 import fractaljax as fj
-from fractaljax.scene_file import write_whole
 
 from .growth_rate import cpu_model, others_running, seconds
+from .page import write
 
 K_N, KAPPA, V = 4e8, 0.5, 0.15
 SCALE = 2e4  # sqrt(K_n/m) [1/s]
@@ -912,15 +912,7 @@ def picture(result: dict[str, Any]) -> bytes:
 def run(out: Path, quick: bool = False) -> list[Path]:
     """Measure, and write limit_cycle.json, .md and .png into a folder; returns their paths."""
     result = measure(quick)
-    files = {
-        "limit_cycle.json": (json.dumps(result, indent=1) + "\n").encode(),
-        "limit_cycle.md": table(result).encode(),
-        "limit_cycle.png": picture(result),
-    }
-    out.mkdir(parents=True, exist_ok=True)
-    for name, content in files.items():
-        write_whole(out / name, content)
-    return [out / name for name in files]
+    return write(out, "limit_cycle", result, table(result), picture(result))
 
 
 if __name__ == "__main__":

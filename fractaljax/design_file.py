@@ -3,7 +3,6 @@
 import importlib.metadata
 import math
 import os
-import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from .constraints import Constraint
 from .design import Design, design
 from .envelope import Envelope
 from .scene import Scene
-from .scene_file import write_whole
+from .scene_file import quoted, read, write_whole
 
 _PACKAGE = __name__.split(".")[0]
 
@@ -89,7 +88,7 @@ def read_design(
 ) -> tuple[Scene, dict[str, Any]]:
     """The scene given and the arguments of `design`; errors as `repeat_design`."""
     try:
-        document = tomllib.loads(Path(path).read_bytes().decode())
+        document = read(Path(path).read_bytes())
         return _scene(document), _options(document["options"], dict(functions or {}))
     except KeyError as error:
         raise ValueError(f"{path}: not a design file, it lacks {error}") from None
@@ -167,14 +166,14 @@ def _row(key: str, value) -> str:
 
 
 def _key(name: str) -> str:
-    return name if name.replace("_", "").isalnum() and name.isascii() else _string(name)
+    return name if name.replace("_", "").isalnum() and name.isascii() else quoted(name)
 
 
 def _value(value) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
-        return _string(value)
+        return quoted(value)
     if isinstance(value, int):
         return str(value)
     if isinstance(value, Mapping):
@@ -182,8 +181,3 @@ def _value(value) -> str:
     if isinstance(value, (tuple, list)):
         return "[" + ", ".join(map(_value, value)) + "]"
     return repr(float(value)) if math.isfinite(value) else str(float(value))
-
-
-def _string(text: str) -> str:
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
-    return '"' + "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in escaped) + '"'

@@ -128,6 +128,12 @@ def refuse_unknown(where: str, given, known) -> None:
             raise ValueError(f"{where} has the unknown key {key!r}; known are {', '.join(known)}")
 
 
+def quoted(text: str) -> str:
+    """A text as a basic string of TOML."""
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    return '"' + "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in escaped) + '"'
+
+
 def write_whole(path: str | os.PathLike, content: bytes) -> None:
     """Write a file through a temporary neighbour, so that it is there whole or not at all."""
     target = Path(path)

@@ -1,14 +1,13 @@
 """Structures as files: a TOML file for the joints, and the matrices it names."""
 
 import io
-import json
 import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .scene_file import parts_of, refuse_unknown, table_of, tables_of
+from .scene_file import parts_of, quoted, refuse_unknown, table_of, tables_of
 
 _LARGEST = 4000  # degrees of freedom; a sparse matrix of more is no reduced model
 
@@ -135,24 +134,20 @@ def _matrix_market(path: Path) -> np.ndarray:
 def render_structure(structure, matrices: str, laws) -> str:
     """The TOML text of a structure whose matrices are in the file `matrices` beside it."""
     lines = ["# A fractaljax structure, in SI units.", "", "[structure]"]
-    lines.append(f"matrices = {_string(matrices)}  # M, C, K and perhaps F")
+    lines.append(f"matrices = {quoted(matrices)}  # M, C, K and perhaps F")
     if structure.names is not None:
-        lines += ["names = [", *(f"    {_string(name)}," for name in structure.names), "]"]
+        lines += ["names = [", *(f"    {quoted(name)}," for name in structure.names), "]"]
     for name, joint in zip(structure.joint_names, structure.joints, strict=True):
         lines += ["", f"[joints.{name}]"]
         for key in ("tangential", "normal"):
-            lines.append(f"{key} = [{', '.join(map(_string, getattr(joint, key)))}]")
+            dofs = [quoted(d) if isinstance(d, str) else str(d) for d in getattr(joint, key)]
+            lines.append(f"{key} = [{', '.join(dofs)}]")
         if joint.V is not None:
             lines.append(f"V = {float(joint.V)!r}  # m/s: sliding velocity")
         lines += tables_of(joint, laws, f"joints.{name}.")
     if not structure.joints:
         lines += ["", "[joints]"]
     return "\n".join(lines) + "\n"
-
-
-def _string(value: int | str) -> str:
-    """As TOML writes it: its basic strings are those of JSON."""
-    return json.dumps(value, ensure_ascii=False)
 
 
 def npz_of(structure) -> bytes:

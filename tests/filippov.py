@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from math import comb, sqrt
+from math import comb, pi, sqrt
 from typing import Any
 
 import numpy as np
@@ -122,6 +122,22 @@ class Mechanism:
         first = [k1, -mu * n1, -c1 - dmu * n1 * x2, 0]
         second = [-mu * n2, k2, 0, -c2 - dmu * n2 * x1]
         return np.linalg.eigvals([[0, 0, -1, 0], [0, 0, 0, -1], first, second]).real.max()
+
+
+PLAIN = Mechanism(
+    m=1.0,
+    omega_1=2000 * pi,
+    omega_2=1600 * pi,
+    xi_1=0.001,
+    xi_2=0.007,
+    F=5.0,
+    V=0.15,
+    K_n=4e8,
+    K_t=2e8,
+    mu_s=0.4,
+    mu_m=0.25,
+    v_m=0.5,
+)
 
 
 @dataclass(frozen=True)

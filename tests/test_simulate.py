@@ -10,25 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
-from filippov import Mechanism, run
+from filippov import PLAIN, Mechanism, run
 
 import fractaljax as fj
 
 PI = np.pi
-PLAIN = Mechanism(
-    m=1.0,
-    omega_1=2000 * PI,
-    omega_2=1600 * PI,
-    xi_1=0.001,
-    xi_2=0.007,
-    F=5.0,
-    V=0.15,
-    K_n=4e8,
-    K_t=2e8,
-    mu_s=0.4,
-    mu_m=0.25,
-    v_m=0.5,
-)
 LONG = 40.0  # in 1/omega: some 170 steps, for which all tests share what is compiled
 TIMES = 60  # at which a motion is looked at
 REACHED = fj.SimulationResult.reached

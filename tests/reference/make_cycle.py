@@ -23,7 +23,7 @@ HERE = pathlib.Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
 
 import filippov  # noqa: E402
-from filippov import Mechanism  # noqa: E402
+from filippov import PLAIN  # noqa: E402
 
 SEED = 1
 RANDOM = 60
@@ -34,20 +34,6 @@ NOISE = 4e-15  # relative rounding of a value
 SAFETY = 10.0  # the smallest of the estimates is a lucky one
 BY = ("K_n", "K_t", "mu_s", "V")
 OF = ("period", "amplitude_1", "amplitude_2", "stick_fraction_1", "stick_fraction_2")
-PLAIN = Mechanism(
-    m=1.0,
-    omega_1=2000 * math.pi,
-    omega_2=1600 * math.pi,
-    xi_1=0.001,
-    xi_2=0.007,
-    F=5.0,
-    V=0.15,
-    K_n=4e8,
-    K_t=2e8,
-    mu_s=0.4,
-    mu_m=0.25,
-    v_m=0.5,
-)
 ABOUT = (
     "Stick-slip limit cycles by event-driven DOP853, SI units; made by make_cycle.py. start and "
     "state are [x1, x2, x1', x2']; itinerary is [sign 1, sign 2, duration] with 0 for stick; "
