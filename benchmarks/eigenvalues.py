@@ -7,11 +7,8 @@ family.
 """
 
 import dataclasses
-import io
-import os
 import platform
 import statistics
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -27,8 +24,8 @@ import fractaljax as fj
 from fractaljax.oscillator import Linearised
 from fractaljax.stability import growth_rate_of_linearised
 
-from .growth_rate import cpu_model, others_running, seconds
-from .page import write
+from .page import png, write
+from .timing import compiled, others_running, ran_on, seconds, this_machine
 
 mp: Any = mpmath.mp  # it makes its functions at run time
 
@@ -161,11 +158,9 @@ def chunks(systems: Any) -> list[Any]:
     return [jax.tree.unflatten(structure, part) for part in zip(*parts, strict=True)]
 
 
-def compiled(function: Callable, *parts) -> tuple[Callable, float]:
+def timed(function: Callable, *parts) -> tuple[Callable, float]:
     """The program of a function, called for each of its arguments, and the seconds it took."""
-    start = time.perf_counter()
-    program = jax.jit(function).lower(parts[0]).compile()
-    elapsed = time.perf_counter() - start
+    program, elapsed = compiled(function, parts[0])
     jax.block_until_ready(program(parts[0]))
     return lambda: [program(part) for part in parts], elapsed
 
@@ -235,10 +230,10 @@ def measure(quick: bool = False) -> dict[str, Any]:
     K_t = K_n * rng.uniform(0.1, 1, size.systems)
     mu = jnp.asarray(rng.uniform(0.05, 0.8, size.systems))
     programs = {
-        NAME: compiled(closed_form, *chunks(linearised(columns))),
-        SCENES: compiled(lambda x: scene_rates(*x), *chunks((K_n, K_t, mu))),
-        AT_ONCE: compiled(closed_form, linearised(columns)),
-        JAX: compiled(lambda A: jnp.linalg.eigvals(A).real.max(axis=1), jnp.asarray(matrices)),
+        NAME: timed(closed_form, *chunks(linearised(columns))),
+        SCENES: timed(lambda x: scene_rates(*x), *chunks((K_n, K_t, mu))),
+        AT_ONCE: timed(closed_form, linearised(columns)),
+        JAX: timed(lambda A: jnp.linalg.eigvals(A).real.max(axis=1), jnp.asarray(matrices)),
     }
     calls: dict[str, Callable] = {NUMPY: lambda: np.linalg.eigvals(matrices).real.max(axis=1)}
     calls |= {name: call for name, (call, _) in programs.items()}
@@ -267,7 +262,7 @@ def measure(quick: bool = False) -> dict[str, Any]:
         "systems": size.systems,
         "repeats": size.repeats,
         "exact_points": size.exact,
-        "machine": {"cpu": cpu_model(), "cores": os.cpu_count(), "others_running": busy},
+        "machine": this_machine(busy),
         "versions": {
             "python": platform.python_version(),
             "jax": jax.__version__,
@@ -325,7 +320,6 @@ def table(result: dict[str, Any]) -> str:
         ]
         cells = [row["family"], f"{row['unstable']:.0%}", *errors, str(row["wrong_signs"])]
         lines.append(f"| {' | '.join(cells)} |")
-    versions = ", ".join(f"{name} {version}" for name, version in result["versions"].items())
     lines += [
         "",
         f"Times are medians of {result['repeats']} runs over {result['systems']} systems of the"
@@ -337,8 +331,7 @@ def table(result: dict[str, Any]) -> str:
         f" {result['exact_points']} systems of each family. A wrong sign is one of the closed"
         " form's growth rates, where the exact one is not 0.",
         "",
-        f"{result['machine']['cpu']}, {result['machine']['cores']} cores,"
-        f" {result['machine']['others_running']:.1f} programs running on them before; {versions}.",
+        ran_on(result),
         "",
     ]
     return "\n".join(lines)
@@ -366,10 +359,7 @@ def picture(result: dict[str, Any]) -> bytes:
     right.legend(loc="best")
     for axis in (left, right):
         axis.invert_yaxis()
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=110)
-    plt.close(figure)
-    return content.getvalue()
+    return png(figure, dpi=110)
 
 
 def run(out: Path, quick: bool = False) -> list[Path]:

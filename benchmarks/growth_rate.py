@@ -7,12 +7,9 @@ runs are taken to 40 digits.
 """
 
 import dataclasses
-import io
 import math
-import os
 import platform
 import statistics
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -29,7 +26,8 @@ import fractaljax as fj
 
 from .exact import exact_rows
 from .loops import STEP, brake, loop_gradient, loop_value, plain_loop, tuned_loop
-from .page import write
+from .page import png, write
+from .timing import compiled, others_running, ran_on, seconds, this_machine
 
 WANTED = 1000  # ratio of the rates of value and gradient
 D_RANGE, G_RANGE = (2.35, 2.6), (3e-11, 3e-9)
@@ -94,15 +92,12 @@ def package_methods(quick: bool) -> dict[str, Callable]:
     return methods
 
 
-def compiled(methods: dict[str, Callable], D, G) -> dict[str, tuple[Callable, float]]:
+def compiled_methods(methods: dict[str, Callable], D, G) -> dict[str, tuple[Callable, float]]:
     """The methods compiled for a grid, each with the seconds of tracing and compiling it."""
     programs = {}
     for name, method in tqdm(methods.items(), desc="compile"):
-        jax.clear_caches()  # no method may profit from the tracing of another
-        start = time.perf_counter()
-        program = jax.jit(method).lower(D, G).compile()
-        programs[name] = program, time.perf_counter() - start
-        jax.block_until_ready(program(D, G))
+        programs[name] = compiled(method, D, G)
+        jax.block_until_ready(programs[name][0](D, G))
     return programs
 
 
@@ -119,13 +114,6 @@ def rows_of(outputs, grid_G: np.ndarray, picked) -> np.ndarray:
 # ---------------------------------------------------------------------------------------------
 # Measuring
 # ---------------------------------------------------------------------------------------------
-
-
-def seconds(function: Callable, *arguments) -> tuple[float, Any]:
-    """Wall-clock seconds of one call, and what it gave."""
-    start = time.perf_counter()
-    result = jax.block_until_ready(function(*arguments))
-    return time.perf_counter() - start, result
 
 
 def spread(errors: np.ndarray) -> dict[str, float]:
@@ -163,7 +151,7 @@ def measure(quick: bool = False) -> dict[str, Any]:
     D, G = grid_D[picked[0]].tolist(), grid_G[picked[1]].tolist()
     numbers = brake()
     growth = tuned_loop(numbers)
-    programs = compiled(package_methods(quick), jnp.asarray(grid_D), jnp.asarray(grid_G))
+    programs = compiled_methods(package_methods(quick), jnp.asarray(grid_D), jnp.asarray(grid_G))
 
     calls: dict[str, tuple[int, Callable]] = {}
     for loop, body in [(PLAIN, plain_loop(numbers)), (TUNED, growth)]:
@@ -227,7 +215,7 @@ def measure(quick: bool = False) -> dict[str, Any]:
         "repeats": size.repeats,
         "difference_step": STEP,
         "regimes_of_sample": {r: regimes.count(r) / size.sample for r in sorted(set(regimes))},
-        "machine": {"cpu": cpu_model(), "cores": os.cpu_count(), "others_running": busy},
+        "machine": this_machine(busy),
         "versions": {
             "python": platform.python_version(),
             "jax": jax.__version__,
@@ -237,21 +225,6 @@ def measure(quick: bool = False) -> dict[str, Any]:
         },
         "methods": methods,
     }
-
-
-def cpu_model() -> str:
-    """The processor's name, where the system tells it."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
-
-
-def others_running() -> float:
-    """Load of the last minute before the benchmark: what other programs took of the machine."""
-    return os.getloadavg()[0] if hasattr(os, "getloadavg") else math.nan
 
 
 # ---------------------------------------------------------------------------------------------
@@ -300,7 +273,6 @@ def table(result: dict[str, Any]) -> str:
         ]
         lines.append(f"| {' | '.join(cells)} |")
     regimes = ", ".join(f"{name} {v:.0%}" for name, v in result["regimes_of_sample"].items())
-    versions = ", ".join(f"{name} {version}" for name, version in result["versions"].items())
     lines += [
         "",
         f"Grid: {side} x {side} surfaces of the reference brake, D {result['grid']['D'][0]} to"
@@ -315,8 +287,7 @@ def table(result: dict[str, Any]) -> str:
         f" {result['exact_points']} of the points, as many of each regime; omega is the modulus of"
         " the critical eigenvalue.",
         "",
-        f"{result['machine']['cpu']}, {result['machine']['cores']} cores,"
-        f" {result['machine']['others_running']:.1f} programs running on them before; {versions}.",
+        ran_on(result),
         "",
     ]
     return "\n".join(lines)
@@ -354,10 +325,7 @@ def picture(result: dict[str, Any]) -> bytes:
     figure.suptitle(
         f"Value and gradient: {result['headline']['ratio_to_loop']:.0f} times the rate of the loop"
     )
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=130)
-    plt.close(figure)
-    return content.getvalue()
+    return png(figure, dpi=130)
 
 
 def run(out: Path, quick: bool = False) -> list[Path]:

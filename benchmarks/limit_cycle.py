@@ -8,7 +8,6 @@ short enough to see that layer. The truth has more digits than a double.
 import dataclasses
 import importlib
 import importlib.metadata
-import io
 import json
 import math
 import os
@@ -34,8 +33,8 @@ from tqdm import tqdm
 
 import fractaljax as fj
 
-from .growth_rate import cpu_model, others_running, seconds
-from .page import write
+from .page import png, write
+from .timing import compiled, others_running, ran_on, seconds, this_machine
 
 K_N, KAPPA, V = 4e8, 0.5, 0.15
 SCALE = 2e4  # sqrt(K_n/m) [1/s]
@@ -82,14 +81,6 @@ def reference(K_n: Any = K_N, kappa: Any = KAPPA) -> fj.Scene:
     return fj.Scene(fj.FixedContact(K_n, kappa * K_n), fj.Stribeck(0.4, 0.25, 0.5), oscillator)
 
 
-def compile_apart(function: Callable, *arguments) -> tuple[Callable, float]:
-    """The compiled program, and the seconds of tracing and compiling it."""
-    jax.clear_caches()  # no program may profit from the tracing of another
-    start = time.perf_counter()
-    program = jax.jit(function).lower(*arguments).compile()
-    return program, time.perf_counter() - start
-
-
 def relative(found, truth: float) -> float:
     """Relative error."""
     return abs(float(found) / truth - 1)
@@ -118,7 +109,7 @@ def exact_rows(size: Size) -> list[dict[str, Any]]:
     for n in tqdm(size.segments, desc="compile"):
         for kind, wrap in kinds.items():
             f = wrap(lambda K, n=n: amplitude(K, segments=n))
-            programs[n, kind] = compile_apart(f, K_N)
+            programs[n, kind] = compiled(f, K_N)
     times: dict[Any, list[float]] = {key: [] for key in programs}
     results = {key: program(K_N) for key, (program, _) in programs.items()}
     for _ in range(size.repeats):
@@ -155,7 +146,7 @@ def regularised_rows(size: Size) -> list[dict[str, Any]]:
             found = fj.limit_cycle(reference(K), regularisation=share * V, throw=False)
             return found.amplitude[0], found.regularisation_error
 
-        program, compile_s = compile_apart(lambda K, f=cycle: jax.jvp(f, (K,), (1.0,)), K_N)
+        program, compile_s = compiled(lambda K, f=cycle: jax.jvp(f, (K,), (1.0,)), K_N)
         (value, differs), (slope, _) = program(K_N)
         times = [seconds(program, K_N)[0] for _ in range(size.slow)]
         rows.append(
@@ -409,7 +400,7 @@ def peer_rows(size: Size) -> list[dict[str, Any]]:
     for name, share in tqdm(solvers, desc="diffrax"):
         start = jnp.array(numbers.start)
         body = diffrax_run(numbers, share, getattr(diffrax, name)(), 1e-8)
-        program, compile_s = compile_apart(body, start)
+        program, compile_s = compiled(body, start)
 
         def turns(program=program, start=start):
             t, x, u = (np.asarray(values) for values in program(start))
@@ -449,7 +440,7 @@ def sharded_times(count: int, repeats: int) -> dict[str, Any]:
     spec = jax.sharding.PartitionSpec("cycles")
     body = jax.shard_map(many(), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
     K_n = jax.device_put(jnp.linspace(*RANGE, count), jax.sharding.NamedSharding(mesh, spec))
-    program, compile_s = compile_apart(body, K_n)
+    program, compile_s = compiled(body, K_n)
     values = np.asarray(program(K_n)[0]).tolist()
     fastest = min(seconds(program, K_n)[0] for _ in range(repeats))
     return {
@@ -482,7 +473,7 @@ def sharded(size: Size, values: np.ndarray) -> dict[str, Any]:
 def batch(size: Size) -> dict[str, Any]:
     """Rate of a batch in one call, on one device and over two, and its errors."""
     K_n = jnp.linspace(*RANGE, size.batch)
-    program, compile_s = compile_apart(many(), K_n)
+    program, compile_s = compiled(many(), K_n)
     found, results = (np.asarray(x) for x in program(K_n))
     fastest = min(seconds(program, K_n)[0] for _ in range(size.slow))
     truth, fine_results = (np.asarray(x) for x in jax.jit(many(FINE))(K_n))
@@ -675,7 +666,7 @@ def measure(quick: bool = False) -> dict[str, Any]:
         "quick": quick,
         "truth": {"period": PERIOD, "amplitude": AMPLITUDE, "slope": SLOPE},
         "repeats": size.repeats,
-        "machine": {"cpu": cpu_model(), "cores": os.cpu_count(), "others_running": busy},
+        "machine": this_machine(busy),
         "versions": versions,
         "not_installed": [] if "heyoka" in versions else ["heyoka"],
         "methods": exact_rows(size) + regularised_rows(size) + peer_rows(size),
@@ -754,7 +745,7 @@ def choice(result: dict[str, Any]) -> str:
 
 def table(result: dict[str, Any]) -> str:
     """The Markdown page: for each table one sentence that says what to take."""
-    many_, machine = result["batch"], result["machine"]
+    many_ = result["batch"]
     two, errors = many_["sharded"], many_["error"]
     batches, over_two = [(1, many_)], ""
     if two:
@@ -870,10 +861,8 @@ def table(result: dict[str, Any]) -> str:
             ),
             "",
         ]
-    versions = ", ".join(f"{name} {version}" for name, version in result["versions"].items())
     lines += [
-        f"{machine['cpu']}, {machine['cores']} cores, {machine['others_running']:.1f} programs"
-        f" running on them before; {versions}.",
+        ran_on(result),
         "",
     ]
     return "\n".join(lines)
@@ -903,10 +892,7 @@ def picture(result: dict[str, Any]) -> bytes:
     axis.set(xlabel="time [s]", ylabel="amplitude of x1: relative error [-]")
     figure.legend(loc="outside right upper", fontsize="small")
     figure.suptitle("Limit cycle: error against run time")
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=130)
-    plt.close(figure)
-    return content.getvalue()
+    return png(figure, dpi=130)
 
 
 def run(out: Path, quick: bool = False) -> list[Path]:

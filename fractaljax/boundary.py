@@ -6,7 +6,6 @@ function smooth on the scale of stiffness, however light the damping. `continuat
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -14,15 +13,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .batches import in_batches
 from .continuation import BranchEnd, trace
-from .critical_friction import (
-    coupling_reserve,
-    critical_frequency,
-    sliding_friction,
-    with_friction_times,
-)
+from .critical_friction import coupling_reserve, critical_frequency
 from .oscillator import linearise
-from .parts import Part, Record, leaf, number, quantities, require_scalar, substitute
+from .parts import Record, number, require_scalar
+from .quantities import (
+    replaced,
+    require_independent,
+    require_known,
+    substituted,
+    with_optional,
+)
+from .ranges import is_logarithmic
 from .scene import Scene
 from .stability import growth_rate_of
 
@@ -74,56 +77,6 @@ class Boundary(Record):
         return "\n".join(rows)
 
 
-# --- quantities that scenes have no name for ----------------------------------------------
-
-
-def _stiffness_ratio(scene, ratio):
-    if scene.contact.fractal:
-        return substitute(scene, {"stiffness_ratio": ratio})
-    return substitute(scene, {"K_t": ratio * scene.contact.K_n})
-
-
-def _frequency_ratio(scene, ratio):
-    return substitute(scene, {"omega_1": ratio * scene.oscillator.omega_2})
-
-
-def _sliding_friction(scene, mu):
-    return with_friction_times(scene, mu / sliding_friction(scene))
-
-
-_DERIVED: dict[str, Callable[[Scene, Any], Scene]] = {
-    "K_t/K_n": _stiffness_ratio,
-    "omega_1/omega_2": _frequency_ratio,
-    "mu": _sliding_friction,
-}
-_MOVED = {"K_t/K_n": ("K_t", "stiffness_ratio"), "omega_1/omega_2": ("omega_1",)}
-
-
-def _placed(scene: Scene, names, values) -> Scene:
-    """The scene with quantities changed, derived ones last; not checked."""
-    known = quantities(scene)
-    chosen = dict(zip(names, values, strict=True))
-    scene = substitute(scene, {name: x for name, x in chosen.items() if name in known})
-    for name, x in chosen.items():
-        if name not in known:
-            scene = _DERIVED[name](scene, x)
-    return scene
-
-
-def _checked(scene: Scene, names, values) -> None:
-    """Refuse a place in the window that is no scene."""
-    for name, x in zip(names, values, strict=True):
-        if name in _DERIVED:
-            number(name, x, at_least=0) if name == "K_t/K_n" else number(name, x, above=0)
-    placed = _placed(scene, names, [jnp.asarray(x, float) for x in values])
-    changes = {}
-    for name, path in quantities(placed).items():
-        value = leaf(placed, path)
-        if value is not None and not isinstance(value, Part):
-            changes[name] = float(value)
-    scene.replace(**changes)
-
-
 # --- the function that vanishes on the boundary -------------------------------------------
 
 
@@ -159,7 +112,8 @@ class _Point(eqx.Module):
 
 
 def _judge(problem, request, p) -> _Point:
-    scene = _placed(request.scene, problem.names, problem.values(request, p))
+    values = dict(zip(problem.names, problem.values(request, p), strict=True))
+    scene = substituted(request.scene, values)
     contact, friction = scene.contact, scene.friction
     if contact.fractal:
         state = contact.state(friction.mu_s, friction.mu_m)
@@ -204,14 +158,11 @@ class _Field:
 
     def values(self, ps):
         """Reserve (n,) and gradient (n, 2) at any number of points."""
-        found = [np.zeros(0)], [np.zeros((0, 2))]
-        for i in range(0, len(ps), _BATCH):
-            piece = ps[i : i + _BATCH]
-            padded = np.concatenate([piece, np.repeat(piece[-1:], _BATCH - len(piece), axis=0)])
-            both = _reserves(self.problem, self.request, jnp.asarray(padded, self.dtype))
-            for pieces, array in zip(found, both, strict=True):
-                pieces.append(np.asarray(array, float)[: len(piece)])
-        return tuple(map(np.concatenate, found))
+
+        def program(ps):
+            return _reserves(self.problem, self.request, jnp.asarray(ps, self.dtype))
+
+        return tuple(np.asarray(x, float) for x in in_batches(program, _BATCH, ps))
 
     def at(self, p):
         """Reserve, its gradient (2,) and the rest at one point."""
@@ -275,15 +226,12 @@ def hopf_boundary(
         raise ValueError(f"lines must be a whole number of at least 2, got {lines!r}")
     windows = [_window(scene, which, window) for which, window in (("x", x), ("y", y))]
     names = (windows[0][0], windows[1][0])
-    for name, other in (names, names[::-1]):
-        if name == other or other in _MOVED.get(name, ()):
-            raise ValueError(f"x and y must be independent, got {names[0]} and {names[1]}")
-    if "K_t/K_n" in names and scene.contact.fractal:
-        scene = scene.replace(stiffness_ratio=1.0)
+    require_independent(scene, names)
+    # Domains are intervals: where all corners are inside, everything is.
     for place in np.ndindex(2, 2):
-        corner = [window[1 + end] for window, end in zip(windows, place, strict=True)]
-        _checked(scene, names, corner)
-    logarithmic = [is_logarithmic(window) for window in windows]
+        replaced(scene, {w[0]: float(w[1 + end]) for w, end in zip(windows, place, strict=True)})
+    scene = with_optional(scene, names)
+    logarithmic = [is_logarithmic(*window[1:]) for window in windows]
     ends = np.array([window[1:] for window in windows])
     ends[logarithmic] = np.log(ends[logarithmic])
     low, high = jnp.asarray(ends.T, scene.oscillator.m.dtype)
@@ -318,24 +266,12 @@ def _branch(field, windows, points, start, end) -> Branch:
     )
 
 
-def is_logarithmic(window: Window) -> bool:
-    """Whether a range spans so much that it is gone along, and shown, in logarithms."""
-    _, low, high = window
-    return low > 0 and high >= 10 * low
-
-
 def _window(scene, which, window) -> Window:
     """A range, checked; the domain of the scene is checked at the corners."""
     if not (isinstance(window, (tuple, list)) and len(window) == 3 and isinstance(window[0], str)):
         raise ValueError(f"{which} must be (name, low, high), got {window!r}")
     name, *ends = window
-    known = quantities(scene)
-    names = [n for n, path in known.items() if not isinstance(leaf(scene, path), Part)]
-    names += [n for n in _DERIVED if n not in names]
-    if name not in names or (name in known and leaf(scene, known[name]) is None):
-        raise ValueError(
-            f"{which} must be a quantity of the scene, got {name!r}; known are {', '.join(names)}"
-        )
+    require_known(scene, name)
     low, high = (float(number(f"{which} limit", end)) for end in ends)
     if not low < high:
         raise ValueError(f"{which} must go from a lower to a higher value, got {window!r}")

@@ -14,8 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .matrices import mass_normalised
 from .parts import Record
-from .structure import Structure, mass_normalised, require_single
+from .structure import Structure, require_single
 
 # Multiples of the rounding error below which something counts as zero: the square of a rigid-body
 # mode's eigenvalue, a real part; both in units of omega. Free beams of 200 degrees of freedom

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 
 from .contact import MU_M_MAX
 from .oscillator import Linearised, dimensionless, linearise
-from .parts import leaf, quantities, require_scalar, substitute
+from .parts import require_scalar
+from .quantities import sliding_friction, with_friction_times
 from .scene import Scene, stiffness
 from .singular import positive_sqrt, safe_divide
 
@@ -54,21 +55,6 @@ def linearised(scene: Scene, friction_slope: bool) -> Linearised:
     """The characteristic polynomial of a scene, its stiffness included."""
     K_n, K_t = stiffness(scene)
     return linearise(scene.oscillator, scene.friction, K_n, K_t, friction_slope)
-
-
-def sliding_friction(scene: Scene) -> jax.Array:
-    """mu(V), the friction coefficient at the velocity of the belt."""
-    friction = scene.friction
-    if not friction.velocity_dependent:
-        return friction.mu_s
-    return friction.coefficient(scene.oscillator.V)
-
-
-def with_friction_times(scene: Scene, factor) -> Scene:
-    """The friction law as a whole times `factor`; not checked."""
-    names = [name for name in quantities(scene.friction) if name in ("mu", "mu_s", "mu_m")]
-    paths = quantities(scene)
-    return substitute(scene, {name: factor * leaf(scene, paths[name]) for name in names})
 
 
 @functools.partial(jax.jit, static_argnames="friction_slope")

@@ -1,7 +1,7 @@
 """The conditions that a design must withstand: ranges and samples of scene quantities.
 
-A condition is a row of places: which sample, and where in each range, from 0 to 1. A range of more
-than a decade is walked in logarithms. The worst condition is sought on a grid of all corners and
+A condition is a row of places: which sample, and where in each range, from 0 to 1. A range of a
+decade or more is walked in logarithms. The worst condition is sought on a grid of all corners and
 points inside, then by halving steps along every range.
 """
 
@@ -10,10 +10,11 @@ import itertools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import jax
 import numpy as np
 
-from .parts import leaf, number, quantities
+from .parts import number
+from .quantities import own_quantities
+from .ranges import within
 from .scene import Scene
 
 _SIDES = {1: 33, 2: 11, 3: 6, 4: 4, 5: 3, 6: 3}  # points along each range, by their number
@@ -92,8 +93,8 @@ class Envelope:
 
     def check(self, scene: Scene, designed: Sequence[str]) -> None:
         """Refuse names that the scene lacks or the design moves, and values outside a domain."""
-        paths = quantities(scene)
-        known = [n for n, path in paths.items() if isinstance(leaf(scene, path), jax.Array)]
+        own = own_quantities(scene)
+        known = [name for name, quantity in own.items() if quantity.value is not None]
         for name in self.names:
             if name not in known:
                 raise ValueError(
@@ -112,7 +113,7 @@ class Envelope:
     def values(self, places: np.ndarray) -> np.ndarray:
         """The quantities (n, names) at places (n, 1 + ranges)."""
         columns = [
-            low * (high / low) ** at if _logarithmic(low, high) else low + (high - low) * at
+            within(low, high, at)
             for at, (low, high) in zip(places[:, 1:].T, self.ranges.values(), strict=True)
         ]
         which = places[:, 0].astype(int)
@@ -202,10 +203,6 @@ def _numbers(name, values) -> list[float]:
 
 def _shown(values) -> str:
     return f"({', '.join(f'{value:g}' for value in values)})"
-
-
-def _logarithmic(low: float, high: float) -> bool:
-    return low > 0 and high > 10 * low
 
 
 def _with_samples(points: np.ndarray, samples) -> np.ndarray:

@@ -3,51 +3,29 @@
 import functools
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from . import transient
+from .cycle import Closed, CycleResult, LimitCycle
 from .events import Cubic, first_root
-from .parts import Record, concrete, number, require_scalar
+from .parts import concrete, number, require_scalar
 from .scene import Scene
-from .shooting import (
-    UNUSED,
-    Segments,
-    flow,
-    maps,
-    next_start,
-    orbit,
-)
+from .shooting import UNUSED, Segments, flow, maps, next_start, orbit
 from .stability import growth_rate
-from .stick_slip import StickSlip, check_rtol, rest, start_state, stick_slip, units
+from .stick_slip import (
+    StickSlip,
+    check_rtol,
+    rest,
+    scaled_start,
+    start_state,
+    stick_slip,
+    units,
+)
 
 _REFINEMENTS = 3
-REGULARISATION_TOLERANCE = 1e-3
 _CROSSINGS = 16  # segments in which x2 may change sign
-
-
-class CycleResult(eqx.Enumeration):
-    """What became of the search for a limit cycle."""
-
-    converged = "a limit cycle was found"
-    depends_on_eps = (
-        "a limit cycle of the regularised law, which still differs from the exact law's: "
-        "choose a smaller regularisation"
-    )
-    inaccurate = "a limit cycle was found, but not to rtol: ask for more segments"
-    equilibrium = "the motion dies out: the sliding equilibrium attracts it"
-    diverged = "the motion grows beyond all bounds"
-    not_periodic = "the motion does not repeat within four turns (a longer period, or none)"
-    too_stiff = (
-        "the regularised law takes more than max_steps steps: allow more, choose a solver such as "
-        "diffrax.Kvaerno5, or leave the regularisation out"
-    )
-    exhausted = (
-        "the motion nearly repeats, but has not settled within max_turns: allow more of them"
-    )
-
 
 # In the order of the numbers in `transient`.
 _RESULTS = (
@@ -58,113 +36,6 @@ _RESULTS = (
     CycleResult.not_periodic,
     CycleResult.exhausted,
 )
-
-
-class Switch(Record):
-    """One change of mode, as `LimitCycle.switches` lists them."""
-
-    time: float  # after `state` [s]
-    direction: int  # which one switches, 1 or 2
-    before: str  # "+", "-" or "stick"
-    after: str
-
-
-class Closed(eqx.Module):
-    """The motion along closed segments."""
-
-    segments: Segments
-
-    def at(self, system: StickSlip, times) -> jax.Array:
-        """Scaled states (4, n) at scaled times (n,) within one period."""
-        segments = self.segments
-        ends = jnp.cumsum(segments.duration)
-        k = jnp.searchsorted(
-            jax.lax.stop_gradient(ends), jax.lax.stop_gradient(times), side="right"
-        )
-        k = jnp.minimum(k, len(ends) - 1)
-        after = times - (ends - segments.duration)[k]
-        return flow(system, segments.y[:, k], after, segments.s[:, k])
-
-
-class Smooth(eqx.Module):
-    """The motion as diffrax's dense solution over one period."""
-
-    solution: Any
-
-    def at(self, system: StickSlip, times) -> jax.Array:
-        """Scaled states (4, n) at scaled times (n,) within one period."""
-        return jax.vmap(self.solution.evaluate, out_axes=1)(times)
-
-
-class LimitCycle(Record):
-    """A limit cycle, as `limit_cycle` returns it. NaN throughout where there is none."""
-
-    period: jax.Array  # [s]
-    amplitude: jax.Array  # (2,) peak to peak, one value a direction [m]
-    velocity_min: jax.Array  # (2,) of dx/dt [m/s]
-    velocity_max: jax.Array  # (2,) [m/s]
-    stick_fraction: jax.Array  # (2,) share of the period in stick (regularised: abs(v) < eps)
-    tension_fraction: jax.Array  # share of the period with K_n x2 < 0: the contact pulls
-    state: jax.Array  # (4,) [x1, x2, v1, v2] on the cycle, where x1 is largest [m, m/s]
-    error: jax.Array  # estimated relative error of period and states
-    turns: jax.Array  # maxima of x1 in one period
-    regularisation_error: jax.Array  # largest relative difference from the exact law's cycle
-    result: CycleResult
-    _monodromy: jax.Array = eqx.field(repr=False)  # (4, 4)
-    _system: StickSlip = eqx.field(repr=False)
-    _motion: Any = eqx.field(repr=False)  # Closed, or Smooth if regularised
-
-    @property
-    def multipliers(self) -> jax.Array:
-        """(4,) complex: the Floquet multipliers, largest modulus first; one of them is 1."""
-        # Worked out when asked for: eigenvalues have no second derivative in JAX.
-        values = jnp.linalg.eigvals(self._monodromy)
-        order = jnp.argsort(-jnp.abs(jax.lax.stop_gradient(values)), axis=-1)
-        return jnp.take_along_axis(values, order, axis=-1)
-
-    @property
-    def frequency(self) -> jax.Array:
-        """1/period [Hz]."""
-        return 1 / self.period
-
-    def orbit(self, n: int = 512) -> tuple[jax.Array, jax.Array]:
-        """Times (n,) [s] and states (n, 4) [m, m/s], evenly over one period from `state`."""
-        system = self._system
-        share = jnp.arange(n) / n
-        y = self._motion.at(system, share * self.period * system.omega)
-        y = jnp.where(jnp.isfinite(self.period), y, jnp.nan)
-        return share * self.period, (y * units(system)[:, None]).T
-
-    def spectrum(self, n: int = 512) -> tuple[jax.Array, jax.Array]:
-        """Harmonics: frequencies (n//2,) [Hz] and peak amplitudes (n//2, 2) [m] of x1 and x2.
-
-        The Fourier coefficients of n samples of the orbit, without the mean.
-        """
-        _, states = self.orbit(n)
-        lines = jnp.abs(jnp.fft.rfft(states[:, :2], axis=0)) / n * 2
-        harmonics = jnp.arange(1, n // 2 + 1)
-        return harmonics / self.period, lines[1 : n // 2 + 1]
-
-    def switches(self) -> list[Switch]:
-        """Every change of mode in one period, in order, with its time.
-
-        **Raises:** `ValueError` for a batch of cycles, inside a compiled program, and for the
-        regularised law, which has none.
-        """
-        if concrete(self.period) is None or self.period.ndim:
-            raise ValueError("switches() needs one cycle, outside of jit: index the batch first")
-        if not isinstance(self._motion, Closed):
-            raise ValueError("a regularised cycle has no switches")
-        segments, names = self._motion.segments, {1: "+", -1: "-", 0: "stick"}
-        used = np.asarray(segments.guard) != UNUSED
-        modes = np.asarray(segments.s)[:, used].astype(int)
-        times = np.cumsum(np.asarray(segments.duration)[used]) / float(self._system.omega)
-        found = []
-        for k, time in enumerate(times):
-            before, after = modes[:, k], np.roll(modes, -1, axis=1)[:, k]
-            for i in np.flatnonzero(before != after):
-                found.append(Switch(float(time), int(i) + 1, names[before[i]], names[after[i]]))
-        return found
 
 
 def _extremes(system: StickSlip, segments: Segments) -> jax.Array:
@@ -243,19 +114,13 @@ def _monodromy(system: StickSlip, segments: Segments, local) -> jax.Array:
     return M[0]
 
 
-def _start(scene: Scene, system: StickSlip, start) -> jax.Array:
-    """The start (4,) in scaled units, constant: by default the equilibrium with x1 displaced."""
-    y = rest(scene, system).at[0].add(1.0) if start is None else start / units(system)
-    return jax.lax.stop_gradient(y)
-
-
 @functools.partial(jax.jit, static_argnames=("segments", "rtol"))
 def _limit_cycle(scene: Scene, start, max_turns, *, segments: int, rtol: float) -> LimitCycle:
     system = stick_slip(scene)
     frozen, still, growth = jax.lax.stop_gradient(
         (system, rest(scene, system), growth_rate(scene) / system.omega)
     )
-    y = _start(scene, system, start)
+    y = scaled_start(scene, system, start)
     found = transient.find(frozen, y, still, growth, max_turns.astype(y.dtype), segments)
     found = jax.lax.stop_gradient(found)
 
@@ -294,77 +159,6 @@ def _limit_cycle(scene: Scene, start, max_turns, *, segments: int, rtol: float) 
         _monodromy=only(_monodromy(system, loop, local)),
         _system=system,
         _motion=Closed(loop),
-    )
-
-
-@eqx.filter_jit
-def _regularised_cycle(
-    scene: Scene, start, eps, exact: LimitCycle, solver, rtol: float, max_steps: int
-) -> LimitCycle:
-    from . import regularised
-
-    system = stick_slip(scene)
-    y = _start(scene, system, start)
-    closed = regularised.close(system, eps, y, solver, rtol, max_steps)
-    solution = regularised.solve(
-        system,
-        eps,
-        closed.y,
-        closed.period,
-        solver,
-        rtol,
-        max_steps,
-        t0=True,
-        steps=True,
-        dense=True,
-    )
-    times, states = regularised.nodes(solution)
-    rates = jax.vmap(lambda y: regularised.field(0.0, y, (system, eps)))(states)
-    low, high = regularised.extremes(times, states, rates) * units(system)[None]
-
-    def end(y):
-        # Tangents are less accurate than states at the same tolerance.
-        tight = rtol / 10, max_steps
-        return regularised.solve(system, eps, y, closed.period, solver, *tight, t1=True).ys[0]
-
-    def share(values, slopes):
-        return regularised.share(times, values, slopes)
-
-    width = eps / system.V
-    stuck = [
-        share((1 - u) ** 2 - width**2, 2 * (u - 1) * a)
-        for u, a in zip(states.T[2:], rates.T[2:], strict=True)
-    ]
-    period = closed.period / system.omega
-    amplitude = (high - low)[:2]
-    differences = jnp.abs(
-        jnp.stack([period / exact.period - 1, *(amplitude / exact.amplitude - 1)])
-    )
-    error = jax.lax.stop_gradient(jnp.max(differences))
-    status = CycleResult.where(
-        error <= REGULARISATION_TOLERANCE, CycleResult.converged, CycleResult.depends_on_eps
-    )
-    lost = CycleResult.where(closed.followed, CycleResult.not_periodic, CycleResult.too_stiff)
-    status = CycleResult.where(closed.found, status, lost)
-
-    def only(value):
-        return jnp.where(closed.found, value, jnp.nan)
-
-    return LimitCycle(
-        period=only(period),
-        amplitude=only(amplitude),
-        velocity_min=only(low[2:]),
-        velocity_max=only(high[2:]),
-        stick_fraction=only(jnp.stack(stuck)),
-        tension_fraction=only(share(states[:, 1], rates[:, 1])),
-        state=only(closed.y * units(system)),
-        error=only(jnp.asarray(rtol, y.dtype)),
-        turns=closed.turns,
-        regularisation_error=only(error),
-        result=status,
-        _monodromy=only(jax.jacfwd(end)(closed.y)),
-        _system=system,
-        _motion=Smooth(solution),
     )
 
 
@@ -432,63 +226,12 @@ def limit_cycle(
         # A period of several turns needs as many more segments.
         cycle = _limit_cycle(scene, start, turns, segments=4 * _segments_for(rtol), rtol=rtol)
     if regularisation is not None:
-        from .regularised import default_solver
+        from .regularised import default_solver, regularised_cycle
 
         eps = number("regularisation", regularisation, above=0)
         solver = default_solver() if solver is None else solver
-        cycle = _regularised_cycle(scene, start, eps, cycle, solver, rtol, max_steps)
+        cycle = regularised_cycle(scene, start, eps, cycle, solver, rtol, max_steps)
     if throw:
         failed = cycle.result != CycleResult.converged
         cycle = cycle.result.error_if(cycle, failed)
     return cycle
-
-
-def attractors(
-    scene: Scene, starts: Any = None, *, rtol: float = 1e-9, max_turns: int = 5000
-) -> list[LimitCycle]:
-    """Every distinct motion that the starts end in, those without a cycle among them.
-
-    Two cycles are one if their periods and amplitudes agree to 1e-6. `starts` is (k, 4), [x1, x2,
-    v1, v2] in m and m/s; by default 32 spread evenly in both directions about the equilibrium, up
-    to velocities of 2 V. The first start that led to each motion decides the order.
-
-    **Raises:** `ValueError` for starts of another shape, and what `limit_cycle` raises.
-    """
-    require_scalar(scene)
-    if starts is None:
-        starts = _spread(scene)
-    starts = number("starts", jnp.asarray(starts, dtype=float))
-    if starts.ndim != 2 or starts.shape[1] != 4:
-        raise ValueError(f"starts must have shape (k, 4), got {starts.shape}")
-    cycles = jax.vmap(
-        lambda start: limit_cycle(scene, start, rtol=rtol, max_turns=max_turns, throw=False)
-    )(starts)
-    distinct: list[LimitCycle] = []
-    for i in range(len(starts)):
-        cycle = jax.tree.map(lambda x, i=i: x[i], cycles)
-        if not any(_same(cycle, other) for other in distinct):
-            if bool(cycle.result == CycleResult.inaccurate):
-                # On its own it gets the segments it needs, and may turn out to be known.
-                cycle = limit_cycle(scene, cycle.state, rtol=rtol, throw=False)
-            if not any(_same(cycle, other) for other in distinct):
-                distinct.append(cycle)
-    return distinct
-
-
-@jax.jit
-def _spread(scene: Scene) -> jax.Array:
-    system = stick_slip(scene)
-    still = rest(scene, system)
-    # Phases of the two directions at unrelated steps, three sizes in turn.
-    k = jnp.arange(32)
-    first, second = 2 * jnp.pi * k / 32, 2 * jnp.pi * ((k * 0.618034) % 1)
-    size = jnp.array([0.5, 1.0, 2.0])[k % 3]
-    away = jnp.stack([jnp.cos(first), jnp.cos(second), jnp.sin(first), jnp.sin(second)], axis=1)
-    return (still[None] + size[:, None] * away) * units(system)[None]
-
-
-def _same(one: LimitCycle, other: LimitCycle) -> bool:
-    numbers = [np.array([c.period, *c.amplitude]) for c in (one, other)]
-    if np.isnan(numbers[0]).any() or np.isnan(numbers[1]).any():
-        return bool(np.isnan(numbers).all()) and bool(one.result == other.result)
-    return bool(np.allclose(*numbers, rtol=1e-6, atol=0))

@@ -1,8 +1,6 @@
 """Both modes of a scene over any two of its quantities, as the source's Figs. 7 to 10 show them."""
 
-import dataclasses
 import functools
-from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
@@ -12,11 +10,18 @@ import numpy as np
 
 from .contact import FixedContact, Regime
 from .friction import Coulomb
-from .parts import Part, Record, leaf, number, quantities, require_scalar
+from .parts import Record, require_scalar
+from .quantities import (
+    FREQUENCY_RATIO,
+    FRICTION,
+    STIFFNESS_RATIO,
+    axis_values,
+    replaced,
+    require_independent,
+    unit,
+)
 from .scene import Scene, brake_scene
 from .stability import stability
-
-STIFFNESS_RATIO, FREQUENCY_RATIO = "K_t/K_n", "omega_1/omega_2"
 
 
 class Modes(Record):
@@ -40,77 +45,38 @@ class Modes(Record):
         return self.real.max(axis=-1)
 
 
-def mapped_quantities(scene: Scene) -> list[str]:
-    """The names `modes_over` takes: numbers of the scene, and two ratios."""
-    paths = quantities(scene)
-    numbers = [name for name, path in paths.items() if not isinstance(leaf(scene, path), Part)]
-    return [*numbers, STIFFNESS_RATIO, FREQUENCY_RATIO]
-
-
 def modes_over(
     scene: Scene, x: tuple[str, Any], y: tuple[str, Any], friction_slope: bool = True
 ) -> Modes:
     """The modes of Eq. 43 over two quantities, each a name and its values (n,) and (m,).
 
-    Names are those of `scene.replace`, and K_t/K_n at the scene's K_n, omega_1/omega_2 at its
-    omega_2. `friction_slope=False` leaves out the slope of the friction law, as the source does.
+    Names are those of `scene.replace`, and K_t/K_n, omega_1/omega_2 and mu (`quantities.py`).
+    `friction_slope=False` leaves out the slope of the friction law, as the source does.
 
     **Raises:** `ValueError` for an unknown name, two names of one quantity, values that are not
     one-dimensional or outside their domain, and for a scene that holds arrays.
     """
-    require_scalar(scene)
-    axes = {name: _values(scene, name, values) for name, values in (x, y)}
-    names = x[0], y[0]
-    if len({_target(scene, name) for name in names}) < 2:
-        raise ValueError(f"x and y must be two quantities, got {names[0]} and {names[1]}")
-    across, up = axes.values()
-    shape = up.size, across.size
-    grid = {
-        names[0]: jnp.broadcast_to(across[None, :], shape),
-        names[1]: jnp.broadcast_to(up[:, None], shape),
-    }
-    first, second, regime = _modes(scene.replace(**_changes(scene, grid)), friction_slope)
+    across, up, grid = grid_over(scene, x, y)
+    first, second, regime = _modes(grid, friction_slope)
     real, frequency = (jnp.stack(pair, axis=-1) for pair in zip(first, second, strict=True))
-    units = _unit(scene, names[0]), _unit(scene, names[1])
-    return Modes(names, units, across, up, real, frequency, regime)
+    units = unit(scene, x[0]), unit(scene, y[0])
+    return Modes((x[0], y[0]), units, across, up, real, frequency, regime)
 
 
-def _values(scene, name, values):
-    known = mapped_quantities(scene)
-    if name not in known:
-        raise ValueError(f"scene has no quantity {name!r}; it has {', '.join(known)}")
-    # A list as NumPy reads it; what is an array already may be traced.
-    values = number(name, values if hasattr(values, "dtype") else np.array(values))
-    if values.ndim != 1 or not values.size:
-        raise ValueError(f"the values of {name} must be a list, got shape {values.shape}")
-    return values
+def grid_over(
+    scene: Scene, x: tuple[str, Any], y: tuple[str, Any]
+) -> tuple[jax.Array, jax.Array, Scene]:
+    """The values (n,) and (m,) of two quantities, and the scene with both on the grid (m, n).
 
-
-def _target(scene: Scene, name: str) -> str:
-    """The quantity of the scene that a name changes."""
-    if name == STIFFNESS_RATIO:
-        return "stiffness_ratio" if scene.contact.fractal else "K_t"
-    return "omega_1" if name == FREQUENCY_RATIO else name
-
-
-def _unit(scene, name):
-    if name in (STIFFNESS_RATIO, FREQUENCY_RATIO):
-        return "-"
-    *owner, field = quantities(scene)[name]
-    fields = {f.name: f for f in dataclasses.fields(leaf(scene, tuple(owner)))}
-    return fields[field].metadata["unit"]
-
-
-def _changes(scene: Scene, grid: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
-    """What `scene.replace` takes, ratios multiplied by what they are ratios to."""
-    changes = {}
-    for name, values in grid.items():
-        if name == STIFFNESS_RATIO and not scene.contact.fractal:
-            values = number(name, values, at_least=0) * grid.get("K_n", scene.contact.K_n)
-        elif name == FREQUENCY_RATIO:
-            values = number(name, values, above=0) * grid.get("omega_2", scene.oscillator.omega_2)
-        changes[_target(scene, name)] = values
-    return changes
+    **Raises:** `ValueError` as `modes_over`.
+    """
+    require_scalar(scene)
+    names = x[0], y[0]
+    across, up = (axis_values(scene, name, values) for name, values in (x, y))
+    require_independent(scene, names)
+    shape = up.size, across.size
+    grid = jnp.broadcast_to(across[None, :], shape), jnp.broadcast_to(up[:, None], shape)
+    return across, up, replaced(scene, dict(zip(names, grid, strict=True)))
 
 
 @functools.partial(jax.jit, static_argnames="friction_slope")
@@ -144,14 +110,17 @@ def _in_pairs(s):
 # Figure and panel: variable, friction, K_n/(4e8 N/m). The axes are lost in the scan: these show
 # the whole unstable region, but for the friction above 1.
 _SOURCE = {
-    "7": ("mu", None, 1.0),
-    "8": ("mu", None, 8.0),
+    "7": (FRICTION, None, 1.0),
+    "8": (FRICTION, None, 8.0),
     "9a": (FREQUENCY_RATIO, 0.1, 1.0),
     "9b": (FREQUENCY_RATIO, 0.2, 1.0),
     "9c": (FREQUENCY_RATIO, 0.2, 0.4),
     "9d": (FREQUENCY_RATIO, 0.3, 1.0),
 }
-_SOURCE_RANGES = {"mu": ((0.0025, 1.0), (0.0025, 1.0)), FREQUENCY_RATIO: ((0.02, 6.0), (0.0, 1.6))}
+_SOURCE_RANGES = {
+    FRICTION: ((0.0025, 1.0), (0.0025, 1.0)),
+    FREQUENCY_RATIO: ((0.02, 6.0), (0.0, 1.6)),
+}
 SOURCE_PANELS = tuple(_SOURCE)
 
 

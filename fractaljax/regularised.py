@@ -12,13 +12,16 @@ import jax
 import jax.numpy as jnp
 import optimistix
 
+from .cycle import CycleResult, LimitCycle
 from .events import Cubic
-from .stick_slip import StickSlip
+from .scene import Scene
+from .stick_slip import StickSlip, scaled_start, stick_slip, units
 
 # Turns of the transient run, and those looked at for a period.
 _TRANSIENT = 64
 _LOOKED_AT = 6
 _LONGEST = 4
+_TOLERANCE = 1e-3  # of the relative difference from the exact law's cycle
 
 
 def field(t, y, args) -> jax.Array:
@@ -70,6 +73,16 @@ class Periodic(eqx.Module):
     turns: jax.Array
     found: jax.Array
     followed: jax.Array  # False where max_steps ended the integration
+
+
+class Smooth(eqx.Module):
+    """The motion as diffrax's dense solution over one period."""
+
+    solution: Any
+
+    def at(self, system: StickSlip, times) -> jax.Array:
+        """Scaled states (4, n) at scaled times (n,) within one period."""
+        return jax.vmap(self.solution.evaluate, out_axes=1)(times)
 
 
 def _turns(times, u):
@@ -163,3 +176,73 @@ def share(times, values, rates) -> jax.Array:
     zero = zero - flipped(zero) / jnp.where(slope == 0, 1, slope)
     below = jnp.where(starts == ends, starts, jnp.where(starts, zero, 1 - zero))
     return jnp.sum(below * h) / times[-1]
+
+
+@eqx.filter_jit
+def regularised_cycle(
+    scene: Scene, start, eps, exact: LimitCycle, solver, rtol: float, max_steps: int
+) -> LimitCycle:
+    """The limit cycle of the regularised law from a start (4,), beside the `exact` law's.
+
+    The arguments are those of `limit_cycle`, with eps in m/s.
+    """
+    system = stick_slip(scene)
+    y = scaled_start(scene, system, start)
+    closed = close(system, eps, y, solver, rtol, max_steps)
+    solution = solve(
+        system,
+        eps,
+        closed.y,
+        closed.period,
+        solver,
+        rtol,
+        max_steps,
+        t0=True,
+        steps=True,
+        dense=True,
+    )
+    times, states = nodes(solution)
+    rates = jax.vmap(lambda y: field(0.0, y, (system, eps)))(states)
+    low, high = extremes(times, states, rates) * units(system)[None]
+
+    def end(y):
+        # Tangents are less accurate than states at the same tolerance.
+        tight = rtol / 10, max_steps
+        return solve(system, eps, y, closed.period, solver, *tight, t1=True).ys[0]
+
+    width = eps / system.V
+    stuck = [
+        share(times, (1 - u) ** 2 - width**2, 2 * (u - 1) * a)
+        for u, a in zip(states.T[2:], rates.T[2:], strict=True)
+    ]
+    period = closed.period / system.omega
+    amplitude = (high - low)[:2]
+    differences = jnp.abs(
+        jnp.stack([period / exact.period - 1, *(amplitude / exact.amplitude - 1)])
+    )
+    error = jax.lax.stop_gradient(jnp.max(differences))
+    status = CycleResult.where(
+        error <= _TOLERANCE, CycleResult.converged, CycleResult.depends_on_eps
+    )
+    lost = CycleResult.where(closed.followed, CycleResult.not_periodic, CycleResult.too_stiff)
+    status = CycleResult.where(closed.found, status, lost)
+
+    def only(value):
+        return jnp.where(closed.found, value, jnp.nan)
+
+    return LimitCycle(
+        period=only(period),
+        amplitude=only(amplitude),
+        velocity_min=only(low[2:]),
+        velocity_max=only(high[2:]),
+        stick_fraction=only(jnp.stack(stuck)),
+        tension_fraction=only(share(times, states[:, 1], rates[:, 1])),
+        state=only(closed.y * units(system)),
+        error=only(jnp.asarray(rtol, y.dtype)),
+        turns=closed.turns,
+        regularisation_error=only(error),
+        result=status,
+        _monodromy=only(jax.jacfwd(end)(closed.y)),
+        _system=system,
+        _motion=Smooth(solution),
+    )

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .batches import in_batches
 from .constraints import Constraint
 from .parts import substitute
 from .scene import Scene
@@ -203,18 +204,6 @@ def _judge(problem: Problem, request: Request, us, conditions):
     return jax.vmap(lambda u, condition: problem.at(request, u, condition))(us, conditions)
 
 
-def _in_batches(program, batch: int, *arrays):
-    """A compiled program on NumPy arrays of any length, through one compiled shape."""
-    pieces = []
-    for i in range(0, len(arrays[0]), batch):
-        piece = [array[i : i + batch] for array in arrays]
-        short = batch - len(piece[0])
-        padded = [np.concatenate([x, np.repeat(x[-1:], short, axis=0)]) for x in piece]
-        results = jax.tree.leaves(program(*padded))
-        pieces.append([np.asarray(x, float)[: len(piece[0])] for x in results])
-    return [np.concatenate(x) for x in zip(*pieces, strict=True)]
-
-
 @dataclasses.dataclass(frozen=True)
 class Model:
     """A problem and its numbers, as functions of NumPy arrays."""
@@ -234,7 +223,8 @@ class Model:
             conditions = None if conditions is None else jnp.asarray(conditions, dtype)
             return _linearise(self.problem, self.request, us, conditions)
 
-        stacked, jacobian = _in_batches(program, self.batch, *given)
+        both = in_batches(program, self.batch, *given)
+        stacked, jacobian = (np.asarray(x, float) for x in both)
         return stacked[:, 0], stacked[:, 1:], jacobian[:, 0], jacobian[:, 1:]
 
     def judge(self, us, conditions):
@@ -246,7 +236,7 @@ class Model:
                 self.problem, self.request, jnp.asarray(us, dtype), jnp.asarray(conditions, dtype)
             )
 
-        return _in_batches(program, self.pairs, us, conditions)[0]
+        return np.asarray(in_batches(program, self.pairs, us, conditions), float)
 
     def judge_all(self, us, conditions):
         """Objective and requirements (n, m, 1 + k) of every surface at every condition."""

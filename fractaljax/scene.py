@@ -15,6 +15,31 @@ from .parts import Part, number, quantities, rebuild, require_scalar
 from .scene_file import parse, render, write_whole
 from .surfaces import Surface
 
+JOINT_LAWS: dict[str, dict[str, type[Part]]] = {
+    "contact": {"fractal": FractalContact, "fixed": FixedContact},
+    "friction": {"coulomb": Coulomb, "stribeck": Stribeck},
+}
+
+
+def friction_for(contact: Contact, friction: Friction) -> Friction:
+    """The friction law of a joint, checked against its contact.
+
+    **Raises:** `TypeError` for a part of the wrong kind; `ValueError` if the contact is fractal
+    and the smallest friction exceeds 0.9, where Eq. 19 ends.
+    """
+    require_kind("contact", contact, Contact)
+    require_kind("friction", friction, Friction)
+    if not contact.fractal:
+        return friction
+    checked = number(friction.lowest, friction.mu_m, at_most=MU_M_MAX)
+    return eqx.tree_at(lambda f: getattr(f, f.lowest), friction, checked)
+
+
+def require_kind(name: str, part: Any, kind: type[Part]) -> None:
+    """Refuse what is not a part of this kind."""
+    if not isinstance(part, kind):
+        raise TypeError(f"{name} must be a {kind.__name__}, got {part!r}")
+
 
 class Scene(Part):
     """Everything a question about stability needs, as one frozen pytree.
@@ -28,18 +53,9 @@ class Scene(Part):
     oscillator: Oscillator
 
     def __init__(self, contact, friction, oscillator):
-        for name, part, kind in [
-            ("contact", contact, Contact),
-            ("friction", friction, Friction),
-            ("oscillator", oscillator, Oscillator),
-        ]:
-            if not isinstance(part, kind):
-                raise TypeError(f"{name} must be a {kind.__name__}, got {part!r}")
-        if contact.fractal:
-            checked = number(friction.lowest, friction.mu_m, at_most=MU_M_MAX)
-            friction = eqx.tree_at(lambda f: getattr(f, f.lowest), friction, checked)
+        self.friction = friction_for(contact, friction)
+        require_kind("oscillator", oscillator, Oscillator)
         self.contact = contact
-        self.friction = friction
         self.oscillator = oscillator
 
     def replace(self, **changes: Any) -> "Scene":
@@ -89,11 +105,7 @@ class Scene(Part):
         write_whole(path, self.to_toml().encode())
 
 
-_LAWS: dict[str, dict[str, type[Part]]] = {
-    "contact": {"fractal": FractalContact, "fixed": FixedContact},
-    "friction": {"coulomb": Coulomb, "stribeck": Stribeck},
-    "oscillator": {"two directions": Oscillator},
-}
+_LAWS = JOINT_LAWS | {"oscillator": {"two directions": Oscillator}}
 
 
 @jax.jit

@@ -4,6 +4,7 @@ Each is jitted, so that a program that calls one many times traces it once.
 """
 
 import math
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,8 @@ _EXPREL = [1 / math.factorial(k + 1) for k in range(12, -1, -1)]
 _EXPREL_SLOPE = [(k + 1) / math.factorial(k + 2) for k in range(12, -1, -1)]
 
 
-def _polynomial(coefficients, x):
+def polynomial(coefficients: Sequence[float], x: jax.Array) -> jax.Array:
+    """The polynomial with these coefficients, highest power first; any shape."""
     value = jnp.full_like(x, coefficients[0])
     for coefficient in coefficients[1:]:
         value = value * x + coefficient
@@ -27,7 +29,7 @@ def exprel(x: jax.Array) -> jax.Array:
     """(exp(x) - 1) / x, with its limit 1 at x = 0; any shape."""
     near = jnp.abs(x) < _SERIES_RADIUS
     far, x = jnp.where(near, 1, x), jnp.where(near, x, 0)
-    return jnp.where(near, _polynomial(_EXPREL, x), (jnp.exp(far) - 1) / far)
+    return jnp.where(near, polynomial(_EXPREL, x), (jnp.exp(far) - 1) / far)
 
 
 @jax.jit
@@ -36,7 +38,7 @@ def _exprel_slope(x):
     near = jnp.abs(x) < _SERIES_RADIUS
     far, x = jnp.where(near, 1, x), jnp.where(near, x, 0)
     exp = jnp.exp(far)
-    return jnp.where(near, _polynomial(_EXPREL_SLOPE, x), (exp - (exp - 1) / far) / far)
+    return jnp.where(near, polynomial(_EXPREL_SLOPE, x), (exp - (exp - 1) / far) / far)
 
 
 exprel.defjvps(lambda dx, value, x: dx * _exprel_slope(x))

@@ -159,6 +159,12 @@ def start_state(start: Any) -> jax.Array:
     return start
 
 
+def scaled_start(scene: Scene, system: StickSlip, start) -> jax.Array:
+    """The start (4,) in scaled units, constant: by default the equilibrium with x1 displaced."""
+    y = rest(scene, system).at[0].add(1.0) if start is None else start / units(system)
+    return jax.lax.stop_gradient(y)
+
+
 def check_rtol(rtol: float) -> None:
     """Refuse a relative tolerance that means nothing."""
     if not 0 < rtol <= 0.1:

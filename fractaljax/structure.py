@@ -11,17 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .contact import MU_M_MAX, Contact, FixedContact, FractalContact
-from .friction import Coulomb, Friction, Stribeck
-from .parts import Part, Record, concrete, number, quantities, quantity, rebuild, require_scalar
-from .scene import Scene
+from .damping import modal_damping, rayleigh_damping
+from .friction import Friction
+from .matrices import array_of, fitting, mass_matrix
+from .parts import Part, Record, number, quantities, quantity, rebuild, require_scalar
+from .scene import JOINT_LAWS, Scene, friction_for
 from .scene_file import read, write_whole
 from .structure_file import npz_of, parse_structure, render_structure
-
-LAWS: dict[str, dict[str, type[Part]]] = {
-    "contact": {"fractal": FractalContact, "fixed": FixedContact},
-    "friction": {"coulomb": Coulomb, "stribeck": Stribeck},
-}
 
 
 class Joint(Part):
@@ -43,12 +39,7 @@ class Joint(Part):
     V: jax.Array | None = quantity("m/s", "sliding velocity")
 
     def __init__(self, contact, friction, tangential, normal, V=None):
-        for name, part, kind in [("contact", contact, Contact), ("friction", friction, Friction)]:
-            if not isinstance(part, kind):
-                raise TypeError(f"{name} must be a {kind.__name__}, got {part!r}")
-        if contact.fractal:
-            checked = number(friction.lowest, friction.mu_m, at_most=MU_M_MAX)
-            friction = eqx.tree_at(lambda f: getattr(f, f.lowest), friction, checked)
+        friction = friction_for(contact, friction)
         if V is None and friction.velocity_dependent:
             raise ValueError("V must be given for friction that depends on the sliding velocity")
         self.contact = contact
@@ -104,13 +95,13 @@ class Structure(Record):
     names: tuple[str, ...] | None = eqx.field(static=True)
 
     def __init__(self, M, C, K, joints, F=None, names=None):
-        M = _array("M", M)
+        M = array_of("M", M)
         if M.ndim != 2 or M.shape[0] != M.shape[1] or not M.size:
             raise ValueError(f"M must be a square matrix, got shape {M.shape}")
         n = M.shape[0]
-        self.M = _mass(M)
-        self.K = _fitting("K", K, (n, n))
-        self.C = jnp.zeros_like(self.K) if C is None else _fitting("C", C, (n, n))
+        self.M = mass_matrix(M)
+        self.K = fitting("K", K, (n, n))
+        self.C = jnp.zeros_like(self.K) if C is None else fitting("C", C, (n, n))
         self.names = _names(names, n)
         self.joints, self.joint_names = _joints(joints)
         self._check_joints()
@@ -118,7 +109,7 @@ class Structure(Record):
             given, F = F, np.zeros(n)
             for dof, force in given.items():
                 F[self.index(dof)] = number(f"F at {dof}", force)
-        self.F = None if F is None else _fitting("F", F, (n,))
+        self.F = None if F is None else fitting("F", F, (n,))
 
     @classmethod
     def from_scene(cls, scene: Scene) -> "Structure":
@@ -235,7 +226,7 @@ class Structure(Record):
         if matrices == path:
             raise ValueError(f"path must be that of the TOML file, got {str(path)!r}")
         require_single(self)
-        text = render_structure(self, matrices.name, LAWS).encode()
+        text = render_structure(self, matrices.name, JOINT_LAWS).encode()
         write_whole(matrices, npz_of(self))
         write_whole(path, text)
 
@@ -254,7 +245,7 @@ def load(path: str | os.PathLike) -> Scene | Structure:
 
 
 def _from_document(document, folder) -> Structure:
-    given = parse_structure(document, folder, LAWS)
+    given = parse_structure(document, folder, JOINT_LAWS)
     joints = {}
     for name, joint in given.pop("joints").items():
         try:
@@ -270,45 +261,6 @@ def _from_document(document, folder) -> Structure:
     return bare.replace(C=C) if damping else bare
 
 
-def rayleigh_damping(M, K, alpha, beta) -> jax.Array:
-    """C = alpha M + beta K (n, n) [N s/m], alpha in 1/s and beta in s.
-
-    **Raises:** `ValueError` unless alpha >= 0 and beta >= 0.
-    """
-    alpha, beta = number("alpha", alpha, at_least=0), number("beta", beta, at_least=0)
-    return alpha * jnp.asarray(M) + beta * jnp.asarray(K)
-
-
-def modal_damping(M, K, ratio) -> jax.Array:
-    """C (n, n) [N s/m] that gives every mode of M and K the damping ratio `ratio`.
-
-    `ratio` is a scalar, or (n,) in the order of rising frequency. C = L X diag(2 ratio omega)
-    X^T L^T with M = L L^T and X the eigenvectors of L^-1 K L^-T: differentiable where those
-    frequencies are distinct.
-
-    **Raises:** `ValueError` unless ratio >= 0 and K is symmetric.
-    """
-    M, K, ratio = _array("M", M), _array("K", K), number("damping_ratio", ratio, at_least=0)
-    if ratio.ndim and ratio.shape != K.shape[:1]:
-        raise ValueError(
-            f"damping_ratio must be a scalar or have shape {K.shape[:1]}, got shape {ratio.shape}"
-        )
-    values = concrete(K)
-    if values is not None and np.abs(values - values.T).max() > 1e-6 * np.abs(values).max():
-        raise ValueError("damping_ratio needs a symmetric K: others have no real modes")
-    L = jnp.linalg.cholesky(M)
-    squares, X = jnp.linalg.eigh(mass_normalised(L, K))
-    omega = jnp.sqrt(jnp.where(squares > 0, squares, 0))
-    LX = L @ X
-    return (LX * (2 * ratio * omega)[None]) @ LX.T
-
-
-def mass_normalised(L: jax.Array, X: jax.Array) -> jax.Array:
-    """L^-1 X L^-T (n, n): the matrix X in coordinates in which M = L L^T is the identity."""
-    half = jax.scipy.linalg.solve_triangular(L, X, lower=True)
-    return jax.scipy.linalg.solve_triangular(L, half.T, lower=True).T
-
-
 def require_single(structure: Structure) -> None:
     """Refuse a structure that holds a batch: `jax.vmap` takes many."""
     if structure.M.ndim != 2 or (structure.F is not None and structure.F.ndim != 1):
@@ -318,59 +270,6 @@ def require_single(structure: Structure) -> None:
         )
     for joint in structure.joints:
         require_scalar(joint)
-
-
-def _array(name: str, value) -> jax.Array:
-    value = value.toarray() if hasattr(value, "toarray") else value  # a sparse matrix
-    kind = f"{value.dtype} numbers" if hasattr(value, "dtype") else type(value).__name__
-    unfit = TypeError(f"{name} must be an array of real numbers, got {kind}")
-    if isinstance(value, (list, tuple)):
-        if any(isinstance(entry, str) for entry in jax.tree.leaves(value)):
-            raise unfit
-        try:
-            value = jnp.asarray(value)
-        except (ValueError, TypeError):  # ragged
-            raise unfit from None
-    try:
-        return number(name, value)
-    except TypeError:
-        raise unfit from None
-
-
-def _fitting(name: str, value, shape: tuple[int, ...]) -> jax.Array:
-    array = _array(name, value)
-    if array.shape != shape:
-        raise ValueError(f"{name} must have shape {shape} as M demands, got {array.shape}")
-    return array
-
-
-def _mass(M: jax.Array) -> jax.Array:
-    """M made exactly symmetric, or the reason why it is no mass matrix."""
-    values, half = concrete(M), (M + M.T) / 2
-    if values is None:
-        bad = ~jnp.isfinite(jnp.linalg.cholesky(half)).all()
-        return eqx.error_if(half, bad, "M must be positive definite")
-    diagonal = np.diagonal(values)
-    if diagonal.min() <= 0:
-        i = int(diagonal.argmin())
-        raise ValueError(
-            f"M must be positive definite, got {diagonal[i].item()} on its diagonal at {i}"
-        )
-    unit = values / np.sqrt(diagonal)[:, None] / np.sqrt(diagonal)[None]
-    uneven = np.abs(unit - unit.T)
-    if uneven.max() > 1e-6:
-        i, j = np.unravel_index(uneven.argmax(), uneven.shape)
-        raise ValueError(
-            f"M must be symmetric, got {values[i, j].item()} at ({i}, {j}) "
-            f"and {values[j, i].item()} at ({j}, {i})"
-        )
-    try:
-        pivot = np.diagonal(np.linalg.cholesky((unit + unit.T) / 2)).min() ** 2
-    except np.linalg.LinAlgError:
-        pivot = 0.0
-    if pivot <= len(unit) * np.finfo(unit.dtype).eps:
-        raise ValueError("M must be positive definite: some motion would have no kinetic energy")
-    return half
 
 
 def _names(names, n: int) -> tuple[str, ...] | None:

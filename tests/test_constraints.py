@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tools import reference_scene
+from tools import reference_scene, state_matrix
 
 import fractaljax as fj
 from fractaljax.constraints import (
@@ -16,8 +16,8 @@ from fractaljax.constraints import (
     NormalStiffness,
     RealContactArea,
     Roughness,
-    root_mean_square_height,
 )
+from fractaljax.roughness import root_mean_square_height
 
 ALL = {
     "K_n >= 4e+08 N/m": NormalStiffness(4e8),
@@ -44,43 +44,6 @@ def everything(scene):
 
     x = jnp.stack([scene.contact.surface.D, jnp.log(scene.contact.surface.G)])
     return values(x), jax.jacfwd(values)(x), jax.jacrev(values)(x)
-
-
-def height(surface, L, L_s, M, x, y, phases):
-    """Eq. 13 summed term by term, without its constant part."""
-    D, G, gamma = (float(part) for part in (surface.D, surface.G, surface.gamma))
-    n_max = int(math.log(L / L_s) / math.log(gamma))
-    z = np.zeros_like(x)
-    for m in range(1, M + 1):
-        along = np.hypot(x, y) * np.cos(np.arctan2(y, x) - math.pi * m / M)
-        for n in range(n_max + 1):
-            wave = 2 * math.pi * gamma**n * along / L
-            z -= gamma ** ((D - 3) * n) * np.cos(wave + phases[m - 1, n])
-    return L * (G / L) ** (D - 2) * math.sqrt(math.log(gamma) / M) * z
-
-
-@pytest.mark.parametrize(("D", "G", "gamma"), [(2.4, 1.342e-10, 1.5), (2.85, 1e-9, 1.3)])
-def test_roughness_of_synthesised_surfaces(D, G, gamma):
-    """The mean square of surfaces summed directly, over points spread far beyond L."""
-    surface, L, L_s, M = fj.Surface(D, G, gamma), 1e-3, 1e-4, 8
-    random = np.random.default_rng(1)
-    x, y = random.uniform(-50 * L, 50 * L, size=(2, 4000))
-    squares = [
-        np.mean(height(surface, L, L_s, M, x, y, random.uniform(0, 2 * math.pi, (M, 40))) ** 2)
-        for _ in range(12)
-    ]
-    expected = root_mean_square_height(surface, L, L_s)
-    assert math.sqrt(np.mean(squares)) == pytest.approx(float(expected), rel=0.01)
-
-
-def test_roughness_counts_its_waves():
-    """The sum over n term by term, where L/L_s is a power of gamma and just beside."""
-    surface = fj.Surface(2.5, 1e-10, 1.5)
-    for ratio, count in [(1.5**7, 8), (1.5**7 * 0.999, 7), (1.5**7 * 1.001, 8), (1.01, 1)]:
-        waves = sum(1.5 ** (2 * (2.5 - 3) * n) for n in range(count))
-        expected = 1e-3 * (1e-10 / 1e-3) ** 0.5 * math.sqrt(math.log(1.5) / 2 * waves)
-        found = root_mean_square_height(surface, 1e-3, 1e-3 / ratio)
-        assert found == pytest.approx(expected, rel=1e-13)
 
 
 def test_names():
@@ -191,19 +154,9 @@ def test_refusals(make, message):
 def test_damping_ratio_is_that_of_the_state_matrix():
     """The least -Re/|lambda| of the state matrix, stable and squealing."""
     for scene in (reference_scene(), reference_scene().replace(mu_s=0.1, mu_m=0.05)):
-        eigenvalues = np.linalg.eigvals(state_matrix(scene))
+        mu = scene.friction.coefficient(scene.oscillator.V)
+        A = state_matrix(scene.oscillator, mu, scene.contact.K_n, scene.contact.K_t)
+        eigenvalues = np.linalg.eigvals(A)
         expected = (-eigenvalues.real / np.abs(eigenvalues)).min()
         found = DampingRatio(0.0, friction_slope=False).measure(scene)
         np.testing.assert_allclose(found, expected, rtol=1e-9)
-
-
-def state_matrix(scene):
-    """Of Eq. 43, with constant friction."""
-    o, c = scene.oscillator, scene.contact
-    mu = float(scene.friction.coefficient(o.V))
-    K = [
-        [o.omega_1**2 + c.K_t / o.m, -mu * c.K_n / o.m],
-        [mu * c.K_t / o.m, o.omega_2**2 + c.K_n / o.m],
-    ]
-    C = np.diag([2 * o.xi_1 * o.omega_1, 2 * o.xi_2 * o.omega_2])
-    return np.block([[np.zeros((2, 2)), np.eye(2)], [-np.array(K, float), -C]])

@@ -15,10 +15,9 @@ from fractaljax.critical_friction import (
     coupling_reserve,
     critical_frequency,
     linearised,
-    sliding_friction,
-    with_friction_times,
 )
 from fractaljax.oscillator import Linearised
+from fractaljax.quantities import sliding_friction, with_friction_times
 from fractaljax.stability import _critical_eigenvalue
 
 _gradient = jax.jit(jax.grad(fj.critical_friction))

@@ -195,46 +195,6 @@ def test_motions_without_a_cycle():
     assert len(seen) == 3
 
 
-def test_one_period_of_the_simulated_motion_returns():
-    """The orbit is the one that `simulate`, which searches its events, runs through."""
-    scene, cycle = reference_scene(), reference_cycle()
-    times, states = cycle.orbit(64)
-    run = fj.simulate(scene, cycle.state, 1.5 * float(cycle.period))
-    states, scale = np.asarray(states), np.abs(states).max(axis=0)
-    np.testing.assert_allclose(np.asarray(run.at(times)) / scale, states / scale, atol=1e-10)
-    again = run.at(np.array([float(cycle.period)]))[0]
-    np.testing.assert_allclose(again / scale, cycle.state / scale, atol=1e-9)
-    switched = [(t, i) for t, i, _, _ in run.switches() if t < cycle.period]
-    assert [i for _, i in switched] == [s.direction for s in cycle.switches()]
-    np.testing.assert_allclose(
-        [t for t, _ in switched], [s.time for s in cycle.switches()], rtol=1e-9
-    )
-
-
-def test_multipliers_are_those_of_the_return_map():
-    """The nontrivial ones against differences of a simulated period; the trivial one is 1."""
-    scene, cycle = reference_scene(), reference_cycle()
-
-    def end(state):
-        return fj.simulate(scene, state, cycle.period).end
-
-    values = np.linalg.eigvals(np.asarray(jax.jacfwd(end)(cycle.state)))
-    order = np.argsort(-np.abs(values))
-    np.testing.assert_allclose(cycle.multipliers[:3], values[order][:3], atol=1e-8)
-    assert abs(cycle.multipliers[0] - 1) < 1e-9
-    assert abs(cycle.multipliers[3]) < 1e-9  # sticking forgets one direction of four
-
-
-def test_spectrum_rebuilds_the_orbit():
-    """Harmonics at multiples of 1/period, with the variance of the orbit."""
-    cycle = reference_cycle()
-    frequencies, lines = cycle.spectrum(256)
-    np.testing.assert_allclose(frequencies, np.arange(1, 129) * cycle.frequency, rtol=1e-12)
-    _, states = cycle.orbit(256)
-    variance = np.asarray(states[:, :2]).var(axis=0)
-    np.testing.assert_allclose((np.asarray(lines) ** 2).sum(axis=0) / 2, variance, rtol=1e-8)
-
-
 @pytest.mark.slow
 def test_error_falls_with_the_eighth_power():
     """Order of convergence in the number of segments, and the estimate that comes with it."""
@@ -328,18 +288,6 @@ def test_second_derivatives():
     assert float(jax.jit(jax.jacfwd(slope))(4e8)) == pytest.approx(float(difference), rel=1e-3)
 
 
-@pytest.mark.slow
-def test_coexisting_attractors():
-    """At K_n = 6e8 the starts end in several distinct cycles, each of them attracting."""
-    scene = reference_scene().replace(K_n=6e8, K_t=3e8)
-    found = fj.attractors(scene)
-    cycles = [cycle for cycle in found if np.isfinite(cycle.period)]
-    assert len(cycles) >= 2
-    periods = sorted(float(cycle.period) for cycle in cycles)
-    assert min(np.diff(periods)) > 1e-6
-    assert all(abs(cycle.multipliers[1]) < 1 for cycle in cycles)
-
-
 def test_mass_on_a_belt_under_constant_load():
     """K_t = 0 and F < 0: x2 rests, and x1 is the classic stick-slip oscillator with load K_n x2.
 
@@ -388,11 +336,6 @@ def test_bad_arguments(arguments, message):
     """One line that names the argument, what it must be and what it was."""
     with pytest.raises(ValueError, match=message):
         fj.limit_cycle(reference_scene(), **arguments)
-
-
-def test_bad_starts_of_attractors():
-    with pytest.raises(ValueError, match=r"starts must have shape \(k, 4\), got \(4,\)"):
-        fj.attractors(reference_scene(), [0.0, 0.0, 0.0, 0.0])
 
 
 def test_a_fixed_contact_traces_no_contact_law():

@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tools import reference_scene
+from tools import reference_scene, state_matrix
 
 import fractaljax as fj
-from fractaljax.maps import SOURCE_PANELS, mapped_quantities, source_modes, source_scene
+from fractaljax.maps import SOURCE_PANELS, source_modes, source_scene
 
 MU, KAPPA = np.linspace(0.02, 1, 13), np.linspace(0.0, 1.4, 11)
 
@@ -22,12 +22,7 @@ def constant_friction(mu=0.4, **changes):
 
 def lapack_modes(scene, mu, K_n, K_t):
     """Pairs (real part, frequency) of the two modes, the lower frequency first."""
-    o = scene.oscillator
-    m, w_1, w_2, xi_1, xi_2 = (float(x) for x in (o.m, o.omega_1, o.omega_2, o.xi_1, o.xi_2))
-    A = np.zeros((4, 4))
-    A[:2, 2:] = np.eye(2)
-    A[2:, :2] = -np.array([[w_1**2 + K_t / m, -mu * K_n / m], [mu * K_t / m, w_2**2 + K_n / m]])
-    A[2:, 2:] = -np.diag([2 * xi_1 * w_1, 2 * xi_2 * w_2])
+    A = state_matrix(scene.oscillator, mu, K_n, K_t)
     s = sorted(np.linalg.eigvals(A), key=lambda s: -s.real)
     upper, real = [z for z in s if z.imag > 0], [z for z in s if z.imag == 0]
     chosen = (upper + real)[:2]
@@ -77,6 +72,19 @@ def test_ratios_are_to_what_the_grid_says():
         assert modes.growth_rate[i, j] == pytest.approx(growth, rel=1e-10)
 
 
+def test_friction_at_the_belt_velocity_scales_the_law():
+    """The mu of a Stribeck law is that at the velocity of the same point."""
+    scene, mu, V = reference_scene(), np.array([0.2, 0.5]), np.array([0.1, 0.15, 0.3])
+    modes = fj.modes_over(scene, ("mu", mu), ("V", V))
+    assert modes.units == ("-", "m/s")
+    for i, j in np.ndindex(3, 2):
+        factor = mu[j] / float(scene.friction.coefficient(V[i]))
+        moved = scene.replace(mu_s=0.4 * factor, mu_m=0.25 * factor, V=V[i])
+        assert modes.growth_rate[i, j] == pytest.approx(float(fj.growth_rate(moved)), rel=1e-9)
+    with pytest.raises(ValueError, match="must be independent, got mu and mu_s"):
+        fj.modes_over(scene, ("mu", mu), ("mu_s", mu))
+
+
 def test_fractal_joint_over_its_surface():
     """The whole chain with the slope of the friction law, and the regime of every point."""
     brake = fj.brake_scene()
@@ -118,8 +126,8 @@ def test_derivatives_to_axes_and_scene(mode):
     [
         (("nu", [0.3]), ("mu", [0.1]), "scene has no quantity 'nu'; it has K_n, K_t, mu, m, "),
         (("mu", [0.1]), ("contact", [0.3]), "scene has no quantity 'contact'"),
-        (("mu", [0.1]), ("mu", [0.3]), "x and y must be two quantities, got mu and mu"),
-        (("K_t", [1e8]), ("K_t/K_n", [0.3]), "must be two quantities, got K_t and K_t/K_n"),
+        (("mu", [0.1]), ("mu", [0.3]), "must be independent, got mu and mu"),
+        (("K_t", [1e8]), ("K_t/K_n", [0.3]), "must be independent, got K_t and K_t/K_n"),
         (("mu", [0.0, 1.0]), ("K_n", [1e8]), "mu must be above 0, got 0.0"),
         (("mu", [0.5]), ("K_t/K_n", [0.1, -0.1]), "K_t/K_n must be at least 0, got -0.1"),
         (("mu", [0.5]), ("omega_1/omega_2", [0.0]), "omega_1/omega_2 must be above 0, got 0.0"),
@@ -138,13 +146,6 @@ def test_scene_of_arrays_is_refused():
         fj.modes_over(
             constant_friction().replace(mu=np.array([0.1, 0.2])), ("K_n", [1e8]), ("K_t", [1e8])
         )
-
-
-def test_names_are_those_of_the_scene_and_two_ratios():
-    """No part among them."""
-    names = ["K_n", "K_t", "mu", "m", "omega_1", "omega_2", "xi_1", "xi_2", "F", "V"]
-    assert mapped_quantities(constant_friction()) == [*names, "K_t/K_n", "omega_1/omega_2"]
-    assert "surface" not in mapped_quantities(fj.brake_scene())
 
 
 def test_source_panels():

@@ -5,6 +5,7 @@ import matplotlib.pyplot
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from tools import assert_whole, labels
 
 import fractaljax as fj
 from fractaljax.maps import source_modes
@@ -13,19 +14,6 @@ from fractaljax.maps import source_modes
 @pytest.fixture(scope="module")
 def modes():
     return source_modes("7", 60)
-
-
-def labels(ax):
-    return [text.get_text() for text in ax.get_legend().get_texts()]
-
-
-def assert_whole(figure):
-    """Nothing is cut off."""
-    figure.draw_without_rendering()
-    for ax in figure.axes:
-        box = ax.get_tightbbox()
-        assert figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1
-        assert figure.bbox.y0 <= box.y0 and box.y1 <= figure.bbox.y1
 
 
 def boundary_of(ax):

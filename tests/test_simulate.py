@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from filippov import PLAIN, Mechanism, run
+from tools import state_matrix
 
 import fractaljax as fj
 
@@ -206,10 +207,7 @@ def test_mass_on_the_belt():
 def test_linear_motion():
     """Coulomb friction without a switch is a linear equation: the matrix exponential."""
     m = replace(PLAIN, mu_s=0.3, mu_m=0.3, F=300.0)  # the equilibrium attracts
-    matrix, force = np.zeros((4, 4)), np.zeros(4)
-    matrix[0, 2] = matrix[1, 3] = 1
-    matrix[2] = [-(m.omega_1**2 + m.K_t / m.m), m.mu_s * m.K_n / m.m, -2 * m.xi_1 * m.omega_1, 0]
-    matrix[3] = [-m.mu_s * m.K_t / m.m, -(m.omega_2**2 + m.K_n / m.m), 0, -2 * m.xi_2 * m.omega_2]
+    matrix, force = state_matrix(scene_of(m).oscillator, m.mu_s, m.K_n, m.K_t), np.zeros(4)
     force[2:] = np.array([1, -1]) * m.F / np.sqrt(2) / m.m
     still = np.linalg.solve(matrix, -force)
     start = still + 0.1 * units(m) * [1, -2, 0.5, 1]

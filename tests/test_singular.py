@@ -11,6 +11,7 @@ from fractaljax.singular import (
     boxcox,
     exp_or_inf,
     exprel,
+    polynomial,
     positive_cbrt,
     positive_sqrt,
     safe_divide,
@@ -25,6 +26,15 @@ FORWARD = {"first": jax.jacfwd, "second": lambda f: jax.jacfwd(jax.jacfwd(f))}
 REVERSE = {"first": jax.jacrev, "second": lambda f: jax.jacrev(jax.jacrev(f))}
 MIXED = {"first": jax.grad, "second": lambda f: jax.jacfwd(jax.jacrev(f))}
 MODES = pytest.mark.parametrize("mode", [FORWARD, REVERSE, MIXED], ids=["fwd", "rev", "mixed"])
+
+
+def test_polynomial_has_its_highest_power_first():
+    x = np.linspace(-2, 2, 6).reshape(2, 3)
+    found = polynomial([3.0, -1.0, 0.0, 0.5], jnp.asarray(x))
+    np.testing.assert_allclose(found, 3 * x**3 - x**2 + 0.5, rtol=1e-14)
+    slope = jax.grad(lambda x: polynomial([3.0, -1.0, 0.0, 0.5], x))(0.7)
+    assert slope == pytest.approx(9 * 0.7**2 - 2 * 0.7, rel=1e-14)
+    assert polynomial([1.0, 2.0], jnp.float32(3)).dtype == jnp.float32
 
 
 def exprel_truth(x):

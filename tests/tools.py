@@ -29,6 +29,14 @@ def reference_scene() -> fj.Scene:
     )
 
 
+def state_matrix(o: fj.Oscillator, mu, K_n, K_t) -> np.ndarray:
+    """Of Eq. 43, (4, 4): constant friction mu on a joint of known stiffness."""
+    m, w_1, w_2, xi_1, xi_2 = (float(x) for x in (o.m, o.omega_1, o.omega_2, o.xi_1, o.xi_2))
+    K = np.array([[w_1**2 + K_t / m, -mu * K_n / m], [mu * K_t / m, w_2**2 + K_n / m]], float)
+    C = np.diag([2 * xi_1 * w_1, 2 * xi_2 * w_2])
+    return np.block([[np.zeros((2, 2)), np.eye(2)], [-K, -C]])
+
+
 def motionless_scene() -> fj.Scene:
     """The same with little friction and much damping: steady sliding attracts."""
     return reference_scene().replace(mu_s=0.05, mu_m=0.04, xi_1=0.05, xi_2=0.05)
@@ -99,3 +107,17 @@ def joints(**changes):
         for name, values in zip(changes, changed, strict=True)
     }
     return jax.tree.map(lambda x: x[: changed[0].size], every_joint(jnp.float64, columns))
+
+
+def labels(ax) -> list[str]:
+    """The words of a legend."""
+    return [text.get_text() for text in ax.get_legend().get_texts()]
+
+
+def assert_whole(figure, artists=None) -> None:
+    """Nothing is cut off: of some artists, or of all axes with their labels and legends."""
+    figure.draw_without_rendering()
+    for artist in figure.axes if artists is None else artists:
+        box = artist.get_tightbbox()
+        assert figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1
+        assert figure.bbox.y0 <= box.y0 and box.y1 <= figure.bbox.y1

@@ -1,19 +1,13 @@
 """The stability boundary in a window of two quantities."""
 
-import dataclasses
 from typing import Any
 
 import numpy as np
 
-from ..boundary import Boundary, BranchEnd, is_logarithmic
-from ..parts import Part
+from ..boundary import Boundary, BranchEnd
+from ..quantities import label
+from ..ranges import is_logarithmic
 from .axes import legend_above, new_axes
-
-_LABELS = {
-    "K_t/K_n": "stiffness ratio K_t/K_n [-]",
-    "omega_1/omega_2": "ratio of natural frequencies ω₁/ω₂ [-]",
-    "mu": "friction coefficient at the belt velocity µ [-]",
-}
 
 
 def boundary(result: Boundary, ax: Any = None) -> Any:
@@ -24,9 +18,9 @@ def boundary(result: Boundary, ax: Any = None) -> Any:
 
     ax = new_axes() if ax is None else ax
     for name, window in (("x", result.x), ("y", result.y)):
-        getattr(ax, f"set_{name}scale")("log" if is_logarithmic(window) else "linear")
+        getattr(ax, f"set_{name}scale")("log" if is_logarithmic(*window[1:]) else "linear")
         getattr(ax, f"set_{name}lim")(window[1], window[2])
-        getattr(ax, f"set_{name}label")(_label(result.scene, window[0]))
+        getattr(ax, f"set_{name}label")(label(result.scene, window[0]))
     if not result.branches:
         words = "it squeals" if result.squeals else "stable"
         ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", va="center")
@@ -58,20 +52,3 @@ def boundary(result: Boundary, ax: Any = None) -> Any:
         handles += ax.plot(*np.transpose(broken), "o", ms=5, **style)
     legend_above(ax, handles)
     return ax
-
-
-def _label(scene, name) -> str:
-    """Meaning, symbol and unit of a quantity."""
-    return _found(scene, name) or _LABELS[name]
-
-
-def _found(part, name):
-    for field in dataclasses.fields(part):
-        value = getattr(part, field.name)
-        if isinstance(value, Part):
-            if label := _found(value, name):
-                return label
-        elif field.name == name:
-            meaning = field.metadata["meaning"].split(";")[0].split(",")[0]
-            return f"{meaning} {name} [{field.metadata['unit']}]"
-    return None
