@@ -15,25 +15,9 @@ import jax.numpy as jnp
 
 from .contact import ContactState
 from .parts import Record, number
+from .roughness import root_mean_square_height
 from .scene import Scene, stiffness
 from .stability import stability
-from .surfaces import Surface
-
-
-def root_mean_square_height(surface: Surface, L, L_s) -> jax.Array:
-    """Sq [m]: the height of Eq. 13 about its mean plane, over wavelengths from L to L_s [m].
-
-    With independent phases the frequencies add up: every one of the M gamma^n of them has the
-    mean square 1/2 of a cosine, so M cancels and
-    Sq^2 = L^2 (G/L)^(2D-4) ln(gamma)/2 sum_{n=0..n_max} gamma^(2(D-3)n),
-    n_max = int(ln(L/L_s)/ln gamma). Any shape; an expectation, that of an area much larger than L.
-    """
-    D, log_gamma = surface.D, jnp.log(surface.gamma)
-    # A ratio that is a power of gamma belongs to it, whatever its rounding.
-    count = 1 + jnp.floor(jnp.log(L / L_s) / log_gamma + 1e-9)
-    exponent = 2 * (D - 3) * log_gamma
-    modes = jnp.expm1(count * exponent) / jnp.expm1(exponent)
-    return L * (surface.G / L) ** (D - 2) * jnp.sqrt(log_gamma / 2 * modes)
 
 
 class Constraint(Record):

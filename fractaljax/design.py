@@ -20,19 +20,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from . import tolerance as scatter
+from . import constraints as limits, tolerance as scatter
 from .envelope import Envelope, condition_text
 from .report import comparison_table, table
+from .roughness import Roughness, roughness
 from .scene import Scene
 from .search import search
 from .stability import growth_rate, growth_rate_of
 from .task import DEFAULT_BOUNDS, Task, pose
+from .topography import Topographies, topography
 from .worst_case import Verdict
 
 _STEPS, _ROBUST_STEPS = (80, 40), (30, 25)
 _ACTIVE = 100  # a requirement met by less than this many times the slack is called active
 _SAMPLES = 100_000  # surfaces drawn for the probability of squeal
 _ROWS = 64  # of a history, described at once
+_WAVELENGTHS = (1e-3, 1e-6)  # [m], of the roughness that is reported
 
 
 class DesignResult(eqx.Enumeration):
@@ -74,6 +77,41 @@ class Design:
         """The result in words."""
         return DesignResult[self.result]
 
+    @property
+    def wavelengths(self) -> tuple[float, float]:
+        """Longest and shortest [m] that roughness counts: of a limit on Sq, or 1 mm and 1 um."""
+        for asked in self.options["constraints"]:
+            if isinstance(asked, limits.Roughness):
+                return float(asked.L), float(asked.L_s)
+        return _WAVELENGTHS
+
+    def roughness(self, L=None, L_s=None) -> tuple[Roughness, Roughness]:
+        """Sq [m], Sa [m] and Sdq of the given and of the designed surface, as `roughness` says.
+
+        Over wavelengths from L to L_s [m], by default those of `wavelengths`.
+        """
+        longest, shortest = self.wavelengths
+        band = longest if L is None else L, shortest if L_s is None else L_s
+        before, after = (roughness(s.contact.surface, *band) for s in (self.initial, self.scene))
+        return before, after
+
+    def topographies(self, n: int = 1024, *, L=None, L_s=None, M=10, key=None) -> Topographies:
+        """Both surfaces on a grid of n x n points with the same phases: one sees what changed.
+
+        L and L_s [m] are by default those of `wavelengths`, but L_s no less than 2 L/n, and `key`
+        that of the design's seed; the rest, and errors, as `topography`.
+        """
+        longest, shortest = self.wavelengths
+        L = longest if L is None else L
+        key = jax.random.key(self.options["seed"]) if key is None else key
+        if L_s is None and 2 * L / n < shortest:
+            L_s = shortest
+        before, after = (
+            np.asarray(topography(scene.contact.surface, L, n, key=key, L_s=L_s, M=M))
+            for scene in (self.initial, self.scene)
+        )
+        return Topographies(before, after, float(L) / n)
+
     def save(self, path: str | os.PathLike) -> None:
         """Write scenes, options, results and history to a TOML file, for `repeat_design`.
 
@@ -84,7 +122,9 @@ class Design:
         save_design(self, path)
 
     def __repr__(self) -> str:
-        lines = [comparison_table(self.initial, self.scene, self.friction_slope, self.active)]
+        shown = self.initial, self.scene, self.friction_slope, self.active, self.wavelengths
+        L, L_s = self.wavelengths
+        lines = [comparison_table(*shown), f"Sq and Sdq: wavelengths from {L:g} to {L_s:g} m"]
         lines += self._under_conditions()
         lines += [f"not met: {name}" for name in self.violated]
         return "\n".join([*lines, self.outcome])

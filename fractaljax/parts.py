@@ -1,5 +1,6 @@
 """The parts a scene is made of: frozen pytrees of named, checked quantities."""
 
+import contextlib
 import dataclasses
 import math
 from collections.abc import Mapping
@@ -37,7 +38,10 @@ def number(
             raise TypeError
         # An explicit dtype also strips weak types, which would compile every caller twice.
         is_float_array = hasattr(value, "dtype") and jnp.issubdtype(dtype, jnp.floating)
-        array = jnp.asarray(value, dtype=dtype if is_float_array else float)
+        traced = isinstance(value, jax.core.Tracer)
+        # A value that is known while a program is traced stays known.
+        with contextlib.nullcontext() if traced else jax.ensure_compile_time_eval():
+            array = jnp.asarray(value, dtype=dtype if is_float_array else float)
     except (TypeError, ValueError, OverflowError):
         raise TypeError(f"{name} must be a real number, got {value!r}") from None
 
@@ -82,7 +86,7 @@ def ordered(name: str, value: jax.Array, other_name: str, other: jax.Array) -> j
 def concrete(array: jax.Array) -> np.ndarray | None:
     """The values of an array, or None while a compiled program is being traced."""
     # Inside an eager `jax.grad` the primal is concrete, and a message can name it.
-    primal = jax.lax.stop_gradient(array)
+    primal = jax.lax.stop_gradient(array) if isinstance(array, jax.core.Tracer) else array
     return None if isinstance(primal, jax.core.Tracer) else np.asarray(primal)
 
 

@@ -4,8 +4,10 @@ import jax.numpy as jnp
 
 from .complex_modes import UNSUPPORTED, assemble
 from .contact import Regime
-from .critical_friction import critical_friction, sliding_friction
-from .limit_cycle import CycleResult, LimitCycle
+from .critical_friction import critical_friction
+from .cycle import CycleResult, LimitCycle
+from .quantities import sliding_friction
+from .roughness import roughness
 from .scene import Scene, stiffness
 from .stability import stability
 from .structure import Joint, Structure
@@ -15,14 +17,22 @@ _LEAST_DAMPED = 10  # stable modes of a structure that its table lists
 _MODES = {"+": "slips, dx/dt < V", "-": "slips, dx/dt > V", "stick": "sticks"}
 
 
-def scene_rows(scene: Scene, friction_slope: bool = True) -> dict[str, str]:
-    """What a scene's joint and its critical mode are like: row titles with units, and values."""
+def scene_rows(
+    scene: Scene, friction_slope: bool = True, wavelengths: tuple[float, float] | None = None
+) -> dict[str, str]:
+    """What a scene's joint and its critical mode are like: row titles with units, and values.
+
+    With the longest and the shortest of the `wavelengths` [m] to count, the roughness as well.
+    """
     K_n, K_t = (float(K) for K in stiffness(scene))
     modes = stability(scene, friction_slope)
     rows = {}
     if scene.contact.fractal:
         surface = scene.contact.surface
         rows |= {"D": f"{surface.D:.6g}", "G [m]": f"{surface.G:.6g}"}
+        if wavelengths is not None:
+            rough = roughness(surface, *wavelengths)
+            rows |= {"Sq [m]": f"{rough.Sq:.6g}", "Sdq": f"{rough.Sdq:.6g}"}
     rows |= {
         "K_n [N/m]": f"{K_n:.6g}",
         "K_t [N/m]": f"{K_t:.6g}",
@@ -172,9 +182,11 @@ def _switching(switches, period) -> str:
     return table(list(columns), rows) + "\ntime 0: x1 is largest"
 
 
-def comparison_table(before: Scene, after: Scene, friction_slope: bool, active) -> str:
+def comparison_table(
+    before: Scene, after: Scene, friction_slope: bool, active, wavelengths=None
+) -> str:
     """Two scenes side by side, and the requirements the second one meets with nothing to spare."""
-    columns = [scene_rows(scene, friction_slope) for scene in (before, after)]
+    columns = [scene_rows(scene, friction_slope, wavelengths) for scene in (before, after)]
     names = list(active) or [_ABSENT]
     for i, name in enumerate(names):
         columns[0]["active constraints" if i == 0 else " " * i] = _ABSENT if i == 0 else ""

@@ -1,6 +1,7 @@
 """Machined surfaces, described by their fractal parameters."""
 
 import jax
+import jax.numpy as jnp
 
 from .parts import Part, number, quantity
 
@@ -19,3 +20,10 @@ class Surface(Part):
         self.D = number("D", D, above=2, below=3)
         self.G = number("G", G, above=0)
         self.gamma = number("gamma", gamma, above=1)
+
+
+def frequency_count(gamma, ratio, xp=jnp):
+    """n_max + 1 of Eq. 13, n_max = int(ln(L/L_s)/ln gamma), `ratio` being L/L_s; any shape."""
+    # A ratio that is a power of gamma belongs to it, whatever its rounding.
+    rounding = float(jnp.finfo(gamma.dtype).eps) ** 0.6
+    return 1 + xp.floor(xp.log(ratio) / xp.log(gamma) + rounding)

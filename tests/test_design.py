@@ -1,7 +1,9 @@
 """Designs against a fine grid, on every kind of request, and the refusals."""
 
+import dataclasses
 import math
 import random
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -591,3 +593,66 @@ def test_fixed_contact_has_no_surface(scene):
     """A joint of given stiffness cannot be designed."""
     with pytest.raises(ValueError, match="a FixedContact has no surface to change"):
         fj.design(scene.replace(contact=fj.FixedContact(4e8, 2e8)))
+
+
+# ---------------------------------------------------------------------------------------------
+# The way back: from D and G to a surface
+# ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def best(scene):
+    return fj.design(scene, progress=False)
+
+
+def test_roughness_before_and_after(best):
+    """Printed and as data, over 1 mm to 1 um, or over the lengths that are asked for."""
+    for band in ((), (5e-4, 1e-5)):
+        for found, side in zip(best.roughness(*band), (best.initial, best.scene), strict=True):
+            expected = fj.roughness(side.contact.surface, *(band or (1e-3, 1e-6)))
+            assert (found.Sq, found.Sdq) == (expected.Sq, expected.Sdq)
+    before, after = best.roughness()
+    lines = [line.split() for line in repr(best).splitlines()]
+    assert ["Sq", "[m]", f"{before.Sq:.6g}", f"{after.Sq:.6g}"] in lines
+    assert ["Sdq", f"{before.Sdq:.6g}", f"{after.Sdq:.6g}"] in lines
+    assert "Sq and Sdq: wavelengths from 0.001 to 1e-06 m" in repr(best)
+
+
+def test_roughness_of_a_limited_design_counts_its_wavelengths(best):
+    """What is printed is what was limited."""
+    limit = fj.constraints.Roughness(at_most=1e-6, L=5e-4, L_s=1e-5)
+    best = dataclasses.replace(best, options=best.options | {"constraints": (limit,)})
+    assert best.wavelengths == (5e-4, 1e-5)
+    assert best.roughness()[1].Sq == limit.measure(best.scene)
+    assert "wavelengths from 0.0005 to 1e-05 m" in repr(best)
+    z = best.topographies(256).after
+    surface, key = best.scene.contact.surface, jax.random.key(0)
+    np.testing.assert_array_equal(z, fj.topography(surface, 5e-4, 256, key=key, L_s=1e-5))
+
+
+def test_topographies_have_the_same_phases(best):
+    """Those of both surfaces by one key, that of the seed if none is given; NumPy in metres."""
+    found = best.topographies(16)
+    assert found.dx == 1e-3 / 16 and type(found.before) is np.ndarray
+    for z, side in ((found.before, best.initial), (found.after, best.scene)):
+        same = fj.topography(side.contact.surface, 1e-3, 16, key=jax.random.key(0))
+        np.testing.assert_array_equal(z, same)
+    assert np.corrcoef(found.before.ravel(), found.after.ravel())[0, 1] > 0.98
+    other = best.topographies(16, L=2e-3, L_s=1e-4, M=4, key=jax.random.key(1))
+    surface = best.scene.contact.surface
+    same = fj.topography(surface, 2e-3, 16, key=jax.random.key(1), L_s=1e-4, M=4)
+    np.testing.assert_array_equal(other.after, same)
+
+
+def test_a_design_samples_no_surface(scene, tmp_path, monkeypatch):
+    """Neither to be found, nor to be printed and saved."""
+
+    def refuse(*_, **__):
+        raise AssertionError
+
+    monkeypatch.setattr(sys.modules["fractaljax.design"], "topography", refuse)
+    best = fj.design(scene, progress=False)
+    best.save(tmp_path / "run.toml")
+    assert "Sdq" in repr(best)
+    with pytest.raises(AssertionError):
+        best.topographies()

@@ -346,3 +346,19 @@ def test_require_scalar():
     with pytest.raises(ValueError, match=message):
         jax.jit(require_scalar)(many)
     jax.vmap(lambda G: require_scalar(rebuild(CONTACT, {"G": G})))(many.surface.G)
+
+
+def test_what_is_known_stays_known_while_a_program_is_traced():
+    """Quantities that are no argument of it have values, and are refused at once."""
+
+    @jax.jit
+    def look(D):
+        surface = fj.Surface(D, 1e-10, gamma=1.4)
+        again = fj.brake_scene().replace(D=D).contact.surface
+        known.extend(concrete(x) for x in (surface.D, surface.G, surface.gamma, again.gamma))
+        with pytest.raises(ValueError, match=r"G must be above 0, got -1\.0"):
+            fj.Surface(D, -1.0)
+        return surface.gamma
+
+    known = []
+    assert look(2.4) == 1.4 and known == [None, 1e-10, 1.4, 1.5]

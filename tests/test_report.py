@@ -35,6 +35,18 @@ def test_rows_agree_with_the_library():
     assert float(constant["growth rate [1/s]"]) == float(f"{fj.growth_rate(scene, False):.6g}")
 
 
+def test_roughness_where_wavelengths_are_given():
+    """That of the surface, after its D and G; a joint without a surface has none."""
+    scene = fj.brake_scene()
+    rows = scene_rows(scene, wavelengths=(1e-3, 1e-5))
+    assert list(rows)[:5] == ["D", "G [m]", "Sq [m]", "Sdq", "K_n [N/m]"]
+    rough = fj.roughness(scene.contact.surface, 1e-3, 1e-5)
+    assert (rows["Sq [m]"], rows["Sdq"]) == (f"{rough.Sq:.6g}", f"{rough.Sdq:.6g}")
+    fixed = scene.replace(contact=fj.FixedContact(4e8, 2e8))
+    assert scene_rows(fixed, wavelengths=(1e-3, 1e-5)) == scene_rows(fixed)
+    assert "Sq" not in comparison_table(fixed, fixed, True, (), (1e-3, 1e-5))
+
+
 def test_fixed_contact_has_no_surface_rows():
     """Nothing is shown that the scene does not have."""
     scene = fj.brake_scene().replace(contact=fj.FixedContact(4e8, 2e8))

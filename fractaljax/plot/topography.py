@@ -1,0 +1,63 @@
+"""Heights of a surface, and of the surfaces before and after a design."""
+
+from typing import Any
+
+import numpy as np
+
+from ..design import Design
+from .axes import new_axes, new_figure
+
+
+def topography(z: Any, dx: float, ax: Any = None, *, dy: float | None = None) -> Any:
+    """Heights [um] of a map z (n, m) [m] about their mean; x [um] along its first axis.
+
+    Points are dx [m] apart, and dy (dx, if not given) along the second axis; NaN is left white.
+
+    **Raises:** `ValueError` for a z that is no map or holds no height, and unless dx, dy > 0.
+    """
+    z = np.asarray(z, float)
+    if z.ndim != 2 or not np.isfinite(z).any():
+        raise ValueError(f"z must be a map (n, m) of heights, got shape {z.shape}")
+    steps = dx, dx if dy is None else dy
+    if not all(np.isfinite(step) and step > 0 for step in steps):
+        raise ValueError(f"dx and dy must be above 0, got {steps[0]!r} and {steps[1]!r}")
+    ax = new_axes() if ax is None else ax
+    heights = _about_mean(z)
+    image = _draw(ax, heights, steps, np.nanmin(heights), np.nanmax(heights))
+    ax.figure.colorbar(image, ax=ax, pad=0.02).set_label("height about the mean [µm]")
+    return ax
+
+
+def topographies(design: Design, **options: Any) -> Any:
+    """The given and the designed surface side by side, at one colour scale; returns the figure.
+
+    `options` are those of `Design.topographies`.
+    """
+    surfaces = design.topographies(**options)
+    heights = [_about_mean(z) for z in (surfaces.before, surfaces.after)]
+    low, high = min(z.min() for z in heights), max(z.max() for z in heights)
+    figure = new_figure(11.2, 5.4)
+    words = "given surface", "designed surface" if not design.violated else "best found"
+    scenes = design.initial, design.scene
+    figure.get_layout_engine().set(wspace=0.06)
+    axes = figure.subplots(1, 2, sharey=True)
+    for ax, z, word, scene in zip(axes, heights, words, scenes, strict=True):
+        image = _draw(ax, z, (surfaces.dx, surfaces.dx), low, high)
+        surface = scene.contact.surface
+        ax.set_title(f"{word}: D = {surface.D:.5g}, G = {surface.G:.4g} m", fontsize="medium")
+        ax.label_outer()
+    figure.colorbar(image, ax=axes, pad=0.02).set_label("height about the mean [µm]")
+    return figure
+
+
+def _about_mean(z):
+    return (z - np.nanmean(z)) * 1e6
+
+
+def _draw(ax, heights, steps, low, high):
+    extent = [0, heights.shape[0] * steps[0] * 1e6, 0, heights.shape[1] * steps[1] * 1e6]
+    style: dict[str, Any] = {"cmap": "cividis", "origin": "lower", "extent": extent}
+    image = ax.imshow(heights.T, vmin=low, vmax=high, **style)
+    ax.set_xlabel("x [µm]")
+    ax.set_ylabel("y [µm]")
+    return image
