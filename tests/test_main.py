@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import equinox as eqx
+import jax
 import numpy as np
 import pytest
 from tools import motionless_scene, reference_cycle, reference_scene
@@ -16,6 +17,7 @@ from fractaljax.__main__ import main
 from fractaljax.report import cycle_table
 
 _WRITTEN = ["design.png", "design.toml", "history.csv", "run.toml"]
+_WRITTEN += ["topographies.png", "topography.npy"]
 
 
 @pytest.fixture(autouse=True)
@@ -34,12 +36,23 @@ def run(capsys, *arguments):
 
 
 def test_design_without_arguments(capsys, tmp_path):
-    """The main job: a progress bar, a table, and three files that hold what was found."""
+    """The main job: a progress bar, a table, and files that hold what was found."""
     status, out, err = run(capsys, "design")
     assert status == 0 and "120/120" in err
-    rows = ["D ", "G [m]", "K_n [N/m]", "K_t [N/m]", "K_t/K_n", "regime", "a_l/a_e"]
+    rows = [
+        "D ",
+        "G [m]",
+        "Sq [m]",
+        "Sdq",
+        "K_n [N/m]",
+        "K_t [N/m]",
+        "K_t/K_n",
+        "regime",
+        "a_l/a_e",
+    ]
     rows += ["Q_e/(mu_s P)", "growth rate [1/s]", "frequency [Hz]", "damping ratio"]
-    rows += ["active constraints", "found: ", "written to fractaljax-design: "]
+    rows += ["active constraints", "Sq and Sdq: wavelengths from 0.001 to 1e-06 m", "found: "]
+    rows += ["written to fractaljax-design: ", "topography.npy: 1024 x 1024 heights in m, dx = "]
     lines = out.splitlines()
     assert lines[0].split() == ["before", "after"]
     assert [
@@ -57,7 +70,10 @@ def test_design_without_arguments(capsys, tmp_path):
     assert float(history[-1]["G [m]"]) == pytest.approx(float(scene.contact.surface.G), rel=1e-12)
     assert float(history[0]["growth_rate [1/s]"]) == pytest.approx(22.0801103, rel=1e-8)
     assert [int(row["step"]) for row in history] == list(range(len(history)))
-    assert (folder / "design.png").read_bytes().startswith(b"\x89PNG")
+    for picture in ("design.png", "topographies.png"):
+        assert (folder / picture).read_bytes().startswith(b"\x89PNG")
+    z = fj.topography(scene.contact.surface, 1e-3, 1024, key=jax.random.key(0))
+    np.testing.assert_allclose(np.load(folder / "topography.npy"), z, rtol=0, atol=1e-18)
 
 
 def test_design_of_a_users_scene(capsys, tmp_path):
@@ -294,7 +310,7 @@ def test_picture_that_fails_leaves_no_half_result(capsys, tmp_path, monkeypatch)
     def fail(*_, **__):
         raise OSError("disk full")
 
-    monkeypatch.setattr("fractaljax.__main__._picture", fail)
+    monkeypatch.setattr("fractaljax.command.design.picture", fail)
     status, _, err = run(capsys, "design", "--quiet", "--out", "a/b")
     assert status == 2 and "disk full" in err
     assert list(tmp_path.iterdir()) == []

@@ -805,7 +805,7 @@ def test_no_loop_no_lapack_no_callback(function):
 
 def test_import_loads_no_heavy_library():
     """Integrators, optimisers and plotting come with the call that needs them."""
-    heavy = ("diffrax", "optax", "matplotlib", "scipy", "tqdm")
+    heavy = ("diffrax", "optax", "matplotlib", "scipy", "tqdm", "SurfaceTopography")
     code = f"import sys, fractaljax; print([x for x in {heavy!r} if x in sys.modules])"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "[]"

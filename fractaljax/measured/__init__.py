@@ -1,0 +1,1 @@
+"""Measured surfaces: heights from instruments, and the fractal parameters they show."""

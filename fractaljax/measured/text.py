@@ -1,0 +1,163 @@
+"""Columns of numbers in a text, with the units that its header gives: CSV of any dialect."""
+
+import csv
+import re
+from typing import NamedTuple
+
+import numpy as np
+
+from .measurement import known_unit, metres
+
+_SEPARATORS = (";", "\t", ",", None)  # None: any white space
+_COMMENTS = ("#", "%", "//", "!")
+_GAPS = {"", "nan", "na", "n/a", "null", "none", "bad", "invalid", "no data"}
+_TRIED = 1000  # lines from which the separator is found
+_BRACKETED = re.compile(r"[\[(]\s*([^\[\]()]+?)\s*[\])]$")  # z [nm], z (nm)
+_SUFFIXED = re.compile(r"(?:^|[/_]\s*|[^\W\d]\s+)([^\s/_]+)$")  # nm, z/nm, z_nm, z in nm, z nm
+_QUANTITY = re.compile(r"^[^:]+:\s*([-+.\deE]+)\s*([^\s\d]+)$")  # Width: 12.3 um
+_VALUE_UNITS = re.compile(r"^Value units:\s*(\S+)$")
+
+
+class Table(NamedTuple):
+    """The numbers of a text, (rows, columns) with NaN for gaps, and a unit or None a column.
+
+    `size` is the width and the height of a map [m] where the header tells them, as Gwyddion's does.
+    """
+
+    numbers: np.ndarray
+    units: list[str | None]
+    size: tuple[float, float] | None = None
+
+
+def read_table(content: bytes) -> Table:
+    """The table in a text: header and comment lines, then as many numbers in every line.
+
+    Columns are separated by semicolons, tabs, commas or spaces; a comma that does not separate is
+    a decimal comma. Empty cells, nan, dashes, asterisks and words like bad are gaps.
+
+    **Raises:** `ValueError` naming the line that is different, or if there is no line of numbers.
+    """
+    lines = _text(content).lstrip("\ufeff").splitlines()
+    while lines and not lines[-1].strip():
+        lines.pop()
+    separator = _separator(lines)
+    start = next((i for i, line in enumerate(lines) if _is_data(line, separator)), None)
+    if start is None:
+        raise ValueError("there is no line of numbers in it")
+    columns = len(_fields(lines[start], separator))
+    rows, empty = [], columns - 1
+    for at, line in enumerate(lines[start:], start=start + 1):
+        if line.lstrip().startswith(_COMMENTS) or (columns > 1 and not line.strip()):
+            continue
+        fields = _fields(line, separator) or [""]
+        if len(fields) != columns:
+            raise ValueError(f"line {at} has {len(fields)} columns, the first one has {columns}")
+        rows.append(_numbers(fields, at))
+        empty = min(empty, columns - _filled(fields))
+    numbers = np.array(rows)[:, : columns - empty]  # every line may end with separators
+    size, unit = _map_header(lines[:start])
+    if size is not None:
+        return Table(numbers, [unit] * numbers.shape[1], size)
+    return Table(numbers, _units(lines[:start], separator, numbers.shape[1]))
+
+
+def _filled(fields) -> int:
+    """How many columns there are up to the last one that is not empty."""
+    return max((i for i, field in enumerate(fields, start=1) if field), default=0)
+
+
+def _map_header(header):
+    """Width and height [m], and the unit of heights, that Gwyddion writes above a map; or None.
+
+    Their titles are in the user's language: width is the first of two lengths.
+    """
+    lines = [line.strip().lstrip("#").strip() for line in header if line.startswith("#")]
+    lengths = [
+        float(found[1]) * metres(unit)
+        for found in map(_QUANTITY.match, lines)
+        if found and (unit := known_unit(found[2])) is not None
+    ]
+    units = [found[1] for found in map(_VALUE_UNITS.match, lines) if found]
+    if len(lengths) != 2 or len(units) != 1:
+        return None, None
+    return (lengths[0], lengths[1]), units[0]
+
+
+def _text(content: bytes) -> str:
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return content.decode("utf-16")
+    if b"\0" in content:
+        raise ValueError("it is not a text")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
+
+
+def _separator(lines):
+    """The separator with which most lines are numbers."""
+    counts = [sum(_is_data(line, s) for line in lines[:_TRIED]) for s in _SEPARATORS]
+    return _SEPARATORS[int(np.argmax(counts))]
+
+
+def _is_data(line, separator) -> bool:
+    if separator is not None and separator not in line:
+        return False
+    fields = [_cell(field) for field in _fields(line, separator)]
+    if separator is None and "," in line and len(fields) == 1:
+        return False  # as likely two whole numbers
+    return None not in fields and any(x == x for x in fields)
+
+
+def _fields(line, separator):
+    if '"' in line and separator is not None:
+        cells = next(csv.reader([line], delimiter=separator))
+    else:
+        cells = line.replace('"', "").split(separator)
+    cells = [cell.strip() for cell in cells]
+    return cells if separator == "," else [cell.replace(",", ".") for cell in cells]
+
+
+def _numbers(fields, at):
+    try:
+        return [float(field) for field in fields]
+    except ValueError:
+        cells = [_cell(field) for field in fields]
+    if None in cells:
+        raise ValueError(f"line {at}: {fields[cells.index(None)]!r} is not a number")
+    return cells
+
+
+def _cell(field):
+    """A number, NaN for a gap, or None."""
+    if field.lower() in _GAPS or not field.strip("-*"):
+        return float("nan")
+    try:
+        return float(field)
+    except ValueError:
+        return None
+
+
+def _units(header, separator, columns):
+    """The unit of each column: from the lines that name columns, or the only one in the header."""
+    units, anywhere = [None] * columns, set()
+    for line in header:
+        line = line.strip().lstrip("".join(_COMMENTS)).strip()
+        fields = [cell for cell in _fields(line, separator) if cell]
+        found = [_unit(field) for field in fields]
+        titles = [_unit(line), *(found if separator else ())]  # words are no titles
+        anywhere |= {unit for unit in titles if unit and known_unit(unit)}
+        if len(fields) == columns:
+            units = [new or old for new, old in zip(found, units, strict=True)]
+    if not any(units) and len(anywhere) == 1:
+        return [anywhere.pop()] * columns
+    return units
+
+
+def _unit(title):
+    """The unit that a title ends with; in brackets, also one that is unknown."""
+    bracketed = _BRACKETED.search(title)
+    if bracketed:
+        return bracketed[1]
+    suffixed = _SUFFIXED.search(title)
+    return suffixed[1] if suffixed and known_unit(suffixed[1]) else None
