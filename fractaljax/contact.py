@@ -238,6 +238,28 @@ def contact_state(surface: Surface, material: Material, P, *, mu_s, mu_m) -> Con
     return FractalContact(surface, material, P).state(mu_s, mu_m)
 
 
+def load_of_area(surface: Surface, material: Material, A_r, mu_m) -> jax.Array:
+    """As `contact_load`, without checks."""
+    D, k_mu = surface.D, friction_correction(mu_m)
+    t = jnp.log((3 - D) / (D - 1) * A_r) - log_critical_area(surface, material, k_mu)
+    elastic = t > 0
+    t = jnp.where(elastic, t, 1)
+    # Elastic contacts carry less than the H a of plastic ones.
+    log_share = log_load(t, D, critical_pressure_ratio(material, k_mu)) - t
+    return material.H * A_r * jnp.exp(jnp.where(elastic, log_share, 0))
+
+
+def contact_load(surface: Surface, material: Material, A_r, *, mu_m) -> jax.Array:
+    """Eqs. 26 to 28: the normal load P [N] at the real contact area A_r [m^2]; any one shape.
+
+    The other way round than `contact_state`, whose A_r under this load is the one given.
+
+    **Raises:** `ValueError` unless A_r > 0 and 0 <= mu_m <= 0.9.
+    """
+    A_r = number("A_r", A_r, above=0)
+    return load_of_area(surface, material, A_r, number("mu_m", mu_m, at_least=0, at_most=MU_M_MAX))
+
+
 class Contact(Part):
     """What gives a scene its contact stiffness."""
 

@@ -475,6 +475,44 @@ def test_load_is_the_sum_of_its_asperities():
     np.testing.assert_allclose(area, state.A_r, rtol=1e-13)
 
 
+@jax.jit
+@jax.vmap
+def _load_and_slopes(x, A_r):
+    """P, and d ln P by [D, ln G, ln A_r], forward and reverse."""
+    material = fj.Material(x["E"], x["nu"], x["sigma_y"], x["H"])
+
+    def log_P(D, log_G, log_A_r):
+        surface = fj.Surface(D, x["G"] * jnp.exp(log_G), x["gamma"])
+        return jnp.log(fj.contact_load(surface, material, A_r * jnp.exp(log_A_r), mu_m=x["mu_m"]))
+
+    at = x["D"], jnp.zeros_like(A_r), jnp.zeros_like(A_r)
+    slopes = [mode(log_P, argnums=(0, 1, 2))(*at) for mode in (jax.jacfwd, jax.jacrev)]
+    return jnp.exp(log_P(*at)), *(jnp.stack(slope) for slope in slopes)
+
+
+def test_load_of_an_area():
+    """P of the table's areas and its derivatives at constant A_r, plastic rows included."""
+    D, slopes = COLUMNS["D"], COLUMNS["dln_a_l"].copy()
+    A_r = (D - 1) / (3 - D) * np.exp(COLUMNS["ln_a_l"])
+    slopes[:, 0] += 1 / (D - 1) + 1 / (3 - D)
+    known = {name: jnp.asarray(COLUMNS[name]) for name in INPUTS}
+    P, forward, reverse = _load_and_slopes(known, jnp.asarray(A_r))
+    wanted = np.stack([-slopes[:, 0], -slopes[:, 1], np.ones_like(D)], axis=1) / slopes[:, 2:]
+    scale = 1 + np.abs(D * wanted[:, 0]) + np.abs(wanted[:, 1]) + np.abs(wanted[:, 2])
+    rounding = scale * (1 + np.abs(COLUMNS["ln_a_l"]))
+    assert_within(np.abs(P / COLUMNS["P"] - 1), 1e-14 * rounding)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-11, atol=1e-11)
+    assert_within(np.abs(forward - wanted).max(axis=1), 1e-11 * scale)
+
+
+def test_area_of_a_load_and_back():
+    """`contact_state` under the load of an area has this area; H A_r where all is plastic."""
+    for G, A_r in ((1.342e-10, 3e-6), (1e-12, 1e-4), (1e-6, 3e-6)):
+        P = fj.contact_load(fj.Surface(2.4, G), MATERIAL, A_r, mu_m=0.25)
+        np.testing.assert_allclose(brake_joint(G=G, P=float(P)).A_r, A_r, rtol=1e-13)
+    np.testing.assert_allclose(P, 9.94e8 * A_r, rtol=1e-15)
+
+
 def test_ratio_of_the_stiffnesses(found):
     """K_t/K_n = 3 (3-D)/((1+nu)(2-nu)(4-D)) (1 - slip)^(1/3), in every row."""
     state, D, nu = found["state"], COLUMNS["D"], COLUMNS["nu"]
@@ -664,6 +702,15 @@ def test_state_refusals(name, bad, bound):
     if name == "P":
         with pytest.raises(ValueError, match=f"^P must be {bound}, got {float(bad)!r}$"):
             fj.FractalContact(SURFACE, MATERIAL, bad)
+
+
+def test_load_refusals():
+    for A_r, mu_m, message in (
+        (0.0, 0.2, "A_r must be above 0, got 0.0"),
+        (1e-6, 1.0, "mu_m must"),
+    ):
+        with pytest.raises(ValueError, match=f"^{message}"):
+            fj.contact_load(SURFACE, MATERIAL, A_r, mu_m=mu_m)
 
 
 def test_the_closed_ends():

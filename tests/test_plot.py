@@ -9,7 +9,7 @@ import matplotlib.pyplot
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from tools import motionless_scene, reference_cycle, reference_scene
+from tools import assert_whole, labels, motionless_scene, reference_cycle, reference_scene
 
 import fractaljax as fj
 
@@ -17,19 +17,6 @@ import fractaljax as fj
 @pytest.fixture(scope="module")
 def best():
     return fj.design(fj.brake_scene(), progress=False)
-
-
-def labels(ax):
-    return [text.get_text() for text in ax.get_legend().get_texts()]
-
-
-def assert_whole(figure, artists):
-    """Nothing is cut off."""
-    figure.draw_without_rendering()
-    for artist in artists:
-        box = artist.get_tightbbox()
-        assert figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1
-        assert figure.bbox.y0 <= box.y0 and box.y1 <= figure.bbox.y1
 
 
 def test_design_picture(best):

@@ -1,11 +1,18 @@
 """What every picture shares."""
 
+from typing import Any
+
+
+def new_figure(width: float = 8.4, height: float = 6.4) -> Any:
+    """A figure outside pyplot, for axes of one's own; a notebook shows it. Sizes in inches."""
+    from .figure import Figure
+
+    return Figure((width, height))
+
 
 def new_axes():
-    """Axes of a new figure, outside pyplot."""
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(8.4, 6.4), layout="constrained").add_subplot()
+    """Axes of a new figure."""
+    return new_figure().add_subplot()
 
 
 def legend_above(ax, handles):

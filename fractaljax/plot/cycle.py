@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from ..limit_cycle import CycleResult, LimitCycle
-from .axes import legend_above, new_axes
+from ..cycle import CycleResult, LimitCycle
+from .axes import legend_above, new_axes, new_figure
 
 _HARMONICS = 20  # for every turn of a period
 _FLOOR = 1e-6  # of the strongest harmonic; what is weaker is below the axis
@@ -77,9 +77,7 @@ def cycle(result: LimitCycle) -> Any:
 
     **Raises:** `ValueError` if there is no limit cycle, or for a batch.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10.4, 7.6), layout="constrained")
+    figure = new_figure(10.4, 7.6)
     for row, direction in zip(figure.subplots(2, 2), (1, 2), strict=True):
         phase_portrait(result, row[0], direction=direction)
         spectrum(result, row[1], direction=direction)

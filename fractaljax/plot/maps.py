@@ -7,7 +7,7 @@ import numpy as np
 
 from ..contact import Regime
 from ..maps import Modes, source_modes
-from .axes import legend_above, new_axes
+from .axes import legend_above, new_axes, new_figure
 
 _QUANTITIES = {"real": "real part [1/s]", "frequency": "frequency [kHz]"}
 
@@ -90,12 +90,11 @@ def mode_surfaces(modes: Modes, ax: Any = None, *, quantity: str = "real") -> An
 
     **Raises:** `ValueError` for a quantity that is neither "real" nor "frequency".
     """
-    from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
     values = _layers(modes, quantity)
     if ax is None:
-        ax = Figure(figsize=(8.4, 6.4), layout="constrained").add_subplot(projection="3d")
+        ax = new_figure().add_subplot(projection="3d")
     x, y = np.meshgrid(np.asarray(modes.x), np.asarray(modes.y))
     handles = []
     words = ("lower", "upper") if quantity == "real" else ("mode 1", "mode 2")
@@ -115,7 +114,7 @@ def mode_surfaces(modes: Modes, ax: Any = None, *, quantity: str = "real") -> An
 
 def modes(result: Modes) -> Any:
     """Growth rate, real parts, and the frequency of each mode; returns the figure."""
-    figure = _figure(11.2, 9.2)
+    figure = new_figure(11.2, 9.2)
     upper, lower = figure.subplots(2, 2)
     growth_map(result, upper[0])
     mode_lines(result, upper[1])
@@ -133,7 +132,7 @@ def source_figure(number: int) -> Any:
         return modes(source_modes(str(number)))
     if number not in (9, 10):
         raise ValueError(f"number must be 7, 8, 9 or 10, got {number!r}")
-    figure = _figure(11.2, 9.2 if number == 9 else 17)
+    figure = new_figure(11.2, 9.2 if number == 9 else 17)
     rows = figure.subplots(2, 2).reshape(4, 1) if number == 9 else figure.subplots(4, 2)
     for letter, row in zip("abcd", rows, strict=True):
         panel = source_modes(f"9{letter}")
@@ -146,12 +145,6 @@ def source_figure(number: int) -> Any:
 # ---------------------------------------------------------------------------------------------
 # What they share
 # ---------------------------------------------------------------------------------------------
-
-
-def _figure(width, height):
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), layout="constrained")
 
 
 def _map_axes(modes, ax):
