@@ -5,9 +5,15 @@ from pathlib import Path
 
 import jax
 
-from . import eigenvalues, growth_rate, limit_cycle
+from . import contact, eigenvalues, growth_rate, limit_cycle, scene_cost
 
-BENCHMARKS = {"eigenvalues": eigenvalues, "growth_rate": growth_rate, "limit_cycle": limit_cycle}
+BENCHMARKS = {
+    "contact": contact,
+    "eigenvalues": eigenvalues,
+    "growth_rate": growth_rate,
+    "limit_cycle": limit_cycle,
+    "scene_cost": scene_cost,
+}
 
 
 def main() -> None:
