@@ -19,7 +19,7 @@ from .margin import margin_of
 from .oscillator import Linearised, dimensionless, linearise
 from .parts import Record
 from .scene import Scene, stiffness
-from .singular import positive_sqrt, safe_divide
+from .singular import polynomial, positive_sqrt, safe_divide
 from .structure import Structure
 
 _NEWTON_STEPS = 2
@@ -55,11 +55,7 @@ class _Quadratic(eqx.Module):
 
 def _cosine_of_third(x):
     """cos(arccos(x)/3) to 2e-7, for -1 <= x <= 1: a polynomial in cos(arccos(x)/2)."""
-    half = jnp.sqrt((1 + x) / 2)
-    value = jnp.full_like(half, _COSINE_OF_THIRD[0])
-    for coefficient in _COSINE_OF_THIRD[1:]:
-        value = value * half + coefficient
-    return value
+    return polynomial(_COSINE_OF_THIRD, jnp.sqrt((1 + x) / 2))
 
 
 def _rough_cbrt(x):

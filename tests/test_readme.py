@@ -55,7 +55,8 @@ def test_links_lead_somewhere():
         assert (ROOT / target).is_file(), target
 
 
-def test_picture_is_the_one_the_command_writes(tmp_path, capsys):
-    """The committed picture is what `fractaljax design` draws, up to the rendering of type."""
+def test_pictures_are_those_the_command_writes(tmp_path, capsys):
+    """The committed pictures are what `fractaljax design` draws, up to the rendering of type."""
     assert main(["design", "--quiet", "--out", str(tmp_path)]) == 0
-    assert_same_picture(tmp_path / "design.png", "design.png")
+    for name in ("design.png", "topographies.png"):
+        assert_same_picture(tmp_path / name, name)
