@@ -22,7 +22,7 @@ from scipy.optimize import brentq
 from tqdm import tqdm
 
 import fractaljax as fj
-from fractaljax import contact
+from fractaljax.mechanism import contact
 
 from .page import png, write
 from .timing import compiled, others_running, ran_on, seconds, this_machine

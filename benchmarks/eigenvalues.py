@@ -21,8 +21,8 @@ import numpy as np
 from tqdm import tqdm
 
 import fractaljax as fj
-from fractaljax.oscillator import Linearised
-from fractaljax.stability import growth_rate_of_linearised
+from fractaljax.mechanism.oscillator import Linearised
+from fractaljax.modes.stability import growth_rate_of_linearised
 
 from .page import png, write
 from .timing import compiled, others_running, ran_on, seconds, this_machine

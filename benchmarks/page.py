@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from fractaljax.scene_file import write_whole
+from fractaljax.base.scene_file import write_whole
 
 
 def png(figure: Any, dpi: int) -> bytes:

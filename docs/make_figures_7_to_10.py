@@ -9,9 +9,9 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from fractaljax.maps import SOURCE_PANELS, Modes, source_modes, source_scene
+from fractaljax.base.scene_file import write_whole
+from fractaljax.modes.maps import SOURCE_PANELS, Modes, source_modes, source_scene
 from fractaljax.plot import mode_surfaces, source_figure
-from fractaljax.scene_file import write_whole
 
 PAGE = Path(__file__).with_name("figures_7_to_10.md")
 POINTS = 400  # a side

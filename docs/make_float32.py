@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import fractaljax as fj
-from fractaljax.scene_file import write_whole
+from fractaljax.base.scene_file import write_whole
 
 PAGE = Path(__file__).with_name("float32.md")
 POINTS = 2000  # a place

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fractaljax.margin import margin_of
-from fractaljax.oscillator import Linearised
-from fractaljax.stability import _eigenvalues
+from fractaljax.mechanism.oscillator import Linearised
+from fractaljax.modes.margin import margin_of
+from fractaljax.modes.stability import _eigenvalues
 
 PICTURE = Path(__file__).with_name("margin.png")
 POINTS = 401

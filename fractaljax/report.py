@@ -2,15 +2,15 @@
 
 import jax.numpy as jnp
 
-from .complex_modes import UNSUPPORTED, assemble
-from .contact import Regime
-from .critical_friction import critical_friction
-from .cycle import CycleResult, LimitCycle
-from .quantities import sliding_friction
-from .roughness import roughness
-from .scene import Scene, stiffness
-from .stability import stability
-from .structure import Joint, Structure
+from .mechanism.contact import Regime
+from .mechanism.quantities import sliding_friction
+from .mechanism.scene import Scene, stiffness
+from .mechanism.structure import Joint, Structure
+from .modes.complex_modes import UNSUPPORTED, assemble
+from .modes.critical_friction import critical_friction
+from .modes.stability import stability
+from .motion.cycle import CycleResult, LimitCycle
+from .surface.roughness import roughness
 
 _ABSENT = "-"
 _LEAST_DAMPED = 10  # stable modes of a structure that its table lists

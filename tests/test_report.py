@@ -5,10 +5,10 @@ import re
 import equinox as eqx
 import numpy as np
 import pytest
-from tools import motionless_scene, reference_cycle, reference_scene
 
 import fractaljax as fj
 from fractaljax.report import comparison_table, cycle_table, scene_rows, stability_table, table
+from tools import motionless_scene, reference_cycle, reference_scene
 
 
 def test_rows_of_every_regime():

@@ -1,5 +1,7 @@
 """A scene without a part costs less than the scene with it."""
 
+from typing import Any
+
 import jax
 import pytest
 
@@ -25,7 +27,7 @@ def test_operations_inside_loops_and_calls_are_counted():
     assert (found["mul"], found["add"]) == (1, 2)  # the second add counts the turns
 
 
-def held(rows, measured, counts):
+def held(rows, measured: Any, counts):
     for row in rows:
         if row.without:
             for count in counts:

@@ -32,7 +32,7 @@ def add_cycle(commands) -> None:
 def _run(arguments) -> int:
     """Find the limit cycle that the motion ends in; write cycle.png and cycle.csv."""
     from .. import plot
-    from ..limit_cycle import CycleResult, limit_cycle
+    from ..motion.limit_cycle import CycleResult, limit_cycle
     from ..report import cycle_table
 
     scene = load_scene(arguments)

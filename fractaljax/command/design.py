@@ -99,8 +99,8 @@ def _run(arguments) -> int:
     before and after, and topography.npy with the heights of the designed one [m].
     """
     from .. import plot
-    from ..design import design
-    from ..design_file import design_text, read_design
+    from ..optimise.design import design
+    from ..optimise.design_file import design_text, read_design
 
     if arguments.repeat is None:
         scene, options = load_scene(arguments), _options(arguments)
@@ -130,7 +130,7 @@ def _run(arguments) -> int:
 
 def _options(arguments) -> dict:
     """The arguments of `design` that a command asks for."""
-    from ..task import DEFAULT_BOUNDS
+    from ..optimise.task import DEFAULT_BOUNDS
 
     asked = {"D": arguments.D, "G": arguments.G}
     bounds = DEFAULT_BOUNDS | {name: tuple(ends) for name, ends in asked.items() if ends}
@@ -152,7 +152,7 @@ def _options(arguments) -> dict:
 
 
 def _constraints(arguments) -> list:
-    from .. import constraints
+    from ..optimise import constraints
 
     limits = {
         name: low_and_high(f"--{name}", getattr(arguments, name.replace("-", "_")))
@@ -179,7 +179,7 @@ def _constraints(arguments) -> list:
 
 
 def _envelope(texts):
-    from ..envelope import Envelope
+    from ..optimise.envelope import Envelope
 
     ranges, samples = {}, {}
     for name, values in (pair("--envelope", text, "NAME=LOW:HIGH") for text in texts):

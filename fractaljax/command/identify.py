@@ -47,7 +47,7 @@ def _run(arguments) -> int:
     from .. import plot
     from ..measured.files import read_measurement
     from ..measured.identify import identify
-    from ..scene import Scene, brake_scene
+    from ..mechanism.scene import Scene, brake_scene
 
     base = brake_scene() if arguments.scene is None else Scene.load(arguments.scene)
     if not base.contact.fractal:
@@ -97,7 +97,7 @@ def _scene_text(base, read, found) -> str:
 
 def _bounds(found) -> str:
     """Options of `design` where its default bounds leave the surface out."""
-    from ..task import DEFAULT_BOUNDS
+    from ..optimise.task import DEFAULT_BOUNDS
 
     ranges = {
         "D": (found.D, max(found.D - 0.1, 1 + found.D / 2), min(found.D + 0.1, 1.5 + found.D / 2)),

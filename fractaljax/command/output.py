@@ -13,7 +13,7 @@ def output(folder: Path):
 
     Where nothing has been written at the end, folders made for it are removed.
     """
-    from ..scene_file import write_whole
+    from ..base.scene_file import write_whole
 
     def write(files):
         for name, content in files.items():

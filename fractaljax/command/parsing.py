@@ -43,7 +43,7 @@ def add_constant_friction(parser) -> None:
 
 def load_scene(arguments):
     """The scene asked for: the reference brake where no file is given."""
-    from ..scene import Scene, brake_scene
+    from ..mechanism.scene import Scene, brake_scene
 
     return brake_scene() if arguments.scene is None else Scene.load(arguments.scene)
 

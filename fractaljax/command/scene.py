@@ -11,7 +11,7 @@ def add_scene(commands) -> None:
 
 def _run(arguments) -> int:
     """Print the reference brake as a scene file."""
-    from ..scene import brake_scene
+    from ..mechanism.scene import brake_scene
 
     print(brake_scene().to_toml(), end="")
     return 0

@@ -19,9 +19,9 @@ def _run(arguments) -> int:
     Of a structure (a file with a table of that name): the joints, and the modes that are unstable
     or least damped.
     """
+    from ..mechanism.scene import brake_scene
+    from ..mechanism.structure import Structure, load
     from ..report import stability_table, structure_table
-    from ..scene import brake_scene
-    from ..structure import Structure, load
 
     subject = brake_scene() if arguments.scene is None else load(arguments.scene)
     slope = not arguments.constant_friction

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from ..parts import Record
-from ..surfaces import Surface
+from ..base.parts import Record
+from ..surface.surfaces import Surface
 from .band import PER_RESOLUTION, chosen_band, given_band
 from .fit import PowerLaw, fit
 from .flags import flags_of

@@ -5,7 +5,7 @@ import math
 import equinox as eqx
 import numpy as np
 
-from ..parts import Record
+from ..base.parts import Record
 from .preparation import spacing
 
 UNITS = {

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import gammaln
 
-from ..surfaces import Surface
+from ..surface.surfaces import Surface
 
 _TAPERS = 3  # of a profile: two thirds of the variance that Hann's window leaves
 _NEAR = 0.02  # in ln f

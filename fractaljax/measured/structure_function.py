@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import gammaln
 
-from ..surfaces import Surface
+from ..surface.surfaces import Surface
 from .spectrum import mean_cosine_power
 
 _BLOCKS = 10  # for the standard error

@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from ..boundary import Boundary, BranchEnd
-from ..quantities import label
-from ..ranges import is_logarithmic
+from ..base.ranges import is_logarithmic
+from ..mechanism.quantities import label
+from ..modes.boundary import Boundary, BranchEnd
 from .axes import legend_above, new_axes
 
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ..cycle import CycleResult, LimitCycle
+from ..motion.cycle import CycleResult, LimitCycle
 from .axes import legend_above, new_axes, new_figure
 
 _HARMONICS = 20  # for every turn of a period

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ..cycle import LimitCycle
+from ..motion.cycle import LimitCycle
 from .axes import legend_above, new_axes, new_figure
 from .cycle import phase_portrait, spectrum
 

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..design import DEFAULT_BOUNDS, Design
-from ..parts import substitute
-from ..scene import Scene
-from ..stability import growth_rate_of
+from ..base.parts import substitute
+from ..mechanism.scene import Scene
+from ..modes.stability import growth_rate_of
+from ..optimise.design import DEFAULT_BOUNDS, Design
 from .axes import legend_above, new_axes
 
 _POINTS = 240  # a side

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..measured.identify import Identification
 from ..measured.spectrum import theoretical_spectrum
-from ..surfaces import Surface
+from ..surface.surfaces import Surface
 from .axes import legend_above, new_axes
 
 

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from ..contact import Regime
-from ..maps import Modes, source_modes
+from ..mechanism.contact import Regime
+from ..modes.maps import Modes, source_modes
 from .axes import legend_above, new_axes, new_figure
 
 _QUANTITIES = {"real": "real part [1/s]", "frequency": "frequency [kHz]"}

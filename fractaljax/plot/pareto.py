@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ..pareto import Front
+from ..optimise.pareto import Front
 from .axes import legend_above, new_axes
 
 

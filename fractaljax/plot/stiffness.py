@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from ..contact import Regime
-from ..ranges import is_logarithmic
-from ..stiffness_curves import StiffnessCurves
+from ..base.ranges import is_logarithmic
+from ..mechanism.contact import Regime
+from ..sweeping.stiffness_curves import StiffnessCurves
 from .axes import legend_above, new_axes, new_figure
 
 _WORDS = {"K_n": "normal stiffness K_n", "K_t": "tangential stiffness K_t"}

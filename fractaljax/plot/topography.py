@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ..design import Design
+from ..optimise.design import Design
 from .axes import new_axes, new_figure
 
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ..simulate import Trajectory
+from ..motion.simulate import Trajectory
 from .axes import legend_above, new_axes
 
 _SAMPLES = 6000

@@ -1,0 +1,1 @@
+"""What every other folder builds on: checked numbers, safe functions, batches, TOML files."""

@@ -1,0 +1,1 @@
+"""Scenes and structures: materials, contact, friction, oscillator, and their quantities."""

@@ -1,0 +1,41 @@
+"""Damping matrices of a structure from what is known of its damping."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..base.parts import concrete, number
+from .matrices import array_of, mass_normalised
+
+
+def rayleigh_damping(M, K, alpha, beta) -> jax.Array:
+    """C = alpha M + beta K (n, n) [N s/m], alpha in 1/s and beta in s.
+
+    **Raises:** `ValueError` unless alpha >= 0 and beta >= 0.
+    """
+    alpha, beta = number("alpha", alpha, at_least=0), number("beta", beta, at_least=0)
+    return alpha * jnp.asarray(M) + beta * jnp.asarray(K)
+
+
+def modal_damping(M, K, ratio) -> jax.Array:
+    """C (n, n) [N s/m] that gives every mode of M and K the damping ratio `ratio`.
+
+    `ratio` is a scalar, or (n,) in the order of rising frequency. C = L X diag(2 ratio omega)
+    X^T L^T with M = L L^T and X the eigenvectors of L^-1 K L^-T: differentiable where those
+    frequencies are distinct.
+
+    **Raises:** `ValueError` unless ratio >= 0 and K is symmetric.
+    """
+    M, K, ratio = array_of("M", M), array_of("K", K), number("damping_ratio", ratio, at_least=0)
+    if ratio.ndim and ratio.shape != K.shape[:1]:
+        raise ValueError(
+            f"damping_ratio must be a scalar or have shape {K.shape[:1]}, got shape {ratio.shape}"
+        )
+    values = concrete(K)
+    if values is not None and np.abs(values - values.T).max() > 1e-6 * np.abs(values).max():
+        raise ValueError("damping_ratio needs a symmetric K: others have no real modes")
+    L = jnp.linalg.cholesky(M)
+    squares, X = jnp.linalg.eigh(mass_normalised(L, K))
+    omega = jnp.sqrt(jnp.where(squares > 0, squares, 0))
+    LX = L @ X
+    return (LX * (2 * ratio * omega)[None]) @ LX.T

@@ -1,0 +1,1 @@
+"""Stability of steady sliding: eigenvalues, margin, boundaries and maps."""

@@ -1,0 +1,79 @@
+"""How stable: a measure that is smooth where the growth rate is not.
+
+Where modes coalesce the derivative of an eigenvalue is infinite, where they cross the largest
+real part has a kink. The third Hurwitz determinant of the characteristic polynomial is smooth at
+both, being the product of -(lambda_i + lambda_j) over all pairs, but says little by its size: for
+two modes s^2 + u_i s + v_i it is u_1 u_2 Delta, where Delta, near (v_1 - v_2)^2, is how far the
+modes lie apart. Smooth minima that have the sign of the true one take the product u_1 u_2 out
+of that, and the smaller of u_1 and u_2 out of their product and their sum.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+
+from ..base.singular import positive_sqrt
+from ..mechanism.oscillator import Linearised, dimensionless, linearise
+from ..mechanism.scene import Scene, stiffness
+
+
+@jax.jit
+def least(total: jax.Array, product: jax.Array) -> jax.Array:
+    """x + y - sqrt(x^2 + y^2) from x + y and x y; any shape. Above 0 exactly where both are.
+
+    Fischer and Burmeister's function (Fischer 1992, doi 10.1080/02331939208843795): analytic but
+    where x = y = 0, 0.59 times the smaller of two equal numbers, the smaller one of two that lie
+    far apart. At x = y = 0 the derivative is that of x + y. Where no real x and y have this sum
+    and product the root is taken as 0.
+    """
+    root = positive_sqrt(total**2 - 2 * product)
+    positive = total > 0
+    # total - root would cancel where the result is near 0.
+    return jnp.where(positive, 2 * product / jnp.where(positive, total + root, 1), total - root)
+
+
+@functools.partial(jax.jit, static_argnames="friction_slope")
+def margin(scene: Scene, shift=0.0, friction_slope: bool = True) -> jax.Array:
+    """Smooth margin of stability [-], a scalar: above 0 exactly where growth_rate < shift [1/s].
+
+    Of lightly damped, well separated modes it is close to the least damping ratio: the smaller
+    real part, 0.5 to 1 times, beside the root mean square sqrt((a + b)/2) of the two natural
+    frequencies in contact. Modes within their damping of each other lower it, to about 0.3
+    times. It is analytic in the scene where modes coalesce and where they cross, unless there is
+    no damping at all; without damping it is 0 where stable and negative in flutter.
+    `friction_slope` as in `growth_rate`.
+
+    **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`.
+    """
+    K_n, K_t = stiffness(scene)
+    return margin_of(linearise(scene.oscillator, scene.friction, K_n, K_t, friction_slope), shift)
+
+
+@jax.jit
+def margin_of(lin: Linearised, shift=0.0) -> jax.Array:
+    """`margin` of a system linearised already; `shift` in 1/s.
+
+    With s = shift + z the polynomial is again (z^2 + c_1 z + a)(z^2 + c_2 z + b) + g, and with
+    a_3, a_2, a_1, a_0 its coefficients (Lienard and Chipart) stable if a_3, a_0, a_1 or a_2 and
+    H_3 = a_1 (a_3 a_2 - a_1) - a_3^2 a_0 are positive. E = Delta + 2 (v_1 + v_2) u_1 u_2 +
+    (u_1 u_2)^2 is a_2^2 - 4 a_0 + a_3 a_1, so u_1 u_2 is half the smooth minimum of two numbers
+    with the sum E and the product 2 H_3; in every stable system E^2 > 4 H_3 as long as
+    4 a_2 >= 3 (a + b) before the shift, that is but for shifts beyond critical damping.
+    """
+    omega, lin = dimensionless(lin)
+    shift = shift / omega
+    heavy = lin.c_1**2 + lin.c_2**2 + jnp.finfo(omega.dtype).eps ** 2
+    a, b = lin.a + shift * (lin.c_1 + shift), lin.b + shift * (lin.c_2 + shift)
+    c_1, c_2, g = lin.c_1 + 2 * shift, lin.c_2 + 2 * shift, lin.g
+    a_3, a_2, a_1, a_0 = c_1 + c_2, a + b + c_1 * c_2, c_1 * b + c_2 * a, a * b + g
+    # H_3 and E by their factors: in powers of the coefficients they cancel.
+    apart = (a - b) ** 2 + a_3 * a_1
+    H_3 = c_1 * c_2 * apart - a_3**2 * g
+    # Damping of both signs beyond critical, a_2 < 0, can make H_3 positive again: leave that out.
+    H_3 = H_3 - a_3 * a_1 * jnp.minimum(a_2, 0)
+    E = apart - 4 * g + 2 * c_1 * c_2 * (a + b) + (c_1 * c_2) ** 2
+    u = least(a_3, least(E, 2 * H_3) / 2)
+    # A single real eigenvalue passes the shift where a_0 = 0: only if damping is heavy.
+    u = least(u * heavy + a_0, u * heavy * a_0) / heavy
+    return u / jnp.sqrt(2.0)

@@ -1,0 +1,1 @@
+"""Stick-slip motion in time, and its limit cycles."""

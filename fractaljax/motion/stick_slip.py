@@ -1,0 +1,171 @@
+"""Dry friction as a Filippov system: slip forward, slip backward or stick, in each direction.
+
+Everything here is in scaled units: time 1/omega, omega^2 = omega_1^2 + omega_2^2 + (K_t + K_n)/m,
+velocity V, length V/omega. A state y is [x1, x2, u1, u2], u_i = (dx_i/dt)/V, and a mode s is
+[s1, s2] with s_i = +1 (slip forward, u_i < 1), -1 (backward, u_i > 1) or 0 (stick, u_i = 1), both
+with their components first and any shape behind.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from ..base.parts import number
+from ..mechanism.friction import Friction
+from ..mechanism.oscillator import equilibrium
+from ..mechanism.scene import Scene, stiffness
+
+SECTION = 4  # the guard of the section u1 = 0, after two guards for each direction
+
+
+class StickSlip(eqx.Module):
+    """The oscillator on its belt (Eq. 39) with the exact friction law, in scaled units."""
+
+    friction: Friction
+    V: jax.Array  # belt velocity [m/s], which scales the friction law's argument
+    omega: jax.Array  # [1/s]
+    a: jax.Array  # (omega_1^2 + K_t/m)/omega^2; that of direction 2 is 1 - a
+    n_1: jax.Array  # K_n/(m omega^2): the load on direction 1 is n_1 x2
+    n_2: jax.Array  # K_t/(m omega^2): the load on direction 2 is -n_2 x1
+    c_1: jax.Array  # damping
+    c_2: jax.Array
+    f: jax.Array  # external force
+
+    def loads(self, y) -> tuple[jax.Array, jax.Array]:
+        """What the coefficient of friction multiplies; sticking attracts where it is positive."""
+        return self.n_1 * y[1], -self.n_2 * y[0]
+
+    def free(self, y, one=1.0) -> tuple[jax.Array, jax.Array]:
+        """Acceleration without friction; `one` = 0 leaves its linear part."""
+        return (
+            one * self.f - self.c_1 * y[2] - self.a * y[0],
+            -one * self.f - self.c_2 * y[3] - (1 - self.a) * y[1],
+        )
+
+    def accelerations(self, y, signs) -> list[jax.Array]:
+        """Of both directions while they slip, friction taken with the `signs` given."""
+        parts = zip(self.free(y), self.loads(y), y[2:], signs, strict=True)
+        return [
+            free + self.friction.branch(self.V * (1 - u), sign) * load
+            for free, load, u, sign in parts
+        ]
+
+    def field(self, y, s) -> jax.Array:
+        """dy/dt in mode s. A sticking direction must have u_i = 1."""
+        slipping = zip(self.accelerations(y, s), s, strict=True)
+        return jnp.stack([y[2], y[3], *(jnp.where(s_i == 0, 0, a) for a, s_i in slipping)])
+
+    def stiffness(self, y) -> jax.Array:
+        """The rate at which friction alone changes sliding velocities; far out it is the largest.
+
+        Zero of shape (...) for a law without slope.
+        """
+        if not self.friction.velocity_dependent:
+            return jnp.zeros_like(y[0])
+        rates = [
+            jnp.abs(self.V * self.friction.slope(self.V * (1 - u)) * load)
+            for load, u in zip(self.loads(y), y[2:], strict=True)
+        ]
+        return jnp.maximum(*rates)
+
+    def guards(self, y, s, one=1.0) -> jax.Array:
+        """Five functions that are positive while mode s lasts, affine in y; shape (5, ...).
+
+        Two for each direction: slipping, its sliding velocity s_i (1 - u_i) and a constant;
+        sticking, the distances of the friction force from its two limits. The last is u1, whose
+        fall through zero marks a turn. `one` = 0 leaves the linear part: guards of dy/dt are the
+        rates of the guards.
+        """
+        limit = self.friction.mu_s
+        rows = []
+        for free, load, u, s_i in zip(self.free(y, one), self.loads(y), y[2:], s, strict=True):
+            slips = s_i != 0
+            rows.append(jnp.where(slips, s_i * (one - u), limit * load + free))
+            rows.append(jnp.where(slips, one, limit * load - free))
+        return jnp.stack([*rows, jnp.broadcast_to(y[2], rows[0].shape)])
+
+    def switch(self, y, s, guard) -> tuple[jax.Array, jax.Array]:
+        """State and mode after the guard of that number has reached zero.
+
+        A slip that ends crosses over if the other side carries it on, and sticks if not: where
+        the load is negative it always crosses, as the sliding mode there repels.
+        """
+        velocities, modes = [], []
+        limit = self.friction.mu_s
+        for i, (free, load) in enumerate(zip(self.free(y), self.loads(y), strict=True)):
+            s_i, u = s[i], y[2 + i]
+            ended = (guard == 2 * i) | (guard == 2 * i + 1)
+            on_other_side = s_i * (free - s_i * limit * load)
+            after_slip = jnp.where(on_other_side > 0, -s_i, 0)
+            after_stick = jnp.where(guard == 2 * i, 1, -1)
+            after = jnp.where(s_i == 0, after_stick, after_slip)
+            modes.append(jnp.where(ended, after.astype(s_i.dtype), s_i))
+            velocities.append(jnp.where(ended, 1, u))
+        velocities[0] = jnp.where(guard == SECTION, 0, velocities[0])
+        return jnp.stack([y[0], y[1], *velocities]), jnp.stack(modes)
+
+    def mode(self, y) -> jax.Array:
+        """The mode that the motion from y starts in."""
+        modes = []
+        limit = self.friction.mu_s
+        for free, load, u in zip(self.free(y), self.loads(y), y[2:], strict=True):
+            forward, backward = free + limit * load, free - limit * load
+            # From rest: into the side whose own field leaves, forward where both do.
+            at_rest = jnp.where(forward < 0, 1, jnp.where(backward > 0, -1, 0))
+            modes.append(jnp.where(u < 1, 1, jnp.where(u > 1, -1, at_rest)).astype(y.dtype))
+        return jnp.stack(modes)
+
+
+def stick_slip(scene: Scene) -> StickSlip:
+    """The scaled system of a scene."""
+    o = scene.oscillator
+    K_n, K_t = stiffness(scene)
+    a, b = o.omega_1**2 + K_t / o.m, o.omega_2**2 + K_n / o.m
+    omega = jnp.sqrt(a + b)
+    return StickSlip(
+        friction=scene.friction,
+        V=o.V,
+        omega=omega,
+        a=a / omega**2,
+        n_1=K_n / o.m / omega**2,
+        n_2=K_t / o.m / omega**2,
+        c_1=2 * o.xi_1 * o.omega_1 / omega,
+        c_2=2 * o.xi_2 * o.omega_2 / omega,
+        f=o.F / o.m / jnp.sqrt(2.0) / omega / o.V,
+    )
+
+
+def rest(scene: Scene, system: StickSlip) -> jax.Array:
+    """The sliding equilibrium (Eq. 40) as a scaled state."""
+    K_n, K_t = stiffness(scene)
+    x_1, x_2 = equilibrium(scene.oscillator, K_n, K_t, scene.friction.coefficient(system.V))
+    length = system.V / system.omega
+    return jnp.stack([x_1 / length, x_2 / length, jnp.zeros_like(x_1), jnp.zeros_like(x_1)])
+
+
+def units(system: StickSlip) -> jax.Array:
+    """What a scaled state is to be multiplied by, (4,): [m, m, m/s, m/s]."""
+    length = system.V / system.omega
+    return jnp.stack([length, length, system.V, system.V])
+
+
+def start_state(start: Any) -> jax.Array:
+    """`start` as an array [x1, x2, v1, v2] (4,), or say why it cannot be one."""
+    start = number("start", jnp.asarray(start, dtype=float))
+    if start.shape != (4,):
+        raise ValueError(f"start must have shape (4,), got {start.shape}; use jax.vmap for many")
+    return start
+
+
+def scaled_start(scene: Scene, system: StickSlip, start) -> jax.Array:
+    """The start (4,) in scaled units, constant: by default the equilibrium with x1 displaced."""
+    y = rest(scene, system).at[0].add(1.0) if start is None else start / units(system)
+    return jax.lax.stop_gradient(y)
+
+
+def check_rtol(rtol: float) -> None:
+    """Refuse a relative tolerance that means nothing."""
+    if not 0 < rtol <= 0.1:
+        raise ValueError(f"rtol must be above 0 and at most 0.1, got {rtol!r}")

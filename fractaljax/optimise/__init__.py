@@ -1,0 +1,1 @@
+"""The nearest surface that does not squeal, over an envelope and with tolerances."""

@@ -1,0 +1,1 @@
+"""Fractal surfaces: their parameters, heights on a grid, roughness."""

@@ -1,0 +1,1 @@
+"""Quantities over grids, in batches."""

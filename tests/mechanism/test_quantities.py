@@ -1,0 +1,208 @@
+"""What every name of a scene means: its own numbers, derived ones, and two of them at once."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fractaljax as fj
+from fractaljax.mechanism.quantities import (
+    axis_values,
+    known_quantities,
+    label,
+    own_quantities,
+    replaced,
+    require_independent,
+    require_known,
+    sliding_friction,
+    substituted,
+    unit,
+    with_friction_times,
+    with_optional,
+)
+from tools import reference_scene
+
+BRAKE = fj.brake_scene()
+FIXED = BRAKE.replace(contact=fj.FixedContact(4e8, 2e8))
+CONSTANT = fj.Scene(FIXED.contact, fj.Coulomb(0.4), BRAKE.oscillator)
+
+
+def mu_of(mu_s, mu_m, v_m, V):
+    """Eq. 38."""
+    return mu_s - 1.5 * (mu_s - mu_m) * V / v_m + (mu_s - mu_m) / 2 * (V / v_m) ** 3
+
+
+# --- names --------------------------------------------------------------------------------
+
+
+def test_own_quantities_are_every_number_with_its_value():
+    own = own_quantities(BRAKE)
+    assert own["D"].value == 2.4 and own["V"].value == 0.15
+    assert (own["omega_1"].unit, own["P"].meaning) == ("rad/s", "normal load")
+    assert own["stiffness_ratio"].value is None
+    stored = [name for name in own if own[name].value is not None]
+    assert len(stored) == len(jax.tree.leaves(BRAKE))
+    assert not {"contact", "surface", "friction"} & own.keys()
+
+
+def test_names_are_those_of_the_scene_and_the_derived_ones():
+    """mu once, also where the scene stores it."""
+    names = ["K_n", "K_t", "mu", "m", "omega_1", "omega_2", "xi_1", "xi_2", "F", "V"]
+    assert known_quantities(CONSTANT) == [*names, "K_t/K_n", "omega_1/omega_2"]
+    assert known_quantities(BRAKE)[-3:] == ["K_t/K_n", "omega_1/omega_2", "mu"]
+
+
+def test_units_and_labels():
+    assert [unit(BRAKE, name) for name in ("G", "V", "mu", "K_t/K_n")] == ["m", "m/s", "-", "-"]
+    assert label(BRAKE, "D") == "fractal dimension D [-]"
+    assert label(CONSTANT, "mu") == "friction coefficient mu [-]"
+    assert label(BRAKE, "mu") == "friction coefficient at the belt velocity µ [-]"
+    assert label(BRAKE, "K_t/K_n") == "stiffness ratio K_t/K_n [-]"
+    assert label(BRAKE, "omega_1/omega_2") == "ratio of natural frequencies ω₁/ω₂ [-]"
+
+
+@pytest.mark.parametrize("name", ["nonsense", "contact", "nu"])
+def test_unknown_names_are_refused_with_the_known_ones(name):
+    with pytest.raises(ValueError, match=f"scene has no quantity '{name}'; it has K_n, K_t, mu"):
+        require_known(CONSTANT, name)
+
+
+@pytest.mark.parametrize(
+    ("scene", "names"),
+    [
+        (CONSTANT, ("mu", "mu")),
+        (CONSTANT, ("K_t", "K_t/K_n")),
+        (BRAKE, ("K_t/K_n", "stiffness_ratio")),
+        (BRAKE, ("D", "omega_1/omega_2", "P", "omega_1")),
+        (BRAKE, ("mu", "mu_s")),
+        (BRAKE, ("mu_m", "mu")),
+    ],
+)
+def test_two_names_of_one_quantity_are_refused(scene, names):
+    with pytest.raises(ValueError, match=r"quantities must be independent, got [\w/]+ and [\w/]+$"):
+        require_independent(scene, names)
+
+
+@pytest.mark.parametrize(
+    ("scene", "names"),
+    [
+        (CONSTANT, ("K_n", "K_t/K_n")),
+        (BRAKE, ("omega_2", "omega_1/omega_2")),
+        (BRAKE, ("mu", "V", "v_m")),
+        (BRAKE, ("mu", "K_t/K_n", "D")),
+    ],
+)
+def test_independent_names_are_not(scene, names):
+    require_independent(scene, names)
+
+
+# --- values -------------------------------------------------------------------------------
+
+
+def test_values_of_an_axis():
+    """Lists as NumPy reads them, integers as numbers, and what is traced."""
+    np.testing.assert_array_equal(axis_values(BRAKE, "P", [1000, 2000]), [1000.0, 2000.0])
+    assert axis_values(BRAKE, "P", [1000, 2000]).dtype == jnp.float64
+    assert axis_values(BRAKE, "K_t/K_n", np.array([0.1], np.float32)).dtype == jnp.float32
+    found = jax.jit(lambda values: axis_values(BRAKE, "D", values))(np.array([2.3, 2.4]))
+    np.testing.assert_array_equal(found, [2.3, 2.4])
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "message"),
+    [
+        ("mass", [1.0], "scene has no quantity 'mass'"),
+        ("D", 2.4, r"the values of D must be a list, got shape \(\)"),
+        ("D", [], r"the values of D must be a list, got shape \(0,\)"),
+        ("D", [[2.3, 2.4]], r"the values of D must be a list, got shape \(1, 2\)"),
+        ("D", [2.3, np.nan], "D must be finite, got nan"),
+    ],
+)
+def test_values_that_are_no_axis_are_refused(name, values, message):
+    with pytest.raises(ValueError, match=message):
+        axis_values(BRAKE, name, values)
+
+
+@pytest.mark.parametrize("place", [replaced, substituted])
+def test_derived_quantities_at_what_is_set_beside_them(place):
+    """Whatever the order."""
+    scene = place(CONSTANT, {"K_t/K_n": 0.5, "K_n": 1e8, "omega_1/omega_2": 2.0, "omega_2": 3e3})
+    assert (scene.contact.K_n, scene.contact.K_t) == (1e8, 5e7)
+    assert (scene.oscillator.omega_1, scene.oscillator.omega_2) == (6e3, 3e3)
+    assert place(CONSTANT, {"mu": 0.2}).friction.mu_s == 0.2
+    moved = place(BRAKE, {"mu": 0.3, "V": 0.25, "v_m": 0.4, "D": 2.5})
+    mu_s, mu_m = moved.friction.mu_s, moved.friction.mu_m
+    assert mu_s / mu_m == pytest.approx(0.4 / 0.25, rel=1e-14)
+    assert mu_of(mu_s, mu_m, 0.4, 0.25) == pytest.approx(0.3, rel=1e-14)
+    assert moved.contact.surface.D == 2.5
+
+
+def test_a_fractal_contact_takes_a_stiffness_ratio_for_its_law():
+    assert replaced(BRAKE, {"K_t/K_n": 0.3}).contact.stiffness_ratio == 0.3
+    K_n, K_t = fj.stiffness(replaced(BRAKE, {"K_t/K_n": 0.3}))
+    assert K_t == pytest.approx(0.3 * float(K_n), rel=1e-14)
+    ready = with_optional(BRAKE, ["K_t/K_n"])
+    assert substituted(ready, {"K_t/K_n": 0.3}).contact.stiffness_ratio == 0.3
+    assert with_optional(ready, ["stiffness_ratio"]) is ready
+    assert with_optional(BRAKE, ["D", "mu"]) is BRAKE
+
+
+def test_a_scaled_law_keeps_its_shape():
+    scene = with_friction_times(FIXED, 0.5)
+    assert float(scene.friction.mu_s) == 0.2
+    assert float(scene.friction.mu_m) == 0.125
+    assert float(sliding_friction(scene)) == pytest.approx(float(sliding_friction(FIXED)) / 2)
+    assert sliding_friction(FIXED) == pytest.approx(mu_of(0.4, 0.25, 0.5, 0.15), rel=1e-15)
+    assert sliding_friction(CONSTANT) == 0.4
+
+
+def test_arrays_take_their_shape_together():
+    """As a grid gives them, and as `vmap` and `jit` see them."""
+    mu, V = np.array([[0.2, 0.3]] * 3), np.array([[0.1] * 2, [0.2] * 2, [0.3] * 2])
+    grid = replaced(BRAKE, {"mu": mu, "V": V}).friction
+    each = jax.jit(jax.vmap(jax.vmap(lambda mu, V: substituted(BRAKE, {"mu": mu, "V": V}))))
+    np.testing.assert_allclose(grid.mu_s, each(mu, V).friction.mu_s, rtol=1e-15)
+    np.testing.assert_allclose(mu_of(grid.mu_s, grid.mu_m, 0.5, V), mu, rtol=1e-14)
+
+
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_derivatives(mode):
+    """d mu_s/dmu and d mu_s/dV of the scaled law in closed form."""
+
+    def mu_s(mu, V):
+        return replaced(BRAKE, {"mu": mu, "V": V}).friction.mu_s
+
+    by_mu, by_V = jax.jit(mode(mu_s, argnums=(0, 1)))(0.3, 0.2)
+    at, slope = mu_of(0.4, 0.25, 0.5, 0.2), 0.15 * 1.5 / 0.5 * ((0.2 / 0.5) ** 2 - 1)
+    assert by_mu == pytest.approx(0.4 / at, rel=1e-14)
+    assert by_V == pytest.approx(-0.3 * 0.4 / at**2 * slope, rel=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("scene", "values", "message"),
+    [
+        (BRAKE, {"K_t/K_n": -0.1}, "K_t/K_n must be at least 0, got -0.1"),
+        (BRAKE, {"omega_1/omega_2": 0.0}, "omega_1/omega_2 must be above 0, got 0.0"),
+        (BRAKE, {"mu": 0.0}, "mu must be above 0, got 0.0"),
+        (CONSTANT, {"mu": 0.0}, "mu must be above 0, got 0.0"),
+        (BRAKE, {"mu": np.array([0.2, 2.0])}, "mu_m must be at most 0.9, got"),
+        (BRAKE, {"mu_s": 0.2}, "mu_s must be at least mu_m = 0.25, got 0.2"),
+        (CONSTANT, {"K_t/K_n": np.nan}, "K_t/K_n must be at least 0, got nan"),
+    ],
+)
+def test_values_outside_their_domain_are_refused(scene, values, message):
+    with pytest.raises(ValueError, match=message):
+        replaced(scene, values)
+
+
+def test_values_outside_their_domain_are_refused_when_compiled():
+    place = jax.jit(lambda ratio: replaced(CONSTANT, {"omega_1/omega_2": ratio}))
+    assert place(2.0).oscillator.omega_1 == 2 * CONSTANT.oscillator.omega_2
+    with pytest.raises(Exception, match="omega_1/omega_2 must be above 0"):
+        place(-1.0)
+
+
+def test_single_precision_stays():
+    scene = jax.tree.map(lambda x: x.astype(jnp.float32), reference_scene())
+    moved = substituted(scene, {"mu": jnp.float32(0.3), "K_t/K_n": jnp.float32(0.4)})
+    assert {leaf.dtype for leaf in jax.tree.leaves(moved)} == {jnp.dtype(jnp.float32)}

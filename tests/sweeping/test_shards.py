@@ -1,0 +1,55 @@
+"""The files of a sweep: whole, recognised, and refused in a line where they are not."""
+
+import numpy as np
+import pytest
+
+from fractaljax.sweeping.shards import Shards, describe
+
+ABOUT = {"key": "1", "axes": {"D": [2.4]}, "batch": 4, "arrays": [""]}
+
+
+def test_what_is_written_is_read(tmp_path):
+    shards = Shards(tmp_path / "new" / "folder", ABOUT)
+    arrays = [np.arange(3.0), np.ones((3, 2), np.int32), np.array([1j, 2, np.nan])]
+    assert not shards.has(7)
+    shards.write(7, arrays)
+    assert shards.has(7)
+    for found, given in zip(
+        Shards(tmp_path / "new" / "folder", ABOUT).read(7), arrays, strict=True
+    ):
+        np.testing.assert_array_equal(found, given)
+        assert found.dtype == given.dtype
+    assert describe(tmp_path / "new" / "folder") == ABOUT
+    assert describe(tmp_path) is None
+
+
+def test_more_than_ten_arrays_keep_their_order(tmp_path):
+    shards = Shards(tmp_path, ABOUT)
+    shards.write(0, [np.array([float(i)]) for i in range(12)])
+    assert [x[0] for x in shards.read(0)] == list(range(12))
+
+
+def test_a_folder_with_other_files(tmp_path):
+    (tmp_path / "thesis.tex").write_text("")
+    with pytest.raises(ValueError, match="out must be an empty folder or that of this sweep, got"):
+        Shards(tmp_path, ABOUT)
+    assert [file.name for file in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.parametrize("content", [b"", b"[1]", b'{"key": 1}', b"\xff\xfe"])
+def test_a_description_that_is_none(tmp_path, content):
+    (tmp_path / "sweep.json").write_bytes(content)
+    with pytest.raises(ValueError, match=r"sweep\.json does not describe a sweep: "):
+        describe(tmp_path)
+
+
+@pytest.mark.parametrize("cut", [0, 10, -1])
+def test_a_damaged_batch(tmp_path, cut):
+    shards = Shards(tmp_path, ABOUT)
+    shards.write(0, [np.arange(3.0)])
+    file = tmp_path / "00000000.npz"
+    file.write_bytes(file.read_bytes()[:cut])
+    with pytest.raises(
+        ValueError, match=r"00000000\.npz cannot be read, remove it and sweep again"
+    ):
+        shards.read(0)
