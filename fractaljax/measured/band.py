@@ -16,9 +16,9 @@ PER_RESOLUTION = 4  # periods of the resolution: a Gaussian filter leaves 96 per
 _BEND = 9.0  # by how much the deviance must fall before a bend or a floor is believed
 _FOLDING = 2.0  # likewise before waves above Nyquist are, which takes no further number
 _FEWEST = 12  # frequencies in a band that is given, ordinates within 2 percent being one
-_FINE = 1.2  # ratio of a bin at the very top
+_MANY = 5  # bins, of which a part of one more can be spared
+_FINE = 1.1  # ratio of a bin at the very top
 _NOTHING = 0.3  # of the law in it: the surface's waves end below the Nyquist frequency
-_MISSING = -0.45  # flat share that is then missing, as cuts of surfaces by Eq. 13 show it
 _UNKNOWN = 1e6  # standard deviation of a flat share of which nothing is known
 
 
@@ -93,6 +93,9 @@ def chosen_band(spectrum: Spectrum, length: float, ratio: float, top: float) -> 
     elif kind is _rolled:
         high = max(corner / PER_RESOLUTION, 3 * low)
         notes.append(f"roll-off above {corner:.3g} 1/m: the band ends at {high:.3g} 1/m")
+    bins = math.floor(math.log(high / low) / math.log(ratio) + 1e-9)
+    if bins >= _MANY:  # part of one may hold a discrete wave, or none, where the law has a part
+        low = high * ratio**-bins
     return Band(low, high, nature, tuple(notes))
 
 
@@ -119,10 +122,21 @@ def nature_of(spectrum: Spectrum, band: tuple[float, float], ratio: float) -> Na
     uppermost = fit(spectrum, band, _FINE, beyond=0.1).ratio[-1]
     if profile and band[1] == spectrum.nyquist and uppermost < _NOTHING:
         # The surface has no finer waves: those it has not are missing wherever it is crossed.
-        return Nature(False, False, 0.0, math.inf, _MISSING, BEYOND)
+        return Nature(False, False, 0.0, math.inf, -_missing_share(plain.p), BEYOND)
     folded = gain > _FOLDING or (gain > 0 and plain.p < 1 < folds.p)
     undecided = profile and abs(gain) < _FOLDING
     return Nature(folded, undecided, 0.0, math.inf, 0.0, BEYOND)
+
+
+def _missing_share(p: float) -> float:
+    """What a cut lacks where no wave is finer than Nyquist's: flat, in units of the law there.
+
+    A wave of frequency k is seen at f = k |cos a|, so what is seen at f from beyond k is the part
+    s < f/k of the mean of s^(p-1) over a: to first order 2/(p B(p/2, 1/2)) (f/k)^p of it.
+    """
+    p = min(max(p, 1.0), 3.0)
+    beta = math.gamma(p / 2) * math.gamma(0.5) / math.gamma((p + 1) / 2)
+    return 2 / (p * beta)
 
 
 def _bent(f, p, corner):

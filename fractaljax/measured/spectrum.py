@@ -127,13 +127,17 @@ def map_spectra(z: np.ndarray, dx: float, dy: float) -> tuple[Spectrum, ...]:
     nyquist = 0.5 / max(dx, dy)
     everywhere = np.ones_like(along_x)
     return tuple(
-        _rings(fx, fy, power, count * chosen, lengths, nyquist)
-        for chosen in (everywhere, along_x, ~along_x)
+        _rings(fx, fy, power, count * chosen, share, lengths, nyquist)
+        for chosen, share in ((everywhere, 1.0), (along_x, 0.5), (~along_x, 0.5))
     )
 
 
-def _rings(fx, fy, power, count, lengths, nyquist) -> Spectrum:
-    """Means over rings one frequency step wide, times 2 pi |f|."""
+def _rings(fx, fy, power, count, share, lengths, nyquist) -> Spectrum:
+    """Sums over (a share of) rings one frequency step wide, beside the step.
+
+    Not means times 2 pi |f|: the number of modes in a ring goes up and down, and a discrete wave
+    lies in few of them.
+    """
     f = np.hypot(fx[:, None], fy)
     step = 1 / min(lengths)
     ring = np.rint(f / step).astype(int).ravel()
@@ -147,9 +151,10 @@ def _rings(fx, fy, power, count, lengths, nyquist) -> Spectrum:
     inflation = 3.7809  # (35/18)^2, Hann's in both directions
     width = np.mean([1 / (3 * length**2) for length in lengths])
     f = frequencies / modes
+    expected = share * np.pi * np.arange(1, rings + 1) * step**2 * lengths[0] * lengths[1]
     return _merged(
         f,
-        2 * np.pi * powers / modes,
+        2 * np.pi * powers / expected,
         modes / inflation,
         1 / f,
         np.full(f.size, width),

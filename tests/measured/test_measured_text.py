@@ -63,7 +63,7 @@ def test_a_header_that_tells_the_size_of_a_map(header):
     numbers, units, size = read_table(text.encode())
     np.testing.assert_array_equal(numbers, [[1, 1.5, 3], [-2, -3, -6]])
     assert units == ["m"] * 3
-    np.testing.assert_allclose(size, [12.34e-6, 5678.9e-9])
+    assert size == pytest.approx((12.34e-6, 5678.9e-9))
 
 
 def test_lengths_in_a_header_are_no_units_of_columns():
