@@ -21,6 +21,7 @@ from .stick_slip import StickSlip, scaled_start, stick_slip, units
 _TRANSIENT = 64
 _LOOKED_AT = 6
 _LONGEST = 4
+_SAME = 1e-5  # scaled: states no further apart repeat
 _TOLERANCE = 1e-3  # of the relative difference from the exact law's cycle
 
 
@@ -121,11 +122,15 @@ def close(system: StickSlip, eps, y, solver, rtol, max_steps: int) -> Periodic:
     )
     times, states = nodes(window)
     times = _turns(times, states[:, 2])
+    for _ in range(2):  # between steps u1 is no line, and turns must not differ by that
+        ends = jax.vmap(window.evaluate)(jnp.nan_to_num(times))
+        rates = jax.vmap(lambda y: field(0.0, y, (frozen, eps_0)))(ends)
+        times = times - ends[:, 2] / jnp.where(rates[:, 2] == 0, 1, rates[:, 2])
     ends = jax.vmap(window.evaluate)(jnp.nan_to_num(times))
     distances = jnp.max(jnp.abs(ends[1 : _LONGEST + 1] - ends[:1]), axis=1)
     distances = jnp.where(jnp.isnan(times[1 : _LONGEST + 1]), jnp.inf, distances)
     closest = jnp.min(distances)
-    turns = 1 + jnp.argmax(distances <= 2 * closest + 1e-6)
+    turns = 1 + jnp.argmax(distances <= 2 * closest + _SAME)
     guess = jnp.nan_to_num(ends[0]), jnp.nan_to_num(times[turns] - times[0], nan=1.0)
 
     def gap(unknown, args):

@@ -50,6 +50,14 @@ def period_later(found: fj.LimitCycle, eps) -> fj.Trajectory:
 # --- what it finds ------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("eps", [1e-3, 2e-3])
+def test_a_turn_is_not_taken_several_times_for_a_period(eps):
+    """Where the motion has settled, turns differ by rounding and interpolation only."""
+    found, exact = cycle(eps), fj.limit_cycle(moved_scene(K_N))
+    assert int(found.turns) == 1
+    assert float(found.period) == pytest.approx(float(exact.period), rel=1e-2)
+
+
 def test_a_large_eps_finds_another_motion():
     """At 0.03 m/s direction 2 never reverses, and everything is tens of percent off: it is told."""
     found = cycle(COARSE)
