@@ -284,9 +284,10 @@ def table(result: dict[str, Any]) -> str:
         "Each row is measured in a Python process of its own, in double precision. Operations are"
         " those of the traced program before any compiler has seen them; FLOPs and bytes are the"
         " compiler's own estimate, which counts the body of a loop once, so that of limit cycles"
-        " it leaves out most of the search, and bytes depend on what it fuses. Run time is the median of"
-        f" {result['repeats']} calls for one scene, that of the call itself (about 10 us) included."
-        f" Libraries are those among {', '.join(HEAVY)} that have been imported by then.",
+        " it leaves out most of the search, and bytes depend on what it fuses. Run time is the"
+        f" median of {result['repeats']} calls for one scene, that of the call itself (about 10"
+        f" us) included. Libraries are those among {', '.join(HEAVY)} that have been imported by"
+        " then.",
         "",
         ran_on(result),
         "",

@@ -4,7 +4,12 @@ import importlib.util
 import re
 from pathlib import Path
 
+import jax.numpy as jnp
+import matplotlib.image
+import numpy as np
 import pytest
+
+import fractaljax as fj
 
 DOCS = Path(__file__).parents[1] / "docs"
 MEASURED = re.compile(r"\d\.?\d*e[+-]\d\d")
@@ -36,3 +41,13 @@ def test_float32_page_has_the_numbers_that_are_measured_now(pages):
     assert len(committed) == len(now) > 50
     assert now == pytest.approx(committed, rel=FACTOR - 1, abs=0)
     assert committed == pytest.approx(now, rel=FACTOR - 1, abs=0)
+
+
+def test_identification_is_drawn_as_it_is_shown_and_finds_the_surface(tmp_path):
+    found = _script("make_identification").draw(tmp_path / "identification.png")
+    drawn, shown = (matplotlib.image.imread(x / "identification.png") for x in (tmp_path, DOCS))
+    assert drawn.shape == shown.shape
+    assert np.abs(drawn - shown).mean() < 0.01
+    truth = fj.brake_scene().contact.surface
+    off = np.array([found.D - truth.D, np.log(found.G) - jnp.log(truth.G)])
+    assert off @ np.linalg.solve(found.covariance, off) < 6  # 95 percent of two numbers

@@ -107,6 +107,8 @@ class Record(eqx.Module):
 
     def _shown(self):
         for field in dataclasses.fields(self):
+            if not field.repr:
+                continue
             value = getattr(self, field.name)
             if isinstance(value, jax.Array) and not isinstance(value, jax.core.Tracer):
                 value = value.item() if value.ndim == 0 else np.asarray(value)

@@ -68,7 +68,7 @@ class Boundary(Record):
         plural = "" if len(self.branches) == 1 else "es"
         rows = [f"stability boundary, {x}, {y}: {len(self.branches)} branch{plural}"]
         for branch in self.branches:
-            ends = f"from {BranchEnd[branch.start]} to {BranchEnd[branch.end]}"
+            ends = f"begins {BranchEnd[branch.start]}, ends {BranchEnd[branch.end]}"
             rows.append(f"  {len(branch.x)} points, {'a loop' if branch.closed else ends}")
         if not self.branches and not self.untraced:
             rows.append("  none found: it squeals" if self.squeals else "  none found: stable")

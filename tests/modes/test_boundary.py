@@ -295,7 +295,7 @@ def test_printed_it_is_a_summary():
     text = repr(over_ratio_and_friction())
     first, second = text.splitlines()
     assert first == "stability boundary, K_t/K_n from 0.01 to 1, mu from 0.05 to 1: 1 branch"
-    assert second.endswith("from at the edge of the window to at the edge of the window")
+    assert second.endswith("begins at the edge of the window, ends at the edge of the window")
 
 
 # --- the picture --------------------------------------------------------------------------

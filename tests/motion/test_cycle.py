@@ -8,6 +8,12 @@ import fractaljax as fj
 from tools import reference_cycle, reference_scene
 
 
+def test_printed_it_shows_its_numbers_and_not_the_orbit():
+    shown = repr(reference_cycle())
+    assert shown.startswith("LimitCycle(period=0.000323") and "a limit cycle was found" in shown
+    assert "_system" not in shown and len(shown) < 1000
+
+
 def test_one_period_of_the_simulated_motion_returns():
     """The orbit is the one that `simulate`, which searches its events, runs through."""
     scene, cycle = reference_scene(), reference_cycle()
