@@ -1,5 +1,6 @@
 """The band of frequencies over which a measured spectrum is that of its surface."""
 
+import functools
 import math
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ PER_RESOLUTION = 4  # periods of the resolution: a Gaussian filter leaves 96 per
 _BEND = 9.0  # by how much the deviance must fall before a bend or a floor is believed
 _FOLDING = 2.0  # likewise before waves above Nyquist are, which takes no further number
 _FEWEST = 12  # frequencies in a band that is given, ordinates within 2 percent being one
+_POOR = 0.25  # scatter of a law so far off that it does not tell where a bend would be
 _MANY = 5  # bins, of which a part of one more can be spared
 _FINE = 1.1  # ratio of a bin at the very top
 _NOTHING = 0.3  # of the law in it: the surface's waves end below the Nyquist frequency
@@ -144,9 +146,9 @@ def _bent(f, p, corner):
     return (1 + (corner / f) ** 2) ** (-p / 2)
 
 
-def _rolled(f, _, cutoff):
+def _rolled(f, _, corner):
     """Heights through a Gaussian filter, which halves their amplitude at the cut-off."""
-    return np.maximum(4.0 ** -((f / cutoff) ** 2), 1e-6)
+    return np.maximum(4.0 ** -((f / corner) ** 2), 1e-6)
 
 
 def _bend(spectrum, band, ratio, nature):
@@ -158,13 +160,16 @@ def _bend(spectrum, band, ratio, nature):
         (_rolled, np.geomspace(4 * low, 1.5 * high, 12)),
         (_bent, np.geomspace(1.2 * low, high / 4, 12)),
     ):
-        gains = [_gain(straight, kind(straight.f, straight.p, c)) for c in corners]
-        corner = corners[int(np.argmax(gains))]
-
-        def bend(f, p, kind=kind, corner=corner):
-            return kind(f, p, corner)
-
-        law = fit(spectrum, band, ratio, **nature.options, reshape=bend)
+        if straight.scatter < _POOR:
+            gains = [_gain(straight, kind(straight.f, straight.p, c)) for c in corners]
+            corners = corners[[int(np.argmax(gains))]]
+        laws = [
+            fit(spectrum, band, ratio, **nature.options, reshape=functools.partial(kind, corner=c))
+            for c in corners
+        ]
+        law, corner = min(
+            zip(laws, corners, strict=True), key=lambda pair: (pair[0].scatter, pair[0].deviance)
+        )
         same = fit(spectrum, band, ratio, **nature.options, scatter=law.scatter)
         if same.deviance - law.deviance > best:
             best, found = same.deviance - law.deviance, (kind, float(corner))
