@@ -18,6 +18,7 @@ _BEND = 9.0  # by how much the deviance must fall before a bend or a floor is be
 _FOLDING = 2.0  # likewise before waves above Nyquist are, which takes no further number
 _FEWEST = 12  # frequencies in a band that is given, ordinates within 2 percent being one
 _POOR = 0.25  # scatter of a law so far off that it does not tell where a bend would be
+_LEAST_END = 0.8  # of the Nyquist frequency: waves that end further down are a roll-off
 _MANY = 5  # bins, of which a part of one more can be spared
 _FINE = 1.1  # ratio of a bin at the very top
 _NOTHING = 0.3  # of the law in it: the surface's waves end below the Nyquist frequency
@@ -121,10 +122,14 @@ def nature_of(spectrum: Spectrum, band: tuple[float, float], ratio: float) -> Na
     if min(plain.deviance, folds.deviance) - noisy.deviance > _BEND and noisy.flat > 0:
         meets = spectrum.nyquist * (2 * noisy.flat) ** (-1 / (noisy.p + (not profile)))
         return Nature(False, False, noisy.flat * math.exp(noisy.log_A), meets, 0.0, _UNKNOWN)
-    uppermost = fit(spectrum, band, _FINE, beyond=0.1).ratio[-1]
-    if profile and band[1] == spectrum.nyquist and uppermost < _NOTHING:
-        # The surface has no finer waves: those it has not are missing wherever it is crossed.
-        return Nature(False, False, 0.0, math.inf, -_missing_share(plain.p), BEYOND)
+    fine = fit(spectrum, band, _FINE, beyond=0.1)
+    seen = np.flatnonzero(fine.ratio >= _NOTHING)
+    if profile and band[1] == spectrum.nyquist and seen.size and seen[-1] < fine.f.size - 1:
+        # The surface has no finer waves: those it has not are missing wherever it is crossed. The
+        # last of discrete waves stands for all up to half a step of gamma above it.
+        end = max(fine.f[seen[-1]] * math.sqrt(ratio) / spectrum.nyquist, _LEAST_END)
+        missing = -_missing_share(plain.p) * end**-plain.p
+        return Nature(False, False, 0.0, math.inf, missing, BEYOND)
     folded = gain > _FOLDING or (gain > 0 and plain.p < 1 < folds.p)
     undecided = profile and abs(gain) < _FOLDING
     return Nature(folded, undecided, 0.0, math.inf, 0.0, BEYOND)

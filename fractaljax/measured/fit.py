@@ -12,6 +12,7 @@ import numpy as np
 from .spectrum import Spectrum
 
 BEYOND = 0.35  # standard deviation of the unknown flat share, in units of the law at Nyquist
+_SPREAD = 0.15  # of the prior's variance: what the flat share is taken to scatter by
 _ROUNDS = 4  # of estimating the scatter anew
 _STEPS = 20
 
@@ -177,7 +178,10 @@ def fit(
         if abs(before - scatter) <= 1e-3 * scatter:
             break
     weight = 1 / (bins.variance + scatter)
-    covariance = np.linalg.inv(slope.T @ (weight[:, None] * slope) + prior)
+    data = slope.T @ (weight[:, None] * slope)
+    inverse = np.linalg.inv(data + prior)
+    # The flat share is held by a wide prior, but scatters about its mean by less.
+    covariance = inverse @ (data + _SPREAD * prior) @ inverse
     safe = np.maximum(ratios, 1e-300)
     deviance = 2 * float(weight @ (ratios - 1 - np.log(safe))) + (at[2] - expected) ** 2 / beyond**2
     found = PowerLaw(

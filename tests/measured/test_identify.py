@@ -24,17 +24,18 @@ def errors(make, D, count, **options):
     return np.array(rows)
 
 
-def assert_honest(rows, bias=0.01, below=0.05, above=0.05):
+def assert_honest(rows, bias=0.01, below=0.05, above=0.05, above_ln_G=0.2):
     """No bias beyond its limit and chance, and 68 percent within one standard error.
 
-    The last two say by how much fewer, or more, they may be, again beyond chance.
+    The last three say by how much fewer, or more, they may be, again beyond chance. Those of ln G
+    grow as its own 1/(2D-4) does, which no symmetric error can follow close to D = 2.
     """
     error, chance = rows[:, 0], 2.5 / math.sqrt(len(rows))
     assert abs(error.mean()) < bias + chance * error.std()
-    for column in (0, 2):
+    for column, more in ((0, above), (2, above_ln_G)):
         covered = np.mean(np.abs(rows[:, column]) < rows[:, column + 1])
         spread = chance * math.sqrt(0.68 * 0.32)
-        assert 0.68 - below - spread < covered < 0.68 + above + spread
+        assert 0.68 - below - spread < covered < 0.68 + more + spread
 
 
 KINDS = {"gaussian": gaussian_profile, "cut": cut}
@@ -52,15 +53,14 @@ def test_profiles(kind, D):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("D", [2.1, 2.5, 2.9])
 def test_two_hundred_profiles(kind, D, n):
-    """Bias in D below 0.01 and 68 percent cover, within the chance that 200 profiles leave.
-
-    A cut through a surface whose waves end at two points lacks those that it would see at an angle:
-    at D = 2.9 that is 0.02.
-    """
+    """Bias in D below 0.01 and 68 percent cover, within the chance that 200 profiles leave."""
     rows = errors(lambda rng, D: KINDS[kind](rng, D, n=n), D, 200)
-    # Waves of fixed amplitude scatter less than chance has it: a cut's errors are wide. And those
-    # of ln G grow as its own 1/(2D-4) does, which no symmetric error can follow close to D = 2.
-    assert_honest(rows, bias=0.01 if kind == "gaussian" else 0.03, above=0.2)
+    if kind == "gaussian":
+        return assert_honest(rows)
+    # Waves of fixed amplitude scatter less than chance has it: a cut's errors are wide. Where they
+    # end just below Nyquist, as with 2048 points, it is not seen that finer ones are missing.
+    hidden = n == 2048 and D == 2.9
+    assert_honest(rows, bias=0.03 if hidden else 0.01, below=0.15 if hidden else 0.05, above=0.2)
 
 
 @pytest.mark.parametrize("make", [gaussian_map, surface])
