@@ -127,7 +127,7 @@ def nature_of(spectrum: Spectrum, band: tuple[float, float], ratio: float) -> Na
     if profile and band[1] == spectrum.nyquist and seen.size and seen[-1] < fine.f.size - 1:
         # The surface has no finer waves: those it has not are missing wherever it is crossed. The
         # last of discrete waves stands for all up to half a step of gamma above it.
-        end = max(fine.f[seen[-1]] * math.sqrt(ratio) / spectrum.nyquist, _LEAST_END)
+        end = max(float(fine.f[seen[-1]]) * math.sqrt(ratio) / spectrum.nyquist, _LEAST_END)
         missing = -_missing_share(plain.p) * end**-plain.p
         return Nature(False, False, 0.0, math.inf, missing, BEYOND)
     folded = gain > _FOLDING or (gain > 0 and plain.p < 1 < folds.p)
