@@ -134,10 +134,19 @@ def quoted(text: str) -> str:
     return '"' + "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in escaped) + '"'
 
 
+def _temporary(target: Path) -> str:
+    return f".{target.name}-"
+
+
+def left_behind(target: Path, file: Path) -> bool:
+    """Whether `file` is the start of `target` that a killed `write_whole` left."""
+    return file.name.startswith(_temporary(target))
+
+
 def write_whole(path: str | os.PathLike, content: bytes) -> None:
     """Write a file through a temporary neighbour, so that it is there whole or not at all."""
     target = Path(path)
-    handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}-")
+    handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=_temporary(target))
     try:
         with os.fdopen(handle, "wb") as file:
             file.write(content)

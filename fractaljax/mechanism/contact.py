@@ -9,6 +9,7 @@ derivative.
 """
 
 import abc
+import math
 from typing import ClassVar
 
 import equinox as eqx
@@ -74,25 +75,37 @@ def critical_pressure_ratio(material: Material, k_mu: jax.Array) -> jax.Array:
     return 1.1 * k_mu * material.sigma_y / material.H
 
 
+def _bounded(t, D):
+    """The smaller of t and that at which the square of e^(rt), r = (5-2D)/2, would overflow.
+
+    From there on plastic contacts carry nothing that counts, and ln P is a straight line in t.
+    """
+    r, largest = (5 - 2 * D) / 2, 0.35 * math.log(jnp.finfo(D.dtype).max)
+    return jnp.minimum(t, largest / jnp.maximum(r, 1e-6))
+
+
 def elastic_to_plastic_load(t: jax.Array, D: jax.Array, beta: jax.Array) -> jax.Array:
     """Ratio of the two terms of Eq. 26 (Eq. 27 at D = 2.5), with t = ln(a_l/a_e) >= 0.
 
-    beta (3-D)/2 (e^(rt) - 1)/r, r = (5-2D)/2, beta as `critical_pressure_ratio`.
+    beta (3-D)/2 (e^(rt) - 1)/r, r = (5-2D)/2, beta as `critical_pressure_ratio`; constant where
+    its square would overflow.
     """
     r = (5 - 2 * D) / 2
-    return beta * (3 - D) / 2 * boxcox(t, r)
+    return beta * (3 - D) / 2 * boxcox(_bounded(t, D), r)
 
 
 def log_load(t: jax.Array, D: jax.Array, beta: jax.Array) -> jax.Array:
     """Eq. 26: ln P minus the ln P of an all-plastic joint with a_l = a_e; t = ln(a_l/a_e) >= 0."""
-    return (D - 1) / 2 * t + jnp.log1p(elastic_to_plastic_load(t, D, beta))
+    beyond = t - _bounded(t, D)
+    curved = (D - 1) / 2 * t + jnp.log1p(elastic_to_plastic_load(t, D, beta))
+    return curved + (5 - 2 * D) / 2 * beyond
 
 
 def _bending(t, D, beta):
     """w = d log_load/dt - (D-1)/2, whose own slope is w (r - w)."""
     r = (5 - 2 * D) / 2
     # e^(rt) as 1 + r (e^(rt) - 1)/r: the exponential is there already.
-    growth = beta * (3 - D) / 2 * (1 + r * boxcox(t, r))
+    growth = beta * (3 - D) / 2 * (1 + r * boxcox(_bounded(t, D), r))
     return growth / (1 + elastic_to_plastic_load(t, D, beta))
 
 
@@ -134,13 +147,14 @@ def area_moment(p, D: jax.Array, log_a_e: jax.Array, t: jax.Array) -> jax.Array:
     """J(p) = integral of a^p n(a) da over the elastic contacts [a_e, a_l] (Eq. 25) [m^(2p)].
 
     (D-1)/2 a_l^((D-1)/2) (a_l^r - a_e^r)/r with r = p + (1-D)/2, written with t = ln(a_l/a_e) as
-    (D-1)/2 a_e^p e^((D-1)t/2) (e^(rt) - 1)/r. Exactly 0 for t <= 0, where nothing is elastic.
+    (D-1)/2 a_l^p (1 - e^(-rt))/r: as D -> 2, a_e alone overflows or underflows. Exactly 0 for
+    t <= 0, where nothing is elastic.
     """
     elastic = t > 0
     # Far in the plastic regime a_e overflows: the unused branch must not see it.
     log_a_e, t = jnp.where(elastic, log_a_e, 0), jnp.where(elastic, t, 1)
     r = p + (1 - D) / 2
-    moment = (D - 1) / 2 * jnp.exp(p * log_a_e + (D - 1) / 2 * t) * boxcox(t, r)
+    moment = (D - 1) / 2 * jnp.exp(p * (log_a_e + t)) * boxcox(t, -r)
     return jnp.where(elastic, moment, 0)
 
 
@@ -197,7 +211,7 @@ class _Joint(eqx.Module):
     log_a_l: jax.Array
     log_a_e: jax.Array
     log_area_ratio: jax.Array
-    elastic_share: jax.Array
+    plastic_share: jax.Array
     K_n: jax.Array
     K_t: jax.Array
     Q_e: jax.Array | None
@@ -214,16 +228,16 @@ def _solve(surface: Surface, material: Material, P, mu_s, mu_m, stiffness_ratio=
     s = log_a_plastic - log_a_e
     t = solve_log_area_ratio(s, D, beta)
     ratio = elastic_to_plastic_load(jnp.maximum(t, 0), D, beta)
-    elastic_share = ratio / (1 + ratio)
+    plastic_share = 1 / (1 + ratio)
     moment = area_moment(0.5, D, log_a_e, t)
     K_n = normal_stiffness(D, E, moment)
     if stiffness_ratio is None:
-        Q_e = tangential_load(area_moment(1.0, D, log_a_e, t), elastic_share * P, material)
+        Q_e = tangential_load(area_moment(1.0, D, log_a_e, t), ratio * plastic_share * P, material)
         slip_ratio = Q_e / (mu_s * P)
         K_t = tangential_stiffness(E, nu, slip_ratio, moment)
     else:
         Q_e, slip_ratio, K_t = None, None, stiffness_ratio * K_n
-    return _Joint(log_a_plastic + (t - s), log_a_e, t, elastic_share, K_n, K_t, Q_e, slip_ratio)
+    return _Joint(log_a_plastic + (t - s), log_a_e, t, plastic_share, K_n, K_t, Q_e, slip_ratio)
 
 
 def contact_state(surface: Surface, material: Material, P, *, mu_s, mu_m) -> ContactState:
@@ -319,7 +333,7 @@ class FractalContact(Contact):
             a_e=exp_or_inf(joint.log_a_e),
             A_r=(D - 1) / (3 - D) * a_l,
             Q_e=joint.Q_e,
-            plastic_share=1 - joint.elastic_share,
+            plastic_share=joint.plastic_share,
             log_area_ratio=joint.log_area_ratio,
             slip_ratio=joint.slip_ratio,
             regime=Regime.where(

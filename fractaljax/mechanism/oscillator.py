@@ -86,10 +86,11 @@ def linearise(
 def dimensionless(lin: Linearised) -> tuple[jax.Array, Linearised]:
     """omega = sqrt(a + b), and the system in its units: no power leaves the range of a float32."""
     omega = jnp.sqrt(lin.a + lin.b)
+    square = 1 / omega**2  # omega^4 stays in the range, but the square of it in a derivative not
     return omega, Linearised(
         a=lin.a / omega**2,
         b=lin.b / omega**2,
         c_1=lin.c_1 / omega,
         c_2=lin.c_2 / omega,
-        g=lin.g / omega**4,
+        g=lin.g * square * square,
     )

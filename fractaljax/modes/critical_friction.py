@@ -30,7 +30,9 @@ def critical_coupling(lin: Linearised) -> jax.Array:
     (a - b)^2/4, where the modes coalesce.
     """
     a_3, a_1 = lin.c_1 + lin.c_2, lin.c_1 * lin.b + lin.c_2 * lin.a
-    share = safe_divide(lin.c_1 * lin.c_2, a_3**2, jnp.full_like(a_3, 0.25))
+    half = jnp.full_like(a_3, 0.5)
+    # Not of products, whose powers in a derivative underflow in a float32.
+    share = safe_divide(lin.c_1, a_3, half) * safe_divide(lin.c_2, a_3, half)
     return share * ((lin.a - lin.b) ** 2 + a_3 * a_1)
 
 

@@ -255,6 +255,12 @@ def _eigenvalues_jvp(primals, tangents):
     return s, _eigenvalue_tangents(lin, dlin, s)
 
 
+def _damping_ratio(s):
+    """-Re/|s|, and 0 where s is."""
+    rest = s == 0
+    return jnp.where(rest, 0, -s.real / jnp.abs(jnp.where(rest, 1, s)))
+
+
 @functools.partial(jax.jit, static_argnames="friction_slope")
 def growth_rate(scene: Scene | Structure, friction_slope: bool = True) -> jax.Array:
     """Largest real part of the eigenvalues [1/s], a scalar; above 0 the scene squeals.
@@ -295,6 +301,6 @@ def stability(scene: Scene | Structure, friction_slope: bool = True) -> Stabilit
         eigenvalues=eigenvalues,
         growth_rate=eigenvalues[0].real,
         frequency=jnp.abs(eigenvalues[0].imag) / (2 * jnp.pi),
-        damping_ratio=-eigenvalues[0].real / jnp.abs(eigenvalues[0]),
+        damping_ratio=_damping_ratio(eigenvalues[0]),
         margin=margin_of(lin),
     )

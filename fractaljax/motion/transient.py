@@ -19,7 +19,7 @@ from .events import Cubic, guards_and_rates, step
 from .shooting import UNUSED, Segments, close, estimated_error, flow, next_start
 from .stick_slip import SECTION, StickSlip
 
-_STEP = 0.25  # of the coarse run, in units of 1/omega; no eigenfrequency exceeds 1
+_STEP = 0.3  # of the coarse run, in units of 1/omega; no eigenfrequency exceeds 1
 _STEPS_A_TURN = 1600
 _TURNS_A_ROUND = 8
 _APPROACHES = 3  # rounds in which the motion must come closer to an orbit that is not at hand

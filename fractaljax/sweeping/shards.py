@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from ..base.scene_file import write_whole
+from ..base.scene_file import left_behind, write_whole
 
 _ABOUT = "sweep.json"
 _MEANINGS = {
@@ -40,7 +40,9 @@ class Shards:
         file = self._folder / _ABOUT
         # Another process of the same sweep may write the file between two of these questions.
         if not file.exists():
-            if any(self._folder.iterdir()) and not file.exists():
+            # A process killed while it wrote the file leaves the start of it under another name.
+            others = [f for f in self._folder.iterdir() if not left_behind(file, f)]
+            if others and not file.exists():
                 raise ValueError(f"out must be an empty folder or that of this sweep, got {path}")
             write_whole(file, json.dumps(about).encode())
         found = describe(path) or {}

@@ -36,6 +36,12 @@ def test_a_folder_with_other_files(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["thesis.tex"]
 
 
+def test_a_sweep_killed_before_it_was_described(tmp_path):
+    (tmp_path / ".sweep.json-1a2b3c").write_text('{"key":')
+    Shards(tmp_path, ABOUT).write(0, [np.arange(3.0)])
+    assert Shards(tmp_path, ABOUT).has(0)
+
+
 @pytest.mark.parametrize("content", [b"", b"[1]", b'{"key": 1}', b"\xff\xfe"])
 def test_a_description_that_is_none(tmp_path, content):
     (tmp_path / "sweep.json").write_bytes(content)
