@@ -8,7 +8,6 @@ a fixed number of Halley's steps; beside it a loop that asks SciPy's brentq for 
 import dataclasses
 import json
 import math
-import platform
 import statistics
 from collections.abc import Callable
 from pathlib import Path
@@ -17,14 +16,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy
 from scipy.optimize import brentq
 from tqdm import tqdm
 
 import fractaljax as fj
 from fractaljax.mechanism import contact
 
-from .page import png, write
+from .page import cell, png, subplots, table, versions
 from .timing import compiled, others_running, ran_on, seconds, this_machine
 
 TABLE = Path(__file__).parents[1] / "tests" / "reference" / "contact.json"
@@ -158,12 +156,7 @@ def measure(quick: bool = False) -> dict[str, Any]:
         "copies": size.copies,
         "repeats": size.repeats,
         "machine": this_machine(busy),
-        "versions": {
-            "python": platform.python_version(),
-            "jax": jax.__version__,
-            "numpy": np.__version__,
-            "scipy": scipy.__version__,
-        },
+        "versions": versions("jax", "numpy", "scipy"),
         "methods": methods,
     }
 
@@ -185,29 +178,36 @@ def choice(result: dict[str, Any]) -> str:
     )
 
 
-def table(result: dict[str, Any]) -> str:
+HEADINGS = [
+    "method",
+    "setting",
+    "compile [s]",
+    "time a joint [ns]",
+    *(f"{name}: median, worst" for name in OUTPUTS),
+    "not finite",
+]
+
+
+def cells(method: dict[str, Any]) -> list[str]:
+    """One row of the table."""
+    return [
+        method["family"],
+        method["setting"] + (" (default)" if method["default"] else ""),
+        cell(method["compile_s"], ".1f"),
+        f"{method['seconds'] * 1e9:.3g}",
+        *(f"{method['median'][name]:.1e}, {method['worst'][name]:.1e}" for name in OUTPUTS),
+        str(method["not_finite"]),
+    ]
+
+
+def text(result: dict[str, Any]) -> str:
     """The Markdown page: one sentence, the table, how it was measured."""
     lines = [
         "# The joint under a given load: error against run time",
         "",
         choice(result),
         "",
-        "| method | setting | compile [s] | time a joint [ns] | a_l: median, worst |"
-        " K_n: median, worst | K_t: median, worst | not finite |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for method in result["methods"]:
-        compile_s = method["compile_s"]
-        cells = [
-            method["family"],
-            method["setting"] + (" (default)" if method["default"] else ""),
-            "-" if compile_s is None else f"{compile_s:.1f}",
-            f"{method['seconds'] * 1e9:.3g}",
-            *(f"{method['median'][name]:.1e}, {method['worst'][name]:.1e}" for name in OUTPUTS),
-            str(method["not_finite"]),
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
-    lines += [
+        *table(HEADINGS, [cells(method) for method in result["methods"]]),
         "",
         f"{result['rows']} joints, each with a surface, material, load and friction of its own,"
         " against 25 digits from quadrature; errors are relative. What is left of them after the"
@@ -225,12 +225,7 @@ def table(result: dict[str, Any]) -> str:
 
 def picture(result: dict[str, Any]) -> bytes:
     """Worst error of K_n over the time of a joint, a line for each family."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, ax = plt.subplots(figsize=(8.4, 5.4), layout="constrained")
+    figure, ax = subplots(figsize=(8.4, 5.4))
     families = list(dict.fromkeys(method["family"] for method in result["methods"]))
     styles = zip(families, ("o-", "s--", "^:"), ("tab:blue", "tab:cyan", "tab:orange"), strict=True)
     for family, style, colour in styles:
@@ -253,9 +248,3 @@ def picture(result: dict[str, Any]) -> bytes:
     ax.grid(True, which="major", alpha=0.4)
     ax.legend(loc="best", fontsize="small")
     return png(figure, dpi=110)
-
-
-def run(out: Path, quick: bool = False) -> list[Path]:
-    """Measure, and write contact.json, .md and .png into a folder; returns their paths."""
-    result = measure(quick)
-    return write(out, "contact", result, table(result), picture(result))

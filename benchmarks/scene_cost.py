@@ -8,7 +8,6 @@ not need must not be there, so the row without it is the cheaper one in every co
 import collections
 import dataclasses
 import json
-import platform
 import statistics
 import subprocess
 import sys
@@ -22,7 +21,7 @@ import jax.numpy as jnp
 
 import fractaljax as fj
 
-from .page import png, write
+from .page import png, subplots, table, versions
 from .timing import others_running, ran_on, this_machine
 
 HEAVY = ("diffrax", "optimistix", "optax", "matplotlib", "scipy", "tqdm")
@@ -238,7 +237,7 @@ def measure(quick: bool = False) -> dict[str, Any]:
         "quick": quick,
         "repeats": repeats,
         "machine": this_machine(busy),
-        "versions": {"python": platform.python_version(), "jax": jax.__version__},
+        "versions": versions("jax"),
         "rows": [in_a_process(row, repeats) for row in tqdm(rows, desc="scene")],
     }
 
@@ -250,7 +249,31 @@ def measure(quick: bool = False) -> dict[str, Any]:
 COUNTS = {"operations": "operations", "flops": "FLOPs", "bytes_accessed": "bytes moved"}
 
 
-def table(result: dict[str, Any]) -> str:
+HEADINGS = [
+    "question",
+    "operations",
+    "FLOPs",
+    "bytes moved",
+    "trace [s]",
+    "compile [s]",
+    "run [us]",
+    "libraries loaded",
+]
+
+
+def cells(row: dict[str, Any]) -> list[str]:
+    """One row of the table."""
+    return [
+        row["name"],
+        f"{row['operations']}",
+        *(f"{row[key]:.3g}" for key in ("flops", "bytes_accessed")),
+        *(f"{row[key]:.2f}" for key in ("trace_s", "compile_s")),
+        f"{row['run_s'] * 1e6:.3g}",
+        ", ".join(row["heavy_modules"]) or "-",
+    ]
+
+
+def text(result: dict[str, Any]) -> str:
     """The Markdown page: one sentence, the table, how it was measured."""
     rows = {row["name"]: row for row in result["rows"]}
     dearer = [
@@ -265,21 +288,7 @@ def table(result: dict[str, Any]) -> str:
         "Every scene costs more than the one that has a part less, in operations, FLOPs and bytes"
         + (f", but for: {', '.join(dearer)}." if dearer else "."),
         "",
-        "| question | operations | FLOPs | bytes moved | trace [s] | compile [s] | run [us] |"
-        " libraries loaded |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for row in result["rows"]:
-        cells = [
-            row["name"],
-            f"{row['operations']}",
-            *(f"{row[key]:.3g}" for key in ("flops", "bytes_accessed")),
-            *(f"{row[key]:.2f}" for key in ("trace_s", "compile_s")),
-            f"{row['run_s'] * 1e6:.3g}",
-            ", ".join(row["heavy_modules"]) or "-",
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
-    lines += [
+        *table(HEADINGS, [cells(row) for row in result["rows"]]),
         "",
         "Each row is measured in a Python process of its own, in double precision. Operations are"
         " those of the traced program before any compiler has seen them; FLOPs and bytes are the"
@@ -297,18 +306,12 @@ def table(result: dict[str, Any]) -> str:
 
 def picture(result: dict[str, Any]) -> bytes:
     """Operations at the left, times at the right, a bar for each row."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
     import numpy as np
 
     rows = result["rows"]
     names = [row["name"] for row in rows]
     places = np.arange(len(rows))
-    figure, (left, right) = plt.subplots(
-        1, 2, figsize=(14, 0.45 * len(rows) + 1.6), layout="constrained", sharey=True
-    )
+    figure, (left, right) = subplots(1, 2, figsize=(14, 0.45 * len(rows) + 1.6), sharey=True)
     left.barh(places, [row["operations"] for row in rows], color="tab:blue", edgecolor="k")
     left.set(xscale="log", xlabel="operations of the traced program [-]", yticks=places)
     left.set_yticklabels(names)
@@ -322,12 +325,6 @@ def picture(result: dict[str, Any]) -> bytes:
     right.grid(True, which="major", alpha=0.4)
     right.legend(loc="best")
     return png(figure, dpi=110)
-
-
-def run(out: Path, quick: bool = False) -> list[Path]:
-    """Measure, and write scene_cost.json, .md and .png into a folder; returns their paths."""
-    result = measure(quick)
-    return write(out, "scene_cost", result, table(result), picture(result))
 
 
 if __name__ == "__main__":

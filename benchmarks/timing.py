@@ -10,12 +10,44 @@ from typing import Any
 
 import jax
 
+LEAST = 0.03  # s: what is timed lasts this long at least, so that the first call counts little
+
 
 def seconds(function: Callable, *arguments) -> tuple[float, Any]:
     """Wall-clock seconds of one call, and what it gave."""
     start = time.perf_counter()
     result = jax.block_until_ready(function(*arguments))
     return time.perf_counter() - start, result
+
+
+def taking_turns(calls: dict[str, Callable], repeats: int) -> dict[str, list[float]]:
+    """Seconds of each call, `repeats` times, by turns: what disturbs the machine disturbs all.
+
+    Short calls are repeated: the first of a turn finds the caches full of another's data.
+    """
+
+    def each(call: Callable, often: int) -> float:
+        start = time.perf_counter()
+        for _ in range(often):
+            jax.block_until_ready(call())
+        return (time.perf_counter() - start) / often
+
+    often = {
+        name: math.ceil(LEAST / min(each(call, 1), each(call, 1))) for name, call in calls.items()
+    }
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(repeats):
+        for name, call in calls.items():
+            times[name].append(each(call, often[name]))
+    return times
+
+
+def too_long(elapsed: float, times_the_work: float, limit: float) -> bool:
+    """Whether a call would take above `limit` [s], by what it took for a part of the work.
+
+    What a short call takes is mostly the calling, and says nothing.
+    """
+    return elapsed > 0.1 and elapsed * times_the_work > limit
 
 
 def compiled(function: Callable, *arguments) -> tuple[Callable, float]:
@@ -27,8 +59,13 @@ def compiled(function: Callable, *arguments) -> tuple[Callable, float]:
 
 
 def this_machine(busy: float) -> dict[str, Any]:
-    """The processor, and how `busy` it was before the benchmark, ready for JSON."""
-    return {"cpu": cpu_model(), "cores": os.cpu_count(), "others_running": busy}
+    """The processor, how `busy` it was before the benchmark, and the device; ready for JSON."""
+    return {
+        "cpu": cpu_model(),
+        "cores": os.cpu_count(),
+        "device": jax.devices()[0].device_kind,
+        "others_running": busy,
+    }
 
 
 def ran_on(result: dict[str, Any]) -> str:
@@ -36,9 +73,15 @@ def ran_on(result: dict[str, Any]) -> str:
     versions = ", ".join(f"{name} {version}" for name, version in result["versions"].items())
     machine = result["machine"]
     return (
-        f"{machine['cpu']}, {machine['cores']} cores, {machine['others_running']:.1f} programs"
-        f" running on them before; {versions}."
+        f"{named(machine)}, {machine['others_running']:.1f} programs running on them before;"
+        f" {versions}."
     )
+
+
+def named(machine: dict[str, Any]) -> str:
+    """Processor and cores, and the device where that is another."""
+    device = "" if machine["device"] == "cpu" else f"{machine['device']} beside "
+    return f"{device}{machine['cpu']}, {machine['cores']} cores"
 
 
 def cpu_model() -> str:

@@ -1,33 +1,22 @@
 """The generated pages say what their scripts say now."""
 
-import importlib.util
 import re
-from pathlib import Path
 
 import jax.numpy as jnp
-import matplotlib.image
 import numpy as np
 import pytest
 
 import fractaljax as fj
+from tools import DOCS, assert_same_picture, load_script
 
-DOCS = Path(__file__).parents[1] / "docs"
 MEASURED = re.compile(r"\d\.?\d*e[+-]\d\d")
 FACTOR = 3  # rounding differs from machine to machine
-
-
-def _script(name):
-    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture(scope="module")
 def pages():
     """The committed page and the one generated now."""
-    script = _script("make_float32")
+    script = load_script(DOCS / "make_float32.py")
     return script.PAGE.read_text(encoding="utf-8"), script.page()
 
 
@@ -44,10 +33,8 @@ def test_float32_page_has_the_numbers_that_are_measured_now(pages):
 
 
 def test_identification_is_drawn_as_it_is_shown_and_finds_the_surface(tmp_path):
-    found = _script("make_identification").draw(tmp_path / "identification.png")
-    drawn, shown = (matplotlib.image.imread(x / "identification.png") for x in (tmp_path, DOCS))
-    assert drawn.shape == shown.shape
-    assert np.abs(drawn - shown).mean() < 0.01
+    found = load_script(DOCS / "make_identification.py").draw(tmp_path / "identification.png")
+    assert_same_picture(tmp_path / "identification.png", "identification.png")
     truth = fj.brake_scene().contact.surface
     off = np.array([found.D - truth.D, np.log(found.G) - jnp.log(truth.G)])
     assert off @ np.linalg.solve(found.covariance, off) < 6  # 95 percent of two numbers

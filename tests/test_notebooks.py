@@ -1,9 +1,7 @@
 """Every notebook runs in a fresh kernel without a warning, and is kept without its outputs."""
 
-import importlib.util
 import itertools
 import time
-from pathlib import Path
 
 import nbformat
 import pytest
@@ -11,21 +9,15 @@ from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError, CellTimeoutError
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 
-FOLDER = Path(__file__).parents[1] / "notebooks"
+from tools import ROOT, load_script
+
+FOLDER = ROOT / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 LIMIT = 600  # s: against one that hangs; what they take is in notebooks/README.md
 PNG = "iVBORw0KGgo"  # how the picture begins in base 64
 
 
-def _strip():
-    spec = importlib.util.spec_from_file_location("strip", FOLDER / "strip.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-stripped = _strip().stripped
+stripped = load_script(FOLDER / "strip.py").stripped
 
 
 def execute(notebook, folder, limit=LIMIT):

@@ -1,28 +1,17 @@
 """README tells the truth: its commands, its example and output, its scene file, its picture."""
 
 import re
-from pathlib import Path
-
-import matplotlib.image
-import numpy as np
 
 import fractaljax as fj
 from fractaljax.__main__ import main
+from tools import ROOT, assert_same_picture
 
-ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
 
 
 def blocks(language):
     """The texts of the fenced blocks of a language."""
     return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
-
-
-def assert_same_picture(drawn, name):
-    """Equal to the one in docs, up to the rendering of type."""
-    drawn, shown = (matplotlib.image.imread(path) for path in (drawn, ROOT / "docs" / name))
-    assert drawn.shape == shown.shape
-    assert np.abs(drawn - shown).mean() < 0.01
 
 
 def test_examples_print_what_is_printed(capsys, tmp_path, monkeypatch):
@@ -33,7 +22,7 @@ def test_examples_print_what_is_printed(capsys, tmp_path, monkeypatch):
         assert len([line for line in code.splitlines() if line.strip()]) <= 15
         exec(compile(code, "README.md", "exec"), names)
         assert capsys.readouterr().out == text
-    assert_same_picture("cycle.png", "cycle.png")
+    assert_same_picture(tmp_path / "cycle.png", "cycle.png")
 
 
 def test_scene_file_is_the_one_the_command_writes():

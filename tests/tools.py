@@ -1,16 +1,24 @@
 """What several test files share: the contact table, its derivatives, a limit cycle."""
 
 import functools
+import importlib.util
 import json
+import subprocess
+import sys
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import matplotlib.image
 import numpy as np
 
 import fractaljax as fj
+from fractaljax.__main__ import main
 
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
 INPUTS = ("D", "G", "gamma", "E", "nu", "sigma_y", "H", "P", "mu_s", "mu_m")
 MEMBERS = {
     "fully_plastic": fj.Regime.fully_plastic,
@@ -121,3 +129,56 @@ def assert_whole(figure, artists=None) -> None:
         box = artist.get_tightbbox()
         assert figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1
         assert figure.bbox.y0 <= box.y0 and box.y1 <= figure.bbox.y1
+
+
+def load_script(path: Path) -> Any:
+    """The module of a Python file that lies in no package."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def assert_same_picture(drawn: Path, name: str) -> None:
+    """A picture is the one in docs, up to the rendering of type."""
+    found, shown = (matplotlib.image.imread(path) for path in (drawn, DOCS / name))
+    assert found.shape == shown.shape
+    assert np.abs(found - shown).mean() < 0.01
+
+
+def run_command(capsys, *arguments) -> tuple[Any, str, str]:
+    """Exit status, standard output and standard error of one call of the command."""
+    try:
+        status = main([str(argument) for argument in arguments])
+    except SystemExit as stop:
+        status = stop.code
+    return status, *capsys.readouterr()
+
+
+def primitives(jaxpr) -> Counter[str]:
+    """How often each primitive stands in a jaxpr, loops and calls and what is in them included."""
+    found = Counter()
+    for equation in jaxpr.eqns:
+        found[equation.primitive.name] += 1
+        for value in jax.tree.leaves(tuple(equation.params.values())):
+            inner = getattr(value, "jaxpr", value)
+            if hasattr(inner, "eqns"):
+                found += primitives(inner)
+    return found
+
+
+def quick_benchmark(name: str, folder: Path) -> tuple[dict, str]:
+    """What `python -m benchmarks NAME --quick` writes to a folder: the numbers and the page."""
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks", name, "--quick", "--out", str(folder)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert done.returncode == 0, done.stderr
+    written = {path.name for path in folder.iterdir()}
+    assert written == {f"{name}.{ending}" for ending in ("json", "md", "png")} | {"README.md"}
+    assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    return json.loads((folder / f"{name}.json").read_text()), (folder / f"{name}.md").read_text()

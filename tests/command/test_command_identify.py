@@ -9,38 +9,18 @@ import pytest
 
 import fractaljax as fj
 import instrument_files as files
-from fractaljax.__main__ import main
 from fractaljax.command.identify import _MEANINGLESS, _bounds
+from synthetic import gaussian_profile
+from tools import run_command as run
 
 D, G = 2.4, 1.342e-10
 DX = 1e-6
 WRITTEN = ["identification.png", "scene.toml"]
 
 
-@pytest.fixture(autouse=True)
-def somewhere_else(tmp_path, monkeypatch):
-    """Every test runs in an empty folder of its own."""
-    monkeypatch.chdir(tmp_path)
-
-
-def run(capsys, *arguments):
-    """Exit status, standard output and standard error of one call of the command."""
-    try:
-        status = main([str(argument) for argument in arguments])
-    except SystemExit as stop:
-        status = stop.code
-    return status, *capsys.readouterr()
-
-
 def profile(n, p=7 - 2 * D, seed=0):
     """Heights [m] of a Gaussian profile with the spectrum of D and G, or with its slope p."""
-    length = 8 * n * DX
-    f = np.arange(1, 4 * n + 1) / length
-    factor = math.gamma(p / 2) / (math.sqrt(math.pi) * math.gamma((p + 1) / 2))
-    spectrum = G ** (2 * D - 4) / 2 * factor * f**-p
-    normal = np.random.default_rng(seed).normal(size=(2, f.size))
-    amplitude = np.sqrt(spectrum / length) * (normal[0] + 1j * normal[1])
-    return np.fft.irfft(np.concatenate([[0], amplitude]), 8 * n)[:n] * 4 * n
+    return gaussian_profile(np.random.default_rng(seed), D=(7 - p) / 2, n=n, G=G, dx=DX)
 
 
 def write_profile(name, z):

@@ -12,27 +12,11 @@ import pytest
 
 import fractaljax as fj
 import fractaljax.base.scene_file
-from fractaljax.__main__ import main
 from fractaljax.report import cycle_table
-from tools import motionless_scene, reference_cycle, reference_scene
+from tools import motionless_scene, reference_cycle, reference_scene, run_command as run
 
 _WRITTEN = ["design.png", "design.toml", "history.csv", "run.toml"]
 _WRITTEN += ["topographies.png", "topography.npy"]
-
-
-@pytest.fixture(autouse=True)
-def somewhere_else(tmp_path, monkeypatch):
-    """Every test runs in an empty folder of its own."""
-    monkeypatch.chdir(tmp_path)
-
-
-def run(capsys, *arguments):
-    """Exit status, standard output and standard error of one call of the command."""
-    try:
-        status = main([str(argument) for argument in arguments])
-    except SystemExit as stop:
-        status = stop.code
-    return status, *capsys.readouterr()
 
 
 def test_design_without_arguments(capsys, tmp_path):

@@ -15,7 +15,7 @@ import fractaljax as fj
 from fractaljax.base.parts import substitute
 from fractaljax.mechanism import contact
 from reference import make_contact
-from tools import INPUTS, MEMBERS, contact_columns, contact_rows, every_joint, joints
+from tools import INPUTS, MEMBERS, contact_columns, contact_rows, every_joint, joints, primitives
 
 COLUMNS = contact_columns()
 PLASTIC, ELASTIC, SLIPS = (COLUMNS["regime"] == name for name in MEMBERS)
@@ -392,18 +392,8 @@ def test_newton_count_is_the_least_that_works(monkeypatch):
     assert _worst_residual() > 1000
 
 
-def primitives(jaxpr):
-    """Every primitive of a jaxpr, those of the jaxprs inside it included."""
-    for equation in jaxpr.eqns:
-        yield equation.primitive.name
-        for value in jax.tree.leaves(tuple(equation.params.values())):
-            inner = getattr(value, "jaxpr", value)
-            if hasattr(inner, "eqns"):
-                yield from primitives(inner)
-
-
 def traced(f, *arguments):
-    return list(primitives(jax.make_jaxpr(f)(*arguments).jaxpr))
+    return list(primitives(jax.make_jaxpr(f)(*arguments).jaxpr).elements())
 
 
 def test_no_loop_is_traced():

@@ -9,7 +9,7 @@ import pytest
 
 import fractaljax as fj
 from fractaljax.modes.maps import SOURCE_PANELS, source_modes, source_scene
-from tools import reference_scene, state_matrix
+from tools import DOCS, load_script, reference_scene, state_matrix
 
 MU, KAPPA = np.linspace(0.02, 1, 13), np.linspace(0.0, 1.4, 11)
 
@@ -168,15 +168,7 @@ NUMBER = re.compile(r"\d+\.?\d*(?:e[+-]?\d+)?")
 
 @pytest.fixture(scope="module")
 def script():
-    import importlib.util
-    from pathlib import Path
-
-    path = Path(__file__).parents[2] / "docs" / "make_figures_7_to_10.py"
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_script(DOCS / "make_figures_7_to_10.py")
 
 
 @pytest.fixture(scope="module")

@@ -1,11 +1,7 @@
 """The margin of stability against Hurwitz determinants and roots in 40 digits, and its picture."""
 
-import importlib.util
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
-import matplotlib.image
 import mpmath as mp
 import numpy as np
 import pytest
@@ -14,9 +10,8 @@ import fractaljax as fj
 from fractaljax.mechanism.oscillator import Linearised
 from fractaljax.modes.margin import least, margin_of
 from fractaljax.modes.stability import _critical_eigenvalue
-from tools import reference_scene
+from tools import DOCS, assert_same_picture, load_script, reference_scene
 
-DOCS = Path(__file__).parents[2] / "docs"
 EPS = np.finfo(float).eps
 
 _margins = jax.jit(jax.vmap(margin_of))
@@ -380,23 +375,13 @@ def test_no_loop_and_no_contact_law_of_a_fixed_contact():
 # --- the picture --------------------------------------------------------------------------
 
 
-def script():
-    spec = importlib.util.spec_from_file_location("make_margin", DOCS / "make_margin.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_picture_in_the_docs_is_the_one_drawn_now(tmp_path):
-    script().draw(tmp_path / "margin.png")
-    drawn, shown = (matplotlib.image.imread(x / "margin.png") for x in (tmp_path, DOCS))
-    assert drawn.shape == shown.shape
-    assert np.abs(drawn - shown).mean() < 0.01
+    load_script(DOCS / "make_margin.py").draw(tmp_path / "margin.png")
+    assert_same_picture(tmp_path / "margin.png", "margin.png")
 
 
 def test_smoothed_abscissa_of_the_picture():
     """The sum over the modes of 1/(2 (s - Re lambda)) is 1/eps for a normal matrix."""
     normal = np.array([[-0.1, 1, 0, 0], [-1, -0.1, 0, 0], [0, 0, -0.3, 2], [0, 0, -2, -0.3]])
-    s = script().smoothed_abscissa(normal, 0.01)
+    s = load_script(DOCS / "make_margin.py").smoothed_abscissa(normal, 0.01)
     assert 1 / (s + 0.1) + 1 / (s + 0.3) == pytest.approx(100, rel=1e-9)

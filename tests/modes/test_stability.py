@@ -15,6 +15,7 @@ import pytest
 import fractaljax as fj
 from fractaljax.mechanism.oscillator import Linearised
 from fractaljax.modes.stability import _critical_eigenvalue, _eigenvalues
+from tools import primitives
 
 EPS = np.finfo(float).eps
 OSCILLATOR = fj.brake_scene().oscillator
@@ -742,18 +743,6 @@ def test_a_scene_of_arrays_is_refused_with_a_hint(function):
     scene = fj.brake_scene().replace(D=np.array([2.4, 2.5]))
     with pytest.raises(ValueError, match=r"D must be a scalar, got shape \(2,\); use jax.vmap"):
         function(scene)
-
-
-def primitives(jaxpr) -> Counter:
-    """How often each primitive stands in a jaxpr, those it calls included."""
-    found = Counter()
-    for equation in jaxpr.eqns:
-        values = [x for v in equation.params.values() for x in (v if isinstance(v, tuple) else [v])]
-        inner = [getattr(x, "jaxpr", x) for x in values if hasattr(getattr(x, "jaxpr", x), "eqns")]
-        found[equation.primitive.name] += not inner
-        for sub in inner:
-            found += primitives(sub)
-    return +found
 
 
 def traced(scene, slope=True, function=fj.growth_rate) -> Counter:

@@ -1,0 +1,1 @@
+"""The stick-slip limit cycle beside transients, one and many."""

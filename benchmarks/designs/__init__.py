@@ -1,0 +1,1 @@
+"""Whole designs beside derivative-free and gradient-based searches."""

@@ -1,0 +1,1 @@
+"""Every quantity at the edges of its range."""

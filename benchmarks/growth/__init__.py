@@ -1,0 +1,1 @@
+"""The growth rate beside LAPACK and beside loops, value and gradient."""

@@ -1,0 +1,1 @@
+"""Sweeps over more and more points."""
