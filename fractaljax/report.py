@@ -1,5 +1,7 @@
 """Scenes, designs and limit cycles as tables that people read."""
 
+import math
+
 import jax.numpy as jnp
 
 from .mechanism.contact import Regime
@@ -24,22 +26,24 @@ def scene_rows(
 
     With the longest and the shortest of the `wavelengths` [m] to count, the roughness as well.
     """
-    K_n, K_t = (float(K) for K in stiffness(scene))
-    modes = stability(scene, friction_slope)
+    modes, fractal = stability(scene, friction_slope), scene.contact.fractal
     rows = {}
-    if scene.contact.fractal:
+    if fractal:
+        state = scene.contact.state(scene.friction.mu_s, scene.friction.mu_m)
+        K_n, K_t = float(state.K_n), float(state.K_t)
         surface = scene.contact.surface
         rows |= {"D": f"{surface.D:.6g}", "G [m]": f"{surface.G:.6g}"}
         if wavelengths is not None:
             rough = roughness(surface, *wavelengths)
             rows |= {"Sq [m]": f"{rough.Sq:.6g}", "Sdq": f"{rough.Sdq:.6g}"}
+    else:
+        K_n, K_t = (float(K) for K in stiffness(scene))
     rows |= {
         "K_n [N/m]": f"{K_n:.6g}",
         "K_t [N/m]": f"{K_t:.6g}",
         "K_t/K_n": f"{K_t / K_n:.6g}" if K_n > 0 else _ABSENT,
     }
-    if scene.contact.fractal:
-        state = scene.contact.state(scene.friction.mu_s, scene.friction.mu_m)
+    if fractal:
         slip = state.slip_ratio
         rows |= {
             "regime": Regime[state.regime].split(":")[0],
@@ -61,7 +65,7 @@ def stability_table(scene: Scene, friction_slope: bool = True) -> str:
     rows |= {
         "margin": f"{modes.margin:+.6g}",
         "friction at V": f"{sliding_friction(scene):.6g}",
-        "critical friction": f"{critical:.6g}" if jnp.isfinite(critical) else "none",
+        "critical friction": f"{critical:.6g}" if math.isfinite(critical) else "none",
     }
     rows |= {
         f"eigenvalue {i} [1/s]": f"{s.real:+.6g} {s.imag:+.6g}i"

@@ -27,11 +27,11 @@ from ..surface.roughness import Roughness, roughness
 from ..surface.topography import Topographies, topography
 from . import constraints as limits, tolerance as scatter
 from .envelope import Envelope, condition_text
-from .search import search
+from .search import STEPS, search
 from .task import DEFAULT_BOUNDS, Task, pose
 from .worst_case import Verdict
 
-_STEPS, _ROBUST_STEPS = (80, 40), (30, 25)
+_ROBUST_STEPS = 30, 25
 _ACTIVE = 100  # a requirement met by less than this many times the slack is called active
 _SAMPLES = 100_000  # surfaces drawn for the probability of squeal
 _ROWS = 64  # of a history, described at once
@@ -194,7 +194,7 @@ def design(
     envelope by itself. `Design.squeal_probability` counts 100,000 surfaces drawn with `seed`,
     each at a condition drawn evenly from the envelope.
 
-    `starts` surfaces, by default 128, or 12 with an envelope or a tolerance, are improved side by
+    `starts` surfaces, by default 16, or 12 with an envelope or a tolerance, are improved side by
     side. They are chosen from `lattice` surfaces a side, by default 48 (1024 for one variable), or
     24 (256): fewer where an objective is expensive. The same arguments give the same design. A
     request that cannot be met is a result, not an error: see `Design.result`, `Design.violated`.
@@ -227,7 +227,7 @@ def design(
         return _conclude(task, before, before, own, DesignResult.unchanged, 0, 0)
     task, us = _choose_starts(task)
     judge = task.judge(len(us))
-    steps = _ROBUST_STEPS if task.robust else _STEPS
+    steps = _ROBUST_STEPS if task.robust else STEPS
     ends, path_to = search(judge.linearise, us, task.slack, progress, steps, judge.refine)
     after = judge.verdict(ends)
     if (after.worst <= 0).any():
@@ -271,10 +271,9 @@ def _choose_starts(task: Task) -> tuple[Task, np.ndarray]:
         )
     merit = np.where(finite, values + 10 * np.maximum(excess, 0).sum(axis=1), np.inf)
     ranked = np.argsort(merit, kind="stable")
-    if task.robust:
-        # With few starts, one for each basin comes first.
-        basins = _least_of_neighbours(merit.reshape((task.lattice,) * variables)).ravel()
-        ranked = np.concatenate([ranked[basins[ranked]], ranked[~basins[ranked]]])
+    # With few starts, one for each basin comes first.
+    basins = _least_of_neighbours(merit.reshape((task.lattice,) * variables)).ravel()
+    ranked = np.concatenate([ranked[basins[ranked]], ranked[~basins[ranked]]])
     promising, rest = ranked[: starts // 2], np.sort(ranked[starts // 2 :])
     even = rest[np.linspace(0, len(rest) - 1, starts - starts // 2).astype(int)][1:]
     own = np.asarray(request.start, float)[None]
@@ -346,10 +345,10 @@ def _conclude(
 ) -> Design:
     """Say what became of every requirement at the end of `path`."""
     problem, request = task.problem, task.request
-    path = jnp.asarray(path, request.low.dtype)
+    path = np.asarray(path, request.low.dtype)
     # Padded, or every length would be compiled anew.
-    padding = jnp.repeat(path[-1:], -len(path) % _ROWS, axis=0)
-    described = _describe(problem, request, jnp.concatenate([path, padding]))
+    padding = np.repeat(path[-1:], -len(path) % _ROWS, axis=0)
+    described = _describe(problem, request, np.concatenate([path, padding]))
     history = {name: np.asarray(column)[: len(path)] for name, column in described.items()}
     final = request.scene
     if result != DesignResult.unchanged:

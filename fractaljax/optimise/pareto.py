@@ -109,7 +109,13 @@ def pareto(
     task, us, limits = _family(task, places, points)
     judge = OneCondition(task.judge(len(us)).model, limits)
     found, _ = search(judge.linearise, us, task.slack, progress)
-    return _front(task, judge.verdict(found), found, limits, limited, names, ends)
+    # Beside its walkers every member may have the ends: the last limit leaves room for one alone.
+    each = found.reshape(points, _WALKERS, -1)
+    shared = np.broadcast_to(places, (points, *places.shape))
+    found = np.concatenate([each, shared], axis=1).reshape(-1, each.shape[2])
+    limits = np.repeat(limits[::_WALKERS], len(found) // points)
+    verdict = OneCondition(judge.model, limits).verdict(found)
+    return _front(task, verdict, found, limits, limited, names, ends)
 
 
 def _place(task: Task, best: Design) -> np.ndarray:
@@ -154,7 +160,7 @@ def _front(task: Task, verdict, us, limits, limited: _Second, names, ends) -> Fr
     first = verdict.values * scale + shift
     second = (verdict.excess[:, -1] + limits) * float(limited.scale) + float(limited.at_most)
     best, failed = [], 0
-    for member in np.arange(len(us)).reshape(-1, _WALKERS):
+    for member in np.arange(len(us)).reshape(-1, _WALKERS + len(ends)):
         holding = member[verdict.worst[member] <= 0]
         if len(holding):
             best.append(holding[first[holding].argmin()])

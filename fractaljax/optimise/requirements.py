@@ -216,11 +216,9 @@ class Model:
     def linearise(self, us, conditions=None):
         """Objective (n,), requirements (n, k), and their Jacobians (n, v) and (n, k, v)."""
         dtype = self.request.low.dtype
-        given = [us] if conditions is None else [us, conditions]
+        given = [x.astype(dtype) for x in (us, conditions) if x is not None]
 
         def program(us, conditions=None):
-            us = jnp.asarray(us, dtype)
-            conditions = None if conditions is None else jnp.asarray(conditions, dtype)
             return _linearise(self.problem, self.request, us, conditions)
 
         both = in_batches(program, self.batch, *given)
@@ -231,12 +229,9 @@ class Model:
         """Objective and requirements (n, 1 + k) of surface i at condition i."""
         dtype = self.request.low.dtype
 
-        def program(us, conditions):
-            return _judge(
-                self.problem, self.request, jnp.asarray(us, dtype), jnp.asarray(conditions, dtype)
-            )
-
-        return np.asarray(in_batches(program, self.pairs, us, conditions), float)
+        program = functools.partial(_judge, self.problem, self.request)
+        given = us.astype(dtype), conditions.astype(dtype)
+        return np.asarray(in_batches(program, self.pairs, *given), float)
 
     def judge_all(self, us, conditions):
         """Objective and requirements (n, m, 1 + k) of every surface at every condition."""

@@ -8,12 +8,15 @@ variables its subproblem is solved by trying every active set. L-BFGS on a growi
 the same optima, later and beside the constraints more often (docs/model.md).
 """
 
+import functools
 from collections.abc import Callable
 
 import numpy as np
 
+STEPS = 20, 40  # of the two phases
 _ROUND_STEPS, _ROUNDS = 15, 8  # of quadratic programming, against harder constraints each time
 _SETTLED = 1e-9  # size of the steps that are not worth taking
+_GAIN = 1e-9  # share of the merit that is not worth a step
 _TRIED = 10  # constraints that the active sets of one step are drawn from
 _PENALTY = 100.0  # weight of the constraints; above every multiplier of a well-scaled problem
 
@@ -23,7 +26,7 @@ def search(
     starts: np.ndarray,
     slack: float,
     progress: bool,
-    steps: tuple[int, int] = (80, 40),
+    steps: tuple[int, int] = STEPS,
     refine: Callable = lambda us: False,
 ):
     """Improve every start; returns the end points (n, v) and a function giving the path to each.
@@ -60,12 +63,19 @@ def search(
     return ends, path_to
 
 
-def _adam(model, us, slack, steps, advance):
+@functools.cache
+def _optimiser(steps):
+    """Adam whose rate decays over so many steps; its update is one compiled program."""
+    import jax
     import optax
 
-    rate = optax.exponential_decay(0.04, steps, 0.1)
-    optimiser = optax.adam(rate, b2=0.95)
-    state = optimiser.init(us)
+    adam = optax.adam(optax.exponential_decay(0.04, steps, 0.1), b2=0.95)
+    return jax.jit(adam.init), jax.jit(adam.update)
+
+
+def _adam(model, us, slack, steps, advance):
+    start, next_update = _optimiser(steps)
+    state = start(us)
     for _ in range(steps):
         _, excess, slope, jacobian = model(us)
         pressed = _PENALTY * np.maximum(excess + slack, 0)
@@ -73,7 +83,7 @@ def _adam(model, us, slack, steps, advance):
         # Beside an exceptional point or gross slip a derivative can be huge or overflow.
         gradient = np.where(np.isfinite(gradient), gradient, 0)
         norm = np.linalg.norm(gradient, axis=1, keepdims=True)
-        update, state = optimiser.update(gradient / np.maximum(norm, 1), state)
+        update, state = next_update(gradient / np.maximum(norm, 1), state)
         us = np.clip(us + np.asarray(update), 0, 1)
         advance(us, excess)
     return us
@@ -104,30 +114,32 @@ def _sqp(model, us, slack, steps, advance):
     hessian = np.tile(np.eye(v), (n, 1, 1))
     radius = np.full(n, 0.05)
     points = _evaluate(model, us)
+    merit = _merit(points, slack)
     for _ in range(steps):
         us, _, excess, slope, jacobian = points
         low = np.maximum(-radius[:, None], -us)
         high = np.minimum(radius[:, None], 1 - us)
-        step, weights = _quadratic_step(slope, hessian, excess + slack, jacobian, low, high)
+        step, weights, gain = _quadratic_step(slope, hessian, excess + slack, jacobian, low, high)
+        if ((gain <= _GAIN * np.abs(merit)) | (radius < _SETTLED)).all():
+            break
         trial = _evaluate(model, us + step)
         # Along a curved constraint the exact penalty refuses full steps (the Maratos effect):
         # a second step, with the constraints shifted to what they were at the first one.
         shifted = trial[2] - np.einsum("nkv,nv->nk", jacobian, step)
-        step, _ = _quadratic_step(slope, hessian, shifted + slack, jacobian, low, high)
+        step, _, _ = _quadratic_step(slope, hessian, shifted + slack, jacobian, low, high)
         corrected = _evaluate(model, us + step)
         trial = _choose(_merit(corrected, slack) < _merit(trial, slack), corrected, trial)
 
-        better = _merit(trial, slack) < _merit(points, slack)
+        reached = _merit(trial, slack)
+        better = reached < merit
         step = trial[0] - us
         change = trial[3] - slope + np.einsum("nk,nkv->nv", weights, trial[4] - jacobian)
         hessian = np.where(better[:, None, None], _bfgs(hessian, step, change), hessian)
         full = np.abs(step).max(axis=1) > 0.9 * radius
         radius = np.where(better, np.where(full, 2 * radius, radius), radius / 3)
         radius = np.clip(radius, 1e-14, 0.3)
-        points = _choose(better, trial, points)
+        points, merit = _choose(better, trial, points), np.where(better, reached, merit)
         advance(points[0], points[2])
-        if radius.max() < _SETTLED:
-            break
     return points[0]
 
 
@@ -161,7 +173,8 @@ def _quadratic_step(slope, hessian, excess, jacobian, low, high):
     Every set of at most v constraints, the faces of low <= p <= high (n, v) among them, is tried
     as the active one; those faces are never left. Of many constraints only those that can come
     closest to being violated inside the faces are tried, but all of them are judged.
-    Returns steps (n, v) and the multipliers of the requirements (n, k).
+    Where no step has less penalty than staying has, the step is none. Returns steps (n, v), the
+    multipliers of the requirements (n, k), and by how much the steps lessen the penalty (n,).
     """
     n, k, v = jacobian.shape
     tried = min(k, _TRIED)
@@ -180,10 +193,10 @@ def _quadratic_step(slope, hessian, excess, jacobian, low, high):
 
     # Parallel or vanishing rows: their steps come out huge, and lose below.
     own = np.einsum("nrr->nr", schur)
-    single = right / (own * (1 + 1e-12) + 1e-200)
+    single = right / (own + 1e-200)
     steps = [free[:, None], free[:, None] - image * single[..., None]]
     i, j = np.triu_indices(tried + 2 * v, 1) if v == 2 else (np.arange(0), np.arange(0))
-    guard = 1e-12 * (own[:, i] + own[:, j]) + 1e-200
+    guard = 1e-14 * (own[:, i] + own[:, j]) + 1e-200
     p, q, r = own[:, i] + guard, own[:, j] + guard, schur[:, i, j]
     with np.errstate(divide="ignore", invalid="ignore"):
         first = (q * right[:, i] - r * right[:, j]) / (p * q - r**2)
@@ -192,15 +205,15 @@ def _quadratic_step(slope, hessian, excess, jacobian, low, high):
             free[:, None] - image[:, i] * first[..., None] - image[:, j] * second[..., None]
         )
     steps = np.clip(np.nan_to_num(np.concatenate(steps, axis=1)), low[:, None], high[:, None])
-    model = (
+    penalty = (
         np.einsum("nv,nsv->ns", slope, steps)
         + np.einsum("nsi,nij,nsj->ns", steps, hessian, steps) / 2
         + _PENALTY
         * np.maximum(excess[:, None] + np.einsum("nkv,nsv->nsk", jacobian, steps), 0).sum(axis=2)
     )
-    best = np.where(np.isfinite(model), model, np.inf).argmin(axis=1)
-
-    every = np.arange(n)
+    penalty = np.where(np.isfinite(penalty), penalty, np.inf)
+    best, every = penalty.argmin(axis=1), np.arange(n)
+    gain = _PENALTY * np.maximum(excess, 0).sum(axis=1) - penalty[every, best]
     members = tried + 2 * v
     pair = best - 1 - members
     weight = np.zeros((n, members))
@@ -211,4 +224,5 @@ def _quadratic_step(slope, hessian, excess, jacobian, low, high):
     weight[both, j[pair[both]]] = second[both, pair[both]]
     weights = np.zeros((n, k))
     np.put_along_axis(weights, near, weight[:, :tried], axis=1)
-    return steps[every, best], np.clip(np.nan_to_num(weights), 0, _PENALTY)
+    step = np.where(gain[:, None] > 0, steps[every, best], 0)
+    return step, np.clip(np.nan_to_num(weights), 0, _PENALTY), np.maximum(gain, 0)

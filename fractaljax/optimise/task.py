@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ..base.parts import number, require_scalar
 from ..mechanism.scene import Scene
@@ -18,7 +19,8 @@ DEFAULT_BOUNDS: dict[str, tuple[float, float]] = {"D": (2.1, 2.9), "G": (1e-12, 
 
 _LATTICE = {1: 1024, 2: 48}  # surfaces a side, judged to choose the starts
 _ROBUST_LATTICE = {1: 256, 2: 24}  # the same against many conditions
-_STARTS, _ROBUST_STARTS = 128, 12
+_STARTS, _ROBUST_STARTS = 16, 12
+_SURVEYED = 64  # surfaces at a time
 _TEMPERATURE = 0.02  # of the smooth maximum over an envelope
 
 
@@ -46,7 +48,9 @@ class Task:
 
     def judge(self, count: int) -> OneCondition:
         """What judges `count` surfaces."""
-        model = Model(self.problem, self.request, self.starts)
+        # Of one condition many surfaces are surveyed, more than walk.
+        batch = self.starts if self.robust else max(self.starts, _SURVEYED)
+        model = Model(self.problem, self.request, batch)
         envelope = self.options["envelope"]
         if envelope is None:
             return OneCondition(model)
@@ -64,8 +68,8 @@ def pose(scene: Scene, options: Mapping[str, Any]) -> Task:
     bounds, low, high, own = _bounds(scene, options["bounds"])
     dtype = scene.contact.surface.D.dtype
     oscillator = scene.oscillator
-    decay = jnp.minimum(oscillator.xi_1 * oscillator.omega_1, oscillator.xi_2 * oscillator.omega_2)
-    slowest = jnp.minimum(oscillator.omega_1, oscillator.omega_2)
+    omega = np.array([oscillator.omega_1, oscillator.omega_2], float)
+    decay = (np.array([oscillator.xi_1, oscillator.xi_2]) * omega).min()
     state = scene.contact.state(scene.friction.mu_s, scene.friction.mu_m)
     target, K_n_min, constraints = (options[n] for n in ("target", "K_n_min", "constraints"))
     numbers: dict[str, Any] = dict(
@@ -73,12 +77,12 @@ def pose(scene: Scene, options: Mapping[str, Any]) -> Task:
         high=high,
         start=(own - low) / (high - low),
         target=-decay / 2 if target is None else number("target", target),
-        growth_scale=jnp.maximum(decay, 1e-4 * slowest),
+        growth_scale=max(decay, 1e-4 * omega.min()),
         K_n_min=state.K_n if K_n_min is None else number("K_n_min", K_n_min, at_least=0),
         area_ratio_min=number("area_ratio_min", options["area_ratio_min"], at_least=1),
         slip_ratio_max=number("slip_ratio_max", options["slip_ratio_max"], above=0, at_most=1),
-        value_shift=jnp.zeros_like(low[0]),
-        value_scale=jnp.ones_like(low[0]),
+        value_shift=0.0,
+        value_scale=1.0,
         constraints=tuple(c if isinstance(c, Constraint) else None for c in constraints),
     )
     envelope, tolerance = options["envelope"], {}
@@ -130,7 +134,7 @@ def _bounds(scene, bounds):
     surface = scene.contact.surface
     low, high, own, checked = [], [], [], {}
     for name in sorted(bounds):
-        scale = jnp.log if name == "G" else jnp.asarray
+        scale = np.log if name == "G" else np.asarray
         ends = [float(number(f"{name} bound", end)) for end in bounds[name]]
         for end in ends:
             scene.replace(**{name: end})  # refuses an end outside the domain of the model
@@ -143,9 +147,9 @@ def _bounds(scene, bounds):
             )
         low.append(scale(ends[0]))
         high.append(scale(ends[1]))
-        own.append(scale(getattr(surface, name)))
+        own.append(scale(value))
         checked[name] = (ends[0], ends[1])
-    return checked, jnp.stack(low), jnp.stack(high), jnp.stack(own)
+    return checked, np.array(low), np.array(high), np.array(own)
 
 
 def _risk(risk, envelope):

@@ -30,6 +30,11 @@ def roughness(surface: Surface, L, L_s) -> Roughness:
     """
     L_s = number("L_s", L_s, above=0)
     L = ordered("L", number("L", L, above=0), "L_s", L_s)
+    return _roughness(surface, L, L_s)
+
+
+@jax.jit
+def _roughness(surface, L, L_s):
     Sq = root_mean_square_height(surface, L, L_s)
     Sa = math.sqrt(2 / math.pi) * Sq
     return Roughness(Sq, Sa, root_mean_square_gradient(surface, L, L_s))

@@ -22,7 +22,7 @@ _WRITTEN += ["topographies.png", "topography.npy"]
 def test_design_without_arguments(capsys, tmp_path):
     """The main job: a progress bar, a table, and files that hold what was found."""
     status, out, err = run(capsys, "design")
-    assert status == 0 and "120/120" in err
+    assert status == 0 and "60/60" in err
     rows = [
         "D ",
         "G [m]",

@@ -277,7 +277,7 @@ def test_same_request_same_design(scene):
 def test_progress_bar(scene, capsys):
     """The search shows where it is, on standard error, unless told not to."""
     fj.design(scene)
-    assert "120/120" in capsys.readouterr().err
+    assert "60/60" in capsys.readouterr().err
     fj.design(scene, progress=False)
     assert capsys.readouterr() == ("", "")
 

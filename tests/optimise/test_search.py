@@ -124,7 +124,7 @@ def test_quadratic_step_against_brute_force():
     root = rng.normal(size=(n, 2, 2))
     hessian = root @ root.transpose(0, 2, 1) + 0.1 * np.eye(2)
     low, high = np.full((n, 2), -0.05), np.full((n, 2), 0.07)
-    steps, multipliers = _quadratic_step(slope, hessian, excess, jacobian, low, high)
+    steps, multipliers, gain = _quadratic_step(slope, hessian, excess, jacobian, low, high)
     assert (steps >= low).all() and (steps <= high).all() and (multipliers >= 0).all()
 
     def penalty(i, p):
@@ -135,6 +135,30 @@ def test_quadratic_step_against_brute_force():
     for i in range(n):
         scanned = min(penalty(i, np.array(p)) for p in itertools.product(side, side))
         assert penalty(i, steps[i]) <= scanned + 1e-9
+        assert gain[i] == pytest.approx(penalty(i, np.zeros(2)) - penalty(i, steps[i]), abs=1e-12)
+
+
+def test_where_nothing_is_gained_no_step_is_taken():
+    """At a corner of two constraints both hold to rounding: the penalty has its least there."""
+    slope, hessian, excess = np.array([[1.0, 2.0]]), np.eye(2)[None], np.zeros((1, 2))
+    low, high = np.full((1, 2), -0.05), np.full((1, 2), 0.05)
+    steps, _, gain = _quadratic_step(slope, hessian, excess, -np.eye(2)[None], low, high)
+    np.testing.assert_array_equal(steps, 0)
+    np.testing.assert_array_equal(gain, 0)
+
+
+def test_a_settled_search_stops():
+    """Fewer evaluations than the steps allow, and none the worse for it."""
+    model, calls = model_of(lambda u: u[0] + 2 * u[1], lambda u: np.array([0.25 - u[0] * u[1]])), []
+
+    def counted(us):
+        calls.append(len(us))
+        return model(us)
+
+    ends, _ = search(counted, starts(6), SLACK, progress=False, steps=(5, 400))
+    point, _ = best_of(model, ends)
+    np.testing.assert_allclose(point, (0.5**0.5, 0.5**1.5), atol=1e-7)
+    assert len(calls) < 100
 
 
 def test_bfgs_stays_positive_definite_and_learns_curvature():
