@@ -208,8 +208,9 @@ def _critical_eigenvalue(lin: Linearised):
     omega, *quadratics = _split(lin)
     (high, _, imag), (other_high, _, other_imag) = map(_roots, quadratics)
     first = high >= other_high
-    return omega * jax.lax.complex(
-        jnp.where(first, high, other_high), jnp.where(first, imag, other_imag)
+    # Parts by themselves: where the real one alone is wanted, the other is not computed.
+    return jax.lax.complex(
+        omega * jnp.where(first, high, other_high), omega * jnp.where(first, imag, other_imag)
     )
 
 
