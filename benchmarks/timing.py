@@ -10,7 +10,7 @@ from typing import Any
 
 import jax
 
-LEAST = 0.03  # s: what is timed lasts this long at least, so that the first call counts little
+LEAST = 0.2  # s: what is timed lasts this long at least, so that the first calls count little
 
 
 def seconds(function: Callable, *arguments) -> tuple[float, Any]:

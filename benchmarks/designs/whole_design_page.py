@@ -1,6 +1,5 @@
 """The page and the picture of whole designs."""
 
-import math
 from typing import Any
 
 import numpy as np
@@ -14,15 +13,17 @@ FLOOR = 1e-9  # least gap that is shown
 
 
 def quickest(runs: list[dict[str, Any]], near: str, cold: bool) -> dict[str, Any] | None:
-    """The method that is first to come near from every start, and None where none does."""
+    """The shortest whole run that comes near from every start, and None where none does.
+
+    Whole, since nobody who does not know the optimum can stop where a run first comes near it.
+    """
     able = [run for run in runs if run[near]["starts"] == run["starts"]]
-    return min(able, key=lambda run: took(run, near, cold) or math.inf, default=None)
+    return min(able, key=lambda run: took(run, cold), default=None)
 
 
-def took(run: dict[str, Any], near: str, cold: bool) -> float | None:
-    """Seconds until a run of a method comes near, with compiling if it is cold."""
-    time = run[near]["seconds"]
-    return None if time is None else time + (run["compile_s"] if cold else 0)
+def took(run: dict[str, Any], cold: bool) -> float:
+    """Seconds of a whole run of a method, with compiling if it is cold."""
+    return run["seconds"] + (run["compile_s"] if cold else 0)
 
 
 def choice(result: dict[str, Any]) -> str:
@@ -35,25 +36,19 @@ def choice(result: dict[str, Any]) -> str:
         named.append(
             "nothing that was tried"
             if best is None
-            else f"{best['name']} ({shown(best, near, cold)} of a run of {best['seconds']:.2g} s)"
+            else f"{best['name']} ({took(best, cold):.2g} s)"
         )
     own = next(run for run in runs if run["family"] == "design")
     return (
         f"For one design of D and G take, where the start may be anywhere, {named[0]} to 1 % and"
         f" {named[1]} to 1e-6, compiling included, and where many designs follow {named[2]};"
         f" `fj.design` comes within 1e-6 from {own['exact']['starts']} of {own['starts']} starts,"
-        f" in {shown(own, 'exact', True)} the first time and {shown(own, 'exact', False)} after."
+        f" in {took(own, True):.2g} s the first time and {took(own, False):.2g} s after."
     )
 
 
-def shown(run: dict[str, Any], near: str, cold: bool) -> str:
-    """The time until a run of a method comes near, in words."""
-    time = took(run, near, cold)
-    return "never" if time is None else f"{time:.2g} s"
-
-
 def quickest_table(result: dict[str, Any]) -> list[str]:
-    """The quickest method that never depends on its start, of every task."""
+    """The shortest run of a method that never depends on its start, of every task."""
     lines = []
     for task in result["tasks"]:
         runs = [run for run in result["runs"] if run["task"] == task["name"]]
@@ -61,7 +56,7 @@ def quickest_table(result: dict[str, Any]) -> list[str]:
         for near in ("near", "exact"):
             for cold in (True, False):
                 best = quickest(runs, near, cold)
-                line.append("-" if best is None else f"{best['name']}: {shown(best, near, cold)}")
+                line.append("-" if best is None else f"{best['name']}: {took(best, cold):.2g} s")
         lines.append(line)
     return table(
         ["task", "to 1 %, first design", "later ones", "to 1e-6, first design", "later ones"], lines
@@ -126,7 +121,7 @@ def text(result: dict[str, Any]) -> str:
         "",
         choice(result),
         "",
-        "The quickest that comes so near from every start:",
+        "The shortest whole run that comes so near from every start:",
         "",
         *quickest_table(result),
         "",
@@ -143,10 +138,11 @@ def text(result: dict[str, Any]) -> str:
         f" design so far that meets every requirement to {MEETS:g}; violation is the worst of the"
         f" answers. Up to {result['starts']} starts, the brake itself and random ones; a grid is"
         " shifted at random instead. Times are medians over all starts, those that never come so"
-        " near counted as infinite, without compiling: that includes tracing and is in a column of"
-        " its own, for `fj.design` what its first call took longer. Evaluations are of one design"
-        " at one condition, with or without a gradient. `fj.design` moves D and G only, and its"
-        " answer keeps 1e-6 of every requirement in hand.",
+        " near counted as infinite, without compiling; those beside a count of starts are when a"
+        " run first comes so near, which only shows to who knows the optimum. Compiling includes"
+        " tracing and is in a column of its own, for `fj.design` what its first call took longer."
+        " Evaluations are of one design at one condition, with or without a gradient. `fj.design`"
+        " moves D and G only, and its answer keeps 1e-6 of every requirement in hand.",
         "",
         ran_on(result),
         "",
