@@ -247,16 +247,10 @@ def design(
     return _conclude(task, before, after.of(best), path_to(best), result, len(us), failed)
 
 
-def _lattice(variables: int, per_side: int):
-    side = (np.arange(per_side) + 0.5) / per_side
-    axes = np.meshgrid(*[side] * variables, indexing="ij")
-    return np.stack([axis.ravel() for axis in axes], axis=1)
-
-
 def _choose_starts(task: Task) -> tuple[Task, np.ndarray]:
     """The scene's own surface, the most promising of a lattice, and an even spread of the rest."""
     request, starts, variables = task.request, task.starts, len(task.problem.variables)
-    lattice = _lattice(variables, task.lattice)
+    lattice = task.surfaces()
     surveyed = task.judge(starts).survey(lattice)
     values, excess = surveyed[:, 0], surveyed[:, 1:]
     finite = np.isfinite(values)

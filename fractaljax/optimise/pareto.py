@@ -106,15 +106,15 @@ def pareto(
         raise ValueError(f"the least {names[0]} and the least {names[1]} are one surface")
     limited = _Second(second, low, high - low)
     task = pose(scene, {**asked, "constraints": (*own, limited)})
-    task, us, limits = _family(task, places, points)
-    judge = OneCondition(task.judge(len(us)).model, limits)
+    task, us, members = _family(task, places, points)
+    model = task.judge(len(us)).model
+    judge = OneCondition(model, np.repeat(members, _WALKERS))
     found, _ = search(judge.linearise, us, task.slack, progress)
     # Beside its walkers every member may have the ends: the last limit leaves room for one alone.
-    each = found.reshape(points, _WALKERS, -1)
-    shared = np.broadcast_to(places, (points, *places.shape))
-    found = np.concatenate([each, shared], axis=1).reshape(-1, each.shape[2])
-    limits = np.repeat(limits[::_WALKERS], len(found) // points)
-    verdict = OneCondition(judge.model, limits).verdict(found)
+    each, shared = found.reshape(points, _WALKERS, -1), np.tile(places, (points, 1, 1))
+    found = np.concatenate([each, shared], axis=1).reshape(-1, places.shape[1])
+    limits = np.repeat(members, _WALKERS + len(places))
+    verdict = OneCondition(model, limits).verdict(found)
     return _front(task, verdict, found, limits, limited, names, ends)
 
 
@@ -128,11 +128,9 @@ def _place(task: Task, best: Design) -> np.ndarray:
 
 
 def _family(task: Task, places, points: int):
-    """The task scaled for search, starts (points walkers, v), and the limit of each of them."""
+    """The task scaled for search, starts (points walkers, v), and the limit of each member."""
     request = task.request
-    side = (np.arange(task.lattice) + 0.5) / task.lattice
-    axes = np.meshgrid(*[side] * places.shape[1], indexing="ij")
-    lattice = np.stack([axis.ravel() for axis in axes], axis=1)
+    lattice = task.surfaces()
     surveyed = task.judge(task.starts).survey(np.concatenate([places, lattice]))
     shift, scale = surveyed[0, 0], abs(surveyed[1, 0] - surveyed[0, 0]) or 1.0
     scaled = dataclasses.replace(
@@ -151,7 +149,7 @@ def _family(task: Task, places, points: int):
         between = limit * places[0] + (1 - limit) * places[1]
         starts.append(np.concatenate([places, between[None], promising]))
     us = np.concatenate(starts)
-    return task, us, np.repeat(members, _WALKERS)
+    return task, us, members
 
 
 def _front(task: Task, verdict, us, limits, limited: _Second, names, ends) -> Front:

@@ -184,7 +184,7 @@ def expected_shortfall(count: int, alpha: float) -> np.ndarray:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _linearise(problem: Problem, request: Request, us, conditions):
+def _linearise(problem: Problem, request: Request, us, conditions=None):
     """What `Problem.over` gives for surfaces us (n, v), and its Jacobian."""
 
     def one(u, conditions):
@@ -215,23 +215,19 @@ class Model:
 
     def linearise(self, us, conditions=None):
         """Objective (n,), requirements (n, k), and their Jacobians (n, v) and (n, k, v)."""
-        dtype = self.request.low.dtype
-        given = [x.astype(dtype) for x in (us, conditions) if x is not None]
-
-        def program(us, conditions=None):
-            return _linearise(self.problem, self.request, us, conditions)
-
-        both = in_batches(program, self.batch, *given)
+        program = functools.partial(_linearise, self.problem, self.request)
+        both = in_batches(program, self.batch, *self._given(us, conditions))
         stacked, jacobian = (np.asarray(x, float) for x in both)
         return stacked[:, 0], stacked[:, 1:], jacobian[:, 0], jacobian[:, 1:]
 
     def judge(self, us, conditions):
         """Objective and requirements (n, 1 + k) of surface i at condition i."""
-        dtype = self.request.low.dtype
-
         program = functools.partial(_judge, self.problem, self.request)
-        given = us.astype(dtype), conditions.astype(dtype)
-        return np.asarray(in_batches(program, self.pairs, *given), float)
+        return np.asarray(in_batches(program, self.pairs, *self._given(us, conditions)), float)
+
+    def _given(self, *arrays):
+        """Those that are there, in the precision of the request."""
+        return [x.astype(self.request.low.dtype) for x in arrays if x is not None]
 
     def judge_all(self, us, conditions):
         """Objective and requirements (n, m, 1 + k) of every surface at every condition."""

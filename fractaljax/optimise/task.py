@@ -46,6 +46,12 @@ class Task:
         """By how much requirements are overfulfilled, so that rounding cannot undo them."""
         return max(1e-6, 10 * float(jnp.finfo(self.request.low.dtype).eps) ** 0.5)
 
+    def surfaces(self) -> np.ndarray:
+        """Those of the lattice, scaled (n, v): the centres of equal cells."""
+        side = (np.arange(self.lattice) + 0.5) / self.lattice
+        axes = np.meshgrid(*[side] * len(self.problem.variables), indexing="ij")
+        return np.stack([axis.ravel() for axis in axes], axis=1)
+
     def judge(self, count: int) -> OneCondition:
         """What judges `count` surfaces."""
         # Of one condition many surfaces are surveyed, more than walk.
@@ -134,7 +140,7 @@ def _bounds(scene, bounds):
     surface = scene.contact.surface
     low, high, own, checked = [], [], [], {}
     for name in sorted(bounds):
-        scale = np.log if name == "G" else np.asarray
+        scale = np.log if name == "G" else float
         ends = [float(number(f"{name} bound", end)) for end in bounds[name]]
         for end in ends:
             scene.replace(**{name: end})  # refuses an end outside the domain of the model
