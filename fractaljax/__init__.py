@@ -1,6 +1,7 @@
 """From a machined surface to a stable mechanism, with gradients all the way back."""
 
 from . import plot as plot
+from ._version import __version__ as __version__
 from .measured.files import read_measurement as read_measurement
 from .measured.identify import Identification as Identification, identify as identify
 from .measured.measurement import Measurement as Measurement
