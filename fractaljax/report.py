@@ -15,6 +15,7 @@ from .motion.cycle import CycleResult, LimitCycle
 from .surface.roughness import roughness
 
 _ABSENT = "-"
+STABLE = "stable against small disturbances"  # all that a growth rate can say
 _LEAST_DAMPED = 10  # stable modes of a structure that its table lists
 _MODES = {"+": "slips, dx/dt < V", "-": "slips, dx/dt > V", "stick": "sticks"}
 
@@ -75,7 +76,7 @@ def stability_table(scene: Scene, friction_slope: bool = True) -> str:
 
 
 def _verdict(modes) -> dict[str, str]:
-    verdict = "it squeals" if modes.growth_rate > 0 else "stable"
+    verdict = "it squeals" if modes.growth_rate > 0 else STABLE
     return {"growth rate [1/s]": f"{modes.growth_rate:+.6g}  ({verdict})"}
 
 
@@ -94,7 +95,7 @@ def structure_table(structure: Structure, friction_slope: bool = True) -> str:
     listed = unstable + [mode for mode in least if mode.growth_rate <= modes.resolution]
     whole = {
         "degrees of freedom": f"{structure.n}",
-        "unstable modes": f"{len(unstable)}  ({'it squeals' if unstable else 'stable'})",
+        "unstable modes": f"{len(unstable)}  ({'it squeals' if unstable else STABLE})",
         "growth rate [1/s]": f"{modes.growth_rate:+.6g}",
         "least damping ratio": f"{modes.margin:+.6g}",
     }

@@ -1,5 +1,6 @@
 """Strict numerics for every test: 64 bits, no silent broadcasting, warnings are errors."""
 
+import os
 import warnings
 
 import jax
@@ -12,3 +13,8 @@ jax.config.update("jax_numpy_dtype_promotion", "standard")
 def pytest_configure(config):
     config.addinivalue_line("filterwarnings", "error")
     warnings.simplefilter("error")
+    # Most of a run is compilation: workers, subprocesses and later runs share what is compiled.
+    folder = os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(config.cache.mkdir("jax")))
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+    jax.config.update("jax_compilation_cache_dir", folder)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

@@ -1,4 +1,4 @@
-"""`fractaljax design`: the nearest surface that does not squeal."""
+"""`fractaljax design`: the nearest surface that is stable against small disturbances."""
 
 from pathlib import Path
 
@@ -40,7 +40,9 @@ _OWN = (  # arguments that leave nothing to repeat
 def add_design(commands) -> None:
     """Add `fractaljax design`."""
     parser = commands.add_parser(
-        "design", help="find the nearest surface that does not squeal", description=_run.__doc__
+        "design",
+        help="find the nearest surface that is stable against small disturbances",
+        description=_run.__doc__,
     )
     add_scene_file(parser)
     add_constant_friction(parser)
@@ -93,7 +95,7 @@ def _add_constraints(parser) -> None:
 
 
 def _run(arguments) -> int:
-    """Find the nearest stable surface; write its scene, the run, the way there, and pictures.
+    """Find the nearest surface stable against small disturbances; write scene, run and pictures.
 
     The files: design.toml, run.toml, history.csv, design.png, topographies.png with the surfaces
     before and after, and topography.npy with the heights of the designed one [m].
@@ -121,10 +123,10 @@ def _run(arguments) -> int:
             "topography.npy": npy(surfaces.after),
         }
         write(files)
-    print(best)
     print(f"written to {arguments.out}: {', '.join(files)}")
     side, dx = len(surfaces.after), surfaces.dx
-    print(f"topography.npy: {side} x {side} heights in m, dx = {dx:g} m")
+    print(f"topography.npy: {side} x {side} heights in m, dx = {dx:g} m\n")
+    print(best)
     return 1 if best.violated else 0
 
 

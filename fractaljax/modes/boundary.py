@@ -71,7 +71,8 @@ class Boundary(Record):
             ends = f"begins {BranchEnd[branch.start]}, ends {BranchEnd[branch.end]}"
             rows.append(f"  {len(branch.x)} points, {'a loop' if branch.closed else ends}")
         if not self.branches and not self.untraced:
-            rows.append("  none found: it squeals" if self.squeals else "  none found: stable")
+            side = "it squeals" if self.squeals else "stable against small disturbances"
+            rows.append(f"  none found: {side}")
         if self.untraced:
             rows.append(f"  {self.untraced} crossings of the lattice could not be followed")
         return "\n".join(rows)

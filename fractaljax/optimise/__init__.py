@@ -1,1 +1,1 @@
-"""The nearest surface that does not squeal, over an envelope and with tolerances."""
+"""The nearest surface stable against small disturbances, over an envelope and with tolerances."""

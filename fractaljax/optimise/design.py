@@ -1,4 +1,4 @@
-"""The nearest surface that does not squeal.
+"""The nearest surface that is stable against small disturbances.
 
 A design moves D and ln G, scaled to [0, 1] by their bounds. Every requirement is a function that
 is at most 0 where it is met, continuous and informative on both sides of every regime boundary:
@@ -127,7 +127,14 @@ class Design:
         lines = [comparison_table(*shown), f"Sq and Sdq: wavelengths from {L:g} to {L_s:g} m"]
         lines += self._under_conditions()
         lines += [f"not met: {name}" for name in self.violated]
-        return "\n".join([*lines, self.outcome])
+        return "\n".join([*lines, self.outcome, self._promise()])
+
+    def _promise(self) -> str:
+        """What the growth rate says of the designed surface, and what it does not."""
+        growth = self.growth_rate if self.growth_rates is None else self.growth_rates[1]
+        if not growth < 0:
+            return "not stable: small disturbances grow"
+        return "stable against small disturbances; a larger kick may still end in squeal"
 
     def _under_conditions(self) -> list[str]:
         """What the envelope and the tolerance make of it, before and after, and the worst."""
@@ -175,6 +182,8 @@ def design(
 ) -> Design:
     """Find by gradients the surface inside `bounds` that is best and meets every requirement.
 
+    The growth rate that it bounds is that of small disturbances: a surface with growth rate < 0 is
+    stable against those, and a larger kick may still end in a limit cycle (see `attractors`).
     Best is, without an `objective`, nearest to the scene's own surface: the least
     d^2 = (dD/(D_hi - D_lo))^2 + (d ln G/(ln G_hi - ln G_lo))^2. An objective is any function of a
     scene that `jax` can differentiate, and is minimised.

@@ -115,7 +115,7 @@ def test_stability(capsys, tmp_path):
     fixed = fj.brake_scene().replace(contact=fj.FixedContact(0.0, 0.0), friction=fj.Coulomb(0.3))
     fixed.save(tmp_path / "fixed.toml")
     status, out, _ = run(capsys, "stability", "fixed.toml")
-    assert status == 0 and "(stable)" in out and "regime" not in out
+    assert status == 0 and "(stable against small disturbances)" in out and "regime" not in out
     status, out, _ = run(capsys, "stability", "--constant-friction")
     assert status == 0 and "+23.311" in out
 

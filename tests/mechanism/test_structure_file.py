@@ -206,7 +206,7 @@ def test_the_command(tmp_path, capsys):
     assert shown.count("unstable") == 3
     assert main(["stability", "--constant-friction", str(tmp_path / "brake.toml")]) == 0
     shown = capsys.readouterr().out
-    assert "unstable modes       0  (stable)" in shown
+    assert "unstable modes       0  (stable against small disturbances)" in shown
     for command in ("design", "cycle"):
         with pytest.raises(SystemExit):
             main([command, str(tmp_path / "brake.toml"), "--out", str(tmp_path / "out")])
