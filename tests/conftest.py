@@ -12,6 +12,9 @@ jax.config.update("jax_numpy_dtype_promotion", "standard")
 
 def pytest_configure(config):
     config.addinivalue_line("filterwarnings", "error")
+    # An entry of the cache that another worker is still writing is compiled anew.
+    cache = "Error (reading|writing) persistent compilation cache"
+    config.addinivalue_line("filterwarnings", f"ignore:{cache}")
     warnings.simplefilter("error")
     # Most of a run is compilation: workers, subprocesses and later runs share what is compiled.
     folder = os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(config.cache.mkdir("jax")))
