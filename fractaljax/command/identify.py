@@ -7,7 +7,7 @@ from .output import output, picture
 
 _INSTRUMENT = ("resolution", "stylus_radius")  # which a file may tell
 _FOLDER = Path("fractaljax-identification")
-_MEANINGLESS = "not fractal"  # begins flags that leave D and G without meaning
+_MEANINGLESS = ("not fractal", "too few levels")  # begin flags that leave D and G without meaning
 
 
 def add_identify(commands) -> None:

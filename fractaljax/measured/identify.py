@@ -7,9 +7,10 @@ import numpy as np
 
 from ..base.parts import Record
 from ..surface.surfaces import Surface
-from .band import PER_RESOLUTION, chosen_band, given_band
+from .band import LOWEST, PER_RESOLUTION, chosen_band, given_band
 from .fit import PowerLaw, fit
 from .flags import flags_of
+from .levels import level_flags, step_limit
 from .preparation import checked, prepared, spacing
 from .spectrum import Spectrum, map_spectra, profile_spectrum
 from .structure_function import StructureFunction, structure_function
@@ -113,8 +114,11 @@ def identify(
         top = min(top, 1 / (PER_RESOLUTION * spacing("resolution", resolution)))
     if stylus_radius is not None:
         top = min(top, tip_limit(spectrum, length, ratio, spacing("stylus_radius", stylus_radius)))
+    limit = step_limit(heights.known, (dx, dy)[: z.ndim])
+    least = 2 * LOWEST / length
     if band is None:
-        chosen = chosen_band(spectrum, length, ratio, top)
+        usable = top if limit < least else min(top, limit)
+        chosen = chosen_band(spectrum, length, ratio, usable)
     else:
         chosen = given_band(band, spectrum, length, ratio, top)
     ends, nature = (chosen.low, chosen.high), chosen.nature
@@ -131,6 +135,7 @@ def identify(
     )
     errors = np.sqrt(np.diag(covariance))
     flags = [*chosen.notes, *flags_of(law, ends, nature, spectra, ratio)]
+    flags += level_flags(heights.known, limit, ends[1], least)
     flags += _flags(D, errors, opinion, z.size, heights)
     return Identification(
         D=D,

@@ -21,6 +21,7 @@ class Heights(NamedTuple):
     missing: int  # NaN in what was given
     outliers: int  # spikes taken out
     unused: int  # points in stretches too short to be of use
+    known: np.ndarray  # what was given less spikes, NaN where missing
 
 
 def spacing(name: str, value: Any) -> float:
@@ -69,7 +70,7 @@ def prepared(z: np.ndarray) -> Heights:
         share = np.isnan(z).mean()
         if share > _MOST_MISSING:
             raise ValueError(f"z has too many gaps: {share:.0%} of the map are missing")
-        return Heights([_bridged_map(z)], missing, int(spikes.sum()), 0)
+        return Heights([_bridged_map(z)], missing, int(spikes.sum()), 0, z)
     stretches = _stretches(z)
     longest = max(stretch.size for stretch in stretches)
     if longest < FEWEST:
@@ -79,7 +80,7 @@ def prepared(z: np.ndarray) -> Heights:
         )
     used = [part for part in stretches if part.size >= max(FEWEST // 2, longest / 8)]
     unused = sum(part.size for part in stretches) - sum(part.size for part in used)
-    return Heights(used, missing, int(spikes.sum()), unused)
+    return Heights(used, missing, int(spikes.sum()), unused, z)
 
 
 def _not_flat(z):

@@ -1,0 +1,122 @@
+"""Heights that come in steps, repeat, are interpolated or clipped: how far a spectrum holds.
+
+Rounding to a step q adds q^2/12 to the variance: where heights change by more than q from point to
+point this is white, q^2 dx/6 of a one-sided profile spectrum; where they do not, it lies at lower
+frequencies and looks like a rougher surface. What tells is second differences, which know no
+offset and no tilt: of heights without steps no two are the same; of heights in steps they are
+multiples of q, and a share of q/(sqrt(2 pi) sigma) of those at a distance is the same, sigma being
+their standard deviation. Where the share is small, the steps do not count at that distance.
+"""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+_REPEATED = 0.2  # share of equal second differences below which D moves by less than its error
+_INTERPOLATED = 0.05  # the share falls below this at once where heights were put in between
+_WINDOW = 0.01  # of the rms second difference: closer ones are equal
+_AROUND = 5  # windows about it in which those of heights without steps are as many
+_FEWEST = 32  # second differences
+_MOST = 2**16  # second differences that are looked at
+_GROWTH = 1.25  # of the distances that are tried
+_HIGHEST = 0.25  # points per wavelength: half the Nyquist frequency
+_EXACT = 1e-9  # of the range: rounding errors
+_CLIPPED = 0.005  # share of the heights that is worth a line, if not a matter of chance
+_CHANCE = 5  # times as many as at the next level, and points
+_STRAIGHT = 0.01  # share of the heights
+
+
+def step_limit(z: np.ndarray, steps: tuple[float, ...]) -> float:
+    """Frequency [1/m] up to which steps of heights z do not count; infinite if nowhere, or 0.
+
+    z (n,) or (n, m) with NaN for gaps, `steps` [m] between points along its axes.
+    """
+    limit = math.inf
+    for axis, step in enumerate(steps):
+        lines, lag = np.moveaxis(z, axis, 0), 1
+        while (share := _repeated(lines, lag)) >= _REPEATED:
+            lag = max(lag + 1, int(_GROWTH * lag))
+            if 2 * lag >= len(lines):
+                return 0.0
+        if lag > 1:
+            lag *= 1 if share > _INTERPOLATED else 2  # a line between points is also a filter
+            limit = min(limit, _HIGHEST / (lag * step))
+    return limit
+
+
+def _second_differences(z, lag=1):
+    """Those along the first axis, without gaps."""
+    differences = z[2 * lag :] - 2 * z[lag:-lag] + z[: -2 * lag]
+    differences = differences[np.isfinite(differences)]
+    return differences[:: -(-differences.size // _MOST) or 1]
+
+
+def _repeated(z, lag) -> float:
+    """Share of the most frequent second difference, beyond that of any continuous density."""
+    found = np.sort(_second_differences(z, lag))
+    if found.size < _FEWEST:
+        return 1.0
+    half = max(_WINDOW * found.std(), _rounding(z))
+    inner, outer = (
+        np.searchsorted(found, found + width, "right") - np.searchsorted(found, found - width)
+        for width in (half, _AROUND * half)
+    )
+    return float((inner - (outer - inner) / (_AROUND - 1)).max() / found.size)
+
+
+def _rounding(z):
+    return 8 * np.finfo(float).eps * np.nanmax(np.abs(z))
+
+
+def level_flags(z: np.ndarray, limit: float, high: float, lowest: float) -> Iterator[str]:
+    """What to say of heights z whose steps count above `limit` [1/m], in a band up to `high`.
+
+    No band is left where `limit` is below `lowest` [1/m].
+    """
+    distinct = np.unique(z[~np.isnan(z)])
+    few = 2 * distinct.size < z.size
+    step = f" (step {np.median(np.diff(distinct)):.3g} m)" if few else ""
+    levels = f"{distinct.size} levels{step}"
+    if limit < lowest:
+        which = f"only {levels}" if few else "few levels, or are interpolated"
+        yield f"too few levels: heights have {which}, and D and G mean nothing"
+    elif limit < high * (1 - 1e-9):
+        which = f"have only {levels}" if few else "come in steps or are interpolated"
+        yield f"heights {which}: D and G are in doubt, the band goes beyond {limit:.3g} 1/m"
+    elif limit < math.inf:
+        which = f"have only {levels}" if few else "come in steps or are interpolated"
+        yield f"heights {which}: the band ends at {high:.3g} 1/m"
+    yield from _clipped(z, distinct)
+    yield from _straight(z)
+
+
+def _clipped(z, distinct):
+    """Many heights at an end of their range."""
+    for what, end, next_one in (
+        ("largest", distinct[-1], distinct[-2]),
+        ("smallest", distinct[0], distinct[1]),
+    ):
+        count, others = np.sum(z == end), np.sum(z == next_one)
+        if count >= max(_CHANCE * others, _CHANCE, _CLIPPED * z.size):
+            yield (
+                f"clipped: {count / z.size:.1%} of the heights are the {what} one, {end:.4g} m"
+            )
+
+
+def _straight(z):
+    """Heights in line with their neighbours, more than there are of any other curvature."""
+    for axis in range(z.ndim):
+        found = np.abs(_second_differences(np.moveaxis(z, axis, 0)))
+        if found.size < _FEWEST:
+            continue
+        exact = max(_EXACT * found.max(), _rounding(z))
+        rest = np.sort(found[found > exact])
+        flat = 1 - rest.size / found.size
+        same = np.searchsorted(rest, rest + exact, "right") - np.arange(rest.size)
+        if flat - same.max(initial=0) / found.size > _STRAIGHT and rest.size < found.size - 3:
+            yield (
+                f"{flat:.1%} of the heights are in line with their neighbours: "
+                "clipped, held or interpolated"
+            )
+            return
