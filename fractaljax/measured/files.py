@@ -1,15 +1,30 @@
 """Measured heights from files: text, NumPy's own, and instruments' formats."""
 
 import io
+import math
 import os
+import stat
+import zipfile
 from pathlib import Path
 
 import numpy as np
+from numpy.lib import format as npy
 
-from .measurement import Measurement, agreed, map_on_grid, measurement, profile_on_grid, scale
+from .measurement import (
+    Measurement,
+    agreed,
+    map_on_grid,
+    measurement,
+    one_line,
+    profile_on_grid,
+    scale,
+)
 from .text import read_table
 
 _TEXTS = {".csv", ".tsv", ".txt", ".dat", ".xyz"}
+_ARRAYS = {".npy", ".npz"}
+_MOST_TEXT, _MOST_ARRAYS, _MOST = 2**28, 2**30, 2**31  # bytes; the last of instruments' formats
+_HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 
 
 def read_measurement(
@@ -26,23 +41,26 @@ def read_measurement(
     `.csv`, `.tsv`, `.txt`, `.dat`, `.xyz`: a text with one column (heights), two (position,
     height), three (x, y, height on a rectangular grid) or more (a map, a line of the text along
     x). `.npy`: heights (n,) or (n, m), x along the first axis. `.npz`: z, dx and perhaps dy in
-    metres. All else is read by the SurfaceTopography package.
+    metres. All else is read by the SurfaceTopography package. At most 256 MiB of text are read,
+    1 GiB of arrays, and 2 GiB in an instrument's format.
 
     `dx`, `dy` [m] are steps, `unit` that of the heights and `position_unit` that of positions (else
     the same), for files that do not say it; what a file says must not be contradicted. `channel`
     is the name or number of one of several. Cells without a height are NaN.
 
     **Raises:** `OSError` if the file cannot be read; `ValueError` naming it for a format that is
-    unknown or damaged, units or steps that neither the file nor an argument tells, positions that
+    unknown or damaged, a file that is too large, units or steps that neither the file nor an argument tells, positions that
     are not equidistant within a tenth of a step, and heights that are no profile or map.
     """
     path = Path(path)
+    suffix = path.suffix.lower()
     try:
-        content = path.read_bytes()
-        if path.suffix.lower() in (".npy", ".npz"):
+        with path.open("rb") as file:
+            content = _content(file, suffix)
+        if suffix in _ARRAYS:
             _refuse_channel(channel)
             return _read_arrays(path, content, dx, dy, unit)
-        if path.suffix.lower() in _TEXTS and _is_text(content):
+        if suffix in _TEXTS and _is_text(content):
             _refuse_channel(channel)
             return _read_text(path, content, dx, dy, unit, position_unit)
         from .instrument_file import read_instrument_file
@@ -50,6 +68,18 @@ def read_measurement(
         return read_instrument_file(path, dx, dy, unit, channel)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
+
+
+def _content(file, suffix) -> bytes:
+    """The bytes of a text or of arrays, if they are not too many; of other files, none."""
+    status, ours = os.fstat(file.fileno()), suffix in _TEXTS | _ARRAYS
+    if not ours and not stat.S_ISREG(status.st_mode):  # its reader would open a pipe once more
+        raise ValueError("it is no regular file: its name must end with .csv, .npy or .npz")
+    most = _MOST_TEXT if suffix in _TEXTS else _MOST_ARRAYS if ours else _MOST
+    content = file.read(most + 1) if ours and status.st_size <= most else b""
+    if max(status.st_size, len(content)) > most:
+        raise ValueError(f"it is too large: at most {most >> 20} MiB are read")
+    return content
 
 
 def _is_text(content) -> bool:
@@ -86,27 +116,52 @@ def _read_text(path, content, dx, dy, unit, position_unit) -> Measurement:
 
 
 def _read_arrays(path, content, dx, dy, unit) -> Measurement:
-    arrays = _load(content)
-    if path.suffix.lower() == ".npz":
+    packed = path.suffix.lower() == ".npz"
+    try:
+        arrays = _unpacked(content) if packed else {"z": _array(content)}
+    except Exception as error:  # of many kinds, down to those of Python's tokenizer
+        reason = one_line(error)
+        raise ValueError(f"it is no sound file of numbers from NumPy: {reason}") from None
+    for name in ("z", "dx", "dy"):
+        if name in arrays and arrays[name].dtype.kind not in "iuf":
+            raise ValueError(f"{name} must be real numbers, got {arrays[name].dtype}")
+    if packed:
         if not {"z", "dx"} <= set(arrays):
             raise ValueError(f"it must hold z and dx in metres, got {', '.join(arrays)}")
         dx, dy = (agreed(name, _number(arrays, name), x) for name, x in (("dx", dx), ("dy", dy)))
-    metre = scale("m" if "dx" in arrays else None, unit, "heights", "--unit")
-    z = arrays["z"]
+    metre = scale("m" if packed else None, unit, "heights", "--unit")
+    z = arrays["z"].astype(float)
     shape = " x ".join(map(str, z.shape))
     return measurement(z * metre, dx, dy, f"{path.name}: array of {shape}")
 
 
-def _load(content: bytes) -> dict[str, np.ndarray]:
-    try:
-        loaded = np.load(io.BytesIO(content), allow_pickle=False)
-        arrays = {"z": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
-    except Exception:  # of many kinds, down to those of Python's tokenizer
-        raise ValueError("it is no sound file of numbers from NumPy") from None
-    for name, array in arrays.items():
-        if array.dtype.kind not in "iuf":
-            raise ValueError(f"{name} must be real numbers, got {array.dtype}")
-    return arrays
+def _unpacked(content: bytes) -> dict[str, np.ndarray]:
+    """The arrays in the bytes of an NPZ file, by name."""
+    with zipfile.ZipFile(io.BytesIO(content)) as packed:
+        size = sum(member.file_size for member in packed.infolist())  # no more will be read
+        if size > _MOST_ARRAYS:
+            raise ValueError(f"it unpacks to {size} bytes, at most {_MOST_ARRAYS} are read")
+        names = packed.namelist()
+        if len(set(names)) < len(names):
+            raise ValueError(f"it holds two arrays of one name: {', '.join(names)}")
+        return {name.removesuffix(".npy"): _array(packed.read(name)) for name in names}
+
+
+def _array(content: bytes) -> np.ndarray:
+    """The array in the bytes of an NPY file, which must be as many as its header says."""
+    file = io.BytesIO(content)
+    version = npy.read_magic(file)
+    if version not in _HEADERS:
+        raise ValueError(f"version {version} of the format")
+    shape, columns_first, dtype = _HEADERS[version](file)
+    start = file.tell()
+    size = math.prod(shape) * dtype.itemsize
+    if size != len(content) - start:
+        raise ValueError(f"{size} bytes were to follow its header, {len(content) - start} do")
+    if dtype.kind not in "iuf":
+        return np.empty(0, dtype)
+    array = np.frombuffer(content, dtype, offset=start) if size else np.empty(0, dtype)
+    return array.reshape(shape, order="F" if columns_first else "C")
 
 
 def _number(arrays, name) -> float | None:

@@ -1,14 +1,17 @@
 """Instruments' own files, through the readers of the SurfaceTopography package."""
 
 import contextlib
+import math
 import warnings
+import zipfile
 from pathlib import Path
 
 import numpy as np
 
-from .measurement import Measurement, agreed, measurement, metres, profile_on_grid, scale
+from .measurement import Measurement, agreed, measurement, metres, one_line, profile_on_grid, scale
 
 _ANY_BYTES = {"hgt": ".hgt", "nms": ".nms"}  # formats that only their suffix tells from others
+_MOST_UNPACKED, _MOST_POINTS = 2**31, 2**27  # bytes, and heights
 _TOLERANCE = 1e-6  # of SurfaceTopography for equal steps of x in a text, in the text's unit
 
 
@@ -20,11 +23,17 @@ def read_instrument_file(path: Path, dx, dy, unit, channel) -> Measurement:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the package and of those that it imports
         package = _package()
+        _refuse_bomb(path)
         with _open(package, path) as reader:
             form = reader.format(), reader.name()
             with _readable(form[1]):
                 channels, default = list(reader.channels), reader.default_channel
             chosen = _channel(channels, default, channel)
+            points = math.prod(int(n) for n in np.ravel(chosen.nb_grid_pts))
+            if not 0 < points <= _MOST_POINTS:
+                raise ValueError(
+                    f"channel {chosen.name!r} has {points} heights, at most {_MOST_POINTS} are read"
+                )
             with _readable(f"channel {chosen.name!r}"):
                 topography, z, x = _heights(chosen)
     metre = scale(topography.unit, unit, "heights", "--unit")
@@ -56,6 +65,16 @@ def _package():
     return SurfaceTopography
 
 
+def _refuse_bomb(path):
+    """Refuse what would unpack to more than memory should hold; many formats are zip archives."""
+    if not zipfile.is_zipfile(path):
+        return
+    with _readable("the archive"), zipfile.ZipFile(path) as packed:
+        size = sum(member.file_size for member in packed.infolist())
+    if size > _MOST_UNPACKED:
+        raise ValueError(f"it unpacks to {size} bytes, at most {_MOST_UNPACKED} are read")
+
+
 @contextlib.contextmanager
 def _open(package, path):
     """The reader of a file, by its content; where there is none, the suffix may tell why."""
@@ -80,7 +99,7 @@ def _reason(package, path, kind) -> str:
     try:
         package.open_topography(str(path), format=kind.format()).close()
     except Exception as error:
-        return f", and not a sound file of {kind.name()}: {_line(error)}"
+        return f", and not a sound file of {kind.name()}: {one_line(error)}"
     return ""
 
 
@@ -90,7 +109,7 @@ def _readable(what):
     try:
         yield
     except Exception as error:
-        raise ValueError(f"{what} cannot be read: {_line(error)}") from None
+        raise ValueError(f"{what} cannot be read: {one_line(error)}") from None
 
 
 def _channel(channels, default, asked):
@@ -130,8 +149,3 @@ def _limits(instrument) -> dict[str, float]:
         for key, name in names.items()
         if parameters.get(key)
     }
-
-
-def _line(error) -> str:
-    """An error of the package in one line."""
-    return " ".join(str(error).split())[:200] or type(error).__name__

@@ -1,7 +1,9 @@
 """Columns of numbers in a text, with the units that its header gives: CSV of any dialect."""
 
 import csv
+import math
 import re
+from array import array
 from typing import NamedTuple
 
 import numpy as np
@@ -10,8 +12,12 @@ from .measurement import known_unit, metres
 
 _SEPARATORS = (";", "\t", ",", None)  # None: any white space
 _COMMENTS = ("#", "%", "//", "!")
-_GAPS = {"", "nan", "na", "n/a", "null", "none", "bad", "invalid", "no data"}
+_GAPS = {"", "nan", "inf", "-inf", "na", "n/a", "null", "none", "bad", "invalid", "no data"}
 _TRIED = 1000  # lines from which the separator is found
+_MOST_LINES, _LONGEST_LINE = 2**24, 2**23  # what takes about a gigabyte to read, and characters
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
+_BROKEN = re.compile(r".?[-+.\d].*\d")  # a cell that was meant to be a number
+_THOUSANDS = re.compile(r"(?<![\d.])[1-9]\d{0,2},0\d\d(?!\d)")  # 1,034.5
 _BRACKETED = re.compile(r"[\[(]\s*([^\[\]()]+?)\s*[\])]$")  # z [nm], z (nm)
 _SUFFIXED = re.compile(r"(?:^|[/_]\s*|[^\W\d]\s+)([^\s/_]+)$")  # nm, z/nm, z_nm, z in nm, z nm
 _QUANTITY = re.compile(r"^[^:]+:\s*([-+.\deE]+)\s*([^\s\d]+)$")  # Width: 12.3 um
@@ -35,30 +41,69 @@ def read_table(content: bytes) -> Table:
     Columns are separated by semicolons, tabs, commas or spaces; a comma that does not separate is
     a decimal comma. Empty cells, nan, dashes, asterisks and words like bad are gaps.
 
-    **Raises:** `ValueError` naming the line that is different, or if there is no line of numbers.
+    **Raises:** `ValueError` naming the line that is different, or if there is no line of numbers;
+    for more than 2^24 lines, or one of more than 2^23 characters; for decimal points beside decimal
+    commas.
     """
-    lines = _text(content).lstrip("\ufeff").splitlines()
-    while lines and not lines[-1].strip():
-        lines.pop()
+    lines = _lines(content)
     separator = _separator(lines)
     start = next((i for i, line in enumerate(lines) if _is_data(line, separator)), None)
     if start is None:
         raise ValueError("there is no line of numbers in it")
     columns = len(_fields(lines[start], separator))
-    rows, empty = [], columns - 1
+    _refuse_broken(lines, start, separator, columns)
+    while columns > 3 and start and _is_gap(lines[start - 1], separator, columns):
+        start -= 1  # a line of a map without a height is one of its lines
+    numbers, empty, marks = array("d"), columns - 1, set()
     for at, line in enumerate(lines[start:], start=start + 1):
         if line.lstrip().startswith(_COMMENTS) or (columns > 1 and not line.strip()):
             continue
         fields = _fields(line, separator) or [""]
         if len(fields) != columns:
             raise ValueError(f"line {at} has {len(fields)} columns, the first one has {columns}")
-        rows.append(_numbers(fields, at))
+        if separator == "," and ",0" in line and _THOUSANDS.search(line):
+            raise ValueError(f"line {at}: does a comma separate thousands in {line[:40]!r}?")
+        marks.update(mark for mark in ".," if separator != "," and mark in line)
+        numbers.extend(_numbers(fields, at))
         empty = min(empty, columns - _filled(fields))
-    numbers = np.array(rows)[:, : columns - empty]  # every line may end with separators
+    if len(marks) > 1:
+        raise ValueError("there are both decimal points and decimal commas in it")
+    table = np.array(numbers).reshape(-1, columns)
+    numbers = table[:, : columns - empty]  # every line may end with separators
     size, unit = _map_header(lines[:start])
     if size is not None:
         return Table(numbers, [unit] * numbers.shape[1], size)
     return Table(numbers, _units(lines[:start], separator, numbers.shape[1]))
+
+
+def _lines(content) -> list[str]:
+    if max(content.count(b"\n"), content.count(b"\r")) > _MOST_LINES:
+        raise ValueError(f"it has too many lines: at most {_MOST_LINES} are read")
+    text = _text(content).lstrip("\ufeff").replace("\r\n", "\n").replace("\r", "\n")
+    lines = text.split("\n")
+    while lines and not lines[-1].strip():
+        lines.pop()
+    for at, line in enumerate(lines, start=1):
+        if len(line) > _LONGEST_LINE:
+            raise ValueError(
+                f"line {at} has {len(line)} characters: at most {_LONGEST_LINE} are read"
+            )
+    return lines
+
+
+def _refuse_broken(lines, start, separator, columns):
+    """Refuse a last line of the header that is one of numbers but for a cell."""
+    fields = _fields(lines[start - 1], separator) if start else []
+    if len(fields) != columns or lines[start - 1].lstrip().startswith(_COMMENTS):
+        return
+    broken = [field for field in fields if _cell(field) is None]
+    if 0 < len(broken) < columns and all(_BROKEN.match(field) for field in broken):
+        raise ValueError(f"line {start}: {broken[0]!r} is not a number")
+
+
+def _is_gap(line, separator, columns):
+    cells = [_cell(field) for field in _fields(line, separator)]
+    return len(cells) == columns and None not in cells
 
 
 def _filled(fields) -> int:
@@ -111,7 +156,10 @@ def _is_data(line, separator) -> bool:
 
 def _fields(line, separator):
     if '"' in line and separator is not None:
-        cells = next(csv.reader([line], delimiter=separator))
+        try:
+            cells = next(csv.reader([line], delimiter=separator, strict=True))
+        except csv.Error:  # quotes in the middle of a cell, or without an end
+            return [line]
     else:
         cells = line.replace('"', "").split(separator)
     cells = [cell.strip() for cell in cells]
@@ -119,23 +167,21 @@ def _fields(line, separator):
 
 
 def _numbers(fields, at):
-    try:
-        return [float(field) for field in fields]
-    except ValueError:
-        cells = [_cell(field) for field in fields]
+    cells = [_cell(field) for field in fields]
     if None in cells:
         raise ValueError(f"line {at}: {fields[cells.index(None)]!r} is not a number")
+    if math.inf in cells or -math.inf in cells:
+        raise ValueError(f"line {at} has a number that is too large")
     return cells
 
 
 def _cell(field):
     """A number, NaN for a gap, or None."""
-    if field.lower() in _GAPS or not field.strip("-*"):
-        return float("nan")
-    try:
+    if _NUMBER.fullmatch(field):
         return float(field)
-    except ValueError:
-        return None
+    if field.lower() in _GAPS or not field.strip("-*"):
+        return math.nan
+    return None
 
 
 def _units(header, separator, columns):
