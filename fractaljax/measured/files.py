@@ -130,7 +130,8 @@ def _read_arrays(path, content, dx, dy, unit) -> Measurement:
             raise ValueError(f"it must hold z and dx in metres, got {', '.join(arrays)}")
         dx, dy = (agreed(name, _number(arrays, name), x) for name, x in (("dx", dx), ("dy", dy)))
     metre = scale("m" if packed else None, unit, "heights", "--unit")
-    z = arrays["z"].astype(float)
+    with np.errstate(invalid="ignore", over="ignore"):  # what is no number in float32 is none here
+        z = arrays["z"].astype(float)
     shape = " x ".join(map(str, z.shape))
     return measurement(z * metre, dx, dy, f"{path.name}: array of {shape}")
 

@@ -12,6 +12,7 @@ from .measurement import Measurement, agreed, measurement, metres, one_line, pro
 
 _ANY_BYTES = {"hgt": ".hgt", "nms": ".nms"}  # formats that only their suffix tells from others
 _MOST_UNPACKED, _MOST_POINTS = 2**31, 2**27  # bytes, and heights
+_TEXTS = {"asc", "xyz"}  # formats whose readers pass over what is no number
 _TOLERANCE = 1e-6  # of SurfaceTopography for equal steps of x in a text, in the text's unit
 
 
@@ -26,6 +27,8 @@ def read_instrument_file(path: Path, dx, dy, unit, channel) -> Measurement:
         _refuse_bomb(path)
         with _open(package, path) as reader:
             form = reader.format(), reader.name()
+            if form[0] in _TEXTS and b"\0" in path.read_bytes():
+                raise ValueError("it is a text with zero bytes in it")
             with _readable(form[1]):
                 channels, default = list(reader.channels), reader.default_channel
             chosen = _channel(channels, default, channel)

@@ -16,8 +16,9 @@ _GAPS = {"", "nan", "inf", "-inf", "na", "n/a", "null", "none", "bad", "invalid"
 _TRIED = 1000  # lines from which the separator is found
 _MOST_LINES, _LONGEST_LINE = 2**24, 2**23  # what takes about a gigabyte to read, and characters
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
-_BROKEN = re.compile(r".?[-+.\d].*\d")  # a cell that was meant to be a number
+_WORD = re.compile(r"(?!nan|inf)[^\W\d_]{3}")  # titles and dates have them, numbers do not
 _THOUSANDS = re.compile(r"(?<![\d.])[1-9]\d{0,2},0\d\d(?!\d)")  # 1,034.5
+_QUOTED = re.compile(r'^"(.*)"$')
 _BRACKETED = re.compile(r"[\[(]\s*([^\[\]()]+?)\s*[\])]$")  # z [nm], z (nm)
 _SUFFIXED = re.compile(r"(?:^|[/_]\s*|[^\W\d]\s+)([^\s/_]+)$")  # nm, z/nm, z_nm, z in nm, z nm
 _QUANTITY = re.compile(r"^[^:]+:\s*([-+.\deE]+)\s*([^\s\d]+)$")  # Width: 12.3 um
@@ -51,9 +52,9 @@ def read_table(content: bytes) -> Table:
     if start is None:
         raise ValueError("there is no line of numbers in it")
     columns = len(_fields(lines[start], separator))
-    _refuse_broken(lines, start, separator, columns)
     while columns > 3 and start and _is_gap(lines[start - 1], separator, columns):
         start -= 1  # a line of a map without a height is one of its lines
+    _refuse_broken(lines, start, separator)
     numbers, empty, marks = array("d"), columns - 1, set()
     for at, line in enumerate(lines[start:], start=start + 1):
         if line.lstrip().startswith(_COMMENTS) or (columns > 1 and not line.strip()):
@@ -91,14 +92,18 @@ def _lines(content) -> list[str]:
     return lines
 
 
-def _refuse_broken(lines, start, separator, columns):
-    """Refuse a last line of the header that is one of numbers but for a cell."""
-    fields = _fields(lines[start - 1], separator) if start else []
-    if len(fields) != columns or lines[start - 1].lstrip().startswith(_COMMENTS):
+def _refuse_broken(lines, start, separator):
+    """Refuse a last line of the header that looks like numbers: it may be the first of them."""
+    at = next((i for i in range(start - 1, -1, -1) if lines[i].strip()), None)
+    if at is None or lines[at].lstrip().startswith(_COMMENTS):
         return
-    broken = [field for field in fields if _cell(field) is None]
-    if 0 < len(broken) < columns and all(_BROKEN.match(field) for field in broken):
-        raise ValueError(f"line {start}: {broken[0]!r} is not a number")
+    cells = [cell for cell in _fields(lines[at], separator) if cell]
+    titled = any(cell[:2].isalpha() or _WORD.search(cell) for cell in cells)
+    if not (titled or all(cell[0].isalpha() for cell in cells)) and any(map(str.isdigit, lines[at])):
+        raise ValueError(
+            f"line {at + 1} is neither a title nor numbers: {lines[at][:40]!r} (if it is to be"
+            " left out, put # before it)"
+        )
 
 
 def _is_gap(line, separator, columns):
@@ -155,13 +160,15 @@ def _is_data(line, separator) -> bool:
 
 
 def _fields(line, separator):
-    if '"' in line and separator is not None:
+    if '"' not in line:
+        cells = line.split(separator)
+    elif separator is None:
+        cells = [_QUOTED.sub(r"\1", cell) for cell in line.split()]
+    else:
         try:
             cells = next(csv.reader([line], delimiter=separator, strict=True))
         except csv.Error:  # quotes in the middle of a cell, or without an end
             return [line]
-    else:
-        cells = line.replace('"', "").split(separator)
     cells = [cell.strip() for cell in cells]
     return cells if separator == "," else [cell.replace(",", ".") for cell in cells]
 
