@@ -1,5 +1,6 @@
 """Measured heights from files: text, NumPy's own, and instruments' formats."""
 
+import errno
 import io
 import math
 import os
@@ -55,8 +56,7 @@ def read_measurement(
     path = Path(path)
     suffix = path.suffix.lower()
     try:
-        with path.open("rb") as file:
-            content = _content(file, suffix)
+        content = _content(path, suffix)
         if suffix in _ARRAYS:
             _refuse_channel(channel)
             return _read_arrays(path, content, dx, dy, unit)
@@ -70,14 +70,19 @@ def read_measurement(
         raise ValueError(f"{path}: {error}") from None
 
 
-def _content(file, suffix) -> bytes:
+def _content(path, suffix) -> bytes:
     """The bytes of a text or of arrays, if they are not too many; of other files, none."""
-    status, ours = os.fstat(file.fileno()), suffix in _TEXTS | _ARRAYS
+    status, ours = path.stat(), suffix in _TEXTS | _ARRAYS
+    if stat.S_ISDIR(status.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if not ours and not stat.S_ISREG(status.st_mode):  # its reader would open a pipe once more
         raise ValueError("it is no regular file: its name must end with .csv, .npy or .npz")
     most = _MOST_TEXT if suffix in _TEXTS else _MOST_ARRAYS if ours else _MOST
-    content = file.read(most + 1) if ours and status.st_size <= most else b""
-    if max(status.st_size, len(content)) > most:
+    size, content = status.st_size, b""
+    if size <= most:
+        with path.open("rb") as file:
+            content = file.read(most + 1 if ours else 0)
+    if max(size, len(content)) > most:
         raise ValueError(f"it is too large: at most {most >> 20} MiB are read")
     return content
 
@@ -155,12 +160,12 @@ def _array(content: bytes) -> np.ndarray:
     if version not in _HEADERS:
         raise ValueError(f"version {version} of the format")
     shape, columns_first, dtype = _HEADERS[version](file)
+    if dtype.kind not in "iuf":
+        return np.empty(0, dtype)  # its kind is refused
     start = file.tell()
     size = math.prod(shape) * dtype.itemsize
     if size != len(content) - start:
         raise ValueError(f"{size} bytes were to follow its header, {len(content) - start} do")
-    if dtype.kind not in "iuf":
-        return np.empty(0, dtype)
     array = np.frombuffer(content, dtype, offset=start) if size else np.empty(0, dtype)
     return array.reshape(shape, order="F" if columns_first else "C")
 

@@ -13,6 +13,8 @@ _SIGMAS = 3.0
 _BENDS = 0.2  # change of D along the band that is worth a line
 _ROUGH = 0.5  # scatter of bins beyond that of their ordinates: peaks rather than a law
 _FEW_DECADES = 1.0  # less, and a factor of 2 at one end of the band moves D by more than 0.15
+_LONG, _SHORT = 1.0, 1e-12  # m: beyond what instruments scan, and below what they resolve
+_STEEP = 30.0  # rms slope
 _LAY = 0.25  # in ln of the power: a difference of directions that is worth a line
 
 
@@ -35,6 +37,26 @@ def flags_of(
         yield from _folding(law, band, spectra[0], ratio)
     if len(spectra) > 1:
         yield from _lay(spectra[1:], band, nature, ratio)
+
+
+def unit_flags(z: np.ndarray, steps: tuple[float, ...]) -> Iterator[str]:
+    """Sizes that no instrument measures: heights z [m] in any shape, steps [m] along its axes."""
+    rms = float(np.nanstd(z))
+    slope = max(
+        float(np.sqrt(np.nanmean(np.square(np.diff(z, axis=axis))))) / step
+        for axis, step in enumerate(steps)
+    )
+    length = max(n * step for n, step in zip(z.shape, steps, strict=True))
+    odd = [
+        (length > _LONG, f"it is {length:.3g} m long"),
+        (min(steps) < _SHORT, f"its points are {min(steps):.3g} m apart"),
+        (rms > _LONG, f"its rms height is {rms:.3g} m"),
+        (rms < _SHORT, f"its rms height is {rms:.3g} m"),
+        (slope > _STEEP, f"its rms slope is {slope:.3g}"),
+    ]
+    reasons = [words for is_odd, words in odd if is_odd]
+    if reasons:
+        yield f"the units may be wrong: {', '.join(reasons)}"
 
 
 def _few_decades(band):

@@ -9,7 +9,7 @@ from ..base.parts import Record
 from ..surface.surfaces import Surface
 from .band import LOWEST, PER_RESOLUTION, chosen_band, given_band
 from .fit import PowerLaw, fit
-from .flags import flags_of
+from .flags import flags_of, unit_flags
 from .levels import level_flags, step_limit
 from .preparation import checked, prepared, spacing
 from .spectrum import Spectrum, map_spectra, profile_spectrum
@@ -114,7 +114,8 @@ def identify(
         top = min(top, 1 / (PER_RESOLUTION * spacing("resolution", resolution)))
     if stylus_radius is not None:
         top = min(top, tip_limit(spectrum, length, ratio, spacing("stylus_radius", stylus_radius)))
-    limit = step_limit(heights.known, (dx, dy)[: z.ndim])
+    steps = (dx, dy)[: z.ndim]
+    limit = step_limit(heights.known, steps)
     least = 2 * LOWEST / length
     if band is None:
         usable = top if limit < least else min(top, limit)
@@ -135,6 +136,7 @@ def identify(
     )
     errors = np.sqrt(np.diag(covariance))
     flags = [*chosen.notes, *flags_of(law, ends, nature, spectra, ratio)]
+    flags += unit_flags(heights.known, steps)
     flags += level_flags(heights.known, limit, ends[1], least)
     flags += _flags(D, errors, opinion, z.size, heights)
     return Identification(

@@ -25,13 +25,15 @@ class Heights(NamedTuple):
 
 
 def spacing(name: str, value: Any) -> float:
-    """A distance between points [m]. **Raises:** `ValueError` unless it is above 0 and finite."""
+    """A distance [m]. **Raises:** `ValueError` unless it is above 0 and finite, within reason."""
     try:
         number = float(value)
     except (TypeError, ValueError):
         raise TypeError(f"{name} must be a number in m, got {value!r}") from None
     if not (math.isfinite(number) and number > 0):
         raise ValueError(f"{name} must be above 0 and finite, in m, got {value!r}")
+    if not 1 / _ABSURD < number < _ABSURD:
+        raise ValueError(f"{name} must be a length in m, got {value!r}")
     return number
 
 
