@@ -1,4 +1,4 @@
-"""Heights that come in steps, repeat, are interpolated or clipped: how far a spectrum holds.
+"""Heights that come in steps, are interpolated, clipped or put together: how far a spectrum holds.
 
 Rounding to a step q adds q^2/12 to the variance: where heights change by more than q from point to
 point this is white, q^2 dx/6 of a one-sided profile spectrum; where they do not, it lies at lower
@@ -25,6 +25,7 @@ _EXACT = 1e-9  # of the range: rounding errors
 _CLIPPED = 0.005  # share of the heights that is worth a line, if not a matter of chance
 _CHANCE = 5  # times as many as at the next level, and points
 _STRAIGHT = 0.01  # share of the heights
+_JUMP = 10.0  # robust standard deviations of a difference of neighbours
 
 
 def step_limit(z: np.ndarray, steps: tuple[float, ...]) -> float:
@@ -89,6 +90,7 @@ def level_flags(z: np.ndarray, limit: float, high: float, lowest: float) -> Iter
         yield f"heights {which}: the band ends at {high:.3g} 1/m"
     yield from _clipped(z, distinct)
     yield from _straight(z)
+    yield from _jump(z)
 
 
 def _clipped(z, distinct):
@@ -118,5 +120,23 @@ def _straight(z):
             yield (
                 f"{flat:.1%} of the heights are in line with their neighbours: "
                 "clipped, held or interpolated"
+            )
+            return
+
+
+def _jump(z):
+    """One difference of neighbours, or of a map's lines, far beyond all others."""
+    for axis in range(z.ndim):
+        change = np.diff(np.moveaxis(z, axis, 0), axis=0)
+        if z.ndim == 2:
+            change = change[np.isfinite(change).any(axis=1)]
+            change = np.nanmean(change, axis=1)
+        change = change[np.isfinite(change)]
+        away = np.abs(change - np.median(change)) if change.size else np.zeros(1)
+        usual = 1.4826 * np.median(away)
+        if away.max() > _JUMP * usual > 0:
+            yield (
+                f"a jump of {away.max():.3g} m, {away.max() / usual:.2g} times what is usual: "
+                "were two scans put together?"
             )
             return
