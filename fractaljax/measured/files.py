@@ -50,8 +50,9 @@ def read_measurement(
     is the name or number of one of several. Cells without a height are NaN.
 
     **Raises:** `OSError` if the file cannot be read; `ValueError` naming it for a format that is
-    unknown or damaged, a file that is too large, units or steps that neither the file nor an argument tells, positions that
-    are not equidistant within a tenth of a step, and heights that are no profile or map.
+    unknown or damaged, a file that is too large, units or steps that neither the file nor an
+    argument tells, positions that are not equidistant within a tenth of a step, and heights that
+    are no profile or map.
     """
     path = Path(path)
     suffix = path.suffix.lower()

@@ -5,20 +5,23 @@ point this is white, q^2 dx/6 of a one-sided profile spectrum; where they do not
 frequencies and looks like a rougher surface. What tells is second differences, which know no
 offset and no tilt: of heights without steps no two are the same; of heights in steps they are
 multiples of q, and a share of q/(sqrt(2 pi) sigma) of those at a distance is the same, sigma being
-their standard deviation. Where the share is small, the steps do not count at that distance.
+their standard deviation. Where the share is small, the steps do not count at that distance. Heights
+held over two points have no such second differences, but equal first ones.
 """
 
+import itertools
 import math
 from collections.abc import Iterator
 
 import numpy as np
 
 _REPEATED = 0.2  # share of equal second differences below which D moves by less than its error
+_FIRST = 1.5  # by as much the share of first differences is larger
 _INTERPOLATED = 0.05  # the share falls below this at once where heights were put in between
 _WINDOW = 0.01  # of the rms second difference: closer ones are equal
 _AROUND = 5  # windows about it in which those of heights without steps are as many
-_FEWEST = 32  # second differences
-_MOST = 2**16  # second differences that are looked at
+_FEWEST = 32  # differences
+_MOST = 2**16  # differences that are looked at
 _GROWTH = 1.25  # of the distances that are tried
 _HIGHEST = 0.25  # points per wavelength: half the Nyquist frequency
 _EXACT = 1e-9  # of the range: rounding errors
@@ -46,24 +49,29 @@ def step_limit(z: np.ndarray, steps: tuple[float, ...]) -> float:
     return limit
 
 
-def _second_differences(z, lag=1):
-    """Those along the first axis, without gaps."""
-    differences = z[2 * lag :] - 2 * z[lag:-lag] + z[: -2 * lag]
-    differences = differences[np.isfinite(differences)]
-    return differences[:: -(-differences.size // _MOST) or 1]
+def _differences(z, order, lag=1):
+    """First or second ones along the first axis, without gaps."""
+    for _ in range(order):
+        z = z[lag:] - z[:-lag]
+    found = z[np.isfinite(z)]
+    return found[:: -(-found.size // _MOST) or 1]
 
 
 def _repeated(z, lag) -> float:
-    """Share of the most frequent second difference, beyond that of any continuous density."""
-    found = np.sort(_second_differences(z, lag))
-    if found.size < _FEWEST:
-        return 1.0
-    half = max(_WINDOW * found.std(), _rounding(z))
-    inner, outer = (
-        np.searchsorted(found, found + width, "right") - np.searchsorted(found, found - width)
-        for width in (half, _AROUND * half)
-    )
-    return float((inner - (outer - inner) / (_AROUND - 1)).max() / found.size)
+    """Share of the most frequent difference, beyond that of any continuous density."""
+    shares = []
+    for order, usual in ((2, 1.0), (1, _FIRST)):
+        found = np.sort(_differences(z, order, lag))
+        if found.size < _FEWEST:
+            return 1.0
+        half = max(_WINDOW * found.std(), _rounding(z))
+        inner, outer = (
+            np.searchsorted(found, found + width, "right") - np.searchsorted(found, found - width)
+            for width in (half, _AROUND * half)
+        )
+        beyond = inner - (outer - inner) / (_AROUND - 1)
+        shares.append(float(beyond.max() / found.size / usual))
+    return max(shares)
 
 
 def _rounding(z):
@@ -77,19 +85,19 @@ def level_flags(z: np.ndarray, limit: float, high: float, lowest: float) -> Iter
     """
     distinct = np.unique(z[~np.isnan(z)])
     few = 2 * distinct.size < z.size
-    step = f" (step {np.median(np.diff(distinct)):.3g} m)" if few else ""
-    levels = f"{distinct.size} levels{step}"
+    which = "come in steps, or are clipped or interpolated"
+    if few:
+        step = np.median(np.diff(distinct))
+        which = f"have only {distinct.size} levels (step {step:.3g} m)"
     if limit < lowest:
-        which = f"only {levels}" if few else "few levels, or are interpolated"
-        yield f"too few levels: heights have {which}, and D and G mean nothing"
+        yield f"too few levels: heights {which}, and D and G mean nothing"
     elif limit < high * (1 - 1e-9):
-        which = f"have only {levels}" if few else "come in steps or are interpolated"
         yield f"heights {which}: D and G are in doubt, the band goes beyond {limit:.3g} 1/m"
     elif limit < math.inf:
-        which = f"have only {levels}" if few else "come in steps or are interpolated"
         yield f"heights {which}: the band ends at {high:.3g} 1/m"
+    else:
+        yield from _straight(z)
     yield from _clipped(z, distinct)
-    yield from _straight(z)
     yield from _jump(z)
 
 
@@ -101,15 +109,13 @@ def _clipped(z, distinct):
     ):
         count, others = np.sum(z == end), np.sum(z == next_one)
         if count >= max(_CHANCE * others, _CHANCE, _CLIPPED * z.size):
-            yield (
-                f"clipped: {count / z.size:.1%} of the heights are the {what} one, {end:.4g} m"
-            )
+            yield (f"clipped: {count / z.size:.1%} of the heights are the {what} one, {end:.4g} m")
 
 
 def _straight(z):
-    """Heights in line with their neighbours, more than there are of any other curvature."""
-    for axis in range(z.ndim):
-        found = np.abs(_second_differences(np.moveaxis(z, axis, 0)))
+    """Heights equal to or in line with their neighbours, more than there are of other changes."""
+    for axis, order in itertools.product(range(z.ndim), (2, 1)):
+        found = np.abs(_differences(np.moveaxis(z, axis, 0), order))
         if found.size < _FEWEST:
             continue
         exact = max(_EXACT * found.max(), _rounding(z))
@@ -117,10 +123,8 @@ def _straight(z):
         flat = 1 - rest.size / found.size
         same = np.searchsorted(rest, rest + exact, "right") - np.arange(rest.size)
         if flat - same.max(initial=0) / found.size > _STRAIGHT and rest.size < found.size - 3:
-            yield (
-                f"{flat:.1%} of the heights are in line with their neighbours: "
-                "clipped, held or interpolated"
-            )
+            alike = "in line with their neighbours" if order == 2 else "equal to their neighbour"
+            yield f"{flat:.1%} of the heights are {alike}: clipped, held or interpolated"
             return
 
 

@@ -103,7 +103,9 @@ def _spikes(z):
         known = ~np.isnan(z)
         away = np.where(known, _from_neighbours(_filled(z)), 0.0)
         size = np.abs(away)
-        limit = _SPIKE * 1.4826 * np.median(size[known])
+        # Of heights in steps most are in line: then the others are no spikes.
+        usual = max(1.4826 * np.median(size[known]), 0.3 * np.quantile(size[known], 0.9))
+        limit = _SPIKE * usual
         # A spike moves its neighbours' means as well: only the largest of them is one.
         new = (size > limit) & (size >= _largest_neighbour(size)) & (limit > 0)
         if not new.any():

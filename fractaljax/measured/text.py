@@ -4,7 +4,7 @@ import csv
 import math
 import re
 from array import array
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -99,7 +99,9 @@ def _refuse_broken(lines, start, separator):
         return
     cells = [cell for cell in _fields(lines[at], separator) if cell]
     titled = any(cell[:2].isalpha() or _WORD.search(cell) for cell in cells)
-    if not (titled or all(cell[0].isalpha() for cell in cells)) and any(map(str.isdigit, lines[at])):
+    if not (titled or all(cell[0].isalpha() for cell in cells)) and any(
+        map(str.isdigit, lines[at])
+    ):
         raise ValueError(
             f"line {at + 1} is neither a title nor numbers: {lines[at][:40]!r} (if it is to be"
             " left out, put # before it)"
@@ -179,7 +181,7 @@ def _numbers(fields, at):
         raise ValueError(f"line {at}: {fields[cells.index(None)]!r} is not a number")
     if math.inf in cells or -math.inf in cells:
         raise ValueError(f"line {at} has a number that is too large")
-    return cells
+    return cast(list[float], cells)
 
 
 def _cell(field):
