@@ -21,10 +21,10 @@ def read_instrument_file(path: Path, dx, dy, unit, channel) -> Measurement:
 
     **Raises:** `ValueError` if the package is not installed, and as `read_measurement`.
     """
+    _refuse_bomb(path)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the package and of those that it imports
         package = _package()
-        _refuse_bomb(path)
         with _open(package, path) as reader:
             form = reader.format(), reader.name()
             if form[0] in _TEXTS and b"\0" in path.read_bytes():

@@ -1,5 +1,11 @@
 """Texts and NumPy's files as measurements, in metres."""
 
+import io
+import os
+import threading
+import warnings
+import zipfile
+
 import numpy as np
 import pytest
 
@@ -96,3 +102,126 @@ def test_no_file(tmp_path):
         read_measurement(tmp_path / "nowhere.csv")
     with pytest.raises(IsADirectoryError):
         read_measurement(tmp_path)
+
+
+def npy(array):
+    content = io.BytesIO()
+    np.save(content, array)
+    return content.getvalue()
+
+
+def packed(**members):
+    """An NPZ file with any bytes under the names z.npy, dx.npy, ..."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as file:
+        for name, member in members.items():
+            file.writestr(f"{name}.npy", member)
+    return content.getvalue()
+
+
+HUGE = npy(np.zeros(3)).replace(b"(3,), }" + b" " * 12, b"(3000000000000,), }")
+STEP = npy(np.array(1e-6))
+DAMAGED = {
+    "huge.npy": (HUGE, "24000000000000 bytes were to follow its header, 24 do"),
+    "long.npy": (npy(np.ones(5)) + b"\0", "40 bytes were to follow its header, 41 do"),
+    "object.npy": (npy(np.array([1, None], object)), "z must be real numbers, got object"),
+    "huge.npz": (packed(z=HUGE, dx=STEP), "24000000000000 bytes were to follow"),
+    "bomb.npz": (packed(z=npy(np.zeros(2**22)), dx=STEP), "it unpacks to 33554"),
+    "cut.npz": (packed(z=npy(np.ones(500)), dx=STEP)[:300], "not a zip file"),
+    "locked.npz": (
+        packed(z=npy(np.ones(5)), dx=STEP).replace(
+            b"PK\x01\x02\x14\x03\x14\0\0", b"PK\x01\x02\x14\x03\x14\0\1"
+        ),
+        "is encrypted",
+    ),
+    "long.csv": (b"1\n" * 2**20, "it is too large: at most 1 MiB are read"),
+    "long.sur": (b"1\n" * 2**20, "it is too large: at most 1 MiB are read"),
+    "bomb.x3p": (packed(z=npy(np.zeros(2**22))), "it unpacks to 33554"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_damaged_and_huge_files(tmp_path, monkeypatch, name):
+    """One line, and no memory taken for what a file only claims to hold."""
+    for limit in ("files._MOST_TEXT", "files._MOST_ARRAYS", "files._MOST"):
+        monkeypatch.setattr(f"fractaljax.measured.{limit}", 2**20)
+    monkeypatch.setattr("fractaljax.measured.instrument_file._MOST_UNPACKED", 2**20)
+    content, message = DAMAGED[name]
+    path = written(tmp_path, name, np.zeros(0) if name.endswith(".npy") else content)
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=message) as caught:
+        read_measurement(path, dx=1e-6, unit="m")
+    assert str(caught.value).startswith(f"{path}: ") and "\n" not in str(caught.value)
+
+
+def test_two_arrays_of_one_name(tmp_path):
+    content = io.BytesIO()
+    with warnings.catch_warnings(), zipfile.ZipFile(content, "w") as file:
+        warnings.simplefilter("ignore")
+        for height in (1.0, 2.0):
+            file.writestr("z.npy", npy(np.full(5, height)))
+    path = written(tmp_path, "a.npz", content.getvalue())
+    with pytest.raises(ValueError, match="two arrays of one name"):
+        read_measurement(path)
+
+
+def test_pipes_and_devices(tmp_path):
+    """Read once and up to a limit, or refused before they are opened."""
+    for suffix in (".csv", ".sur"):
+        os.mkfifo(tmp_path / f"pipe{suffix}")
+    sender = threading.Thread(target=(tmp_path / "pipe.csv").write_text, args=["1\n2\n"])
+    sender.start()
+    read = read_measurement(tmp_path / "pipe.csv", dx=1e-6, unit="m")
+    sender.join()
+    np.testing.assert_array_equal(read.z, [1, 2])
+    for path in (tmp_path / "pipe.sur", "/dev/zero"):
+        with pytest.raises(ValueError, match="it is no regular file"):
+            read_measurement(path)
+
+
+def test_random_damage(tmp_path):
+    """Bytes changed, lost and put in: an error in a line, or numbers that are there."""
+    rng = np.random.default_rng(0)
+    z = np.cumsum(rng.standard_normal(40))
+    text = "x[um],z[nm]\n" + "".join(f"{i / 2},{h:.6g}\n" for i, h in enumerate(z))
+    sound = {"a.csv": text.encode(), "a.npy": npy(z), "a.npz": packed(z=npy(z), dx=STEP)}
+    refused = 0
+    for trial in range(300):
+        name = [*sound][trial % 3]
+        content = bytearray(sound[name])
+        at = int(rng.integers(len(content)))
+        match trial % 4:
+            case 0:
+                content[at] ^= 1 << int(rng.integers(8))
+            case 1:
+                del content[at : at + int(rng.integers(1, 9))]
+            case 2:
+                content[at:at] = [b"1e400", b",", b"\n", b"1.0D6", b'"'][rng.integers(5)]
+            case 3:
+                del content[at:]
+        (tmp_path / name).write_bytes(content)
+        given = {"dx": 1e-6, "unit": "m"} if name == "a.npy" else {}
+        try:
+            read = read_measurement(tmp_path / name, **given)
+        except ValueError as error:
+            refused += 1
+            assert "\n" not in str(error)
+            continue
+        if name == "a.npz":
+            np.testing.assert_array_equal(read.z, z)  # what a checksum guards
+        elif name == "a.csv":
+            lines = content.decode("latin-1").replace("\r", "\n").split("\n")
+            cells = {line.split(",")[-1].strip().strip('"') for line in lines[1:]}
+            heights = {h for h in read.z.tolist() if h == h}
+            assert len(heights) <= len(lines) and all(
+                any(abs(float(c) * 1e-9 - h) <= 1e-12 * abs(h) for c in cells if _is_number(c))
+                for h in heights
+            )
+    assert refused > 120
+
+
+def _is_number(cell):
+    try:
+        return float(cell) == float(cell)
+    except ValueError:
+        return False

@@ -187,6 +187,7 @@ def test_instrument_limits(tmp_path, package):
         ("noise.bin", bytes(range(251)) * 8, "no format that SurfaceTopography .* knows$"),
         ("square", bytes(2 * 64**2), "no format that SurfaceTopography .* knows$"),
         ("nothing.sur", b"", "no format that SurfaceTopography .* knows"),
+        ("zero.txt", b"1 2 3 4\n" * 4 + b"1.\0 2 3 4\n", "it is a text with zero bytes in it"),
         ("words.doc", b"no numbers here\n", "no format that SurfaceTopography .* knows"),
         ("cut.x3p", files.x3p(heights(), DX, DY)[:500], "not a sound file of XML 3D surface"),
         (

@@ -108,3 +108,36 @@ def test_refused(content, message):
     """One line that names the line."""
     with pytest.raises(ValueError, match=message):
         read_table(content)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"0;1\n1;1.0D6\n", "line 2: '1.0D6' is not a number"),
+        (b"0 1\n1 1_000\n", "line 2: '1_000' is not a number"),
+        ("0 1\n1 \u0661\n".encode(), "line 2: '\u0661' is not a number"),
+        (b"0;1\n1;5 nm\n", "line 2: '5 nm' is not a number"),
+        (b'0 1\n1 2."5\n', "line 2: '2.\"5' is not a number"),
+        (b"0,1\n1,1e400\n", "line 2 has a number that is too large"),
+        (b"0;1,5\n1;2.5\n", "both decimal points and decimal commas"),
+        (b"1,234.5\n2,034.5\n", "line 2: does a comma separate thousands in '2,034.5'"),
+        (b'0,1\n1,"2\n', "line 2 has 1 columns, the first one has 2"),
+        (b"x,z\n0,1.2x\n1,2\n", "line 2 is neither a title nor numbers: '0,1.2x'"),
+        (b"1\n1,2\n1,2\n1,2\n", "line 1 is neither a title nor numbers"),
+        (b"1,\n" * (2**24 + 1), "too many lines: at most 16777216 are read"),
+        (b"1," * 2**22 + b"1", "line 1 has 8388609 characters: at most 8388608"),
+    ],
+)
+def test_what_is_no_plain_number_is_refused(content, message):
+    """Never read in part, nor passed over."""
+    with pytest.raises(ValueError, match=message):
+        read_table(content)
+
+
+def test_a_first_line_of_a_map_without_heights_is_kept():
+    text = (
+        b"# Width: 4 um\n# Height: 3 um\n# Value units: m\n---\t---\t---\t---\n"
+        + b"1\t2\t3\t4\n" * 2
+    )
+    numbers, _, _ = read_table(text)
+    assert numbers.shape == (3, 4) and np.isnan(numbers[0]).all()
