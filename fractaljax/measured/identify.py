@@ -7,7 +7,7 @@ import numpy as np
 
 from ..base.parts import Record
 from ..surface.surfaces import Surface
-from .band import LOWEST, PER_RESOLUTION, chosen_band, given_band
+from .band import HIGHEST, LOWEST, PER_RESOLUTION, chosen_band, given_band
 from .fit import PowerLaw, fit
 from .flags import flags_of, unit_flags
 from .levels import level_flags, step_limit
@@ -137,7 +137,8 @@ def identify(
     errors = np.sqrt(np.diag(covariance))
     flags = [*chosen.notes, *flags_of(law, ends, nature, spectra, ratio)]
     flags += unit_flags(heights.known, steps)
-    flags += level_flags(heights.known, limit, ends[1], least)
+    wanted = min(top, HIGHEST[spectrum.kind] * spectrum.nyquist) if band is None else ends[1]
+    flags += level_flags(heights.known, limit, ends[1], wanted, least)
     flags += _flags(D, errors, opinion, z.size, heights)
     return Identification(
         D=D,

@@ -23,7 +23,7 @@ _AROUND = 5  # windows about it in which those of heights without steps are as m
 _FEWEST = 32  # differences
 _MOST = 2**16  # differences that are looked at
 _GROWTH = 1.25  # of the distances that are tried
-_HIGHEST = 0.25  # points per wavelength: half the Nyquist frequency
+_HIGHEST = 0.25  # periods from point to point: half the Nyquist frequency
 _EXACT = 1e-9  # of the range: rounding errors
 _CLIPPED = 0.005  # share of the heights that is worth a line, if not a matter of chance
 _CHANCE = 5  # times as many as at the next level, and points
@@ -78,24 +78,26 @@ def _rounding(z):
     return 8 * np.finfo(float).eps * np.nanmax(np.abs(z))
 
 
-def level_flags(z: np.ndarray, limit: float, high: float, lowest: float) -> Iterator[str]:
+def level_flags(
+    z: np.ndarray, limit: float, high: float, wanted: float, lowest: float
+) -> Iterator[str]:
     """What to say of heights z whose steps count above `limit` [1/m], in a band up to `high`.
 
-    No band is left where `limit` is below `lowest` [1/m].
+    Without steps the band would go up to `wanted`; none is left where `limit` is below `lowest`.
     """
-    distinct = np.unique(z[~np.isnan(z)])
-    few = 2 * distinct.size < z.size
+    known = z[~np.isnan(z)]
+    distinct = np.unique(known)
     which = "come in steps, or are clipped or interpolated"
-    if few:
+    if 2 * distinct.size < known.size:
         step = np.median(np.diff(distinct))
         which = f"have only {distinct.size} levels (step {step:.3g} m)"
     if limit < lowest:
         yield f"too few levels: heights {which}, and D and G mean nothing"
     elif limit < high * (1 - 1e-9):
         yield f"heights {which}: D and G are in doubt, the band goes beyond {limit:.3g} 1/m"
-    elif limit < math.inf:
+    elif limit < wanted * (1 - 1e-9):
         yield f"heights {which}: the band ends at {high:.3g} 1/m"
-    else:
+    elif limit == math.inf:
         yield from _straight(z)
     yield from _clipped(z, distinct)
     yield from _jump(z)
@@ -109,7 +111,7 @@ def _clipped(z, distinct):
     ):
         count, others = np.sum(z == end), np.sum(z == next_one)
         if count >= max(_CHANCE * others, _CHANCE, _CLIPPED * z.size):
-            yield (f"clipped: {count / z.size:.1%} of the heights are the {what} one, {end:.4g} m")
+            yield f"clipped: {count / z.size:.1%} of the heights are the {what} one, {end:.4g} m"
 
 
 def _straight(z):

@@ -127,7 +127,11 @@ def test_no_scene_for_what_is_not_fractal(capsys, monkeypatch):
     assert any(flag.startswith(_MEANINGLESS) for flag in fj.identify(wavy, DX).flags)
     found = fj.identify(profile(1024), DX)
     write_profile("mine.csv", profile(1024))
-    for flag, status, written in [("not fractal: peaks", 1, WRITTEN[:1]), ("odd", 0, WRITTEN)]:
+    for flag, status, written in [
+        ("not fractal: peaks", 1, WRITTEN[:1]),
+        ("too few levels: heights have only 3", 1, WRITTEN[:1]),
+        ("odd", 0, WRITTEN),
+    ]:
         flagged = dataclasses.replace(found, flags=(flag,))
         monkeypatch.setattr("fractaljax.measured.identify.identify", lambda *_, f=flagged, **__: f)
         assert run(capsys, "identify", "mine.csv", "--out", flag)[::2] == (status, "")
