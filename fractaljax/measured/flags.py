@@ -42,10 +42,11 @@ def flags_of(
 def unit_flags(z: np.ndarray, steps: tuple[float, ...]) -> Iterator[str]:
     """Sizes that no instrument measures: heights z [m] in any shape, steps [m] along its axes."""
     rms = float(np.nanstd(z))
-    slope = max(
-        float(np.sqrt(np.nanmean(np.square(np.diff(z, axis=axis))))) / step
-        for axis, step in enumerate(steps)
-    )
+    slope = 0.0
+    for axis, step in enumerate(steps):
+        change = np.diff(z, axis=axis)
+        if not np.isnan(change).all():
+            slope = max(slope, float(np.sqrt(np.nanmean(change**2))) / step)
     length = max(n * step for n, step in zip(z.shape, steps, strict=True))
     odd = [
         (length > _LONG, f"it is {length:.3g} m long"),

@@ -147,3 +147,11 @@ def test_units_that_may_be_wrong(scales, reason):
     assert not any("units" in flag for flag in fj.identify(z, DX).flags)
     flags = fj.identify(scales[0] * z, scales[1] * DX).flags
     assert any("the units may be wrong" in flag and reason in flag for flag in flags), flags
+
+
+def test_every_other_height_missing():
+    """No two neighbours are known: lines were put in between."""
+    z = gaussian_profile(np.random.default_rng(0), 2.4, 2048)
+    z[::2] = np.nan
+    found = assert_within_errors_or_flagged(z, 2.4)
+    assert any(flag.startswith("heights ") for flag in found.flags)
