@@ -1,5 +1,7 @@
 """A coarse step that stops where the first guard of a mode reaches zero."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -32,32 +34,39 @@ class Cubic(eqx.Module):
     def minimum(self) -> tuple[jax.Array, jax.Array]:
         """Where it is lowest strictly inside, and whether it is so anywhere; else 0."""
         square = self.k_2**2 - 3 * self.k_1 * self.k_3
-        below = self.k_2 + jnp.sqrt(jnp.maximum(square, 0))
-        x = jnp.where(below == 0, 0, -self.k_1 / jnp.where(below == 0, 1, below))
+        root = jnp.sqrt(jnp.maximum(square, 0))
+        # Of the two forms of the same root the one that takes no difference of like numbers.
+        over = jnp.where(self.k_2 > 0, -self.k_1, root - self.k_2)
+        below = jnp.where(self.k_2 > 0, self.k_2 + root, 3 * self.k_3)
+        x = jnp.where(below == 0, 0, over / jnp.where(below == 0, 1, below))
         inside = (square >= 0) & (x > 0) & (x < 1)
         return jnp.where(inside, x, 0), inside
 
-    def root_before(self, end) -> jax.Array:
-        """Where it falls through zero in (0, end], if it does: Newton steps from the secant."""
+    def root_before(self, end, start: Any = 0) -> jax.Array:
+        """Where it falls through zero in (0, end], if it does: Newton steps from the secant.
+
+        From `start`, where that is further.
+        """
         at_end = self(end)
         x = end * self.k_0 / jnp.where(self.k_0 == at_end, 1, self.k_0 - at_end)
+        x = jnp.maximum(x, start)
         for _ in range(3):
             slope = self.slope(x)
             x = jnp.clip(x - self(x) / jnp.where(slope == 0, 1, slope), 0, end)
         return x
 
 
-def without_start(cubic: Cubic, fresh) -> Cubic:
-    """The cubic, divided by x where it starts at zero: `fresh`, a guard that has just left zero.
+def without_start(cubic: Cubic, rising) -> Cubic:
+    """The cubic less its value at the start, divided by x, where it is `rising` there.
 
-    Its root at the start is not found again then, and a short excursion is not missed.
+    Its root is where the cubic is back at the level it started from, however short the excursion.
     """
     k_0, k_1, k_2, k_3 = cubic.k_0, cubic.k_1, cubic.k_2, cubic.k_3
     return Cubic(
-        jnp.where(fresh, jnp.maximum(k_1, 0), k_0),
-        jnp.where(fresh, k_2, k_1),
-        jnp.where(fresh, k_3, k_2),
-        jnp.where(fresh, 0, k_3),
+        jnp.where(rising, jnp.maximum(k_1, 0), k_0),
+        jnp.where(rising, k_2, k_1),
+        jnp.where(rising, k_3, k_2),
+        jnp.where(rising, 0, k_3),
     )
 
 
@@ -67,15 +76,19 @@ def first_root(g_0, g_1, d_0, d_1) -> jax.Array:
     Given are its values and slopes at 0 and 1. One that starts at zero has just left it, and that
     root does not count. One that starts below zero is late: its root is 0.
     """
-    fresh = g_0 == 0
-    cubic = without_start(Cubic.through(g_0, g_1, d_0, d_1), fresh)
+    entered = g_0 == 0
+    whole = Cubic.through(g_0, g_1, d_0, d_1)
+    cubic = without_start(whole, entered)
     # A minimum inside that is below zero hides a root before it even if the end is above.
     lowest, dips = cubic.minimum()
     dips &= cubic(lowest) < 0
     end = jnp.where(dips, lowest, 1)
-    x = cubic.root_before(end)
+    # One that rises from just above zero has a root just behind its start, which does not count.
+    rising = ~entered & (d_0 > 0)
+    back = without_start(whole, rising).root_before(end)
+    x = cubic.root_before(end, jnp.where(rising, back, 0))
     # A step of no length would be tried for ever.
-    x = jnp.where(fresh, jnp.maximum(x, 1e-6), x)
+    x = jnp.where(entered, jnp.maximum(x, 1e-6), x)
     return jnp.where(g_0 < 0, 0, jnp.where(cubic(end) < 0, x, 2))
 
 

@@ -5,14 +5,19 @@ advance together, and the step itself is all that is needed.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 
-def runge_kutta(tableau, field: Callable, y, h, *, written_out: bool = False) -> jax.Array:
+def runge_kutta(
+    tableau, field: Callable, y, h, *, written_out: bool = False, error: bool = False
+) -> Any:
     """The state after a step h of dy/dt = field(y); y of any shape, h broadcasts with it.
+
+    With `error`, beside it the difference from the embedded method of lower order.
 
     `tableau` is that of an explicit diffrax solver. A loop over the stages compiles several times
     faster; `written_out`, a batch of steps runs several times faster.
@@ -40,7 +45,8 @@ def runge_kutta(tableau, field: Callable, y, h, *, written_out: bool = False) ->
 
     none = jnp.zeros((stages, *y.shape), y.dtype)
     slopes, _ = jax.lax.scan(stage, none, (jnp.arange(stages), jnp.asarray(rows, y.dtype)))
-    return y + h * weighted(jnp.asarray(tableau.b_sol, y.dtype), slopes)
+    end = y + h * weighted(jnp.asarray(tableau.b_sol, y.dtype), slopes)
+    return (end, h * weighted(jnp.asarray(tableau.b_error, y.dtype), slopes)) if error else end
 
 
 def _combine(weights: np.ndarray, slopes: list[jax.Array]) -> jax.Array:

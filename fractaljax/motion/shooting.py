@@ -7,6 +7,7 @@ Newton's equations then chain affine maps of the four components, all segments a
 """
 
 import functools
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -45,11 +46,15 @@ def _tableau(name: str):
     return getattr(diffrax, name).tableau
 
 
-def flow(system: StickSlip, y, duration, s, written_out=False) -> jax.Array:
-    """The state (4, ...) after `duration` (...) in mode s (2, ...), by one eighth-order step."""
+def flow(system: StickSlip, y, duration, s, written_out=False, error=False) -> Any:
+    """The state (4, ...) after `duration` (...) in mode s (2, ...), by one eighth-order step.
+
+    With `error`, an estimate (4, ...) of its error beside it.
+    """
     field = functools.partial(_field, system, s)
     duration = jnp.asarray(duration)[None]
-    return runge_kutta(_tableau("Dopri8"), field, y, duration, written_out=written_out)
+    options = {"written_out": written_out, "error": error}
+    return runge_kutta(_tableau("Dopri8"), field, y, duration, **options)
 
 
 def _field(system: StickSlip, s, y) -> jax.Array:

@@ -19,7 +19,8 @@ from .events import NONE, Cubic, guards_and_rates, without_start
 from .shooting import flow
 from .stick_slip import SECTION, StickSlip, check_rtol, start_state, stick_slip, units
 
-_NEWTON_STEPS = 5
+_REJECTIONS = 20  # of a step whose error is above rtol
+_MOST_GUESSES = 60  # of the time of an event; some four are enough as a rule
 
 
 class SimulationResult(eqx.Enumeration):
@@ -84,57 +85,97 @@ def _event(system: StickSlip, y, s, h, y_1):
     def at(t):
         along = flow(system, lanes[0], t, lanes[1])
         rate = system.field(along, lanes[1])
-        curve = jax.jvp(lambda y: system.field(y, lanes[1]), (along,), (rate,))[1]
 
         def pick(values):
             return jnp.sum(jnp.where(own, values[:SECTION], 0), axis=0)
 
-        return (
-            pick(system.guards(along, lanes[1])),
-            pick(system.guards(rate, lanes[1], 0.0)),
-            pick(system.guards(curve, lanes[1], 0.0)),
-        )
+        def curve():
+            change = jax.jvp(lambda y: system.field(y, lanes[1]), (along,), (rate,))[1]
+            return pick(system.guards(change, lanes[1], 0.0))
+
+        value, slope = system.guards(along, lanes[1]), system.guards(rate, lanes[1], 0.0)
+        return pick(value), pick(slope), curve
 
     g_0, g_1, d_0, d_1 = (x[:SECTION] for x in (g_0, g_1, d_0, d_1))
-    fresh = g_0 == 0
-    whole = Cubic.through(g_0, g_1, d_0, d_1)
-    cubic = without_start(whole, fresh)
-    theta, inside = whole.minimum()
+    # The mode says that every guard starts above zero; what rounding makes of it does not count.
+    rounding = 16 * jnp.finfo(y.dtype).eps * (1 + jnp.max(jnp.abs(y)) + jnp.abs(system.f))
+    late = g_0 < -rounding
+    g_0 = jnp.maximum(g_0, 0)
+    d_0 = jnp.where((g_0 <= rounding) & (d_0 >= -rounding), jnp.maximum(d_0, 0), d_0)
+    rising = d_0 >= 0
+    cubic = Cubic.through(g_0, g_1, d_0, d_1)
+    theta, inside = cubic.minimum()
 
     def lower(_, t):
         _, rate, curve = at(t)
-        return jnp.clip(t - rate / jnp.where(curve == 0, 1, curve), 0, h)
+        bend = curve()
+        return jnp.clip(t - rate / jnp.where(bend == 0, 1, bend), 0, h)
 
     bottom = jnp.where(inside, jax.lax.fori_loop(0, 3, lower, theta * h), 0)
     depth, _, curve = at(bottom)
-    dips = inside & (depth < 0)
+    bend = curve()
+    dips = inside & (depth < -rounding)
     end = jnp.where(dips, bottom, h)
-    below = dips | (g_1 < 0)
-    t = cubic.root_before(end / h) * h
+    falls = dips | (g_1 < 0)
+    t = without_start(cubic, rising).root_before(end / h) * h
     # A shallow dip is a parabola, with two roots that Newton's method cannot tell apart from afar.
-    half = jnp.sqrt(2 * jnp.maximum(-depth, 0) / jnp.where(curve > 0, curve, 1))
-    shallow = dips & (curve > 0) & (depth > -1e-2)
+    half = jnp.sqrt(2 * jnp.maximum(-depth, 0) / jnp.where(bend > 0, bend, 1))
+    shallow = dips & (bend > 0) & (depth > -1e-2)
     t = jnp.where(shallow, jnp.clip(bottom - half, 0, bottom), t)
     t = jnp.where(dips & (t >= bottom), bottom / 2, t)
 
-    def refine(_, t):
-        value, rate, _ = at(t)
-        # Of a guard that starts at zero the quotient by t is what must vanish.
-        slope = jnp.where(fresh, rate - value / jnp.where(t == 0, 1, t), rate)
-        return jnp.clip(t - value / jnp.where(slope == 0, 1, slope), 0, end)
+    def searching(carry):
+        *_, found, count = carry
+        return ~jnp.all(found) & (count < _MOST_GUESSES)
 
-    t = jax.lax.fori_loop(0, _NEWTON_STEPS, refine, t)
-    t = jnp.where(fresh, jnp.maximum(t, 1e-9 * h), t)
-    t = jnp.where(g_0 < 0, 0, jnp.where(below, t, jnp.inf))
+    def refine(carry):
+        t, low, high, found, count = carry
+        value, rate, _ = at(t)
+        low, high = jnp.where(value > 0, t, low), jnp.where(value > 0, high, t)
+        # Of a guard that rises first the quotient by t is what must vanish: the root behind it,
+        # where it came from, is none of this step's.
+        slope = jnp.where(rising, rate - value / jnp.where(t == 0, 1, t), rate)
+        guess = t - value / jnp.where(slope == 0, 1, slope)
+        between = (guess >= low) & (guess <= high)
+        guess = jnp.where(between, guess, (low + high) / 2)
+        near = (jnp.abs(guess - t) <= close) | (jnp.abs(value) <= close)
+        return jnp.where(found, t, guess), low, high, found | near, count + 1
+
+    close = 2 * jnp.finfo(y.dtype).eps
+    start = t, jnp.zeros_like(t), end, ~falls | late, 0
+    t, *_ = jax.lax.while_loop(searching, refine, start)
+    # A step of no length would be tried for ever.
+    t = jnp.where(rising, jnp.maximum(t, 1e-12 * h), t)
+    t = jnp.where(late, 0, jnp.where(falls, t, jnp.inf))
     first = jnp.min(t)
     hit = first <= h
     return jnp.where(hit, first, h), jnp.where(hit, guards[jnp.argmin(t)], NONE)
 
 
-def _step(system: StickSlip, y, s, h):
-    """A step h, or less, in mode s: state, mode, length and the guard that ended it."""
-    h = h / jnp.maximum(1, 2 * system.stiffness(y))
-    y_1 = flow(system, y, h, s)
+def _smooth_step(system: StickSlip, y, s, longest, left, rtol):
+    """A step in mode s, as long as may be: the state that it ends in, and its length."""
+    h = jnp.minimum(longest / jnp.maximum(1, 2 * system.stiffness(y)), left)
+    allowed = rtol * (1 + jnp.max(jnp.abs(y)))
+
+    def attempt(h):
+        y_1, error = flow(system, y, h, s, error=True)
+        return y_1, h, jnp.max(jnp.abs(error)) / allowed
+
+    def rejected(carry):
+        (*_, error), count = carry
+        return ~(error <= 1) & (count < _REJECTIONS)
+
+    def shorter(carry):
+        (_, h, error), count = carry
+        return attempt(h * jnp.where(error < 1e5, 0.9 * error ** (-1 / 8), 0.2)), count + 1
+
+    (y_1, h, _), _ = jax.lax.while_loop(rejected, shorter, (attempt(h), 0))
+    return y_1, h
+
+
+def _step(system: StickSlip, y, s, longest, left, rtol):
+    """That step, or less: state, mode, length, and the guard that ended it."""
+    y_1, h = _smooth_step(system, y, s, longest, left, rtol)
     g_0, d_0 = guards_and_rates(system, y, s, h, system.field(y, s))
     g_1, d_1 = guards_and_rates(system, y_1, s, h, system.field(y_1, s))
     cubic = Cubic.through(g_0, g_1, d_0, d_1)
@@ -168,7 +209,7 @@ _RESULTS = (
 
 
 @functools.partial(jax.jit, static_argnames="max_steps")
-def _run(system: StickSlip, y, end, h, *, max_steps: int) -> _Steps:
+def _run(system: StickSlip, y, end, h, rtol, *, max_steps: int) -> _Steps:
     limit = 1e3 * (1 + jnp.max(jnp.abs(y)))
 
     def running(carry):
@@ -177,7 +218,7 @@ def _run(system: StickSlip, y, end, h, *, max_steps: int) -> _Steps:
 
     def body(carry):
         y, s, t, k, duration, modes, guards = carry
-        y, s_new, dt, guard = _step(system, y, s, jnp.minimum(h, end - t))
+        y, s_new, dt, guard = _step(system, y, s, h, end - t, rtol)
         # What is left of the time after rounding is no step.
         t = jnp.where((guard == NONE) & (dt >= end - t), end, t + dt)
         return (
@@ -222,7 +263,9 @@ def _repeat(system: StickSlip, y, end, steps: _Steps) -> Trajectory:
         own = jnp.arange(SECTION + 1) == guard
         value = jnp.sum(jnp.where(own, system.guards(y_1, s), 0))
         slope = jnp.sum(jnp.where(own, system.guards(rate, s, 0.0), 0))
-        late = value / jax.lax.stop_gradient(jnp.where(slope == 0, 1, slope))
+        # Zero, with the derivative of the time at which the guard is zero.
+        off = value - jax.lax.stop_gradient(value)
+        late = off / jax.lax.stop_gradient(jnp.where(slope == 0, 1, slope))
         y_2, _ = system.switch(y_1 - late * rate, s, guard)
         return (y_2, t + dt - late), (y_2, t + dt - late, s_new)
 
@@ -321,7 +364,7 @@ def simulate(
         return _checked(_regularised(system, y, end, eps, solver, rtol, max_steps), throw)
     h = jnp.asarray(min(0.25 * (rtol / 1e-9) ** 0.125, 0.5), y.dtype)
     frozen, y_0, end_0 = jax.lax.stop_gradient((system, y, end))
-    steps = _run(frozen, y_0, end_0, h, max_steps=max_steps)
+    steps = _run(frozen, y_0, end_0, h, rtol, max_steps=max_steps)
     if concrete(steps.count) is not None:
         # As few shapes as may be, each compiled once.
         used = min(max_steps, 1 << max(int(steps.count) - 1, 15).bit_length())
