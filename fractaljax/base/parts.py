@@ -90,6 +90,16 @@ def concrete(array: jax.Array) -> np.ndarray | None:
     return None if isinstance(primal, jax.core.Tracer) else np.asarray(primal)
 
 
+def raise_unless(wanted: Any, outcome: Any) -> Any:
+    """`outcome` if its `result` is the member `wanted`; else `RuntimeError` with its message."""
+    result = outcome.result
+    if concrete(result._value) is None:
+        return result.error_if(outcome, result != wanted)
+    if bool(result != wanted):
+        raise RuntimeError(result._enumeration[result])
+    return outcome
+
+
 def _digits(x) -> str:
     return repr(x.item()) if isinstance(x, np.generic) else repr(x)
 

@@ -14,7 +14,7 @@ from .stick_slip import rest, stick_slip, units
 
 
 def attractors(
-    scene: Scene, starts: Any = None, *, rtol: float = 1e-9, max_turns: int = 5000
+    scene: Scene, starts: Any = None, *, rtol: float | None = None, max_turns: int = 5000
 ) -> list[LimitCycle]:
     """Every distinct motion that the starts end in, those without a cycle among them.
 

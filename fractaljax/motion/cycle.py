@@ -12,6 +12,9 @@ from .shooting import UNUSED, Segments, flow
 from .stick_slip import StickSlip, units
 
 
+_SQUARINGS = 40  # of a monodromy matrix
+
+
 class CycleResult(eqx.Enumeration):
     """What became of the search for a limit cycle."""
 
@@ -21,6 +24,7 @@ class CycleResult(eqx.Enumeration):
         "choose a smaller regularisation"
     )
     inaccurate = "a limit cycle was found, but not to rtol: ask for more segments"
+    unstable = "a limit cycle was found, but it repels: motions beside it leave it"
     equilibrium = "the motion dies out: the sliding equilibrium attracts it"
     diverged = "the motion grows beyond all bounds"
     not_periodic = "the motion does not repeat within four turns (a longer period, or none)"
@@ -31,6 +35,28 @@ class CycleResult(eqx.Enumeration):
     exhausted = (
         "the motion nearly repeats, but has not settled within max_turns: allow more of them"
     )
+
+
+def repels(monodromy, rate, error) -> jax.Array:
+    """Whether small deviations from an orbit grow, by more than what is known of their growth.
+
+    The monodromy (4, 4) maps the orbit's own `rate` (4,) onto itself. By how much it misses that,
+    or by the relative `error` of the orbit, it may be wrong altogether.
+    """
+    along = rate / jnp.linalg.norm(rate)
+    missed = jnp.max(jnp.abs(jnp.sum(monodromy * along[None], axis=1) - along))
+    across = jnp.eye(4, dtype=along.dtype) - along[:, None] * along[None]
+
+    def square(_, carry):
+        # The largest multiplier to the power of 2^k, apart from its logarithm.
+        power, log = carry
+        size = jnp.max(jnp.abs(power))
+        power = power / jnp.where(size > 0, size, 1)
+        return power @ power, 2 * (log + jnp.log(size))
+
+    start = across @ monodromy @ across, jnp.zeros_like(error)
+    _, log = jax.lax.fori_loop(0, _SQUARINGS, square, start)
+    return log / 2**_SQUARINGS > 10 * (missed + error)
 
 
 class Switch(Record):

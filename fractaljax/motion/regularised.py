@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import optimistix
 
 from ..mechanism.scene import Scene
-from .cycle import CycleResult, LimitCycle
+from .cycle import CycleResult, LimitCycle, repels
 from .events import Cubic
 from .stick_slip import StickSlip, scaled_start, stick_slip, units
 
@@ -226,9 +226,10 @@ def regularised_cycle(
         jnp.stack([period / exact.period - 1, *(amplitude / exact.amplitude - 1)])
     )
     error = jax.lax.stop_gradient(jnp.max(differences))
-    status = CycleResult.where(
-        error <= _TOLERANCE, CycleResult.converged, CycleResult.depends_on_eps
-    )
+    monodromy = jax.jacfwd(end)(closed.y)
+    leaves = repels(*jax.lax.stop_gradient((monodromy, rates[0])), jnp.asarray(rtol, y.dtype))
+    status = CycleResult.where(leaves, CycleResult.unstable, CycleResult.converged)
+    status = CycleResult.where(error <= _TOLERANCE, status, CycleResult.depends_on_eps)
     lost = CycleResult.where(closed.followed, CycleResult.not_periodic, CycleResult.too_stiff)
     status = CycleResult.where(closed.found, status, lost)
 
@@ -247,7 +248,7 @@ def regularised_cycle(
         turns=closed.turns,
         regularisation_error=only(error),
         result=status,
-        _monodromy=only(jax.jacfwd(end)(closed.y)),
+        _monodromy=only(monodromy),
         _system=system,
         _motion=Smooth(solution),
     )

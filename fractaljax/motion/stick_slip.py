@@ -165,7 +165,16 @@ def scaled_start(scene: Scene, system: StickSlip, start) -> jax.Array:
     return jax.lax.stop_gradient(y)
 
 
-def check_rtol(rtol: float) -> None:
-    """Refuse a relative tolerance that means nothing."""
+def check_rtol(rtol: float | None, dtype: Any) -> float:
+    """A relative tolerance that means something in `dtype`; by default 1e-9, or the least one.
+
+    **Raises:** `ValueError` for one above 0.1, or below 4096 times the rounding error of `dtype`.
+    """
+    least = 4096 * float(jnp.finfo(dtype).eps)
+    if rtol is None:
+        return max(1e-9, least)
     if not 0 < rtol <= 0.1:
         raise ValueError(f"rtol must be above 0 and at most 0.1, got {rtol!r}")
+    if rtol < least:
+        raise ValueError(f"rtol must be at least {least:.2g} in {jnp.dtype(dtype)}, got {rtol!r}")
+    return float(rtol)
