@@ -37,6 +37,7 @@ MEMBERS = (
     "equilibrium",
     "diverged",
     "depends_on_eps",
+    "unstable",
 )
 
 

@@ -11,7 +11,6 @@ from ..base.parts import Record, concrete
 from .shooting import UNUSED, Segments, flow
 from .stick_slip import StickSlip, units
 
-
 _SQUARINGS = 40  # of a monodromy matrix
 
 

@@ -52,7 +52,7 @@ class Trajectory(Record):
         **Raises:** `ValueError` for times of another shape or outside; `RuntimeError` inside a
         compiled program.
         """
-        times = self._inside(number("times", times))
+        times = self._inside(number("times", jnp.asarray(times)))
         if self._solution is not None:
             states = jax.vmap(self._solution.evaluate)(times * self._system.omega)
             return states * units(self._system)[None]

@@ -152,6 +152,33 @@ def test_short_excursion(duration):
     np.testing.assert_allclose(found, root, rtol=1e-4)
 
 
+@pytest.mark.parametrize("height", [1e-16, 1e-12, 1e-8, 1e-5])
+def test_start_just_above_zero(height):
+    """One that rises from there has its root where it comes down, not just behind its start."""
+    root, far = np.array([0.1, 0.4, 0.8]), np.array([1.5, 4.0, 50.0])
+    # (x + height)(root - x)(1 - x/far)
+    k = [
+        coefficients_of(np.array([-height, r, f]), height * r)
+        for r, f in zip(root, far, strict=True)
+    ]
+    ends = np.array([[c[0], c.sum(), c[1], c @ np.arange(4)] for c in k]).T
+    np.testing.assert_allclose(found_root(*ends), root, rtol=1e-4)
+
+
+def coefficients_of(roots, start):
+    """k_0 ... k_3 of the cubic with these roots and this value at 0."""
+    k = np.asarray(Polynomial.fromroots(roots).coef)
+    return k * start / k[0]
+
+
+def test_minimum_behind_a_hill():
+    """A cubic that starts level has its minimum where it has it, to the last digits."""
+    for rise in (0.0, 1e-18, 1e-12, 1e-6):
+        x, inside = Cubic(*(jnp.array(k) for k in (0.0, rise, -1.0, 1.0))).minimum()
+        assert inside
+        np.testing.assert_allclose(x, (1 + np.sqrt(1 - 3 * rise)) / 3, rtol=1e-14)
+
+
 def test_late_start():
     """One that starts below zero is late: its root is at once, wherever it goes."""
     x = cubics("any")

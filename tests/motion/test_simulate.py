@@ -141,6 +141,56 @@ def test_start_on_the_belt(x, v):
     np.testing.assert_array_equal(found.modes[0], truth[0].signs)
 
 
+def beside_the_belt(count):
+    """Mechanisms and starts with one velocity or both a few ulp, or up to 1e-6, off the belt's."""
+    rng = np.random.default_rng(0)
+    for k in range(count):
+        start = 1.2 * rng.normal(size=4)
+        for i in ((2,), (3,), (2, 3))[k % 3]:
+            ulps = rng.choice([1, 2, 10]) * np.finfo(float).eps
+            start[i] = 1 + rng.choice([-1, 1]) * (ulps if k % 2 else 10 ** rng.uniform(-15, -6))
+        yield random_case(k)[0], start
+
+
+def test_start_beside_the_belt():
+    """A guard that is just above zero and rises has no root behind it: time goes forward."""
+    reversals = 0
+    for m, start in beside_the_belt(60):
+        start, t1 = start * units(m), 3 / omega(m)
+        found, truth = fj.simulate(scene_of(m), start, t1, rtol=1e-12), run(m, start, t1, 1e-13)
+        assert (np.diff(found.times) >= 0).all()
+        end = truth[-1].end / units(m)
+        size = max(1, abs(end).max())
+        np.testing.assert_allclose(found.end / units(m), end, rtol=0, atol=1e-10 * size)
+        reversals += len(truth) > 2
+    assert reversals > 10
+
+
+def test_short_slip_before_a_switch_of_the_other_direction():
+    """The reproducer of a step backwards in time: the design of the README, at default rtol."""
+    scene = fj.brake_scene().replace(D=2.4319698833358783, G=1.2340705508799051e-10)
+    K_n, K_t = map(float, fj.stiffness(scene))
+    parts = vars(scene.oscillator) | vars(scene.friction)
+    m = Mechanism(K_n=K_n, K_t=K_t, **{name: float(value) for name, value in parts.items()})
+    start, t1 = [-4.25546516e-06, 1.14128067e-06, 0.116792001, 0.187975114], 0.8 / 52283.1
+    found, truth = fj.simulate(scene, start, t1), run(m, start, t1)
+    assert (np.diff(found.times) >= 0).all()
+    assert [s[1:] for s in found.switches()] == [s[1:] for s in switches(truth)]
+    np.testing.assert_allclose(found.end / units(m), truth[-1].end / units(m), rtol=0, atol=1e-10)
+
+
+def test_steep_friction_reaches_the_end():
+    """Steps that friction shortens do not shorten what is left of the time for ever."""
+    m = replace(PLAIN, v_m=0.05)
+    agree(m, [0.5, -0.5, 0.2, 0.3], 1e-4 * omega(m))
+
+
+def test_friction_that_becomes_steep_within_a_step():
+    """What a step of the usual length would miss by 1e-7 is kept to rtol by a shorter one."""
+    m = replace(PLAIN, V=0.005, F=-6000.0, v_m=0.008, mu_s=0.3, mu_m=0.16)
+    agree(m, [0.0, -0.1, 1.0, 0.16], 0.2)
+
+
 @pytest.mark.parametrize("duration", [1e-6, 0.01, 0.2])
 def test_shorter_than_a_step(duration):
     """One step is enough, and it ends where it should."""
@@ -265,6 +315,27 @@ def test_at():
     steps = np.flatnonzero(np.diff(found.times) > 0)[-TIMES:]
     states = np.asarray(found.at(found.times[steps]))
     np.testing.assert_allclose(states, np.asarray(found.states)[steps], rtol=1e-15)
+
+
+@pytest.mark.parametrize("regularisation", [None, 0.03])
+def test_at_no_other_times(regularisation):
+    """Times outside the simulation, and of another shape, are refused; t1 itself is not."""
+    m, t1 = PLAIN, 1e-5
+    start = np.array([1.0, 0.2, 0.3, 0.1]) * units(m)
+    found = fj.simulate(scene_of(m), start, t1, regularisation=regularisation)
+    np.testing.assert_allclose(found.at([0.0, t1]), [start, found.end], rtol=1e-12)
+    text = r"^times must be from 0 to the end of the simulation, .*, got "
+    with pytest.raises(ValueError, match=text + r"2e-05$"):
+        found.at([0.0, 2e-5])
+    with pytest.raises(ValueError, match=text + r"-1e-09$"):
+        found.at([-1e-9])
+    with pytest.raises(ValueError, match=r"^times must be finite, got nan$"):
+        found.at([np.nan])
+    with pytest.raises(ValueError, match=r"^times must have shape \(k,\), got \(\)$"):
+        found.at(1e-6)
+    late = jax.jit(lambda times: found.at(times))
+    with pytest.raises(RuntimeError, match="times must be from 0 to the end of the simulation"):
+        jax.block_until_ready(late(jnp.array([2e-5])))
 
 
 def test_what_a_trajectory_holds():
@@ -400,7 +471,7 @@ def test_out_of_steps():
         atol=1e-13,
     )
     np.testing.assert_array_equal(short.modes, whole.modes[:17])
-    with pytest.raises(RuntimeError, match="max_steps were used up before the end time"):
+    with pytest.raises(RuntimeError, match=r"^max_steps were used up before the end time$"):
         fj.simulate(scene_of(m), start, t1, max_steps=16)
 
 
@@ -411,7 +482,7 @@ def test_diverged():
     assert found.result == fj.SimulationResult.diverged
     assert np.isfinite(found.states).all() and found.times[-1] < 0.02
     assert abs(found.end / units(PLAIN)).max() > 1e3
-    with pytest.raises(RuntimeError, match="the motion grew beyond all bounds"):
+    with pytest.raises(RuntimeError, match=r"^the motion grew beyond all bounds$"):
         fj.simulate(scene_of(PLAIN), start, 0.02)
 
 
@@ -428,6 +499,7 @@ GOOD = {"start": [0.0, 0.0, 0.0, 0.0], "t1": 1e-3}
         ({"t1": np.inf}, "t1 must be above 0, got inf"),
         ({"rtol": 0.0}, "rtol must be above 0 and at most 0.1, got 0.0"),
         ({"rtol": 0.5}, "rtol must be above 0 and at most 0.1, got 0.5"),
+        ({"rtol": 1e-300}, "rtol must be at least 9.1e-13 in float64, got 1e-300"),
         ({"max_steps": 0}, "max_steps must be a whole number of at least 1, got 0"),
         ({"max_steps": 10.0}, "max_steps must be a whole number of at least 1, got 10.0"),
         ({"regularisation": 0.0}, "regularisation must be above 0, got 0.0"),

@@ -407,7 +407,19 @@ def test_rtol_refusals(bad):
     """The message holds the argument, both bounds and the value."""
     text = f"rtol must be above 0 and at most 0.1, got {bad!r}"
     with pytest.raises(ValueError) as caught:
-        check_rtol(bad)
+        check_rtol(bad, jnp.float64)
     assert str(caught.value) == text
-    for good in (0.1, 1e-3, 1e-16):
-        check_rtol(good)
+    for good in (0.1, 1e-3, 1e-12):
+        assert check_rtol(good, jnp.float64) == good
+
+
+@pytest.mark.parametrize(
+    ("dtype", "usual", "least", "bad"),
+    [("float64", 1e-9, "9.1e-13", 1e-14), ("float32", 4096 * 2**-23, "0.00049", 1e-9)],
+)
+def test_rtol_follows_the_precision(dtype, usual, least, bad):
+    """One that the precision cannot hold is refused; the default is one that it can."""
+    assert check_rtol(None, dtype) == usual
+    with pytest.raises(ValueError, match=f"^rtol must be at least {least} in {dtype}, got {bad}$"):
+        check_rtol(bad, dtype)
+    assert check_rtol(float(least), dtype) == float(least)
