@@ -55,7 +55,7 @@ def repels(monodromy, rate, error) -> jax.Array:
 
     start = across @ monodromy @ across, jnp.zeros_like(error)
     _, log = jax.lax.fori_loop(0, _SQUARINGS, square, start)
-    return log / 2**_SQUARINGS > 10 * (missed + error)
+    return log / 2.0**_SQUARINGS > 10 * (missed + error)
 
 
 class Switch(Record):
