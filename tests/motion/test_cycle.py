@@ -1,10 +1,12 @@
 """What a limit cycle tells: orbit, switches, multipliers and spectrum, against `simulate`."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import fractaljax as fj
+from fractaljax.motion.cycle import repels
 from tools import reference_cycle, reference_scene
 
 
@@ -59,3 +61,37 @@ def test_switches_are_those_of_one_cycle():
     many = jax.tree.map(lambda x: x[None], reference_cycle())
     with pytest.raises(ValueError, match="needs one cycle, outside of jit: index the batch first"):
         many.switches()
+
+
+def monodromy_of(block, rate, rng):
+    """A matrix (4, 4) that maps `rate` onto itself and has the other multipliers of `block`."""
+    basis = np.column_stack([rate, rng.normal(size=(4, 3))])
+    inner = np.eye(4)
+    inner[1:, 1:] = block
+    inner[0, 1:] = rng.normal(size=3)
+    return basis @ inner @ np.linalg.inv(basis)
+
+
+def blocks(largest):
+    """Multipliers of that modulus: real, a pair, a double one without its eigenvectors, alone."""
+    turn = largest * np.array([[np.cos(1), -np.sin(1)], [np.sin(1), np.cos(1)]])
+    yield np.diag([largest, 0.5, -0.2])
+    yield np.diag([-largest, 0.999, 0.0])
+    yield np.block([[turn, np.ones((2, 1))], [np.zeros((1, 2)), np.full((1, 1), 0.7)]])
+    yield np.array([[largest, 1.0, 0.0], [0.0, largest, 0.0], [0.0, 0.0, 0.1]])
+    yield np.diag([largest, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("largest", [0.0, 0.3, 1 - 1e-6, 1 + 1e-6, 1.0009, 30.0])
+def test_orbits_that_repel(largest):
+    """Decided by the largest multiplier but the one of the motion itself, in a batch."""
+    rng = np.random.default_rng(1)
+    rates = rng.normal(size=(5, 4))
+    pairs = zip(blocks(largest), rates, strict=True)
+    matrices = np.array([monodromy_of(block, rate, rng) for block, rate in pairs])
+    one = jax.jit(jax.vmap(repels, in_axes=(0, 0, None)))
+    found = one(jnp.asarray(matrices), jnp.asarray(rates), 1e-9)
+    expected = [largest > 1 or max(abs(np.linalg.eigvals(b))) > 1 for b in blocks(largest)]
+    np.testing.assert_array_equal(found, expected)
+    # What is within the error of the orbit is not said.
+    assert not np.any(one(jnp.asarray(matrices), jnp.asarray(rates), 1e-2)) or largest > 1.1

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
+from filippov import Mechanism, return_slopes
 from fractaljax.base.parts import substitute
 from tools import motionless_scene, reference_cycle, reference_scene
 
@@ -312,12 +313,44 @@ def test_mass_on_a_belt_under_constant_load():
     assert stuck == pytest.approx((x_leave - x_enter) / 0.02, rel=1e-7)
 
 
+LIGHTLY_DAMPED = Mechanism(
+    m=1.0,
+    omega_1=7040.0,
+    omega_2=5190.0,
+    xi_1=0.000154,
+    xi_2=0.000735,
+    F=2.51,
+    V=0.307,
+    K_n=5.08e8,
+    K_t=3.23e8,
+    mu_s=0.251,
+    mu_m=0.14,
+    v_m=0.535,
+)
+
+
+def test_an_orbit_that_repels():
+    """The motion passes it slowly: its numbers are given, with multipliers, but it is no limit."""
+    m = LIGHTLY_DAMPED
+    scene = scene_of(vars(m))
+    cycle = fj.limit_cycle(scene, throw=False)
+    assert cycle.result == fj.CycleResult.unstable and cycle.turns == 1
+    y = m.scaled(np.asarray(cycle.state))
+    truth = np.linalg.eigvals(return_slopes(m, y[[0, 1, 3]], 1, 1e-12))
+    expected = np.sort(np.abs([*truth, 1.0]))
+    np.testing.assert_allclose(np.sort(np.abs(cycle.multipliers)), expected, rtol=1e-7)
+    assert expected[-1] > 1.0001 and np.isfinite(cycle.amplitude).all()
+    with pytest.raises(RuntimeError, match=r"^a limit cycle was found, but it repels: [^\n]*$"):
+        fj.limit_cycle(scene)
+
+
 def test_physical_outcomes_raise_only_if_asked():
     """A motion that dies out is a result; with `throw` it is an error with that message."""
     cycle = fj.limit_cycle(motionless_scene(), throw=False)
     assert cycle.result == fj.CycleResult.equilibrium
     assert np.isnan(cycle.amplitude).all()
-    with pytest.raises(RuntimeError, match="the sliding equilibrium attracts it"):
+    text = r"^the motion dies out: the sliding equilibrium attracts it$"
+    with pytest.raises(RuntimeError, match=text):
         fj.limit_cycle(motionless_scene())
 
 
@@ -327,6 +360,7 @@ def test_physical_outcomes_raise_only_if_asked():
         ({"start": [0.0, 0.0]}, r"start must have shape \(4,\), got \(2,\)"),
         ({"start": [np.nan, 0, 0, 0]}, "start must be finite, got nan"),
         ({"rtol": 0}, "rtol must be above 0 and at most 0.1, got 0"),
+        ({"rtol": 1e-300}, "rtol must be at least 9.1e-13 in float64, got 1e-300"),
         ({"segments": 3}, "segments must be a whole number of at least 16, got 3"),
         ({"max_turns": 0}, "max_turns must be at least 1, got 0"),
         ({"regularisation": 0}, "regularisation must be above 0, got 0"),
@@ -336,6 +370,13 @@ def test_bad_arguments(arguments, message):
     """One line that names the argument, what it must be and what it was."""
     with pytest.raises(ValueError, match=message):
         fj.limit_cycle(reference_scene(), **arguments)
+
+
+def test_a_tolerance_that_the_precision_cannot_hold():
+    """In float32 the default is what that holds, and less is refused."""
+    scene = jax.tree.map(lambda x: x.astype(jnp.float32), reference_scene())
+    with pytest.raises(ValueError, match=r"^rtol must be at least 0.00049 in float32, got 1e-09$"):
+        fj.limit_cycle(scene, rtol=1e-9)
 
 
 def test_a_fixed_contact_traces_no_contact_law():
@@ -356,6 +397,7 @@ def test_single_precision():
     scene = jax.tree.map(lambda x: x.astype(jnp.float32), reference_scene())
     cycle = fj.limit_cycle(scene, throw=False)
     assert cycle.period.dtype == jnp.float32
+    assert cycle.result == fj.CycleResult.converged
     assert float(cycle.period * OMEGA) == pytest.approx(6.467446, rel=1e-4)
 
 
