@@ -18,9 +18,7 @@ from ..base.parts import Record
 from ..mechanism.matrices import mass_normalised
 from ..mechanism.structure import Structure, require_single
 
-# Multiples of the rounding error below which something counts as zero: the square of a rigid-body
-# mode's eigenvalue, a real part; both in units of omega. Free beams of 200 degrees of freedom
-# reach 0.3.
+# Multiples of the rounding error that sums of n products may have.
 _ROUNDING = 16.0
 
 
@@ -32,6 +30,7 @@ class Mode(NamedTuple):
     damping_ratio: float  # -Re/|s|
     shape: np.ndarray  # (n,) complex displacements, the largest of them 1
     largest: int | str  # the degree of freedom of that one, by name where it has one
+    resolution: float  # what rounding can make of the growth rate [1/s]
 
 
 class ComplexModes(Record):
@@ -48,20 +47,31 @@ class ComplexModes(Record):
     frequency: jax.Array  # of the eigenvalue with the largest real part [Hz]
     damping_ratio: jax.Array  # of the same eigenvalue, -Re/|s|
     margin: jax.Array  # least damping ratio of all but rigid-body modes
+    resolution: jax.Array  # what rounding can make of the growth rate [1/s]
     frequencies: jax.Array  # (2n,) [Hz]
     damping_ratios: jax.Array  # (2n,)
+    resolutions: jax.Array  # (2n,) what rounding can make of each eigenvalue [1/s]
     shapes: jax.Array  # (2n, n) complex displacements, the largest of each 1
-    resolution: jax.Array  # what rounding can make of a real part [1/s]
     names: tuple[str, ...] | None = eqx.field(static=True)
 
     def unstable(self) -> list[Mode]:
         """The modes that grow, the fastest first; one of each conjugate pair.
 
-        A real part within `resolution` of 0 does not count: without damping, it is rounding.
+        A real part within its resolution of 0 does not count: see `unresolved`.
 
         **Raises:** `ValueError` for a batch.
         """
-        return [mode for mode in self._modes() if mode.growth_rate > float(self.resolution)]
+        return [mode for mode in self._modes() if mode.growth_rate > mode.resolution]
+
+    def unresolved(self) -> list[Mode]:
+        """The modes of which rounding leaves open whether they grow or die out.
+
+        So are those without damping. Rigid-body modes are not among them.
+
+        **Raises:** `ValueError` for a batch.
+        """
+        modes = [mode for mode in self._modes() if abs(mode.growth_rate) <= mode.resolution]
+        return [mode for mode in modes if mode.growth_rate or mode.frequency]
 
     def least_damped(self, count: int = 10) -> list[Mode]:
         """The `count` oscillating modes of least damping ratio, that one first.
@@ -75,10 +85,18 @@ class ComplexModes(Record):
         if self.eigenvalues.ndim != 1:
             raise ValueError(f"modes are listed of one structure, got {self.eigenvalues.shape}")
         s, shapes = np.asarray(self.eigenvalues), np.asarray(self.shapes)
-        rows = zip(s, self.frequencies.tolist(), self.damping_ratios.tolist(), shapes, strict=True)
+        numbers = self.frequencies, self.damping_ratios, self.resolutions
+        rows = zip(s, shapes, *(x.tolist() for x in numbers), strict=True)
         return [
-            Mode(float(s.real), frequency, ratio, shape, self._named(int(np.abs(shape).argmax())))
-            for s, frequency, ratio, shape in rows
+            Mode(
+                growth_rate=float(s.real),
+                frequency=frequency,
+                damping_ratio=ratio,
+                shape=shape,
+                largest=self._named(int(np.abs(shape).argmax())),
+                resolution=resolution,
+            )
+            for s, shape, frequency, ratio, resolution in rows
             if s.imag >= 0
         ]
 
@@ -139,28 +157,143 @@ UNSUPPORTED = (
 )
 
 
-class _Scaled(eqx.Module):
-    """z v = A v in units of omega, its vectors v being (L^T x, z L^T x)."""
+class _Scaled(NamedTuple):
+    """(z^2 M + z C + K) x = 0 in units, all of them powers of two, that leave no rounding."""
 
-    A: jax.Array  # (2n, 2n)
-    L: jax.Array  # (n, n), M = L L^T
+    M: jax.Array  # (n, n), its diagonal from 1 to 4
+    C: jax.Array  # (n, n)
+    K: jax.Array  # (n, n), like C of order one where it is largest
+    units: jax.Array  # (n,) of the degrees of freedom
     omega: jax.Array  # [rad/s]
 
 
 def _scaled(structure: Structure, friction_slope: bool) -> _Scaled:
     M, C, K = assemble(structure, friction_slope)
-    L = jnp.linalg.cholesky(M)
-    C, K = mass_normalised(L, C), mass_normalised(L, K)
-    damping, stiffness = _row_sum(C), _row_sum(K)
-    omega = jnp.where(stiffness > 0, jnp.sqrt(stiffness), damping)
+    units = _power_of_two(-_half_exponent(jnp.diagonal(M)), K.dtype)
+    M, C, K = (X * units[:, None] * units[None] for X in (M, C, K))
+    stiffness, damping = _row_sum(K), _row_sum(C)
+    exponent = jnp.maximum(
+        jnp.where(stiffness > 0, _half_exponent(stiffness), _LEAST),
+        jnp.where(damping > 0, jnp.frexp(damping)[1], _LEAST),
+    )
     # The eigenvalues do not depend on the unit of time.
-    omega = jax.lax.stop_gradient(jnp.where(omega > 0, omega, 1))
-    zero, one = jnp.zeros_like(K), jnp.eye(structure.n, dtype=K.dtype)
-    return _Scaled(jnp.block([[zero, one], [-K / omega**2, -C / omega]]), L, omega)
+    omega = _power_of_two(jnp.where(exponent > _LEAST, exponent, 0), K.dtype)
+    return _Scaled(M, C / omega, K / omega / omega, units, omega)
+
+
+_LEAST = -2000  # below the exponent of any number
 
 
 def _row_sum(X) -> jax.Array:
-    return jnp.abs(X).sum(axis=1).max()
+    return jax.lax.stop_gradient(jnp.abs(X).sum(axis=1).max())
+
+
+def _half_exponent(x) -> jax.Array:
+    """Of the square root of x, by powers of two."""
+    return jnp.frexp(jax.lax.stop_gradient(x))[1] // 2
+
+
+def _power_of_two(exponent, dtype) -> jax.Array:
+    return jnp.ldexp(jnp.ones_like(exponent, dtype), exponent)
+
+
+class _Modes(NamedTuple):
+    """Of a scaled problem: y_i (z_i^2 M + z_i C + K) = 0 as well, and y_i (2 z_i M + C) x_i = 1."""
+
+    z: jax.Array  # (2n,) eigenvalues
+    X: jax.Array  # (n, 2n), right vectors in columns
+    Y: jax.Array  # (2n, n), left vectors in rows
+    error: jax.Array  # (2n,) what rounding can make of an eigenvalue
+    rigid: jax.Array  # (2n,) whether K x = 0 and z = 0, both to rounding
+
+
+@jax.custom_jvp
+def _modes(M, C, K) -> _Modes:
+    z, X, Y = _lapack(M, C, K)
+    eps = jnp.finfo(M.dtype).eps
+    size = jnp.abs(z)
+    MX, CX, KX = (A @ X for A in (M, C, K))
+    M_size, C_size, K_size = (jnp.abs(A) @ jnp.abs(X) for A in (M, C, K))
+    slope = jnp.einsum("ij,ji->i", Y, 2 * MX * z[None] + CX)
+    most = jnp.einsum("ij,ji->i", jnp.abs(Y), 2 * M_size * size[None] + C_size)
+    # Defective to the last bit: as rounding would have split it.
+    slope = jnp.where(jnp.abs(slope) > eps * most, slope, jnp.sqrt(eps) * most)
+    slope = jnp.where(slope == 0, 1, slope)
+    Y = Y / slope[:, None]
+    # What is left of the problem, and what of that may be rounding: between all of the modes.
+    rounding = _ROUNDING * eps
+    left = -Y @ (MX * z[None] ** 2 + CX * z[None] + KX)
+    off = jnp.abs(left) + rounding * (
+        jnp.abs(Y) @ (M_size * size[None] ** 2 + C_size * size[None] + K_size)
+    )
+    z, error = _pairwise(z, jnp.diagonal(left), _shift(z, off))
+    inertia, stiffness, force = (
+        jnp.abs(jnp.einsum("ij,ji->i", *pair))
+        for pair in ((Y, MX), (jnp.abs(Y), K_size), (jnp.abs(Y), jnp.abs(KX)))
+    )
+    stiffness = rounding * stiffness
+    rigid = (size**2 * inertia <= stiffness) & (force <= stiffness)
+    double = jnp.sqrt(stiffness / jnp.where(inertia > 0, inertia, 1))
+    error = jnp.where(rigid & (double < error), double, error)
+    return _Modes(z, X, Y, error + jnp.sqrt(jnp.finfo(M.dtype).tiny), rigid)
+
+
+def _lapack(M, C, K):
+    """Eigenvalues (2n,), right vectors (n, 2n) and left ones (2n, n), as good as LAPACK makes them.
+
+    Of degrees of freedom that differ by orders of magnitude it keeps the slow ones only where the
+    fast ones come first; Cholesky's factors keep them where the fast ones come last.
+    """
+    n = len(M)
+    unit = jnp.diagonal(M)
+    rate = jnp.maximum(jnp.sqrt(jnp.abs(jnp.diagonal(K)) / unit), jnp.abs(jnp.diagonal(C)) / unit)
+    slow_first = jnp.argsort(rate)
+    L = jnp.linalg.cholesky(M[slow_first][:, slow_first])
+    C, K = (mass_normalised(L, A[slow_first][:, slow_first]) for A in (C, K))
+    A = jnp.block([[jnp.zeros_like(K), jnp.eye(n, dtype=K.dtype)], [-K, -C]])
+    fast_first = np.arange(2 * n).reshape(2, n).T[::-1].ravel()
+    z, left, right = jax.lax.linalg.eig(
+        A[fast_first][:, fast_first],
+        compute_left_eigenvectors=True,
+        compute_right_eigenvectors=True,
+    )
+    back, undo = np.argsort(fast_first), jnp.argsort(slow_first)
+    # Of a state (x, z x) the upper half, of its left vector the lower.
+    halves = jnp.concatenate([right[back][:n], left[back][n:].conj()], axis=1)
+    halves = jax.scipy.linalg.solve_triangular(L.astype(z.dtype), halves, lower=True, trans="T")
+    halves = halves[undo]
+    return z, halves[:, : 2 * n], halves[:, 2 * n :].T
+
+
+def _shift(z, off):
+    """(k,): how far an eigenvalue can be moved by errors `off` (k, k) between all of them."""
+    both = jnp.sqrt(off) * jnp.sqrt(off.T)
+    apart = jnp.abs(z[None] - z[:, None])
+    # Of [[0, e], [f, g]] they move by e f/g, and where they meet by sqrt(e f).
+    moved = jnp.where(both < apart, both * (both / jnp.where(apart > 0, apart, 1)), both)
+    return moved.sum(axis=1) - jnp.diagonal(moved) + jnp.diagonal(off)
+
+
+def _pairwise(z, correction, error):
+    """Corrected eigenvalues and their errors, conjugate to the last bit where they were."""
+    second = (z.imag < 0) & (z == jnp.roll(z, 1).conj())
+    correction = jnp.where(second, jnp.roll(correction, 1).conj(), correction)
+    return z + correction, jnp.where(second, jnp.roll(error, 1), error)
+
+
+@_modes.defjvp
+def _modes_jvp(primals, tangents):
+    at = _modes(*primals)
+    z, X, Y = at.z, at.X, at.Y
+    dM, dC, dK = (dA.astype(X.dtype) for dA in tangents)
+    drawn = Y @ (dM @ X)
+    P = -(drawn * z[None] ** 2 + Y @ (dC @ X) * z[None] + Y @ (dK @ X))
+    # Of all lengths the vectors could take, the ones with w dv = 0, w and v being those of the
+    # states: eigenvalues and shapes do not depend on the choice.
+    same = jnp.eye(len(z), dtype=z.dtype)
+    turn = P * _inverse(z[None] - z[:, None] + same) * (1 - same)
+    none = jnp.zeros_like(at.error), np.zeros(at.rigid.shape, jax.dtypes.float0)
+    return at, _Modes(jnp.diagonal(P), X @ turn, -(turn + drawn * z[None]) @ Y, *none)
 
 
 def _inverse(x) -> jax.Array:
@@ -169,68 +302,22 @@ def _inverse(x) -> jax.Array:
     return x.conj() / jnp.maximum(size, jnp.finfo(size.dtype).eps ** 2)
 
 
-@jax.custom_jvp
-def _eigenvectors(A):
-    """Eigenvalues z (k,) of A, right vectors V in columns, left vectors W in rows: W V = 1."""
-    z, left, right = jax.lax.linalg.eig(
-        A, compute_left_eigenvectors=True, compute_right_eigenvectors=True
-    )
-    left = left.conj().T
-    return z, right, left * _inverse((left * right.T).sum(axis=1))[:, None]
-
-
-@_eigenvectors.defjvp
-def _eigenvectors_jvp(primals, tangents):
-    (A,), (dA,) = primals, tangents
-    z, V, W = _eigenvectors(A)
-    P = W @ dA.astype(V.dtype) @ V
-    # Of all lengths the vectors could take, the ones with w dv = 0: eigenvalues and shapes do not
-    # depend on the choice.
-    apart = (z[None] - z[:, None]) + jnp.eye(len(z), dtype=z.dtype)
-    turn = P * _inverse(apart) * (1 - jnp.eye(len(z), dtype=z.dtype))
-    return (z, V, W), (jnp.diagonal(P), V @ turn, -turn @ W)
-
-
-@jax.custom_jvp
-def _eigenvalues(A):
-    """The same eigenvalues by a cheaper route, in any order."""
-    return jnp.linalg.eigvals(A)
-
-
-@_eigenvalues.defjvp
-def _eigenvalues_jvp(primals, tangents):
-    (A,), (dA,) = primals, tangents
-    z, V, W = _eigenvectors(A)
-    return z, ((W @ dA.astype(V.dtype)) * V.T).sum(axis=1)
-
-
-def _rigid_at_rest(z):
-    """Eigenvalues with those of rigid-body modes, which rounding splits, put to 0."""
-    rigid = z.real**2 + z.imag**2 <= _ROUNDING * jnp.finfo(z.dtype).eps
-    return jnp.where(rigid, 0, z)
-
-
 def growth_rate_of_structure(structure: Structure, friction_slope: bool) -> jax.Array:
     """Largest real part of the eigenvalues [1/s], a scalar: `growth_rate` of a structure."""
-    scaled = _scaled(structure, friction_slope)
-    real = _rigid_at_rest(_eigenvalues(scaled.A)).real
-    return scaled.omega * real[jnp.argmax(real)]
+    return complex_modes(structure, friction_slope).growth_rate
 
 
 def complex_modes(structure: Structure, friction_slope: bool) -> ComplexModes:
     """Every mode of a structure: its `stability`."""
     scaled = _scaled(structure, friction_slope)
-    z, V, _ = _eigenvectors(scaled.A)
-    z = _rigid_at_rest(z)
+    z, X, _, error, rigid = _modes(scaled.M, scaled.C, scaled.K)
+    z = jnp.where(rigid, 0, z)
     order = jnp.lexsort((-z.imag, -z.real))
-    z, V = z[order], V[:, order]
-    rigid = z == 0
+    z, x, error, rigid = z[order], (X.T * scaled.units[None])[order], error[order], rigid[order]
     size = jnp.abs(jnp.where(rigid, 1, z))
     ratios = jnp.where(rigid, 0, -z.real / size)
     frequencies = scaled.omega * jnp.abs(z.imag) / (2 * jnp.pi)
-    x = jax.scipy.linalg.solve_triangular(
-        scaled.L.astype(V.dtype), V[: structure.n], lower=True, trans="T"
-    ).T
+    resolutions = scaled.omega * error
     largest = jnp.abs(jax.lax.stop_gradient(x)).argmax(axis=1)
     return ComplexModes(
         eigenvalues=scaled.omega * z,
@@ -238,9 +325,10 @@ def complex_modes(structure: Structure, friction_slope: bool) -> ComplexModes:
         frequency=frequencies[0],
         damping_ratio=ratios[0],
         margin=jnp.where(rigid, 1, ratios).min(),  # no damping ratio exceeds 1
+        resolution=resolutions[0],
         frequencies=frequencies,
         damping_ratios=ratios,
+        resolutions=resolutions,
         shapes=x / jnp.take_along_axis(x, largest[:, None], axis=1),
-        resolution=_ROUNDING * jnp.finfo(scaled.omega.dtype).eps * scaled.omega,
         names=structure.names,
     )
