@@ -15,7 +15,6 @@ from .motion.cycle import CycleResult, LimitCycle
 from .surface.roughness import roughness
 
 _ABSENT = "-"
-STABLE = "stable against small disturbances"  # all that a growth rate can say
 _LEAST_DAMPED = 10  # stable modes of a structure that its table lists
 _MODES = {"+": "slips, dx/dt < V", "-": "slips, dx/dt > V", "stick": "sticks"}
 
@@ -76,27 +75,34 @@ def stability_table(scene: Scene, friction_slope: bool = True) -> str:
 
 
 def _verdict(modes) -> dict[str, str]:
-    verdict = "it squeals" if modes.growth_rate > 0 else STABLE
+    verdict = "it squeals" if modes.growth_rate > 0 else "stable"
     return {"growth rate [1/s]": f"{modes.growth_rate:+.6g}  ({verdict})"}
 
 
 def structure_table(structure: Structure, friction_slope: bool = True) -> str:
     """The joints of a structure, its verdict, and its unstable and its least damped modes.
 
-    **Raises:** `ValueError` as `assemble`, and if the structure has no equilibrium under F.
+    **Raises:** `ValueError` as `assemble`, if the structure has no equilibrium under F, and if its
+    numbers leave the range of floating-point numbers.
     """
     try:
-        assemble(structure, friction_slope)
+        matrices = assemble(structure, friction_slope)
     except RuntimeError:  # of many lines, from inside a compiled program
         raise ValueError(UNSUPPORTED) from None
+    for name, X in zip("MCK", matrices, strict=True):
+        if not jnp.isfinite(X).all():
+            raise ValueError(f"{name} with the joints attached must be finite")
     modes = stability(structure, friction_slope)
-    unstable = modes.unstable()
-    least = modes.least_damped(_LEAST_DAMPED + len(unstable))
-    listed = unstable + [mode for mode in least if mode.growth_rate <= modes.resolution]
+    if not jnp.isfinite(modes.eigenvalues).all():
+        raise ValueError(f"M, C and K have no eigenvalues in the range of {modes.margin.dtype}")
+    unstable, unresolved = modes.unstable(), modes.unresolved()
+    marked = unstable + unresolved
+    least = modes.least_damped(_LEAST_DAMPED + len(marked))
+    listed = marked + [mode for mode in least if mode.growth_rate < -mode.resolution]
     whole = {
         "degrees of freedom": f"{structure.n}",
-        "unstable modes": f"{len(unstable)}  ({'it squeals' if unstable else STABLE})",
-        "growth rate [1/s]": f"{modes.growth_rate:+.6g}",
+        "unstable modes": f"{len(unstable)}  ({_structure_verdict(modes, unstable, unresolved)})",
+        "growth rate [1/s]": f"{modes.growth_rate:+.6g}  (to +-{modes.resolution:.1g})",
         "least damping ratio": f"{modes.margin:+.6g}",
     }
     tables = [table([""], [whole])]
@@ -111,12 +117,23 @@ def structure_table(structure: Structure, friction_slope: bool = True) -> str:
             "growth rate [1/s]": [f"{mode.growth_rate:+.6g}" for mode in listed],
             "damping ratio": [f"{mode.damping_ratio:+.6g}" for mode in listed],
             "moves most": [f"{mode.largest}" for mode in listed],
-            "": ["unstable"] * len(unstable) + [""] * (len(listed) - len(unstable)),
+            "": ["unstable"] * len(unstable)
+            + [f"unresolved to +-{mode.resolution:.1g}" for mode in unresolved]
+            + [""] * (len(listed) - len(marked)),
         }
         titles = [f"mode {i}" for i in range(1, len(listed) + 1)]
         rows = [dict(zip(titles, cells, strict=True)) for cells in columns.values()]
         tables.append(table(list(columns), rows))
     return "\n\n".join(tables)
+
+
+def _structure_verdict(modes, unstable, unresolved) -> str:
+    still = modes.resolutions[modes.eigenvalues == 0]
+    also = [f"{len(unresolved)} unresolved"] if unresolved else []
+    if still.size:
+        also.append(f"{still.size} eigenvalues 0 to +-{still.max():.1g} 1/s: rigid bodies")
+    verdict = "it squeals" if unstable else "stable" if not also else "else stable"
+    return "; ".join([verdict, *also] if unstable else [*also, verdict])
 
 
 def _joint_rows(joint: Joint) -> dict[str, str]:

@@ -68,6 +68,16 @@ def number(
     return array
 
 
+def flag(name: str, value: Any) -> bool:
+    """Return `value` as a bool.
+
+    **Raises:** `TypeError` for anything but True and False, Python's or NumPy's.
+    """
+    if not isinstance(value, (bool, np.bool_)):
+        raise TypeError(f"{name} must be True or False, got {value!r}")
+    return bool(value)
+
+
 def ordered(name: str, value: jax.Array, other_name: str, other: jax.Array) -> jax.Array:
     """Return `value`, refused like in `number` unless it is at least `other` everywhere."""
     values, others = concrete(value), concrete(other)

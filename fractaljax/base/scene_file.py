@@ -11,6 +11,9 @@ from typing import Any, cast
 
 from .parts import Part
 
+_DEEPEST = 20  # tables and arrays within each other; a scene has 3
+_TOO_DEEP = "not a file of fractaljax: its tables or arrays are nested too deeply"
+
 type_table = Mapping[str, Mapping[str, type[Part]]]
 
 
@@ -67,11 +70,32 @@ def read(content: bytes) -> dict[str, Any]:
     **Raises:** `ValueError` with the place where it is no TOML.
     """
     try:
-        return tomllib.loads(content.decode())
+        document = tomllib.loads(content.decode())
+    except RecursionError:
+        raise ValueError(_TOO_DEEP) from None
     except UnicodeDecodeError as error:
         raise ValueError(f"not a text in UTF-8: {error.reason} at byte {error.start}") from None
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"not a TOML file: {error}") from None
+    level: list[Any] = [document]
+    for _ in range(_DEEPEST):
+        inside = (list(x.values()) if isinstance(x, dict) else x for x in level)
+        level = [x for values in inside for x in values if isinstance(x, (dict, list))]
+    if level:
+        raise ValueError(_TOO_DEEP)
+    return document
+
+
+def read_bounded(path: str | os.PathLike, most: int = 10_000_000) -> bytes:
+    """The content of a file, or of a pipe, of no more than `most` bytes.
+
+    **Raises:** `OSError` if it cannot be read; `ValueError` if there is more: /dev/zero has no end.
+    """
+    with open(path, "rb") as file:
+        content = file.read(most + 1) if os.fstat(file.fileno()).st_size <= most else None
+    if content is None or len(content) > most:
+        raise ValueError(f"the file is larger than {most / 1e6:g} MB, as large as it may be")
+    return content
 
 
 def parts_of(document: dict[str, Any], laws: type_table, inside: str = "") -> dict[str, Part]:

@@ -5,16 +5,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..base.parts import concrete, number
-from .matrices import array_of, mass_normalised
+from .matrices import fitting, mass_matrix, mass_normalised, square
 
 
 def rayleigh_damping(M, K, alpha, beta) -> jax.Array:
     """C = alpha M + beta K (n, n) [N s/m], alpha in 1/s and beta in s.
 
-    **Raises:** `ValueError` unless alpha >= 0 and beta >= 0.
+    **Raises:** `ValueError` unless alpha >= 0 and beta >= 0 are scalars and M and K are square
+    matrices of one size; `TypeError` for what is no array of real numbers.
     """
+    M = square("M", M)
+    K = fitting("K", K, M.shape)
     alpha, beta = number("alpha", alpha, at_least=0), number("beta", beta, at_least=0)
-    return alpha * jnp.asarray(M) + beta * jnp.asarray(K)
+    for name, value in (("alpha", alpha), ("beta", beta)):
+        if value.ndim:
+            raise ValueError(f"{name} must be a scalar, got shape {value.shape}")
+    return alpha * M + beta * K
 
 
 def modal_damping(M, K, ratio) -> jax.Array:
@@ -24,9 +30,11 @@ def modal_damping(M, K, ratio) -> jax.Array:
     X^T L^T with M = L L^T and X the eigenvectors of L^-1 K L^-T: differentiable where those
     frequencies are distinct.
 
-    **Raises:** `ValueError` unless ratio >= 0 and K is symmetric.
+    **Raises:** `ValueError` unless ratio >= 0, M is symmetric and positive definite, and K
+    symmetric and of the size of M; `TypeError` for what is no array of real numbers.
     """
-    M, K, ratio = array_of("M", M), array_of("K", K), number("damping_ratio", ratio, at_least=0)
+    M = mass_matrix(square("M", M))
+    K, ratio = fitting("K", K, M.shape), number("damping_ratio", ratio, at_least=0)
     if ratio.ndim and ratio.shape != K.shape[:1]:
         raise ValueError(
             f"damping_ratio must be a scalar or have shape {K.shape[:1]}, got shape {ratio.shape}"

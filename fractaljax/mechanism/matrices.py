@@ -17,16 +17,24 @@ def array_of(name: str, value) -> jax.Array:
     kind = f"{value.dtype} numbers" if hasattr(value, "dtype") else type(value).__name__
     unfit = TypeError(f"{name} must be an array of real numbers, got {kind}")
     if isinstance(value, (list, tuple)):
-        if any(isinstance(entry, str) for entry in jax.tree.leaves(value)):
+        if any(isinstance(entry, (str, bool, np.bool_)) for entry in jax.tree.leaves(value)):
             raise unfit
         try:
             value = jnp.asarray(value)
-        except (ValueError, TypeError):  # ragged
+        except (ValueError, TypeError, OverflowError):  # ragged, or too large
             raise unfit from None
     try:
         return number(name, value)
     except TypeError:
         raise unfit from None
+
+
+def square(name: str, value) -> jax.Array:
+    """Like `array_of`, and a `ValueError` for what is no square matrix."""
+    array = array_of(name, value)
+    if array.ndim != 2 or array.shape[0] != array.shape[1] or not array.size:
+        raise ValueError(f"{name} must be a square matrix, got shape {array.shape}")
+    return array
 
 
 def fitting(name: str, value, shape: tuple[int, ...]) -> jax.Array:

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..base.parts import Part, number, quantity
+from ..base.parts import Part, flag, number, quantity
 from .friction import Friction
 
 
@@ -69,7 +69,7 @@ def linearise(
     mu = friction.coefficient(oscillator.V) if friction.velocity_dependent else friction.mu_s
     c_1 = 2 * oscillator.xi_1 * oscillator.omega_1
     c_2 = 2 * oscillator.xi_2 * oscillator.omega_2
-    if friction_slope and friction.velocity_dependent:
+    if flag("friction_slope", friction_slope) and friction.velocity_dependent:
         x_01, x_02 = equilibrium(oscillator, K_n, K_t, mu)
         slope = friction.slope(oscillator.V)
         c_1 = c_1 + slope * K_n * x_02 / m

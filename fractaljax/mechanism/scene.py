@@ -1,14 +1,13 @@
 """A scene: a joint, a friction law and an oscillator, and its TOML file."""
 
 import os
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import jax
 
 from ..base.parts import Part, number, quantities, rebuild, require_scalar
-from ..base.scene_file import parse, render, write_whole
+from ..base.scene_file import parse, read_bounded, render, write_whole
 from ..surface.surfaces import Surface
 from .contact import MU_M_MAX, Contact, FixedContact, FractalContact
 from .friction import Coulomb, Friction, Stribeck
@@ -80,7 +79,7 @@ class Scene(Part):
         for anything unknown, missing or outside its domain.
         """
         try:
-            return cls(**parse(Path(path).read_bytes(), _LAWS))
+            return cls(**parse(read_bounded(path), _LAWS))
         except (ValueError, TypeError) as error:
             raise ValueError(f"{path}: {error}") from None
 

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..base.parts import Part, Record, number, quantities, quantity, rebuild, require_scalar
-from ..base.scene_file import read, write_whole
+from ..base.scene_file import read, read_bounded, write_whole
 from .damping import modal_damping, rayleigh_damping
 from .friction import Friction
-from .matrices import array_of, fitting, mass_matrix
+from .matrices import fitting, mass_matrix, square
 from .scene import JOINT_LAWS, Scene, friction_for
 from .structure_file import npz_of, parse_structure, render_structure
 
@@ -95,9 +95,7 @@ class Structure(Record):
     names: tuple[str, ...] | None = eqx.field(static=True)
 
     def __init__(self, M, C, K, joints, F=None, names=None):
-        M = array_of("M", M)
-        if M.ndim != 2 or M.shape[0] != M.shape[1] or not M.size:
-            raise ValueError(f"M must be a square matrix, got shape {M.shape}")
+        M = square("M", M)
         n = M.shape[0]
         self.M = mass_matrix(M)
         self.K = fitting("K", K, (n, n))
@@ -106,9 +104,15 @@ class Structure(Record):
         self.joints, self.joint_names = _joints(joints)
         self._check_joints()
         if isinstance(F, Mapping):
-            given, F = F, np.zeros(n)
+            given, F, named = F, np.zeros(n), {}
             for dof, force in given.items():
-                F[self.index(dof)] = number(f"F at {dof}", force)
+                at = self.index(dof)
+                if at in named:
+                    raise ValueError(
+                        f"F gives one degree of freedom twice, as {named[at]!r} and as {dof!r}"
+                    )
+                named[at] = dof
+                F[at] = number(f"F at {dof}", force)
         self.F = None if F is None else fitting("F", F, (n,))
 
     @classmethod
@@ -135,7 +139,7 @@ class Structure(Record):
     def index(self, dof: int | str) -> int:
         """The index of a degree of freedom given by index or name.
 
-        **Raises:** `ValueError` if there is none.
+        **Raises:** `ValueError` if there is none; `TypeError` for anything else.
         """
         if isinstance(dof, str):
             if self.names is None:
@@ -147,9 +151,11 @@ class Structure(Record):
                     f"unknown degree of freedom {dof!r}; the structure has {_some(self.names)}"
                 )
             return self.names.index(dof)
+        if not isinstance(dof, (int, np.integer)) or isinstance(dof, bool):
+            raise TypeError(f"a degree of freedom must be an index or a name, got {dof!r}")
         if not 0 <= dof < self.n:
             raise ValueError(f"unknown degree of freedom {dof}: they are 0 to {self.n - 1}")
-        return dof
+        return int(dof)
 
     def direction(self, dofs: tuple[int | str, ...]) -> np.ndarray:
         """The vector d (n,) of 1, -1 and 0 for which d.x is the displacement that `dofs` names."""
@@ -191,13 +197,20 @@ class Structure(Record):
 
     def _check_joints(self):
         for name, joint in zip(self.joint_names, self.joints, strict=True):
+            directions = []
             for dofs in (joint.tangential, joint.normal):
                 try:
-                    indices = [self.index(dof) for dof in dofs]
+                    indices = {self.index(dof) for dof in dofs}
                 except ValueError as error:
                     raise ValueError(f"joint {name}: {error}") from None
-                if len(set(indices)) != len(indices):
+                if len(indices) != len(dofs):
                     raise ValueError(f"joint {name}: {dofs!r} is one degree of freedom twice")
+                directions.append(indices)
+            if directions[0] == directions[1]:
+                raise ValueError(
+                    f"joint {name}: tangential {joint.tangential!r} and normal {joint.normal!r} "
+                    "are one direction"
+                )
 
     def _shown(self):
         yield f"n={self.n}"
@@ -211,7 +224,7 @@ class Structure(Record):
         for anything unknown, missing, not fitting or outside its domain.
         """
         try:
-            return _from_document(read(Path(path).read_bytes()), Path(path).parent)
+            return _from_document(read(read_bounded(path)), Path(path).parent)
         except (ValueError, TypeError) as error:
             raise ValueError(f"{path}: {error}") from None
 
@@ -237,11 +250,13 @@ def load(path: str | os.PathLike) -> Scene | Structure:
     **Raises:** as `Scene.load` and `Structure.load`.
     """
     try:
-        content = Path(path).read_bytes()
-        held = "structure" in read(content)
-    except ValueError as error:
+        content = read_bounded(path)  # once: a pipe holds it no longer
+        document = read(content)
+        if "structure" in document:
+            return _from_document(document, Path(path).parent)
+        return Scene.from_toml(content.decode())
+    except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
-    return Structure.load(path) if held else Scene.load(path)
 
 
 def _from_document(document, folder) -> Structure:
@@ -275,6 +290,8 @@ def require_single(structure: Structure) -> None:
 def _names(names, n: int) -> tuple[str, ...] | None:
     if names is None:
         return None
+    if isinstance(names, (set, frozenset, Mapping)):
+        raise TypeError(f"names must be in an order, got {names!r}")
     names = (names,) if isinstance(names, str) else tuple(names)
     if not all(isinstance(name, str) and name and name.isprintable() for name in names):
         raise ValueError(f"names must be printable strings, got {_some(map(repr, names))}")

@@ -1,15 +1,47 @@
 """Structures as files: a TOML file for the joints, and the matrices it names."""
 
+import bz2
+import gzip
 import io
+import lzma
+import math
+import struct
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..base.scene_file import parts_of, quoted, refuse_unknown, table_of, tables_of
+from ..base.scene_file import (
+    parts_of,
+    quoted,
+    read_bounded,
+    refuse_unknown,
+    table_of,
+    tables_of,
+)
+from .matrix_market import read_matrix_market
 
 _LARGEST = 4000  # degrees of freedom; a sparse matrix of more is no reduced model
+_REDUCE = f"reduce the model to {_LARGEST} degrees of freedom at most"
+_LARGEST_FILE = 4 * 8 * _LARGEST**2
+
+# What Python's readers of compressed files and of NumPy's raise where bytes make no sense.
+_DAMAGED = (
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    gzip.BadGzipFile,
+    struct.error,
+    EOFError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    RuntimeError,  # NotImplementedError, for an unknown compression, and RecursionError
+    MemoryError,
+    OverflowError,
+)
 
 _ARRAYS = ("M", "C", "K", "F")
 _KEYS = ("matrices", "M", "C", "K", "rayleigh", "damping_ratio", "F", "names")
@@ -39,7 +71,7 @@ def parse_structure(document: dict[str, Any], folder: Path, laws) -> dict[str, A
             raise ValueError(f"[structure] lacks the matrix {name}: neither a file nor in matrices")
     if "F" in table:
         _once("F", found)
-        found["F"] = _force(table["F"], folder)
+        found["F"] = _force(table["F"], _names(table), folder)
     joints = table_of(document, "joints")
     return {
         "M": found["M"],
@@ -70,15 +102,27 @@ def _names(table) -> list[str] | None:
     return names
 
 
-def _force(given, folder: Path):
+def _force(given, names, folder: Path):
     if isinstance(given, str):
         force = _matrix_market(folder / given)
         return force.ravel() if 1 in force.shape else force
     if isinstance(given, dict):
-        return {int(dof) if dof.isdecimal() else dof: force for dof, force in given.items()}
+        return _by_degree_of_freedom(given, names or ())
     if not isinstance(given, list):
         raise ValueError(f"[structure] F must be a list, a table or a file's name, got {given!r}")
     return given
+
+
+def _by_degree_of_freedom(given, names) -> dict[int | str, Any]:
+    """Keys of TOML are texts: one that is no name may be an index."""
+    found = {}
+    for key, force in given.items():
+        index = key.isascii() and key.isdecimal() and key not in names
+        dof = int(key[:9]) if index else key  # more digits than that are no index either
+        if dof in found:
+            raise ValueError(f"[structure] F gives the degree of freedom {dof} twice")
+        found[dof] = force
+    return found
 
 
 def _damping(table, has_matrix: bool) -> dict[str, Any]:
@@ -104,31 +148,64 @@ def _joint(name: str, table: dict[str, Any], laws) -> dict[str, Any]:
 
 
 def _npz(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a .npz file, none of which is read before its size and kind are known."""
+    content = read_bounded(path, _LARGEST_FILE)
     try:
-        with np.load(path, allow_pickle=False) as file:
-            refuse_unknown(path.name, file.files, _ARRAYS)
-            return {name: file[name] for name in file.files}
-    except (zipfile.BadZipFile, EOFError, AttributeError, TypeError):
-        raise ValueError(f"{path.name} is not a .npz file") from None
+        with zipfile.ZipFile(io.BytesIO(content)) as file:
+            members = file.infolist()
+            names = [member.filename.removesuffix(".npy") for member in members]
+            refuse_unknown(path.name, names, _ARRAYS)
+            if len(set(names)) < len(names):
+                raise ValueError("it holds an array twice")
+            return {
+                name: _npy(name, file, member) for name, member in zip(names, members, strict=True)
+            }
     except ValueError as error:
-        raise ValueError(f"{path.name}: {error}") from None
+        prefix = "" if str(error).startswith(path.name) else f"{path.name}: "
+        raise ValueError(f"{prefix}{error}") from None
+    except _DAMAGED:
+        raise ValueError(f"{path.name} is not a .npz file, or damaged") from None
+
+
+def _npy(name: str, file: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+    if member.flag_bits & 1:
+        raise ValueError(f"{name} is encrypted")
+    if member.file_size > 8 * _LARGEST**2 + 10_000:
+        raise ValueError(f"{name} has {member.file_size} bytes; {_REDUCE}")
+    content = io.BytesIO(file.read(member))
+    version = np.lib.format.read_magic(content)
+    # Of version 3, for names in structured arrays, the header is read like that of version 2.
+    read_header = (
+        np.lib.format.read_array_header_1_0
+        if version == (1, 0)
+        else np.lib.format.read_array_header_2_0
+    )
+    shape, _, dtype = read_header(content)
+    if dtype.hasobject:
+        raise ValueError(f"Object arrays cannot be loaded, and {name} is one")
+    if not (dtype.kind in "iu" or (dtype.kind == "f" and dtype.itemsize in (4, 8))):
+        raise ValueError(f"{name} must be an array of real numbers, got {dtype} numbers")
+    if math.prod(shape) * dtype.itemsize != member.file_size - content.tell():
+        raise ValueError(f"{name} is damaged: it has not as many numbers as it says")
+    content.seek(0)
+    array = np.lib.format.read_array(content, allow_pickle=False)
+    return array.astype(dtype.newbyteorder("="))
 
 
 def _matrix_market(path: Path) -> np.ndarray:
-    from scipy.io import mminfo, mmread
-
-    with open(path, "rb"):  # says so plainly if it cannot be read
-        pass
+    """The matrix in a Matrix Market file, which may be compressed: .mtx.gz, .mtx.bz2."""
+    opener = {".gz": gzip.open, ".bz2": bz2.open}.get(path.suffix, open)
     try:
-        rows, columns, *_ = mminfo(path)
-        if max(rows, columns) <= _LARGEST:
-            matrix = mmread(path)
-            return matrix if isinstance(matrix, np.ndarray) else matrix.toarray()
-    except (ValueError, TypeError, IndexError, OverflowError) as error:
-        raise ValueError(f"{path.name} is not a Matrix Market file: {error}") from None
-    raise ValueError(
-        f"{path.name} holds {rows} x {columns} numbers; reduce the model to {_LARGEST} at most"
-    )
+        with opener(path, "rb") as file:
+            return read_matrix_market(file, _LARGEST)
+    except ValueError as error:
+        raise ValueError(f"{path.name} {error}") from None
+    except _DAMAGED:
+        raise ValueError(f"{path.name} is damaged") from None
+    except OSError as error:
+        if error.errno is None:  # of bz2, not of the system
+            raise ValueError(f"{path.name} is damaged") from None
+        raise
 
 
 def render_structure(structure, matrices: str, laws) -> str:

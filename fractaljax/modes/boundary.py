@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..base.batches import in_batches
-from ..base.parts import Record, number, require_scalar
+from ..base.parts import Record, flag, number, require_scalar
 from ..base.ranges import is_logarithmic
 from ..mechanism.oscillator import linearise
 from ..mechanism.quantities import (
@@ -223,6 +223,7 @@ def hopf_boundary(
     same one, a range that is empty, inverted or outside the domain, or a scene that holds arrays.
     """
     require_scalar(scene)
+    friction_slope = flag("friction_slope", friction_slope)
     if int(lines) != lines or lines < 2:
         raise ValueError(f"lines must be a whole number of at least 2, got {lines!r}")
     windows = [_window(scene, which, window) for which, window in (("x", x), ("y", y))]
@@ -236,7 +237,7 @@ def hopf_boundary(
     ends = np.array([window[1:] for window in windows])
     ends[logarithmic] = np.log(ends[logarithmic])
     low, high = jnp.asarray(ends.T, scene.oscillator.m.dtype)
-    problem = _Problem(names, (logarithmic[0], logarithmic[1]), bool(friction_slope))
+    problem = _Problem(names, (logarithmic[0], logarithmic[1]), friction_slope)
     field = _Field(problem, _Request(scene, low, high))
     branches, squeals, untraced = trace(field, int(lines))
     return Boundary(
@@ -244,7 +245,7 @@ def hopf_boundary(
         x=windows[0],
         y=windows[1],
         branches=tuple(_branch(field, windows, *branch) for branch in branches),
-        friction_slope=bool(friction_slope),
+        friction_slope=friction_slope,
         squeals=squeals,
         untraced=untraced,
     )

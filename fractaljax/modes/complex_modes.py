@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..base.parts import Record
+from ..base.parts import Record, flag
 from ..mechanism.matrices import mass_normalised
 from ..mechanism.structure import Structure, require_single
 
@@ -129,7 +129,7 @@ def assemble(structure: Structure, friction_slope: bool = True):
         K = K - mu * K_n * jnp.outer(t, n) + mu * K_t * jnp.outer(n, t)
         joints.append((joint, K_n, K_t, t, n))
     sloping = [joint for joint in joints if joint[0].friction.velocity_dependent]
-    if friction_slope and sloping:
+    if flag("friction_slope", friction_slope) and sloping:
         x_0 = _equilibrium(structure.F, K)
         for joint, K_n, K_t, t, n in sloping:
             slope = joint.friction.slope(joint.V)
@@ -274,8 +274,9 @@ def _shift(z, off):
     """(k,): how far an eigenvalue can be moved by errors `off` (k, k) between all of them."""
     both = jnp.sqrt(off) * jnp.sqrt(off.T)
     apart = _size(z[None] - z[:, None]) / 1.5
-    # Of [[0, e], [f, g]] they move by e f/g, and where they meet by sqrt(e f).
-    moved = jnp.where(both < apart, both * (both / jnp.where(apart > 0, apart, 1)), both)
+    # Of [[0, e], [f, g]] they move by e f/g, and where they meet by sqrt(e f): twice either, for
+    # there may be more than two.
+    moved = 2 * both * jnp.where(both < apart, both / jnp.where(apart > 0, apart, 1), 1)
     return moved.sum(axis=1) - jnp.diagonal(moved) + jnp.diagonal(off)
 
 

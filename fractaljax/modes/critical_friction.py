@@ -12,7 +12,7 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from ..base.parts import require_scalar
+from ..base.parts import flag, require_scalar
 from ..base.singular import positive_sqrt, safe_divide
 from ..mechanism.contact import MU_M_MAX
 from ..mechanism.oscillator import Linearised, dimensionless, linearise
@@ -76,7 +76,7 @@ def critical_friction(scene: Scene, friction_slope: bool = True) -> jax.Array:
     **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`.
     """
     require_scalar(scene)
-    sloping = friction_slope and scene.friction.velocity_dependent
+    sloping = flag("friction_slope", friction_slope) and scene.friction.velocity_dependent
     if sloping or scene.contact.fractal:
         factor = _first_factor(scene, friction_slope)
         found = factor < jnp.inf

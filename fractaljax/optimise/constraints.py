@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..base.parts import Record, number
+from ..base.parts import Record, flag, number
 from ..mechanism.contact import ContactState
 from ..mechanism.scene import Scene, stiffness
 from ..modes.stability import stability
@@ -205,7 +205,7 @@ class DampingRatio(Constraint):
 
     def __init__(self, at_least, *, friction_slope=True):
         self.at_least, self.at_most = _limits("damping ratio", at_least, above=-1, below=1)
-        self.friction_slope = bool(friction_slope)
+        self.friction_slope = flag("friction_slope", friction_slope)
 
     def measure(self, scene):
         eigenvalues = stability(scene, self.friction_slope).eigenvalues
@@ -231,7 +231,7 @@ class Frequency(Constraint):
 
     def __init__(self, at_least=None, at_most=None, *, friction_slope=True):
         self.at_least, self.at_most = _limits("frequency", at_least, at_most, above=0)
-        self.friction_slope = bool(friction_slope)
+        self.friction_slope = flag("friction_slope", friction_slope)
 
     def measure(self, scene):
         """The lower and the higher frequency (2,) [Hz]; 0 for an overdamped mode."""

@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..base.parts import flag
 from ..mechanism.scene import Scene
 from ..modes.stability import growth_rate, growth_rate_of
 from ..report import comparison_table, table
@@ -224,7 +225,7 @@ def design(
         quantile=quantile,
         area_ratio_min=area_ratio_min,
         slip_ratio_max=slip_ratio_max,
-        friction_slope=bool(friction_slope),
+        friction_slope=flag("friction_slope", friction_slope),
         starts=starts,
         lattice=lattice,
         seed=seed,
