@@ -63,9 +63,9 @@ def read_matrix_market(file, largest: int) -> np.ndarray:
         place = next(places) if layout == "array" else (_index(row), _index(column))
         i, j = place
         if not (0 <= i < shape[0] and 0 <= j < shape[1]):
-            lines.refuse(f"must be inside {shape[0]} x {shape[1]}, counted from 1,")
+            lines.refuse(f"must be inside {shape[0]} x {shape[1]}, counted from 1")
         if symmetry != "general" and (i < j or (i == j and symmetry == "skew-symmetric")):
-            lines.refuse(f"must lie below the diagonal, the matrix being {symmetry},")
+            lines.refuse(f"must lie below the diagonal, the matrix being {symmetry}")
         if given[i, j]:
             lines.refuse("must not give an entry twice")
         given[i, j] = True

@@ -106,7 +106,7 @@ class Structure(Record):
         if isinstance(F, Mapping):
             given, F, named = F, np.zeros(n), {}
             for dof, force in given.items():
-                at = self.index(dof)
+                at, dof = self.index(dof), dof if isinstance(dof, str) else int(dof)
                 if at in named:
                     raise ValueError(
                         f"F gives one degree of freedom twice, as {named[at]!r} and as {dof!r}"

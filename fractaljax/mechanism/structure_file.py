@@ -157,6 +157,9 @@ def _npz(path: Path) -> dict[str, np.ndarray]:
             refuse_unknown(path.name, names, _ARRAYS)
             if len(set(names)) < len(names):
                 raise ValueError("it holds an array twice")
+            end = content.rfind(b"PK\5\6")
+            if int.from_bytes(content[end + 10 : end + 12], "little") != len(names):
+                raise ValueError("it is damaged: an array is lost")
             return {
                 name: _npy(name, file, member) for name, member in zip(names, members, strict=True)
             }

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.sparse
 
 import fractaljax as fj
 from structures import beam, matrices
@@ -51,3 +52,22 @@ def test_modal_damping_refuses():
         fj.modal_damping(M, K, np.array([0.1, 0.2]))
     with pytest.raises(ValueError, match=r"damping_ratio must be at least 0, got -0\.1"):
         fj.modal_damping(M, K, -0.1)
+
+
+def test_what_has_another_shape_is_refused():
+    M, _, K = matrices(3)
+    for damping in (fj.rayleigh_damping, lambda M, K, *_: fj.modal_damping(M, K, 0.01)):
+        with pytest.raises(ValueError, match=r"M must be a square matrix, got shape \(3,\)"):
+            damping(np.diag(M), K, 1.0, 1e-6)
+        with pytest.raises(
+            ValueError, match=r"K must have shape \(3, 3\) as M demands, got \(3,\)"
+        ):
+            damping(M, np.diag(K), 1.0, 1e-6)
+        with pytest.raises(ValueError, match=r"K must have shape \(3, 3\) as M demands"):
+            damping(M, np.eye(4), 1.0, 1e-6)
+        sparse = damping(scipy.sparse.csr_matrix(M), scipy.sparse.csr_matrix(K), 1.0, 1e-6)
+        np.testing.assert_array_equal(sparse, damping(M, K, 1.0, 1e-6))
+    with pytest.raises(ValueError, match=r"beta must be a scalar, got shape \(3,\)"):
+        fj.rayleigh_damping(M, K, 1.0, np.ones(3))
+    with pytest.raises(ValueError, match="M must be positive definite"):
+        fj.modal_damping(-M, K, 0.01)

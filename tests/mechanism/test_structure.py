@@ -57,6 +57,28 @@ def test_forces_by_name():
     np.testing.assert_array_equal(structure.F, [0.0, -2.0, 5.0])
 
 
+def test_forces_and_joints_that_name_one_degree_of_freedom_twice_are_refused():
+    M, C, K = matrices(3)
+    named = {"names": ("x", "y", "z")}
+    twice = "F gives one degree of freedom twice, as"
+    refused(f"{twice} 'x' and as 0", M, C, K, ONE, F={"x": 1.0, 0: 2.0}, **named)
+    refused(f"{twice} 2 and as 'z'", M, C, K, ONE, F={np.int64(2): 1.0, "z": 2.0}, **named)
+    for dof in (True, np.True_, 1.0, None, ("x",)):
+        refused("must be an index or a name", M, C, K, ONE, F={dof: 1.0}, kind=TypeError)
+    for tangential, normal in [("x", 0), (0, "x"), (("x", "y"), (0, 1)), ((0, 1), ("y", "x"))]:
+        joint = fj.Joint(ONE.contact, ONE.friction, tangential, normal)
+        refused("joint pad: tangential .* and normal", M, C, K, {"pad": joint}, **named)
+    refused("names must be in an order", M, C, K, ONE, names={"x", "y", "z"}, kind=TypeError)
+
+
+def test_names_that_are_numerals_are_names():
+    M, C, K = matrices(3)
+    structure = fj.Structure(M, C, K, ONE, F={"0": 5.0, 0: 7.0}, names=("2", "0", "1"))
+    np.testing.assert_array_equal(structure.F, [7.0, 5.0, 0.0])
+    with pytest.raises(TypeError, match="must be an index or a name, got True"):
+        structure.index(True)
+
+
 def test_joints_have_names():
     M, C, K = matrices(3)
     assert fj.Structure(M, C, K, [ONE, ONE]).joint_names == ("joint_1", "joint_2")

@@ -1,4 +1,9 @@
+import io
+import os
 import re
+import threading
+import warnings
+import zipfile
 
 import jax
 import numpy as np
@@ -9,6 +14,7 @@ import scipy.sparse
 import fractaljax as fj
 from fractaljax.__main__ import main
 from fractaljax.mechanism.structure import load
+from fractaljax.mechanism.structure_file import _npz
 from structures import matrices, two_joints
 
 JOINT = """
@@ -49,6 +55,30 @@ def folder(tmp_path):
     scipy.io.mmwrite(tmp_path / "F.mtx", np.array([[1.0], [2.0], [3.0]]))
     scipy.io.mmwrite(tmp_path / "complex.mtx", 1j * K)
     scipy.io.mmwrite(tmp_path / "huge.mtx", scipy.sparse.eye_array(100_000).tocoo())
+    with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("M.npy", b"")
+    bomb = (tmp_path / "bomb.npz").read_bytes()
+    place = bomb.index(b"PK\x01\x02") + 24  # of the size in the directory
+    size = (256_000_000).to_bytes(4, "little")
+    (tmp_path / "bomb.npz").write_bytes(bomb[:place] + size + bomb[place + 4 :])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the name twice
+        with zipfile.ZipFile(tmp_path / "twice.npz", "w") as file:
+            file.writestr("M.npy", b"")
+            file.writestr("M.npy", b"")
+    for name, X in {"complex": 1j * M, "text": np.array(["a"]), "scalar": np.array(1.0)}.items():
+        np.savez(tmp_path / f"{name}.npz", M=X, K=K)
+    whole = bytearray((tmp_path / "two.npz").read_bytes())
+    (tmp_path / "cut.npz").write_bytes(whole[:-50])
+    for mark, flags in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        whole[whole.index(mark) + flags] |= 1
+    (tmp_path / "encrypted.npz").write_bytes(whole)
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": "<f8", "fortran_order": False, "shape": (10**6, 10**6)}
+    )
+    with zipfile.ZipFile(tmp_path / "liar.npz", "w") as file:
+        file.writestr("M.npy", header.getvalue())
     (tmp_path / "no.npz").write_text("hello")
     (tmp_path / "no.mtx").write_text("hello")
     return tmp_path
@@ -71,6 +101,60 @@ def test_matrices_from_every_kind_of_file(folder):
         'matrices = "two.npz"\nC = "C.mtx"\nF = {x = 1.0, y = 2.0, 2 = 3}',
     ]:
         equal(fj.Structure.load(written(folder, text)), expected)
+
+
+def test_names_that_are_numerals_are_names(folder):
+    path = folder / "brake.toml"
+    joints = JOINT.replace('["x", "y"]', '["2", "0"]').replace('"z"', '"1"')
+    text = '[structure]\nmatrices = "two.npz"\n'
+    path.write_text(f'{text}names = ["2", "0", "1"]\nF = {{"0" = 500, 2 = 7}}\n{joints}')
+    structure = fj.Structure.load(path)
+    np.testing.assert_array_equal(structure.F, [7.0, 500.0, 0.0])
+    path.write_text(f"{text}F = {{0 = 500}}\n[joints]\n")
+    np.testing.assert_array_equal(fj.Structure.load(path).F, [500.0, 0.0, 0.0])
+
+
+def test_a_pipe_is_read_once(tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    for scene in (fj.brake_scene(), fj.brake_scene().replace(D=2.5)):
+        writer = threading.Thread(target=pipe.write_text, args=[scene.to_toml()])
+        writer.start()
+        assert load(pipe).to_toml() == scene.to_toml()
+        writer.join()
+
+
+def test_endless_and_large_files_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="/dev/zero: the file is larger than 10 MB"):
+        load("/dev/zero")
+    with open(tmp_path / "large.toml", "wb") as file:
+        file.truncate(10**12)
+    for read in (load, fj.Scene.load, fj.Structure.load):
+        with pytest.raises(ValueError, match=r"large.toml: the file is larger than 10 MB"):
+            read(tmp_path / "large.toml")
+
+
+def test_arrays_of_any_order_of_bytes(folder):
+    M, _, K = matrices(3)
+    np.savez(folder / "big.npz", M=M.astype(">f8"), K=np.asfortranarray(K))
+    structure = fj.Structure.load(written(folder, 'matrices = "big.npz"'))
+    np.testing.assert_array_equal(structure.K, K)
+
+
+def test_no_flipped_byte_of_a_npz_file_passes_unnoticed(folder):
+    whole = (folder / "two.npz").read_bytes()
+    M, _, K = matrices(3)
+    for place in np.random.default_rng(0).integers(len(whole), size=150):
+        damaged = bytearray(whole)
+        damaged[place] ^= 1 << (place % 8)
+        (folder / "damaged.npz").write_bytes(damaged)
+        try:
+            found = _npz(folder / "damaged.npz")
+        except ValueError as error:
+            assert "\n" not in str(error)
+            continue
+        np.testing.assert_array_equal(found["M"], M)
+        np.testing.assert_array_equal(found["K"], K)
 
 
 def test_damping_from_numbers(folder):
@@ -153,6 +237,26 @@ BAD = [
     ('M = "missing.mtx"\nK = "K.mtx"', "missing.mtx"),
     ('matrices = "missing.npz"', "missing.npz"),
     ('matrices = "all.npz"\nM =', "not a TOML file"),
+]
+
+BAD += [
+    ('matrices = "two.npz"\nF = {x = 1, 0 = 2}', "F gives one degree of freedom twice"),
+    ('matrices = "two.npz"\nF = {0 = 1, 00 = 2}', "[structure] F gives the degree of freedom 0"),
+    ('matrices = "two.npz"\nF = {"\u0660" = 1}', "unknown degree of freedom '\u0660'"),
+    ('matrices = "two.npz"\nF = [true, 2, 3]', "F must be an array of real numbers"),
+    (f'matrices = "two.npz"\nF = [1{"0" * 400}, 2, 3]', "F must be an array of real numbers"),
+    (f'matrices = "two.npz"\nF = {"[" * 30}{"]" * 30}', "nested too deeply"),
+    (f'matrices = "two.npz"\nF = {"[" * 9000}{"]" * 9000}', "nested too deeply"),
+    ('matrices = "/dev/zero"', "larger than"),
+    ('M = "/dev/zero"\nK = "K.mtx"', "zero is not a Matrix Market file"),
+    ('matrices = "encrypted.npz"', "encrypted.npz: M is encrypted"),
+    ('matrices = "bomb.npz"', "bomb.npz: M has 256000000 bytes; reduce the model"),
+    ('matrices = "twice.npz"', "twice.npz: it holds an array twice"),
+    ('matrices = "complex.npz"', "complex.npz: M must be an array of real numbers, got complex128"),
+    ('matrices = "text.npz"', "text.npz: M must be an array of real numbers, got <U1"),
+    ('matrices = "liar.npz"', "liar.npz: M is damaged: it has not as many numbers as it says"),
+    ('matrices = "cut.npz"', "cut.npz is not a .npz file, or damaged"),
+    ('matrices = "scalar.npz"', "M must be a square matrix, got shape ()"),
 ]
 
 GOOD = 'matrices = "all.npz"'
