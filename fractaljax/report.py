@@ -96,8 +96,8 @@ def structure_table(structure: Structure, friction_slope: bool = True) -> str:
     if not jnp.isfinite(modes.eigenvalues).all():
         raise ValueError(f"M, C and K have no eigenvalues in the range of {modes.margin.dtype}")
     unstable, unresolved = modes.unstable(), modes.unresolved()
-    marked = unstable + unresolved
-    least = modes.least_damped(_LEAST_DAMPED + len(marked))
+    marked = unstable + unresolved[:_LEAST_DAMPED]
+    least = modes.least_damped(_LEAST_DAMPED + len(unstable) + len(unresolved))
     listed = marked + [mode for mode in least if mode.growth_rate < -mode.resolution]
     whole = {
         "degrees of freedom": f"{structure.n}",
@@ -118,7 +118,7 @@ def structure_table(structure: Structure, friction_slope: bool = True) -> str:
             "damping ratio": [f"{mode.damping_ratio:+.6g}" for mode in listed],
             "moves most": [f"{mode.largest}" for mode in listed],
             "": ["unstable"] * len(unstable)
-            + [f"unresolved to +-{mode.resolution:.1g}" for mode in unresolved]
+            + [f"unresolved to +-{mode.resolution:.1g}" for mode in marked[len(unstable) :]]
             + [""] * (len(listed) - len(marked)),
         }
         titles = [f"mode {i}" for i in range(1, len(listed) + 1)]

@@ -118,6 +118,12 @@ def assemble(structure: Structure, friction_slope: bool = True):
 
     **Raises:** `ValueError` for a batch, and where a slope needs F and there is none.
     """
+    M, C, K, _ = _attached(structure, friction_slope)
+    return M, C, K
+
+
+def _attached(structure: Structure, friction_slope: bool):
+    """As `assemble`, and what rounding of the equilibrium can make of C (n, n), if anything."""
     require_single(structure)
     C, K = structure.C, structure.K
     joints = []
@@ -129,26 +135,40 @@ def assemble(structure: Structure, friction_slope: bool = True):
         K = K - mu * K_n * jnp.outer(t, n) + mu * K_t * jnp.outer(n, t)
         joints.append((joint, K_n, K_t, t, n))
     sloping = [joint for joint in joints if joint[0].friction.velocity_dependent]
-    if flag("friction_slope", friction_slope) and sloping:
-        x_0 = _equilibrium(structure.F, K)
-        for joint, K_n, K_t, t, n in sloping:
-            slope = joint.friction.slope(joint.V)
-            C = C + slope * K_n * (n @ x_0) * jnp.outer(t, t)
-            C = C - slope * K_t * (t @ x_0) * jnp.outer(n, n)
-    return structure.M, C, K
+    if not (flag("friction_slope", friction_slope) and sloping):
+        return structure.M, C, K, None
+    directions = jnp.stack([d for *_, t, n in sloping for d in (t, n)])
+    along, errors = _equilibrium(structure.F, K, directions)
+    doubt = jnp.zeros_like(C)
+    for i, (joint, K_n, K_t, t, n) in enumerate(sloping):
+        slope = joint.friction.slope(joint.V)
+        tt, nn = jnp.outer(t, t), jnp.outer(n, n)
+        C = C + slope * K_n * along[2 * i + 1] * tt - slope * K_t * along[2 * i] * nn
+        error = K_n * errors[2 * i + 1] * jnp.abs(tt) + K_t * errors[2 * i] * jnp.abs(nn)
+        doubt = doubt + jnp.abs(slope) * error
+    return structure.M, C, K, jax.lax.stop_gradient(doubt)
 
 
-def _equilibrium(F, K) -> jax.Array:
-    """Eq. 40: the displacements x_0 (n,) [m] with K x_0 = F, the joints being in K."""
+def _equilibrium(F, K, directions) -> tuple[jax.Array, jax.Array]:
+    """Eq. 40: d.x_0 [m] for each of the `directions` (k, n), and what rounding can make of it.
+
+    x_0 (n,) solves K x_0 = F, the joints being in K.
+    """
     if F is None:
         raise ValueError(
             "F must be given where friction depends on the sliding velocity, for its slope acts "
             "through the static equilibrium; or leave the slope out with friction_slope=False"
         )
     x_0 = jnp.linalg.solve(K, F)
-    # |dx|/|x| <= eps |K| |x|/|F|: what rounding of K can make of x_0.
-    spread = jnp.finfo(K.dtype).eps * jnp.abs(K).max() * jnp.abs(x_0).max()
-    return eqx.error_if(x_0, ~(spread <= 0.01 * jnp.abs(F).max()), UNSUPPORTED)
+    along = directions @ x_0
+    # K dx = -dK x_0, where |dK| <= eps |K| entry by entry: d.dx = -(K^-T d).(dK x_0).
+    K, x_0, F, size = jax.lax.stop_gradient((K, jnp.abs(x_0), F, jnp.abs(along)))
+    eps = jnp.finfo(K.dtype).eps
+    through = jnp.abs(jnp.linalg.solve(K.T, directions.T))
+    errors = _ROUNDING * eps * (jnp.abs(K) @ x_0) @ through
+    supported = eps * jnp.abs(K).max() * x_0.max() <= 0.01 * jnp.abs(F).max()
+    supported |= errors.max() <= 0.01 * size.max()
+    return eqx.error_if(along, ~supported, UNSUPPORTED), errors
 
 
 UNSUPPORTED = (
@@ -164,13 +184,14 @@ class _Scaled(NamedTuple):
     C: jax.Array  # (n, n)
     K: jax.Array  # (n, n), like C of order one where it is largest
     units: jax.Array  # (n,) of the degrees of freedom
+    doubt: jax.Array | None  # (n, n), of C
     omega: jax.Array  # [rad/s]
 
 
 def _scaled(structure: Structure, friction_slope: bool) -> _Scaled:
-    M, C, K = assemble(structure, friction_slope)
+    M, C, K, doubt = _attached(structure, friction_slope)
     units = _power_of_two(-_half_exponent(jnp.diagonal(M)), K.dtype)
-    M, C, K = (X * units[:, None] * units[None] for X in (M, C, K))
+    M, C, K, doubt = jax.tree.map(lambda X: X * units[:, None] * units[None], (M, C, K, doubt))
     stiffness, damping = _row_sum(K), _row_sum(C)
     exponent = jnp.maximum(
         jnp.where(stiffness > 0, _half_exponent(stiffness), _LEAST),
@@ -178,7 +199,8 @@ def _scaled(structure: Structure, friction_slope: bool) -> _Scaled:
     )
     # The eigenvalues do not depend on the unit of time.
     omega = _power_of_two(jnp.where(exponent > _LEAST, exponent, 0), K.dtype)
-    return _Scaled(M, C / omega, K / omega / omega, units, omega)
+    doubt = None if doubt is None else doubt / omega
+    return _Scaled(M, C / omega, K / omega / omega, units, doubt, omega)
 
 
 _LEAST = -2000  # below the exponent of any number
@@ -208,7 +230,7 @@ class _Modes(NamedTuple):
 
 
 @jax.custom_jvp
-def _modes(M, C, K) -> _Modes:
+def _modes(M, C, K, doubt) -> _Modes:
     z, X, Y = _lapack(M, C, K)
     eps = jnp.finfo(M.dtype).eps
     row, size = z[None], _size(z)[None]
@@ -222,13 +244,17 @@ def _modes(M, C, K) -> _Modes:
     # What is left of the problem, and what of that may be rounding: between all of the modes.
     left = -Y @ ((MX * row + CX) * row + KX)
     off = _size(left) + _ROUNDING * eps * (_size(Y) @ ((M_size * size + C_size) * size + K_size))
+    if doubt is not None:
+        off = off + _size(Y) @ (doubt @ _size(X) * size)
     z, error = _pairwise(z, jnp.diagonal(left), _shift(z, off))
     inertia = _size((Y.T * MX).sum(axis=0))
     stiffness = _ROUNDING * eps * (_size(Y.T) * K_size).sum(axis=0)
     force = (_size(Y.T) * _size(KX)).sum(axis=0)
     rigid = (size[0] ** 2 * inertia <= stiffness) & (force <= stiffness)
-    double = jnp.sqrt(stiffness / jnp.where(inertia > 0, inertia, 1))
-    error = jnp.where(rigid, jnp.minimum(double, error), error)
+    double = jnp.minimum(jnp.sqrt(stiffness / jnp.where(inertia > 0, inertia, 1)), error)
+    # Told from elastic modes by far; else it is one of those, lost in rounding.
+    rigid &= double < 0.01 * jnp.where(rigid | (size[0] < error), jnp.inf, size[0]).min()
+    error = jnp.where(rigid, double, error)
     return _Modes(z, X, Y, error + jnp.sqrt(jnp.finfo(M.dtype).tiny), rigid)
 
 
@@ -291,7 +317,7 @@ def _pairwise(z, correction, error):
 def _modes_jvp(primals, tangents):
     at = _modes(*primals)
     z, X, Y = at.z, at.X, at.Y
-    dM, dC, dK = (dA.astype(X.dtype) for dA in tangents)
+    dM, dC, dK = (dA.astype(X.dtype) for dA in tangents[:3])
     drawn = Y @ (dM @ X)
     P = -(drawn * z[None] ** 2 + Y @ (dC @ X) * z[None] + Y @ (dK @ X))
     # Of all lengths the vectors could take, the ones with w dv = 0, w and v being those of the
@@ -313,7 +339,7 @@ def _inverse(x, least) -> jax.Array:
 def growth_rate_of_structure(structure: Structure, friction_slope: bool) -> jax.Array:
     """Largest real part of the eigenvalues [1/s], a scalar: `growth_rate` of a structure."""
     scaled = _scaled(structure, friction_slope)
-    modes = _modes(scaled.M, scaled.C, scaled.K)
+    modes = _modes(scaled.M, scaled.C, scaled.K, scaled.doubt)
     # Sorting them would compile for as long as all the rest.
     real = jnp.where(modes.rigid, 0, modes.z.real)
     return scaled.omega * real[jnp.argmax(real)]
@@ -322,7 +348,7 @@ def growth_rate_of_structure(structure: Structure, friction_slope: bool) -> jax.
 def complex_modes(structure: Structure, friction_slope: bool) -> ComplexModes:
     """Every mode of a structure: its `stability`."""
     scaled = _scaled(structure, friction_slope)
-    z, X, _, error, rigid = _modes(scaled.M, scaled.C, scaled.K)
+    z, X, _, error, rigid = _modes(scaled.M, scaled.C, scaled.K, scaled.doubt)
     z = jnp.where(rigid, 0, z)
     order = jnp.lexsort((-z.imag, -z.real))
     z, x, error, rigid = z[order], (X.T * scaled.units[None])[order], error[order], rigid[order]
