@@ -300,9 +300,9 @@ def _shift(z, off):
     """(k,): how far an eigenvalue can be moved by errors `off` (k, k) between all of them."""
     both = jnp.sqrt(off) * jnp.sqrt(off.T)
     apart = _size(z[None] - z[:, None]) / 1.5
-    # Of [[0, e], [f, g]] they move by e f/g, and where they meet by sqrt(e f): twice either, for
-    # there may be more than two.
-    moved = 2 * both * jnp.where(both < apart, both / jnp.where(apart > 0, apart, 1), 1)
+    # Of [[0, e], [f, g]] they move by e f/g, and where they meet by sqrt(e f); of more than two,
+    # by more.
+    moved = 4 * both * jnp.where(both < apart, both / jnp.where(apart > 0, apart, 1), 1)
     return moved.sum(axis=1) - jnp.diagonal(moved) + jnp.diagonal(off)
 
 

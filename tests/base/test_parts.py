@@ -12,6 +12,7 @@ import fractaljax as fj
 from fractaljax.base.parts import (
     Part,
     concrete,
+    flag,
     leaf,
     number,
     ordered,
@@ -362,3 +363,11 @@ def test_what_is_known_stays_known_while_a_program_is_traced():
 
     known = []
     assert look(2.4) == 1.4 and known == [None, 1e-10, 1.4, 1.5]
+
+
+def test_flags_are_true_or_false():
+    for given in (True, np.True_):
+        assert flag("friction_slope", given) is True
+    for given in ("no", 0, 1, None, jnp.array(True), np.array([True])):
+        with pytest.raises(TypeError, match="friction_slope must be True or False, got"):
+            flag("friction_slope", given)

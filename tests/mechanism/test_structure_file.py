@@ -318,6 +318,44 @@ def test_the_command(tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    ("C", "K", "verdict"),
+    [
+        (0.1, 1e4, "0  (stable)"),
+        (0.0, 1e4, "0  (2 unresolved; else stable)"),
+        (-0.1, 1e4, "2  (it squeals)"),
+        (0.1, 0.0, "0  (2 eigenvalues 0 to +-0 1/s: rigid bodies; else stable)"),
+    ],
+)
+def test_the_verdict(tmp_path, capsys, C, K, verdict):
+    fj.Structure(np.eye(2), C * np.eye(2), K * np.diag([1, 1.1]), []).save(tmp_path / "s.toml")
+    assert main(["stability", str(tmp_path / "s.toml")]) == 0
+    shown = capsys.readouterr().out
+    assert f"unstable modes      {verdict}" in shown
+    assert shown.count("unresolved to") == (2 if "unresolved" in verdict else 0)
+
+
+def test_the_command_refuses_numbers_out_of_range(tmp_path, capsys):
+    joint = fj.Joint(fj.FixedContact(1.5e308, 1e5), fj.Coulomb(0.3), 0, 1)
+    fj.Structure(np.eye(2), None, 1e308 * np.eye(2), joint).save(tmp_path / "s.toml")
+    with pytest.raises(SystemExit) as stopped:
+        main(["stability", str(tmp_path / "s.toml")])
+    assert stopped.value.code == 2
+    out, error = capsys.readouterr()
+    assert out == ""
+    assert error == "fractaljax: K with the joints attached must be finite\n"
+
+
+def test_the_command_reads_a_pipe(tmp_path, capsys):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    writer = threading.Thread(target=pipe.write_text, args=[fj.brake_scene().to_toml()])
+    writer.start()
+    assert main(["stability", str(pipe)]) == 0
+    writer.join()
+    assert "it squeals" in capsys.readouterr().out
+
+
 def test_the_command_refuses_what_has_no_equilibrium(tmp_path, capsys):
     K = 1e6 * np.kron(np.eye(2), [[1, -1], [-1, 1]])
     joint = fj.Joint(fj.FixedContact(1e5, 5e4), fj.Stribeck(0.4, 0.2, 0.5), (0, 1), (2, 3), V=0.1)

@@ -532,6 +532,111 @@ def test_far_beyond_critical_damping():
     assert fj.growth_rate(structure) == pytest.approx(-1e-6, abs=1e-15 * 2e6)
 
 
+# Structures of widely differing stiffness, against many digits.
+
+
+def exact_eigenvalues(M, C, K):
+    """Of s^2 M + s C + K, as if the entries had no rounding error."""
+    n = len(M)
+    with mp.workdps(100):
+        M, C, K = (mp.matrix(np.asarray(X, float).tolist()) for X in (M, C, K))
+        A = mp.zeros(2 * n)
+        A[:n, n:], A[n:, :n], A[n:, n:] = mp.eye(n), -mp.inverse(M) * K, -mp.inverse(M) * C
+        return np.array([complex(s) for s in mp.eig(A, left=False, right=False)])
+
+
+def assert_resolved_or_said(structure):
+    """Every eigenvalue is right within its resolution; returns the modes and the exact ones."""
+    exact = exact_eigenvalues(*fj.assemble(structure))
+    modes = fj.stability(structure)
+    found, error = np.asarray(modes.eigenvalues), np.asarray(modes.resolutions)[:, None]
+    apart = np.abs(found[:, None] - exact[None])
+    pairs = scipy.optimize.linear_sum_assignment(apart / (np.abs(found)[:, None] + error))
+    assert (apart <= error)[pairs].all()
+    growing = exact.real[pairs[1]] > error[:, 0][pairs[0]]
+    assert bool(modes.unstable()) == growing.any()
+    rate = fj.growth_rate(structure)
+    np.testing.assert_allclose(rate, modes.growth_rate, rtol=1e-12, atol=float(modes.resolution))
+    return modes, exact
+
+
+@pytest.mark.parametrize("coupling", [0.0, 1e4])
+def test_a_stiff_part_elsewhere_hides_no_squeal(coupling):
+    K = np.diag([3.0e4, 3.1e4, 1e12]) + coupling * np.outer([1, 0, -1], [1, 0, -1])
+    joint = fj.Joint(fj.FixedContact(2e4, 1e4), fj.Coulomb(0.6), 0, 1)
+    structure = fj.Structure(np.diag([1.0, 1.0, 1e-8]), np.diag([0.1, 0.1, 1e-3]), K, joint)
+    modes, exact = assert_resolved_or_said(structure)
+    assert modes.growth_rate == pytest.approx(exact.real.max(), rel=1e-12)
+    assert len(modes.unstable()) == 1
+    assert modes.unresolved() == []
+    slope = jax.grad(lambda mu: fj.growth_rate(structure.replace(mu=mu)))(0.6)
+    ends = [
+        exact_eigenvalues(*fj.assemble(structure.replace(mu=mu))).real.max()
+        for mu in (0.6001, 0.5999)
+    ]
+    assert slope == pytest.approx((ends[0] - ends[1]) / 2e-4, rel=1e-6)
+
+
+def any_structure(rng):
+    """Three masses and springs over many decades: held or free, damped or not, with a joint."""
+    n, decades = 3, rng.choice([1.0, 5.0, 10.0])
+    m, k = 10 ** rng.uniform(-decades, decades, (2, n))
+    M, K = np.diag(m), np.zeros((n, n))
+    for i in range(n - 1):
+        K[i : i + 2, i : i + 2] += 1e4 * k[i] * np.array([[1, -1], [-1, 1]])
+    if rng.random() < 0.7:
+        K += 1e4 * np.diag(k * (rng.random(n) < 0.7))
+    each = np.sqrt(m * np.diag(K))
+    C = rng.choice([0.0, 1e-3, 1e-2]) * np.diag(each)
+    if rng.random() < 0.3:
+        C = C + 0.1 * rng.uniform() * np.sqrt(np.outer(each, each)) * (np.tri(n) - np.tri(n).T)
+    i, j = rng.permutation(n)[:2]
+    K_n = 10 ** rng.uniform(-2, 1) * np.sqrt(K[i, i] * K[j, j])
+    K += fj.assemble(
+        fj.Structure(
+            np.eye(n),
+            None,
+            np.zeros((n, n)),
+            fj.Joint(fj.FixedContact(K_n, 0.4 * K_n), fj.Coulomb(0.7), int(i), int(j)),
+        )
+    )[2] * (rng.random() < 0.6)
+    return fj.Structure(M, C, K, [])
+
+
+def test_any_structure_is_resolved_or_said_not_to_be():
+    rng = np.random.default_rng(0)
+    outcomes = []
+    for _ in range(20):
+        modes, exact = assert_resolved_or_said(any_structure(rng))
+        outcomes.append(len(modes.unstable()) - len(modes.unresolved()))
+        assert all(mode.resolution < 1e-3 * exact.real.max() for mode in modes.unstable())
+    assert min(outcomes) < 0 < max(outcomes)
+
+
+def test_what_float32_cannot_hold_is_unresolved():
+    Q = np.linalg.qr(np.random.default_rng(0).standard_normal((3, 3)))[0]
+    K = (Q * [1e2, 1e9, 1e14]) @ Q.T
+    arrays = np.eye(3), 1e-2 * np.eye(3), (K + K.T) / 2
+    modes = fj.stability(fj.Structure(*(X.astype(np.float32) for X in arrays), []))
+    assert modes.unstable() == []
+    assert modes.unresolved()
+    assert modes.resolution > 10.0
+    assert fj.stability(fj.Structure(*arrays, [])).unresolved() == []  # of float64
+    # Without the turn nothing is lost.
+    arrays = np.eye(3), 1e-2 * np.eye(3), np.diag([1e2, 1e9, 1e14])
+    modes = fj.stability(fj.Structure(*(X.astype(np.float32) for X in arrays), []))
+    np.testing.assert_allclose(np.sort(np.abs(modes.eigenvalues))[:2], 10.0, rtol=1e-6)
+
+
+def test_rounding_of_the_equilibrium_counts_in_the_resolution():
+    """The slope of friction acts through K x_0 = F, of which a stiff spring leaves few digits."""
+    K = 1e13 * np.outer([1, -1], [1, -1]) + np.diag([1e3, 1.1e3])
+    joint = fj.Joint(fj.FixedContact(20.0, 10.0), fj.Stribeck(0.4, 0.2, 0.5), 0, 1, V=0.1)
+    structure = fj.Structure(np.eye(2), 0.1 * np.eye(2), K, joint, F=[30.0, -30.0])
+    coulomb = structure.replace(friction=fj.Coulomb(0.35))
+    assert fj.stability(structure).resolutions.max() > 2 * fj.stability(coulomb).resolutions.max()
+
+
 # Precision, units, batches, and what is not evaluated.
 
 
@@ -611,6 +716,14 @@ def test_what_a_structure_does_not_need_is_not_there():
     # Left vectors are: rigid-body modes and the errors of eigenvalues are told by them.
     for absent in (" log ", " exp ", " sort["):
         assert absent not in operations(coulomb, True)
+
+
+@pytest.mark.parametrize("question", [fj.growth_rate, fj.stability, fj.assemble])
+def test_friction_slope_is_true_or_false(question):
+    structure = two_joints(4)
+    for wrong in ("no", 0, None):
+        with pytest.raises(TypeError, match="friction_slope must be True or False, got"):
+            question(structure, wrong)
 
 
 def test_slope_without_force():

@@ -798,3 +798,25 @@ def test_import_loads_no_heavy_library():
     code = f"import sys, fractaljax; print([x for x in {heavy!r} if x in sys.modules])"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    "question",
+    [
+        fj.growth_rate,
+        fj.stability,
+        fj.critical_friction,
+        fj.margin,
+        functools.partial(fj.hopf_boundary, x=("kappa", 0, 1), y=("mu", 0.1, 0.2)),
+        functools.partial(fj.design, progress=False),
+        lambda scene, friction_slope: fj.constraints.DampingRatio(
+            0.01, friction_slope=friction_slope
+        ),
+        lambda scene, friction_slope: fj.constraints.Frequency(1.0, friction_slope=friction_slope),
+    ],
+)
+def test_friction_slope_is_true_or_false(question):
+    brake = fj.brake_scene()
+    for scene in (brake, brake.replace(friction=fj.Coulomb(0.4))):
+        with pytest.raises(TypeError, match="friction_slope must be True or False, got 'no'"):
+            question(scene, friction_slope="no")
