@@ -78,7 +78,7 @@ def read_matrix_market(file, largest: int) -> np.ndarray:
             matrix[j, i] = mirrored.conjugate() if symmetry == "hermitian" else mirrored
     if lines.filled() is not None:
         lines.refuse(f"must not be there, after all of {count} numbers")
-    return matrix if matrix.imag.any() else matrix.real.copy()
+    return matrix if np.imag(matrix).any() else np.real(matrix).copy()
 
 
 class _Lines:

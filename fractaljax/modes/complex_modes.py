@@ -7,7 +7,7 @@ distinct eigenvalues, ds = w dA v for left and right vectors w and v with w v = 
 vectors themselves are given as well, so that derivatives of every order are right.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -326,7 +326,7 @@ def _modes_jvp(primals, tangents):
     apart = z[None] - z[:, None]
     least = jnp.finfo(z.dtype).eps * (_size(z)[None] + _size(z)[:, None])
     turn = P * _inverse(apart + same, least) * (1 - same)
-    none = jnp.zeros_like(at.error), np.zeros(at.rigid.shape, jax.dtypes.float0)
+    none: Any = jnp.zeros_like(at.error), np.zeros(at.rigid.shape, jax.dtypes.float0)
     return at, _Modes(jnp.diagonal(P), X @ turn, -(turn + drawn * z[None]) @ Y, *none)
 
 

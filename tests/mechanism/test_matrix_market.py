@@ -118,10 +118,9 @@ def test_blank_lines_and_remarks():
 
 
 def test_compressed_files(tmp_path):
-    for suffix, opened in ((".gz", gzip.open), (".bz2", bz2.open)):
+    for suffix, compress in ((".gz", gzip.compress), (".bz2", bz2.compress)):
         path = tmp_path / f"K.mtx{suffix}"
-        with opened(path, "wb") as file:
-            file.write(f"{ONE}3.0\n".encode())
+        path.write_bytes(compress(f"{ONE}3.0\n".encode()))
         assert _matrix_market(path) == 3
         path.write_bytes(path.read_bytes()[:-9])
         with pytest.raises(ValueError, match=f"K.mtx{suffix} is damaged"):

@@ -120,7 +120,9 @@ def test_a_pipe_is_read_once(tmp_path):
     for scene in (fj.brake_scene(), fj.brake_scene().replace(D=2.5)):
         writer = threading.Thread(target=pipe.write_text, args=[scene.to_toml()])
         writer.start()
-        assert load(pipe).to_toml() == scene.to_toml()
+        found = load(pipe)
+        assert isinstance(found, fj.Scene)
+        assert found.to_toml() == scene.to_toml()
         writer.join()
 
 

@@ -535,7 +535,7 @@ def test_far_beyond_critical_damping():
 # Structures of widely differing stiffness, against many digits.
 
 
-def exact_eigenvalues(M, C, K):
+def exact_eigenvalues(M, C, K) -> Any:
     """Of s^2 M + s C + K, as if the entries had no rounding error."""
     n = len(M)
     with mp.workdps(100):
@@ -613,18 +613,22 @@ def test_any_structure_is_resolved_or_said_not_to_be():
     assert min(outcomes) < 0 < max(outcomes)
 
 
+def single(M, C, K):
+    return fj.Structure(M.astype(np.float32), C.astype(np.float32), K.astype(np.float32), [])
+
+
 def test_what_float32_cannot_hold_is_unresolved():
     Q = np.linalg.qr(np.random.default_rng(0).standard_normal((3, 3)))[0]
     K = (Q * [1e2, 1e9, 1e14]) @ Q.T
     arrays = np.eye(3), 1e-2 * np.eye(3), (K + K.T) / 2
-    modes = fj.stability(fj.Structure(*(X.astype(np.float32) for X in arrays), []))
+    modes = fj.stability(single(*arrays))
     assert modes.unstable() == []
     assert modes.unresolved()
     assert modes.resolution > 10.0
     assert fj.stability(fj.Structure(*arrays, [])).unresolved() == []  # of float64
     # Without the turn nothing is lost.
     arrays = np.eye(3), 1e-2 * np.eye(3), np.diag([1e2, 1e9, 1e14])
-    modes = fj.stability(fj.Structure(*(X.astype(np.float32) for X in arrays), []))
+    modes = fj.stability(single(*arrays))
     np.testing.assert_allclose(np.sort(np.abs(modes.eigenvalues))[:2], 10.0, rtol=1e-6)
 
 
