@@ -1,3 +1,5 @@
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -59,7 +61,7 @@ def test_forces_by_name():
 
 def test_forces_and_joints_that_name_one_degree_of_freedom_twice_are_refused():
     M, C, K = matrices(3)
-    named = {"names": ("x", "y", "z")}
+    named: Any = {"names": ("x", "y", "z")}
     twice = "F gives one degree of freedom twice, as"
     refused(f"{twice} 'x' and as 0", M, C, K, ONE, F={"x": 1.0, 0: 2.0}, **named)
     refused(f"{twice} 2 and as 'z'", M, C, K, ONE, F={np.int64(2): 1.0, "z": 2.0}, **named)
