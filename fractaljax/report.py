@@ -3,6 +3,7 @@
 import math
 
 import jax.numpy as jnp
+import numpy as np
 
 from .mechanism.contact import Regime
 from .mechanism.quantities import sliding_friction
@@ -10,11 +11,12 @@ from .mechanism.scene import Scene, stiffness
 from .mechanism.structure import Joint, Structure
 from .modes.complex_modes import UNSUPPORTED, assemble
 from .modes.critical_friction import critical_friction
-from .modes.stability import stability
+from .modes.stability import Stability, require_computable, stability
 from .motion.cycle import CycleResult, LimitCycle
 from .surface.roughness import roughness
 
 _ABSENT = "-"
+_ROUNDING = 1e-14  # of the largest eigenvalue: growth rates below it have no sign
 _LEAST_DAMPED = 10  # stable modes of a structure that its table lists
 _MODES = {"+": "slips, dx/dt < V", "-": "slips, dx/dt > V", "stick": "sticks"}
 
@@ -58,25 +60,54 @@ def scene_rows(
 
 
 def stability_table(scene: Scene, friction_slope: bool = True) -> str:
-    """The rows of one scene, its verdict, and every eigenvalue."""
+    """The rows of one scene, its verdict, every eigenvalue, and a remark on its friction.
+
+    **Raises:** `ValueError` if the growth rate is out of what can be computed.
+    """
+    require_computable(scene, friction_slope)
     modes = stability(scene, friction_slope)
     rows = scene_rows(scene, friction_slope) | _verdict(modes)
     critical = critical_friction(scene, friction_slope)
     rows |= {
         "margin": f"{modes.margin:+.6g}",
         "friction at V": f"{sliding_friction(scene):.6g}",
-        "critical friction": f"{critical:.6g}" if math.isfinite(critical) else "none",
+        "critical friction": "none" if math.isinf(critical) else f"{critical:.6g}",
     }
     rows |= {
         f"eigenvalue {i} [1/s]": f"{s.real:+.6g} {s.imag:+.6g}i"
         for i, s in enumerate(modes.eigenvalues.tolist(), start=1)
     }
-    return table([""], [rows])
+    return "\n".join([table([""], [rows]), *friction_remark(scene, scene.oscillator.V)])
 
 
-def _verdict(modes) -> dict[str, str]:
-    verdict = "it squeals" if modes.growth_rate > 0 else "stable"
-    return {"growth rate [1/s]": f"{modes.growth_rate:+.6g}  ({verdict})"}
+def _verdict(modes: Stability) -> dict[str, str]:
+    growth, margin = float(modes.growth_rate), float(modes.margin)
+    growth, rounding = growth + 0.0, _ROUNDING * float(jnp.abs(modes.eigenvalues).max())
+    verdict = "it squeals" if growth > 0 else "stable"
+    if abs(growth) <= rounding or growth * margin > 0:
+        # Beside heavy damping or without any, rounding can decide on the sign of the growth rate;
+        # that of the margin, if it has one, is right.
+        verdict = "0 to rounding: it neither grows nor dies out"
+        if margin != 0:
+            verdict = f"0 to rounding; {'it squeals' if margin < 0 else 'stable'} by its margin"
+    return {"growth rate [1/s]": f"{growth:+.6g}  ({verdict})"}
+
+
+def friction_remark(scene: Scene, speed) -> list[str]:
+    """A line where a sliding speed [m/s] is one at which friction exceeds mu_s, else none.
+
+    Speeds and quantities of the scene may be arrays of one shape: the worst of them is shown.
+    """
+    law = scene.friction
+    shown = np.broadcast_arrays(*map(np.asarray, (speed, law.coefficient(speed), law.mu_s)))
+    speeds, mu, static = (values.ravel() for values in shown)
+    worst = int((mu / static).argmax())
+    if not mu[worst] > static[worst] * (1 + _ROUNDING):
+        return []
+    return [
+        f"remark: at a sliding speed of {speeds[worst]:.6g} m/s the friction law gives "
+        f"{mu[worst]:.6g}, above mu_s = {static[worst]:.6g}: it is not meant for such speeds"
+    ]
 
 
 def structure_table(structure: Structure, friction_slope: bool = True) -> str:
@@ -188,6 +219,8 @@ def cycle_table(scene: Scene, cycle: LimitCycle) -> str:
     switches = [] if regularised else cycle.switches()
     if switches:
         tables.append(_switching(switches, cycle.period))
+    relative = scene.oscillator.V - jnp.stack([cycle.velocity_min, cycle.velocity_max])
+    tables += friction_remark(scene, jnp.abs(relative).max())
     return "\n\n".join(tables)
 
 

@@ -30,14 +30,15 @@ def number(
 
     **Raises:** `TypeError` if `value` is not real and numeric; `ValueError` as said.
     """
-    if isinstance(value, (bool, str, bytes)) or value is None:
+    if isinstance(value, (bool, np.bool_, str, bytes, np.ma.MaskedArray)) or value is None:
         raise TypeError(f"{name} must be a number, got {value!r}")
     try:
         dtype = jnp.result_type(value)
         if not (jnp.issubdtype(dtype, jnp.floating) or jnp.issubdtype(dtype, jnp.integer)):
             raise TypeError
         # An explicit dtype also strips weak types, which would compile every caller twice.
-        is_float_array = hasattr(value, "dtype") and jnp.issubdtype(dtype, jnp.floating)
+        # Half precision, which no law here survives, counts as a plain number.
+        is_float_array = hasattr(value, "dtype") and dtype in (jnp.float32, jnp.float64)
         traced = isinstance(value, jax.core.Tracer)
         # A value that is known while a program is traced stays known.
         with contextlib.nullcontext() if traced else jax.ensure_compile_time_eval():
@@ -69,9 +70,9 @@ def number(
 
 
 def flag(name: str, value: Any) -> bool:
-    """Return `value` as a bool.
+    """Return `value` as a bool, or say that it is none.
 
-    **Raises:** `TypeError` for anything but True and False, Python's or NumPy's.
+    **Raises:** `TypeError` unless it is True or False, of Python or of NumPy.
     """
     if not isinstance(value, (bool, np.bool_)):
         raise TypeError(f"{name} must be True or False, got {value!r}")
@@ -159,13 +160,16 @@ def leaf(part: Part, path: tuple[str, ...]) -> Any:
 
 
 def rebuild(part: Part, changes: Mapping[str, Any]) -> Any:
-    """Construct `part` anew, checks included, with named quantities changed wherever they live."""
+    """Construct `part` anew, checks included, with named quantities changed wherever they live.
+
+    Those inside a part that is itself among the changes are changed in the new one.
+    """
     arguments, changed = {}, False
     for field in dataclasses.fields(part):
         old = getattr(part, field.name)
         new = changes.get(field.name, old)
-        if new is old and isinstance(old, Part):
-            new = rebuild(old, changes)
+        if isinstance(new, Part):
+            new = rebuild(new, changes)
         changed |= new is not old
         arguments[field.name] = new
     return type(part)(**arguments) if changed else part

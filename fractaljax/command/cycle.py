@@ -32,10 +32,12 @@ def add_cycle(commands) -> None:
 def _run(arguments) -> int:
     """Find the limit cycle that the motion ends in; write cycle.png and cycle.csv."""
     from .. import plot
+    from ..modes.stability import require_computable
     from ..motion.limit_cycle import CycleResult, limit_cycle
     from ..report import cycle_table
 
     scene = load_scene(arguments)
+    require_computable(scene)
     with output(arguments.out) as write:
         cycle = limit_cycle(
             scene,

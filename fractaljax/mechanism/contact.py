@@ -16,7 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..base.parts import Part, Record, number, quantity
+from ..base.parts import Part, Record, number, ordered, quantity
 from ..base.singular import boxcox, exp_or_inf, positive_cbrt
 from ..surface.surfaces import Surface
 from .materials import Material
@@ -186,8 +186,11 @@ def tangential_stiffness(E, nu, slip_ratio: jax.Array, root_area_moment: jax.Arr
 
 
 def dimensionless_normal_stiffness(D, A_r, a_e) -> jax.Array:
-    """Eq. 31: K_n* = K_n/(E sqrt(A_a)) from A_r* = A_r/A_a and a_e* = a_e/A_a; any shape."""
-    moment = _root_area_moment_of_real_area(D, A_r, a_e)
+    """Eq. 31: K_n* = K_n/(E sqrt(A_a)) from A_r* = A_r/A_a and a_e* = a_e/A_a; any shape.
+
+    **Raises:** `ValueError` unless 2 < D < 3, A_r > 0 and a_e > 0.
+    """
+    D, moment = _root_area_moment_of_real_area(D, A_r, a_e)
     return normal_stiffness(D, 1.0, moment)
 
 
@@ -195,14 +198,21 @@ def dimensionless_tangential_stiffness(D, nu, A_r, a_e, slip_ratio) -> jax.Array
     """Eq. 37: K_t* = K_t/(E sqrt(A_a)), `slip_ratio` being Q_e*/(mu P*); any shape.
 
     The source's text normalises by the shear modulus; its equation, followed here, by E.
+
+    **Raises:** `ValueError` unless 2 < D < 3, 0 <= nu <= 0.5, A_r > 0, a_e > 0 and `slip_ratio` is
+    finite.
     """
-    moment = _root_area_moment_of_real_area(D, A_r, a_e)
+    nu = number("nu", nu, at_least=0, at_most=0.5)
+    slip_ratio = number("slip_ratio", slip_ratio)
+    _, moment = _root_area_moment_of_real_area(D, A_r, a_e)
     return tangential_stiffness(1.0, nu, slip_ratio, moment)
 
 
 def _root_area_moment_of_real_area(D, A_r, a_e):
+    D = number("D", D, above=2, below=3)
+    A_r, a_e = number("A_r", A_r, above=0), number("a_e", a_e, above=0)
     log_a_l, log_a_e = jnp.log((3 - D) / (D - 1) * A_r), jnp.log(a_e)  # Eq. 28
-    return area_moment(0.5, D, log_a_e, log_a_l - log_a_e)
+    return D, area_moment(0.5, D, log_a_e, log_a_l - log_a_e)
 
 
 class _Joint(eqx.Module):
@@ -245,10 +255,10 @@ def contact_state(surface: Surface, material: Material, P, *, mu_s, mu_m) -> Con
 
     `mu_m` lowers the pressure at yield (Eq. 19), `mu_s` bounds the tangential load (Eq. 35).
 
-    **Raises:** `ValueError` unless P > 0, mu_s > 0 and 0 <= mu_m <= 0.9.
+    **Raises:** `ValueError` unless P > 0, mu_s > 0, 0 <= mu_m <= 0.9 and mu_m <= mu_s.
     """
-    mu_s = number("mu_s", mu_s, above=0)
     mu_m = number("mu_m", mu_m, at_least=0, at_most=MU_M_MAX)
+    mu_s = ordered("mu_s", number("mu_s", mu_s, above=0), "mu_m", mu_m)
     return FractalContact(surface, material, P).state(mu_s, mu_m)
 
 

@@ -67,7 +67,8 @@ class Coulomb(Friction):
 class Stribeck(Friction):
     """Friction that falls from mu_s at rest to its minimum mu_m at v_m and rises beyond (Eq. 38).
 
-    mu(v) = mu_s sgn(v) - 3 (mu_s - mu_m)/(2 v_m) v + (mu_s - mu_m)/(2 v_m^3) v^3.
+    mu(v) = mu_s sgn(v) - 3 (mu_s - mu_m)/(2 v_m) v + (mu_s - mu_m)/(2 v_m^3) v^3. Beyond
+    sqrt(3) v_m it exceeds mu_s, and grows without bound: a law for speeds up to about v_m.
 
     **Raises:** `ValueError` unless mu_s > 0, 0 <= mu_m <= mu_s and v_m > 0.
     """

@@ -84,13 +84,22 @@ def linearise(
 
 
 def dimensionless(lin: Linearised) -> tuple[jax.Array, Linearised]:
-    """omega = sqrt(a + b), and the system in its units: no power leaves the range of a float32."""
+    """omega = sqrt(a + b), and the system in its units: no power leaves the range of a float32.
+
+    omega is NaN, and so is what follows from it, where rounding leaves no sign to be trusted:
+    damping above 1/sqrt(eps) omega (6.7e7 omega; 2.9e3 omega in float32), coupling above
+    omega^4/eps, and numbers that overflowed.
+    """
     omega = jnp.sqrt(lin.a + lin.b)
     square = 1 / omega**2  # omega^4 stays in the range, but the square of it in a derivative not
+    damping = jnp.maximum(jnp.abs(lin.c_1), jnp.abs(lin.c_2)) / omega
+    coupling = lin.g * square * square
+    most = float(jnp.finfo(omega.dtype).eps) ** -0.5
+    omega = jnp.where((damping < most) & (coupling < most**2), omega, jnp.nan)
     return omega, Linearised(
         a=lin.a / omega**2,
         b=lin.b / omega**2,
         c_1=lin.c_1 / omega,
         c_2=lin.c_2 / omega,
-        g=lin.g * square * square,
+        g=coupling,
     )

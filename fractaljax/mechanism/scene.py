@@ -60,16 +60,18 @@ class Scene(Part):
     def replace(self, **changes: Any) -> "Scene":
         """A scene with named quantities changed wherever they live: `replace(D=2.5, mu_s=0.3)`.
 
-        Whole parts have names as well: `replace(friction=Coulomb(0.4))`.
+        Whole parts have names as well: `replace(friction=Coulomb(0.4))`. A quantity given beside
+        the part that holds it is changed in the new part.
 
-        **Raises:** `ValueError` for a name the scene does not have, listing those it has, and for
-        values outside their domain.
+        **Raises:** `ValueError` for a name the scene does not have then, listing those it has, and
+        for values outside their domain.
         """
-        known = quantities(self)
+        scene = rebuild(self, changes)
+        known = quantities(scene)
         for name in changes:
             if name not in known:
                 raise ValueError(f"scene has no quantity {name!r}; it has {', '.join(known)}")
-        return rebuild(self, changes)
+        return scene
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> "Scene":

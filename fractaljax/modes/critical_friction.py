@@ -69,7 +69,7 @@ def critical_friction(scene: Scene, friction_slope: bool = True) -> jax.Array:
     joint answers as it does in `stiffness`: K_t of a fractal joint depends on mu_s, its critical
     area on mu_m. The first friction that squeals is looked for from 1/500 to 500 times that of
     the scene, as far as Eq. 19 goes (mu_m <= 0.9): 0 if the least squeals already, infinite if
-    none does. To hold the stiffness, `scene.replace(contact=FixedContact(*stiffness(scene)))`.
+    none does, NaN where it is out of what can be computed. To hold the stiffness, `scene.replace(contact=FixedContact(*stiffness(scene)))`.
 
     The derivative is that of the root, and 0 where it is 0 or infinite.
 
@@ -79,8 +79,8 @@ def critical_friction(scene: Scene, friction_slope: bool = True) -> jax.Array:
     sloping = flag("friction_slope", friction_slope) and scene.friction.velocity_dependent
     if sloping or scene.contact.fractal:
         factor = _first_factor(scene, friction_slope)
-        found = factor < jnp.inf
-        return jnp.where(found, sliding_friction(scene) * jnp.where(found, factor, 1), jnp.inf)
+        none = factor == jnp.inf
+        return jnp.where(none, jnp.inf, sliding_friction(scene) * jnp.where(none, 1, factor))
     lin = linearised(scene, friction_slope=False)
     K_n, K_t = stiffness(scene)
     m = scene.oscillator.m
@@ -111,13 +111,15 @@ def _first_factor(scene, friction_slope):
         factors = jnp.minimum(
             factors, safe_divide(MU_M_MAX, lowest, jnp.full_like(lowest, jnp.inf))
         )
-    squeals = jax.vmap(lambda factor: _reserve(scene, factor, friction_slope) < 0)(factors)
+    reserves = jax.vmap(lambda factor: _reserve(scene, factor, friction_slope))(factors)
+    # What cannot be computed is not taken for stable: the first of those makes the root NaN.
+    squeals = ~(reserves >= 0)
     first = jnp.argmax(squeals)
 
     def halve(_, ends):
         low, high = ends
         middle = (low + high) / 2
-        inside = _reserve(scene, middle, friction_slope) < 0
+        inside = ~(_reserve(scene, middle, friction_slope) >= 0)
         return jnp.where(inside, low, middle), jnp.where(inside, middle, high)
 
     ends = factors[jnp.maximum(first - 1, 0)], factors[first]
@@ -126,7 +128,8 @@ def _first_factor(scene, friction_slope):
     step = safe_divide(value, slope, jnp.zeros_like(value))
     # Eq. 19 has a step, where no root needs be.
     factor = factor - jnp.where(jnp.abs(step) < 1e-6 * factor, step, 0)
-    return jnp.where(squeals[0], 0, jnp.where(squeals[first], factor, jnp.inf))
+    root = jnp.where(squeals[0], 0, jnp.where(squeals[first], factor, jnp.inf))
+    return jnp.where(jnp.isnan(reserves[first]), jnp.nan, root)
 
 
 @_first_factor.defjvp

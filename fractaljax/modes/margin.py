@@ -42,10 +42,13 @@ def margin(scene: Scene, shift=0.0, friction_slope: bool = True) -> jax.Array:
     frequencies in contact. Modes within their damping of each other lower it, to about 0.3
     times. It is analytic in the scene where modes coalesce and where they cross, unless there is
     no damping at all; without damping it is 0 where stable and negative in flutter.
-    `friction_slope` as in `growth_rate`.
+    `friction_slope` as in `growth_rate`; NaN where that is.
 
-    **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`.
+    **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`; `TypeError` for a `shift`
+    that is no number.
     """
+    if jnp.issubdtype(jnp.result_type(shift), jnp.bool_):
+        raise TypeError("shift must be a growth rate [1/s], got a bool; friction_slope comes third")
     K_n, K_t = stiffness(scene)
     return margin_of(linearise(scene.oscillator, scene.friction, K_n, K_t, friction_slope), shift)
 

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from ..base.parts import Record
 from ..base.singular import polynomial, positive_sqrt, safe_divide
 from ..mechanism.oscillator import Linearised, dimensionless, linearise
+from ..mechanism.quantities import sliding_friction
 from ..mechanism.scene import Scene, stiffness
 from ..mechanism.structure import Structure
 from .complex_modes import ComplexModes, complex_modes, growth_rate_of_structure
@@ -256,6 +257,36 @@ def _eigenvalues_jvp(primals, tangents):
     return s, _eigenvalue_tangents(lin, dlin, s)
 
 
+def require_computable(scene: Scene, friction_slope: bool = True) -> None:
+    """Refuse a scene whose growth rate or margin is NaN, naming what left the range of numbers.
+
+    **Raises:** `ValueError` as said.
+    """
+    K_n, K_t = stiffness(scene)
+    lin = linearise(scene.oscillator, scene.friction, K_n, K_t, friction_slope)
+    if jnp.isfinite(growth_rate_of_linearised(lin)) and jnp.isfinite(margin_of(lin)):
+        return
+    size = jnp.sqrt(lin.a + lin.b)
+    found = {
+        "K_n [N/m]": K_n,
+        "K_t [N/m]": K_t,
+        "the friction at V": sliding_friction(scene),
+        "(K_t/m + omega_1^2) [1/s^2]": lin.a,
+        "(K_n/m + omega_2^2) [1/s^2]": lin.b,
+        "the damping of x1 [1/s]": lin.c_1,
+        "the damping of x2 [1/s]": lin.c_2,
+        "the coupling mu^2 K_n K_t/m^2 [1/s^4]": lin.g,
+    }
+    names = [name for name, value in found.items() if not jnp.isfinite(value)]
+    if not names:
+        ratios = {name: jnp.abs(found[name]) / size for name in list(found)[-3:-1]}
+        ratios[list(found)[-1]] = lin.g**0.25 / size
+        names = [max(ratios, key=lambda name: float(ratios[name]))]
+    raise ValueError(
+        f"stability cannot be computed in {size.dtype}: {names[0]} is {found[names[0]]:.6g}"
+    )
+
+
 def _damping_ratio(s):
     """-Re/|s|, and 0 where s is."""
     rest = s == 0
@@ -268,7 +299,8 @@ def growth_rate(scene: Scene | Structure, friction_slope: bool = True) -> jax.Ar
 
     `friction_slope=False` leaves out the slope of the friction law, as the source's Eq. 43 does.
     Towards coalescing eigenvalues the derivative grows without bound, as it must; exactly there,
-    where it is infinite, some finite number stands for it. A `Structure` takes LAPACK's route.
+    where it is infinite, some finite number stands for it. Where numbers leave the range in which
+    a sign can be told (`dimensionless`) it is NaN. A `Structure` takes LAPACK's route.
 
     **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`; or if a structure without F
     has friction with a slope.
