@@ -69,6 +69,14 @@ def number(
     return array
 
 
+def scalar(name: str, value: Any, **domain: float) -> jax.Array:
+    """As `number`, but for one number only."""
+    array = number(name, value, **domain)
+    if array.ndim:
+        raise ValueError(f"{name} must be a single number, got shape {array.shape}")
+    return array
+
+
 def flag(name: str, value: Any) -> bool:
     """Return `value` as a bool, or say that it is none.
 

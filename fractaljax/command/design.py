@@ -3,7 +3,14 @@
 from pathlib import Path
 
 from .output import csv_text, npy, output, picture
-from .parsing import add_constant_friction, add_scene_file, load_scene, low_and_high, number, pair
+from .parsing import (
+    add_constant_friction,
+    add_scene_file,
+    load_scene,
+    low_and_high,
+    number,
+    pairs_of,
+)
 
 _UNITS = {"G": "m", "growth_rate": "1/s", "K_n": "N/m", "K_t": "N/m"}  # of the history
 _LIMITS = {
@@ -68,6 +75,7 @@ def add_design(commands) -> None:
 def _add_conditions(parser) -> None:
     parser.add_argument(
         "--envelope",
+        action="extend",
         nargs="+",
         metavar="NAME=LOW:HIGH",
         help="ranges, or NAME=V1,V2,V3 measured together, that the design withstands",
@@ -75,6 +83,7 @@ def _add_conditions(parser) -> None:
     parser.add_argument("--risk", help="worst (the default), smooth, smooth:T or cvar:ALPHA")
     parser.add_argument(
         "--tolerance",
+        action="extend",
         nargs="+",
         metavar="NAME=SIGMA",
         help="standard deviations of D and lnG as machined",
@@ -126,6 +135,8 @@ def _run(arguments) -> int:
     print(f"written to {arguments.out}: {', '.join(files)}")
     side, dx = len(surfaces.after), surfaces.dx
     print(f"topography.npy: {side} x {side} heights in m, dx = {dx:g} m\n")
+    for line in _remarks(scene, options):
+        print(line)
     print(best)
     return 1 if best.violated else 0
 
@@ -146,9 +157,10 @@ def _options(arguments) -> dict:
     if arguments.envelope is not None:
         options["envelope"] = _envelope(arguments.envelope)
     if arguments.tolerance is not None:
-        pairs = [pair("--tolerance", text, "NAME=SIGMA") for text in arguments.tolerance]
+        pairs = pairs_of("--tolerance", arguments.tolerance, "NAME=SIGMA")
         options["tolerance"] = {
-            "ln G" if name == "lnG" else name: number("--tolerance", text) for name, text in pairs
+            "ln G" if name == "lnG" else name: number("--tolerance", text)
+            for name, text in pairs.items()
         }
     return options
 
@@ -184,10 +196,26 @@ def _envelope(texts):
     from ..optimise.envelope import Envelope
 
     ranges, samples = {}, {}
-    for name, values in (pair("--envelope", text, "NAME=LOW:HIGH") for text in texts):
+    for name, values in pairs_of("--envelope", texts, "NAME=LOW:HIGH").items():
         into, separator = (ranges, ":") if ":" in values else (samples, ",")
         into[name] = [number(f"--envelope {name}", value) for value in values.split(separator)]
+        if len(into[name]) < 2:
+            raise ValueError(
+                f"--envelope {name} must be LOW:HIGH or at least two samples, got {values!r}"
+            )
     return Envelope(ranges, samples)
+
+
+def _remarks(scene, options) -> list[str]:
+    """What `friction_remark` says of the scene, over its envelope."""
+    from ..optimise.envelope import Envelope
+    from ..report import friction_remark
+
+    if options.get("envelope") is not None:
+        envelope = Envelope.of(options["envelope"])
+        values = envelope.values(envelope.grid())
+        scene = scene.replace(**dict(zip(envelope.names, values.T, strict=True)))
+    return friction_remark(scene, scene.oscillator.V)
 
 
 def _scene_text(best) -> str:

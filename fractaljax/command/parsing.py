@@ -6,11 +6,24 @@ import sys
 from pathlib import Path
 
 
+class _Once(argparse.Action):
+    """Stores a value, and refuses a second one instead of forgetting the first."""
+
+    given = False
+
+    def __call__(self, parser, namespace, values, option_string=None):
+        if self.given:
+            raise argparse.ArgumentError(self, "given more than once")
+        self.given = True
+        setattr(namespace, self.dest, values)
+
+
 class Parser(argparse.ArgumentParser):
     """A parser that refuses in one line, and takes negative numbers of any form."""
 
     def __init__(self, *arguments, **options):
         super().__init__(*arguments, **options)
+        self.register("action", None, _Once)
         # Older Pythons take -1e-5 for an option.
         self._negative_number_matcher = re.compile(r"-\.?\d")
 
@@ -23,6 +36,36 @@ def refuse(message) -> None:
     line = " ".join(str(message).split())
     print(f"fractaljax: {line}", file=sys.stderr)
     raise SystemExit(2)
+
+
+def reason(error: Exception) -> str | None:
+    """What a failure that a user can cause means, in a line; None for any other."""
+    if isinstance(error, OSError):
+        return _about_file(error)
+    if isinstance(error, (RecursionError, MemoryError, ArithmeticError)):
+        words = {RecursionError: "too deeply nested", MemoryError: "not enough memory"}
+        kind = next((kind for kind in words if isinstance(error, kind)), None)
+        return f"{words[kind]}: {error}" if kind else f"a number is out of range: {error}"
+    text = str(error)
+    if isinstance(error, (ValueError, TypeError)):
+        return text
+    # Raised while a compiled program ran: the line beside JAX's own account of the program.
+    checked = re.search(r"EquinoxRuntimeError: (.+)", text)
+    if checked:
+        return checked[1]
+    return f"not enough memory: {text}" if text.startswith("RESOURCE_EXHAUSTED") else None
+
+
+def _about_file(error: OSError) -> str:
+    words = {
+        FileNotFoundError: "no such file",
+        IsADirectoryError: "a folder, not a file",
+        NotADirectoryError: "not a folder",
+        PermissionError: "no permission for",
+    }
+    if error.filename is None:
+        return str(error)
+    return f"{words.get(type(error), error.strerror)}: {error.filename}"
 
 
 def add_scene_file(parser) -> None:
@@ -56,12 +99,17 @@ def low_and_high(option, text):
     return tuple(number(option, end) if end else None for end in (low, high))
 
 
-def pair(option, text, form):
-    """NAME=VALUE as two texts; `form` says how it should look."""
-    name, equals, value = text.partition("=")
-    if not (name and equals and value):
-        raise ValueError(f"{option} must be {form}, got {text!r}")
-    return name, value
+def pairs_of(option, texts, form) -> dict[str, str]:
+    """Several NAME=VALUE as texts by name; `form` says how each should look."""
+    found = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not (name and equals and value):
+            raise ValueError(f"{option} must be {form}, got {text!r}")
+        if name in found:
+            raise ValueError(f"{option} has {name} more than once")
+        found[name] = value
+    return found
 
 
 def number(option, text) -> float:

@@ -69,7 +69,8 @@ def critical_friction(scene: Scene, friction_slope: bool = True) -> jax.Array:
     joint answers as it does in `stiffness`: K_t of a fractal joint depends on mu_s, its critical
     area on mu_m. The first friction that squeals is looked for from 1/500 to 500 times that of
     the scene, as far as Eq. 19 goes (mu_m <= 0.9): 0 if the least squeals already, infinite if
-    none does, NaN where it is out of what can be computed. To hold the stiffness, `scene.replace(contact=FixedContact(*stiffness(scene)))`.
+    none does, NaN where it is out of what can be computed. To hold the stiffness,
+    `scene.replace(contact=FixedContact(*stiffness(scene)))`.
 
     The derivative is that of the root, and 0 where it is 0 or infinite.
 

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..base.parts import Record, flag, number
+from ..base.parts import Record, flag, scalar
 from ..mechanism.contact import ContactState
 from ..mechanism.scene import Scene, stiffness
 from ..modes.stability import stability
@@ -69,7 +69,7 @@ def _limits(symbol, at_least, at_most=None, *, above=-math.inf, below=math.inf) 
     if at_least is None and at_most is None:
         raise ValueError(f"{symbol} needs at_least or at_most")
     low, high = (
-        None if limit is None else number(f"{symbol} {which}", limit, above=above, below=below)
+        None if limit is None else scalar(f"{symbol} {which}", limit, above=above, below=below)
         for which, limit in [("at_least", at_least), ("at_most", at_most)]
     )
     if low is not None and high is not None and not low < high:
@@ -179,8 +179,8 @@ class Roughness(Constraint):
 
     def __init__(self, at_least=None, at_most=None, *, L, L_s):
         self.at_least, self.at_most = _limits("Sq", at_least, at_most, above=0)
-        self.L = number("L", L, above=0)
-        self.L_s = number("L_s", L_s, above=0)
+        self.L = scalar("L", L, above=0)
+        self.L_s = scalar("L_s", L_s, above=0)
         if not self.L_s < self.L:
             raise ValueError(f"L_s must be below L, got {L_s!r} and {L!r}")
 

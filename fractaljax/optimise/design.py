@@ -22,7 +22,7 @@ import numpy as np
 
 from ..base.parts import flag
 from ..mechanism.scene import Scene
-from ..modes.stability import growth_rate, growth_rate_of
+from ..modes.stability import growth_rate, growth_rate_of, require_computable
 from ..report import comparison_table, table
 from ..surface.roughness import Roughness, roughness
 from ..surface.topography import Topographies, topography
@@ -213,8 +213,16 @@ def design(
     inverted or without the scene's own surface, for an envelope of anything that the scene lacks
     or the design moves, and for options outside their domain.
     """
+    bounds = DEFAULT_BOUNDS if bounds is None else bounds
+    for name, given in {"bounds": bounds, "tolerance": tolerance or {}}.items():
+        if not isinstance(given, Mapping):
+            raise TypeError(f"{name} must be a mapping, got {given!r}")
+    if objective is not None and not callable(objective):
+        raise TypeError(f"objective must be a function of a scene, got {objective!r}")
+    if callable(constraints) or not all(map(callable, constraints)):
+        raise TypeError(f"constraints must be a list of functions of a scene, got {constraints!r}")
     options = dict(
-        bounds=dict(DEFAULT_BOUNDS if bounds is None else bounds),
+        bounds=dict(bounds),
         objective=objective,
         target=target,
         K_n_min=K_n_min,
@@ -231,6 +239,10 @@ def design(
         seed=seed,
     )
     task = pose(scene, options)
+    count = task.lattice ** len(task.problem.variables)
+    if task.starts > count:
+        raise ValueError(f"starts must be at most the {count} of the lattice, got {task.starts}")
+    require_computable(scene, task.problem.friction_slope)
     own = np.asarray(task.request.start, float)[None]
     before = task.judge(1).verdict(own)
     if objective is None and before.worst[0] <= 0:

@@ -1,6 +1,7 @@
 """A design as a TOML file: the scene given, every option, what came of it, and the way there."""
 
 import importlib.metadata
+import inspect
 import math
 import os
 from collections.abc import Callable, Mapping
@@ -10,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from ..base.scene_file import quoted, read, write_whole
+from ..base.scene_file import quoted, read, refuse_unknown, table_of, write_whole
 from ..mechanism.scene import Scene
 from . import constraints as known_constraints
 from .constraints import Constraint
@@ -89,7 +90,8 @@ def read_design(
     """The scene given and the arguments of `design`; errors as `repeat_design`."""
     try:
         document = read(Path(path).read_bytes())
-        return _scene(document), _options(document["options"], dict(functions or {}))
+        options = table_of(document, "options")
+        return _scene(document), _options(options, dict(functions or {}))
     except KeyError as error:
         raise ValueError(f"{path}: not a design file, it lacks {error}") from None
     except (ValueError, TypeError) as error:
@@ -101,23 +103,43 @@ def _scenes(best):
 
 
 def _scene(document) -> Scene:
-    scene = Scene.from_toml(document["given"])
-    dtype = jnp.dtype(document["precision"])
+    scene = Scene.from_toml(_text("given", document["given"]))
+    precision = document["precision"]
+    if precision not in ("float32", "float64"):
+        raise ValueError(f"precision must be float32 or float64, got {precision!r}")
+    dtype = jnp.dtype(precision)
     if dtype == jnp.float64 and not jax.config.read("jax_enable_x64"):
         raise ValueError('the design is in float64: jax.config.update("jax_enable_x64", True)')
     return jax.tree.map(lambda x: x.astype(dtype), scene)
 
 
+def _text(name: str, value) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{name} must be a text, got {value!r}")
+    return value
+
+
 def _options(table, functions) -> dict[str, Any]:
+    """The arguments of `design`, which checks their values itself."""
+    arguments = inspect.signature(design).parameters
+    refuse_unknown("[options]", table, [*arguments][1:-1])  # but the scene and the progress bar
     options = dict(table)
-    options["bounds"] = {name: tuple(ends) for name, ends in options["bounds"].items()}
+    options["bounds"] = {
+        name: tuple(ends) if isinstance(ends, list) else ends
+        for name, ends in table_of(options, "bounds", "options.").items()
+    }
     if "objective" in options:
         options["objective"] = _function(options["objective"], functions)
     if "envelope" in options:
-        options["envelope"] = Envelope(**options["envelope"])
+        conditions = table_of(options, "envelope", "options.")
+        refuse_unknown("[options.envelope]", conditions, ("ranges", "samples"))
+        options["envelope"] = Envelope(**conditions)
     if isinstance(options["risk"], list):
         options["risk"] = tuple(options["risk"])
-    options["constraints"] = [_constraint(asked, functions) for asked in options["constraints"]]
+    constraints = options["constraints"]
+    if not (isinstance(constraints, list) and all(isinstance(c, dict) for c in constraints)):
+        raise TypeError(f"constraints must be a list of tables, got {constraints!r}")
+    options["constraints"] = [_constraint(asked, functions) for asked in constraints]
     return options
 
 
@@ -130,12 +152,15 @@ def _function_name(function) -> str:
 
 def _function(name: str, functions):
     """The function of this name: one of those given, or of this package."""
-    if name in functions:
+    if _text("a function's name", name) in functions:
         return functions[name]
     module, _, member = name.partition(":")
     if module.split(".")[0] != _PACKAGE or not member:
         raise ValueError(f"the function {name!r} is not in the file: give it in `functions`")
-    return getattr(importlib.import_module(module), member)
+    try:
+        return getattr(importlib.import_module(module), member)
+    except (ImportError, AttributeError):
+        raise ValueError(f"the package has no function {name!r}") from None
 
 
 def _constraint_table(asked) -> dict[str, Any]:
@@ -151,9 +176,14 @@ def _constraint(table, functions):
     if "function" in table:
         return _function(table["function"], functions)
     fields = dict(table)
-    kind = getattr(known_constraints, fields.pop("kind"), None)
-    if not (isinstance(kind, type) and issubclass(kind, Constraint)):
+    kind = getattr(known_constraints, _text("the kind of a constraint", fields.pop("kind")), None)
+    if not (isinstance(kind, type) and issubclass(kind, Constraint)) or kind is Constraint:
         raise ValueError(f"there is no constraint {table['kind']!r}")
+    known = inspect.signature(kind).parameters
+    refuse_unknown(f"the constraint {kind.__name__}", fields, known)
+    for name, parameter in known.items():
+        if parameter.default is inspect.Parameter.empty and name not in fields:
+            raise ValueError(f"the constraint {kind.__name__} lacks {name!r}")
     return kind(**fields)
 
 

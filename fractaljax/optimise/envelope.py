@@ -10,9 +10,10 @@ import itertools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import jax
 import numpy as np
 
-from ..base.parts import number
+from ..base.parts import scalar
 from ..base.ranges import within
 from ..mechanism.quantities import own_quantities
 from ..mechanism.scene import Scene
@@ -40,6 +41,9 @@ class Envelope:
     samples: Mapping[str, Sequence[float]] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
+        for which in ("ranges", "samples"):
+            if not isinstance(getattr(self, which), Mapping):
+                raise TypeError(f"{which} must be a mapping, got {getattr(self, which)!r}")
         ranges, samples = {}, {}
         for name, ends in dict(self.ranges).items():
             ends = _numbers(name, ends)
@@ -196,9 +200,9 @@ class Envelope:
 
 def _numbers(name, values) -> list[float]:
     """A flat list of finite numbers."""
-    if isinstance(values, (str, bytes)) or not hasattr(values, "__len__"):
+    if not isinstance(values, (tuple, list, np.ndarray, jax.Array)) or not np.ndim(values):
         raise TypeError(f"envelope of {name} must be a range or samples, got {values!r}")
-    return [float(number(f"envelope of {name}", value)) for value in values]
+    return [float(scalar(f"envelope of {name}", value)) for value in values]
 
 
 def _shown(values) -> str:

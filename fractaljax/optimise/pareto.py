@@ -19,10 +19,11 @@ from ..mechanism.scene import Scene
 from .constraints import Constraint
 from .design import Design, design
 from .search import search
-from .task import Task, pose
+from .task import Task, pose, whole
 from .worst_case import OneCondition
 
 _WALKERS = 8  # surfaces improved for each member of the front
+_POINTS_MAX = 1000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,8 +84,7 @@ def pareto(
     **Raises:** `ValueError` for fewer than three points, where no surface meets the requirements,
     for objectives without a trade-off, and as `design`.
     """
-    if isinstance(points, bool) or int(points) != points or points < 3:
-        raise ValueError(f"points must be a whole number of at least 3, got {points!r}")
+    points = whole("points", points, 3, _POINTS_MAX)
     refused = sorted({"objective", "starts", "envelope", "risk"} & set(options))
     if refused:
         raise ValueError(f"pareto does not take {', '.join(refused)}")

@@ -1,6 +1,7 @@
 """The request for a design, checked: its numbers, its structure, and what judges a surface."""
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -8,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..base.parts import number, require_scalar
-from ..mechanism.scene import Scene
+from ..base.parts import require_scalar, scalar
+from ..mechanism.scene import Scene, require_kind
 from . import tolerance as scatter
 from .constraints import Constraint
 from .requirements import Model, Problem, Request, Scatter, expected_shortfall
@@ -19,7 +20,10 @@ DEFAULT_BOUNDS: dict[str, tuple[float, float]] = {"D": (2.1, 2.9), "G": (1e-12, 
 
 _LATTICE = {1: 1024, 2: 48}  # surfaces a side, judged to choose the starts
 _ROBUST_LATTICE = {1: 256, 2: 24}  # the same against many conditions
+_LATTICE_MAX = {1: 1_000_000, 2: 1000}  # what memory holds
 _STARTS, _ROBUST_STARTS = 16, 12
+_STARTS_MAX = 10_000
+_SEED_MAX = 2**63 - 1  # of a JAX key
 _SURVEYED = 64  # surfaces at a time
 _TEMPERATURE = 0.02  # of the smooth maximum over an envelope
 
@@ -68,6 +72,7 @@ class Task:
 
 def pose(scene: Scene, options: Mapping[str, Any]) -> Task:
     """Check the arguments of `design` and turn them into numbers and structure."""
+    require_kind("scene", scene, Scene)
     require_scalar(scene)
     if not scene.contact.fractal:
         raise ValueError("design needs a FractalContact: a FixedContact has no surface to change")
@@ -82,11 +87,11 @@ def pose(scene: Scene, options: Mapping[str, Any]) -> Task:
         low=low,
         high=high,
         start=(own - low) / (high - low),
-        target=-decay / 2 if target is None else number("target", target),
+        target=-decay / 2 if target is None else scalar("target", target),
         growth_scale=max(decay, 1e-4 * omega.min()),
-        K_n_min=state.K_n if K_n_min is None else number("K_n_min", K_n_min, at_least=0),
-        area_ratio_min=number("area_ratio_min", options["area_ratio_min"], at_least=1),
-        slip_ratio_max=number("slip_ratio_max", options["slip_ratio_max"], above=0, at_most=1),
+        K_n_min=state.K_n if K_n_min is None else scalar("K_n_min", K_n_min, at_least=0),
+        area_ratio_min=scalar("area_ratio_min", options["area_ratio_min"], at_least=1),
+        slip_ratio_max=scalar("slip_ratio_max", options["slip_ratio_max"], above=0, at_most=1),
         value_shift=0.0,
         value_scale=1.0,
         constraints=tuple(c if isinstance(c, Constraint) else None for c in constraints),
@@ -95,7 +100,7 @@ def pose(scene: Scene, options: Mapping[str, Any]) -> Task:
     if envelope is not None:
         envelope.check(scene, tuple(bounds))
     risk, numbers["risk"] = _risk(options["risk"], envelope)
-    level = number("quantile", options["quantile"], at_least=0.5, at_most=0.999)
+    level = scalar("quantile", options["quantile"], at_least=0.5, at_most=0.999)
     if options["tolerance"] is not None:
         tolerance = scatter.check_tolerance(options["tolerance"], scene, bounds)
         deviates, weights = scatter.nodes(len(tolerance))
@@ -103,14 +108,15 @@ def pose(scene: Scene, options: Mapping[str, Any]) -> Task:
             name: sigma * z for (name, sigma), z in zip(tolerance.items(), deviates.T, strict=True)
         }
         numbers["scatter"] = Scatter(*jax.tree.map(jnp.asarray, (shifts, weights, level)))
-    _whole("seed", options["seed"], 0)
+    whole("seed", options["seed"], 0, _SEED_MAX)
     robust = envelope is not None or bool(tolerance)
     variables = len(bounds)
     starts, lattice = options["starts"], options["lattice"]
-    if starts is None:
-        starts = _ROBUST_STARTS if robust else _STARTS
     if lattice is None:
         lattice = (_ROBUST_LATTICE if robust else _LATTICE)[variables]
+    lattice = whole("lattice", lattice, 1, _LATTICE_MAX[variables])
+    if starts is None:
+        starts = min(_ROBUST_STARTS if robust else _STARTS, lattice**variables)
     # In the precision of the scene, whatever that of the arguments.
     numbers = jax.tree.map(lambda x: jnp.asarray(x, dtype), numbers)
     problem = Problem(
@@ -128,20 +134,24 @@ def pose(scene: Scene, options: Mapping[str, Any]) -> Task:
         options,
         bounds,
         tolerance,
-        _whole("starts", starts, 1),
-        _whole("lattice", lattice, 1),
+        whole("starts", starts, 1, _STARTS_MAX),
+        lattice,
     )
 
 
 def _bounds(scene, bounds):
     """Bounds as numbers by name, and the least, the largest and the own of D and ln G."""
     if not bounds or not set(bounds) <= set(DEFAULT_BOUNDS):
-        raise ValueError(f"bounds must be on D, G or both, got {', '.join(bounds) or 'none'}")
+        raise ValueError(
+            f"bounds must be on D, G or both, got {', '.join(map(str, bounds)) or 'none'}"
+        )
     surface = scene.contact.surface
     low, high, own, checked = [], [], [], {}
     for name in sorted(bounds):
         scale = np.log if name == "G" else float
-        ends = [float(number(f"{name} bound", end)) for end in bounds[name]]
+        if not isinstance(bounds[name], (tuple, list, np.ndarray)):
+            raise TypeError(f"bounds on {name} must be (lower, upper), got {bounds[name]!r}")
+        ends = [float(scalar(f"{name} bound", end)) for end in bounds[name]]
         for end in ends:
             scene.replace(**{name: end})  # refuses an end outside the domain of the model
         value = float(getattr(surface, name))
@@ -160,14 +170,15 @@ def _bounds(scene, bounds):
 
 def _risk(risk, envelope):
     """The kind of risk, and its number: weights of ordered conditions, or a temperature."""
-    kind, parameter = (risk, None) if isinstance(risk, str) else tuple(risk)
+    pair = (risk, None) if isinstance(risk, str) else risk
+    kind, parameter = pair if isinstance(pair, (tuple, list)) and len(pair) == 2 else (None, None)
     if kind == "worst" and parameter is None:
         return "worst", None
     if kind == "smooth":
         temperature = _TEMPERATURE if parameter is None else parameter
-        parameter = number("temperature of risk", temperature, above=0)
+        parameter = scalar("temperature of risk", temperature, above=0)
     elif kind == "cvar" and parameter is not None:
-        alpha = float(number("alpha of risk", parameter, at_least=0, below=1))
+        alpha = float(scalar("alpha of risk", parameter, at_least=0, below=1))
         count = 1 if envelope is None else len(envelope.cells())
         parameter = expected_shortfall(count, alpha)
     else:
@@ -179,7 +190,12 @@ def _risk(risk, envelope):
     return kind, parameter
 
 
-def _whole(name, value, least) -> int:
-    if isinstance(value, bool) or int(value) != value or value < least:
-        raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
+def whole(name: str, value: Any, least: int, most: float = math.inf) -> int:
+    """`value` as an int, refused unless it is a whole number from `least` to `most`."""
+    bounds = f"at least {least}" + (f" and at most {most}" if most < math.inf else "")
+    plain = not isinstance(value, (list, tuple)) and np.asarray(value).dtype.kind in "iuf"
+    plain = plain and np.ndim(value) == 0
+    # Compared before it is converted: infinity and NaN are no whole numbers either.
+    if not (plain and least <= value <= most and value % 1 == 0):
+        raise ValueError(f"{name} must be a whole number of {bounds}, got {value!r}")
     return int(value)

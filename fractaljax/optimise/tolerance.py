@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..base.parts import number
+from ..base.parts import scalar
 from ..mechanism.scene import Scene
 
 NAMES = {"D": "D", "G": "ln G"}  # as written in a tolerance
@@ -36,7 +36,7 @@ def check_tolerance(tolerance: Mapping[str, Any], scene: Scene, bounds: Mapping)
         names = ", ".join(map(str, tolerance)) or "none"
         raise ValueError(f"tolerance must be of D, ln G or both, got {names}")
     checked = {
-        short: float(number(f"tolerance of {name}", tolerance[name], at_least=0))
+        short: float(scalar(f"tolerance of {name}", tolerance[name], at_least=0))
         for short, name in NAMES.items()
         if name in tolerance
     }
