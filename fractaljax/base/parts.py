@@ -31,7 +31,7 @@ def number(
     **Raises:** `TypeError` if `value` is not real and numeric; `ValueError` as said.
     """
     if isinstance(value, (bool, np.bool_, str, bytes, np.ma.MaskedArray)) or value is None:
-        raise TypeError(f"{name} must be a number, got {value!r}")
+        raise TypeError(f"{name} must be a number, got {brief(value)}")
     try:
         dtype = jnp.result_type(value)
         if not (jnp.issubdtype(dtype, jnp.floating) or jnp.issubdtype(dtype, jnp.integer)):
@@ -44,7 +44,7 @@ def number(
         with contextlib.nullcontext() if traced else jax.ensure_compile_time_eval():
             array = jnp.asarray(value, dtype=dtype if is_float_array else float)
     except (TypeError, ValueError, OverflowError):
-        raise TypeError(f"{name} must be a real number, got {value!r}") from None
+        raise TypeError(f"{name} must be a real number, got {brief(value)}") from None
 
     bounds = [
         (f"above {above:g}", lambda x: x > above, above > -math.inf),
@@ -63,10 +63,33 @@ def number(
     values = concrete(array)
     if values is None:
         return eqx.error_if(array, ~inside(array, jnp), f"{name} must be {wanted}")
-    bad = values[~inside(values, np)]
+    # Compiled programs take what is smaller than any normal number for 0.
+    tiny = np.abs(values) < jnp.finfo(values.dtype).tiny
+    bad = values[~inside(np.where(tiny, 0, values), np)]
     if bad.size:
         raise ValueError(f"{name} must be {wanted}, got {_digits(bad.flat[0])}")
     return array
+
+
+def brief(value: Any) -> str:
+    """`value` as a message shows it: in one line, and not a whole scene or a thousand digits."""
+    try:
+        text = " ".join(repr(value).split())
+    except ValueError:  # Python prints no integer that long
+        return "a very large integer"
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def whole(name: str, value: Any, least: int, most: float = math.inf) -> int:
+    """`value` as an int, refused unless it is a whole number from `least` to `most`."""
+    listed = isinstance(value, (list, tuple))
+    array = np.empty(1) if listed else np.asarray(value)
+    plain = array.dtype.kind in "iuf" and array.ndim == 0
+    # Compared before it is converted: infinity and NaN are no whole numbers either.
+    if not (plain and least <= array <= most and array % 1 == 0):
+        bounds = f"at least {least}" + (f" and at most {most}" if most < math.inf else "")
+        raise ValueError(f"{name} must be a whole number of {bounds}, got {brief(value)}")
+    return int(array)
 
 
 def scalar(name: str, value: Any, **domain: float) -> jax.Array:
@@ -83,7 +106,7 @@ def flag(name: str, value: Any) -> bool:
     **Raises:** `TypeError` unless it is True or False, of Python or of NumPy.
     """
     if not isinstance(value, (bool, np.bool_)):
-        raise TypeError(f"{name} must be True or False, got {value!r}")
+        raise TypeError(f"{name} must be True or False, got {brief(value)}")
     return bool(value)
 
 
@@ -177,7 +200,7 @@ def rebuild(part: Part, changes: Mapping[str, Any]) -> Any:
         old = getattr(part, field.name)
         new = changes.get(field.name, old)
         if isinstance(new, Part):
-            new = rebuild(new, changes)
+            new = rebuild(new, {name: x for name, x in changes.items() if name != field.name})
         changed |= new is not old
         arguments[field.name] = new
     return type(part)(**arguments) if changed else part

@@ -16,7 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..base.parts import Part, Record, number, ordered, quantity
+from ..base.parts import Part, Record, brief, number, ordered, quantity, require_scalar, scalar
 from ..base.singular import boxcox, exp_or_inf, positive_cbrt
 from ..surface.surfaces import Surface
 from .materials import Material
@@ -251,15 +251,24 @@ def _solve(surface: Surface, material: Material, P, mu_s, mu_m, stiffness_ratio=
 
 
 def contact_state(surface: Surface, material: Material, P, *, mu_s, mu_m) -> ContactState:
-    """The joint of `surface` and `material` under the normal load P [N]; scalars or one shape.
+    """The joint of `surface` and `material` under the normal load P [N]; scalars only.
 
     `mu_m` lowers the pressure at yield (Eq. 19), `mu_s` bounds the tangential load (Eq. 35).
 
-    **Raises:** `ValueError` unless P > 0, mu_s > 0, 0 <= mu_m <= 0.9 and mu_m <= mu_s.
+    **Raises:** `ValueError` unless P > 0, mu_s > 0, 0 <= mu_m <= 0.9 and mu_m <= mu_s, and for
+    arrays: use `jax.vmap`.
     """
-    mu_m = number("mu_m", mu_m, at_least=0, at_most=MU_M_MAX)
-    mu_s = ordered("mu_s", number("mu_s", mu_s, above=0), "mu_m", mu_m)
-    return FractalContact(surface, material, P).state(mu_s, mu_m)
+    mu_m = scalar("mu_m", mu_m, at_least=0, at_most=MU_M_MAX)
+    mu_s = ordered("mu_s", scalar("mu_s", mu_s, above=0), "mu_m", mu_m)
+    contact = FractalContact(surface, material, P)
+    require_scalar(contact)
+    return contact.state(mu_s, mu_m)
+
+
+def _require_kinds(surface, material):
+    for name, part, kind in (("surface", surface, Surface), ("material", material, Material)):
+        if not isinstance(part, kind):
+            raise TypeError(f"{name} must be a {kind.__name__}, got {brief(part)}")
 
 
 def load_of_area(surface: Surface, material: Material, A_r, mu_m) -> jax.Array:
@@ -280,6 +289,7 @@ def contact_load(surface: Surface, material: Material, A_r, *, mu_m) -> jax.Arra
 
     **Raises:** `ValueError` unless A_r > 0 and 0 <= mu_m <= 0.9.
     """
+    _require_kinds(surface, material)
     A_r = number("A_r", A_r, above=0)
     return load_of_area(surface, material, A_r, number("mu_m", mu_m, at_least=0, at_most=MU_M_MAX))
 
@@ -310,10 +320,7 @@ class FractalContact(Contact):
     fractal: ClassVar[bool] = True
 
     def __init__(self, surface, material, P, stiffness_ratio=None):
-        if not isinstance(surface, Surface):
-            raise TypeError(f"surface must be a Surface, got {surface!r}")
-        if not isinstance(material, Material):
-            raise TypeError(f"material must be a Material, got {material!r}")
+        _require_kinds(surface, material)
         self.surface = surface
         self.material = material
         self.P = number("P", P, above=0)

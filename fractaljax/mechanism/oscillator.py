@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..base.parts import Part, flag, number, quantity
+from ..base.parts import Part, brief, flag, number, quantity
 from .friction import Friction
 
 
@@ -48,7 +48,18 @@ def equilibrium(oscillator: Oscillator, K_n, K_t, mu) -> tuple[jax.Array, jax.Ar
     """Eq. 40 as the linear system it comes from: the static displacements (x_01, x_02) [m].
 
     [[K_1 + K_t, -mu K_n], [mu K_t, K_2 + K_n]] x_0 = [F, -F]/sqrt(2); its determinant is positive.
+
+    **Raises:** `TypeError` for what is no `Oscillator`; `ValueError` unless K_n >= 0, K_t >= 0 and
+    mu is finite.
     """
+    if not isinstance(oscillator, Oscillator):
+        raise TypeError(f"oscillator must be an Oscillator, got {brief(oscillator)}")
+    K_n, K_t = number("K_n", K_n, at_least=0), number("K_t", K_t, at_least=0)
+    return static_displacements(oscillator, K_n, K_t, number("mu", mu))
+
+
+def static_displacements(oscillator: Oscillator, K_n, K_t, mu) -> tuple[jax.Array, jax.Array]:
+    """As `equilibrium`, without checks."""
     # In flexibilities: the determinant itself and its square leave the range of a float32.
     r_1 = 1 / (oscillator.m * oscillator.omega_1**2 + K_t)
     r_2 = 1 / (oscillator.m * oscillator.omega_2**2 + K_n)
@@ -70,7 +81,7 @@ def linearise(
     c_1 = 2 * oscillator.xi_1 * oscillator.omega_1
     c_2 = 2 * oscillator.xi_2 * oscillator.omega_2
     if flag("friction_slope", friction_slope) and friction.velocity_dependent:
-        x_01, x_02 = equilibrium(oscillator, K_n, K_t, mu)
+        x_01, x_02 = static_displacements(oscillator, K_n, K_t, mu)
         slope = friction.slope(oscillator.V)
         c_1 = c_1 + slope * K_n * x_02 / m
         c_2 = c_2 - slope * K_t * x_01 / m

@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 
-from ..base.parts import Part, number, quantities, rebuild, require_scalar
+from ..base.parts import Part, brief, number, quantities, rebuild, require_scalar
 from ..base.scene_file import parse, read_bounded, render, write_whole
 from ..surface.surfaces import Surface
 from .contact import MU_M_MAX, Contact, FixedContact, FractalContact
@@ -37,7 +37,7 @@ def friction_for(contact: Contact, friction: Friction) -> Friction:
 def require_kind(name: str, part: Any, kind: type[Part]) -> None:
     """Refuse what is not a part of this kind."""
     if not isinstance(part, kind):
-        raise TypeError(f"{name} must be a {kind.__name__}, got {part!r}")
+        raise TypeError(f"{name} must be a {kind.__name__}, got {brief(part)}")
 
 
 class Scene(Part):
@@ -115,6 +115,7 @@ def stiffness(scene: Scene) -> tuple[jax.Array, jax.Array]:
 
     **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`.
     """
+    require_kind("scene", scene, Scene)
     require_scalar(scene)
     return scene.contact.stiffness(scene.friction.mu_s, scene.friction.mu_m)
 

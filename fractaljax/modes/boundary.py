@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..base.batches import in_batches
-from ..base.parts import Record, flag, number, require_scalar
+from ..base.parts import Record, flag, require_scalar, scalar, whole
 from ..base.ranges import is_logarithmic
 from ..mechanism.oscillator import linearise
 from ..mechanism.quantities import (
@@ -24,12 +24,13 @@ from ..mechanism.quantities import (
     substituted,
     with_optional,
 )
-from ..mechanism.scene import Scene
+from ..mechanism.scene import Scene, require_kind
 from .continuation import BranchEnd, trace
 from .critical_friction import coupling_reserve, critical_frequency
 from .stability import growth_rate_of
 
 _BATCH = 512  # points judged at once
+_LINES_MAX = 2000  # of which the square is evaluated
 _UNDAMPED = 1e-12  # damping that passes for none, beside sqrt(a + b)
 _STEP = 0.3  # the mu_m at which Eq. 19 has one
 
@@ -163,7 +164,16 @@ class _Field:
         def program(ps):
             return _reserves(self.problem, self.request, jnp.asarray(ps, self.dtype))
 
-        return tuple(np.asarray(x, float) for x in in_batches(program, _BATCH, ps))
+        reserves, gradients = (np.asarray(x, float) for x in in_batches(program, _BATCH, ps))
+        if np.isnan(reserves).any():
+            place = self.quantities(ps[np.isnan(reserves)][0])
+            raise ValueError(
+                "stability cannot be computed at "
+                + ", ".join(
+                    f"{n} = {x:.6g}" for n, x in zip(self.problem.names, place, strict=True)
+                )
+            )
+        return reserves, gradients
 
     def at(self, p):
         """Reserve, its gradient (2,) and the rest at one point."""
@@ -222,10 +232,10 @@ def hopf_boundary(
     **Raises:** `ValueError` for a name that is no quantity of the scene, two names that set the
     same one, a range that is empty, inverted or outside the domain, or a scene that holds arrays.
     """
+    require_kind("scene", scene, Scene)
     require_scalar(scene)
     friction_slope = flag("friction_slope", friction_slope)
-    if int(lines) != lines or lines < 2:
-        raise ValueError(f"lines must be a whole number of at least 2, got {lines!r}")
+    lines = whole("lines", lines, 2, _LINES_MAX)
     windows = [_window(scene, which, window) for which, window in (("x", x), ("y", y))]
     names = (windows[0][0], windows[1][0])
     require_independent(scene, names)
@@ -239,7 +249,7 @@ def hopf_boundary(
     low, high = jnp.asarray(ends.T, scene.oscillator.m.dtype)
     problem = _Problem(names, (logarithmic[0], logarithmic[1]), friction_slope)
     field = _Field(problem, _Request(scene, low, high))
-    branches, squeals, untraced = trace(field, int(lines))
+    branches, squeals, untraced = trace(field, lines)
     return Boundary(
         scene=scene,
         x=windows[0],
@@ -274,7 +284,7 @@ def _window(scene, which, window) -> Window:
         raise ValueError(f"{which} must be (name, low, high), got {window!r}")
     name, *ends = window
     require_known(scene, name)
-    low, high = (float(number(f"{which} limit", end)) for end in ends)
+    low, high = (float(scalar(f"{which} limit", end)) for end in ends)
     if not low < high:
         raise ValueError(f"{which} must go from a lower to a higher value, got {window!r}")
     return name, low, high

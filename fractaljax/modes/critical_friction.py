@@ -17,7 +17,7 @@ from ..base.singular import positive_sqrt, safe_divide
 from ..mechanism.contact import MU_M_MAX
 from ..mechanism.oscillator import Linearised, dimensionless, linearise
 from ..mechanism.quantities import sliding_friction, with_friction_times
-from ..mechanism.scene import Scene, stiffness
+from ..mechanism.scene import Scene, require_kind, stiffness
 
 _FACTORS = 512  # of friction, looked at for the first root
 _HALVINGS = 50
@@ -76,6 +76,7 @@ def critical_friction(scene: Scene, friction_slope: bool = True) -> jax.Array:
 
     **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`.
     """
+    require_kind("scene", scene, Scene)
     require_scalar(scene)
     sloping = flag("friction_slope", friction_slope) and scene.friction.velocity_dependent
     if sloping or scene.contact.fractal:

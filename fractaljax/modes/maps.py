@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..base.parts import Record, require_scalar
+from ..base.parts import Record, brief, require_scalar
 from ..mechanism.contact import FixedContact, Regime
 from ..mechanism.friction import Coulomb
 from ..mechanism.quantities import (
@@ -20,7 +20,7 @@ from ..mechanism.quantities import (
     require_independent,
     unit,
 )
-from ..mechanism.scene import Scene, brake_scene
+from ..mechanism.scene import Scene, brake_scene, require_kind
 from .stability import stability
 
 
@@ -70,7 +70,11 @@ def grid_over(
 
     **Raises:** `ValueError` as `modes_over`.
     """
+    require_kind("scene", scene, Scene)
     require_scalar(scene)
+    for axis, given in (("x", x), ("y", y)):
+        if not (isinstance(given, (tuple, list)) and len(given) == 2 and isinstance(given[0], str)):
+            raise TypeError(f"{axis} must be a name and its values, got {brief(given)}")
     names = x[0], y[0]
     across, up = (axis_values(scene, name, values) for name, values in (x, y))
     require_independent(scene, names)

@@ -47,8 +47,9 @@ def margin(scene: Scene, shift=0.0, friction_slope: bool = True) -> jax.Array:
     **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`; `TypeError` for a `shift`
     that is no number.
     """
-    if jnp.issubdtype(jnp.result_type(shift), jnp.bool_):
-        raise TypeError("shift must be a growth rate [1/s], got a bool; friction_slope comes third")
+    kind = jnp.dtype(bool) if shift is None else jnp.result_type(shift)
+    if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
+        raise TypeError(f"shift must be a real number, got {kind}; friction_slope comes third")
     K_n, K_t = stiffness(scene)
     return margin_of(linearise(scene.oscillator, scene.friction, K_n, K_t, friction_slope), shift)
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from ..base.parts import number
 from ..mechanism.friction import Friction
-from ..mechanism.oscillator import equilibrium
+from ..mechanism.oscillator import static_displacements
 from ..mechanism.scene import Scene, stiffness
 
 SECTION = 4  # the guard of the section u1 = 0, after two guards for each direction
@@ -140,7 +140,9 @@ def stick_slip(scene: Scene) -> StickSlip:
 def rest(scene: Scene, system: StickSlip) -> jax.Array:
     """The sliding equilibrium (Eq. 40) as a scaled state."""
     K_n, K_t = stiffness(scene)
-    x_1, x_2 = equilibrium(scene.oscillator, K_n, K_t, scene.friction.coefficient(system.V))
+    x_1, x_2 = static_displacements(
+        scene.oscillator, K_n, K_t, scene.friction.coefficient(system.V)
+    )
     length = system.V / system.omega
     return jnp.stack([x_1 / length, x_2 / length, jnp.zeros_like(x_1), jnp.zeros_like(x_1)])
 

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..base.parts import flag
+from ..base.parts import brief, flag
 from ..mechanism.scene import Scene
 from ..modes.stability import growth_rate, growth_rate_of, require_computable
 from ..report import comparison_table, table
@@ -214,13 +214,16 @@ def design(
     or the design moves, and for options outside their domain.
     """
     bounds = DEFAULT_BOUNDS if bounds is None else bounds
-    for name, given in {"bounds": bounds, "tolerance": tolerance or {}}.items():
-        if not isinstance(given, Mapping):
-            raise TypeError(f"{name} must be a mapping, got {given!r}")
+    for name, mapping in (("bounds", bounds), ("tolerance", tolerance)):
+        if not isinstance(mapping, Mapping) and mapping is not None:
+            raise TypeError(f"{name} must be a mapping, got {brief(mapping)}")
     if objective is not None and not callable(objective):
-        raise TypeError(f"objective must be a function of a scene, got {objective!r}")
-    if callable(constraints) or not all(map(callable, constraints)):
-        raise TypeError(f"constraints must be a list of functions of a scene, got {constraints!r}")
+        raise TypeError(f"objective must be a function of a scene, got {brief(objective)}")
+    if not isinstance(constraints, (list, tuple)) or not all(map(callable, constraints)):
+        raise TypeError(
+            f"constraints must be a list of functions of a scene, got {brief(constraints)}"
+        )
+    progress = flag("progress", progress)
     options = dict(
         bounds=dict(bounds),
         objective=objective,

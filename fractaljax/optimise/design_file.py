@@ -88,8 +88,13 @@ def read_design(
     path: str | os.PathLike, functions: Mapping[str, Callable[[Scene], Any]] | None = None
 ) -> tuple[Scene, dict[str, Any]]:
     """The scene given and the arguments of `design`; errors as `repeat_design`."""
+    if not isinstance(functions, Mapping) and functions is not None:
+        raise TypeError(f"functions must be a mapping of names to functions, got {functions!r}")
     try:
         document = read(Path(path).read_bytes())
+        # Versions are texts, of whatever packages.
+        tables = [name for name, value in document.items() if not isinstance(value, str)]
+        refuse_unknown("the file", tables, ("options", "result", "history"))
         options = table_of(document, "options")
         return _scene(document), _options(options, dict(functions or {}))
     except KeyError as error:

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from ..base.parts import scalar
+from ..base.parts import brief, scalar
 from ..base.ranges import within
 from ..mechanism.quantities import own_quantities
 from ..mechanism.scene import Scene
@@ -43,7 +43,7 @@ class Envelope:
     def __post_init__(self):
         for which in ("ranges", "samples"):
             if not isinstance(getattr(self, which), Mapping):
-                raise TypeError(f"{which} must be a mapping, got {getattr(self, which)!r}")
+                raise TypeError(f"{which} must be a mapping, got {brief(getattr(self, which))}")
         ranges, samples = {}, {}
         for name, ends in dict(self.ranges).items():
             ends = _numbers(name, ends)
@@ -73,7 +73,7 @@ class Envelope:
         if isinstance(conditions, Envelope):
             return conditions
         if not isinstance(conditions, Mapping):
-            raise TypeError(f"envelope must be a mapping or an Envelope, got {conditions!r}")
+            raise TypeError(f"envelope must be a mapping or an Envelope, got {brief(conditions)}")
         given = {name: _numbers(name, values) for name, values in conditions.items()}
         for name, values in given.items():
             if len(values) < 2:
@@ -201,7 +201,7 @@ class Envelope:
 def _numbers(name, values) -> list[float]:
     """A flat list of finite numbers."""
     if not isinstance(values, (tuple, list, np.ndarray, jax.Array)) or not np.ndim(values):
-        raise TypeError(f"envelope of {name} must be a range or samples, got {values!r}")
+        raise TypeError(f"envelope of {name} must be a range or samples, got {brief(values)}")
     return [float(scalar(f"envelope of {name}", value)) for value in values]
 
 

@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..base.parts import number
+from ..base.parts import brief, flag, number, whole
 from ..mechanism.scene import Scene
 from .constraints import Constraint
 from .design import Design, design
 from .search import search
-from .task import Task, pose, whole
+from .task import Task, pose
 from .worst_case import OneCondition
 
 _WALKERS = 8  # surfaces improved for each member of the front
@@ -85,6 +85,12 @@ def pareto(
     for objectives without a trade-off, and as `design`.
     """
     points = whole("points", points, 3, _POINTS_MAX)
+    if not (isinstance(names, (tuple, list)) and len(names) == 2):
+        raise TypeError(f"names must be those of both objectives, got {brief(names)}")
+    for name, objective in zip(("first", "second"), (first, second), strict=True):
+        if not callable(objective):
+            raise TypeError(f"{name} must be a function of a scene, got {brief(objective)}")
+    progress = flag("progress", progress)
     refused = sorted({"objective", "starts", "envelope", "risk"} & set(options))
     if refused:
         raise ValueError(f"pareto does not take {', '.join(refused)}")

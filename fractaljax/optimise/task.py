@@ -1,7 +1,6 @@
 """The request for a design, checked: its numbers, its structure, and what judges a surface."""
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..base.parts import require_scalar, scalar
+from ..base.parts import brief, require_scalar, scalar, whole
 from ..mechanism.scene import Scene, require_kind
 from . import tolerance as scatter
 from .constraints import Constraint
@@ -149,8 +148,8 @@ def _bounds(scene, bounds):
     low, high, own, checked = [], [], [], {}
     for name in sorted(bounds):
         scale = np.log if name == "G" else float
-        if not isinstance(bounds[name], (tuple, list, np.ndarray)):
-            raise TypeError(f"bounds on {name} must be (lower, upper), got {bounds[name]!r}")
+        if not isinstance(bounds[name], (tuple, list, np.ndarray)) or not np.ndim(bounds[name]):
+            raise TypeError(f"bounds on {name} must be (lower, upper), got {brief(bounds[name])}")
         ends = [float(scalar(f"{name} bound", end)) for end in bounds[name]]
         for end in ends:
             scene.replace(**{name: end})  # refuses an end outside the domain of the model
@@ -183,19 +182,8 @@ def _risk(risk, envelope):
         parameter = expected_shortfall(count, alpha)
     else:
         raise ValueError(
-            f'risk must be "worst", "smooth", ("smooth", T) or ("cvar", alpha), got {risk!r}'
+            f'risk must be "worst", "smooth", ("smooth", T) or ("cvar", alpha), got {brief(risk)}'
         )
     if envelope is None:
         raise ValueError(f"risk {risk!r} needs an envelope")
     return kind, parameter
-
-
-def whole(name: str, value: Any, least: int, most: float = math.inf) -> int:
-    """`value` as an int, refused unless it is a whole number from `least` to `most`."""
-    bounds = f"at least {least}" + (f" and at most {most}" if most < math.inf else "")
-    plain = not isinstance(value, (list, tuple)) and np.asarray(value).dtype.kind in "iuf"
-    plain = plain and np.ndim(value) == 0
-    # Compared before it is converted: infinity and NaN are no whole numbers either.
-    if not (plain and least <= value <= most and value % 1 == 0):
-        raise ValueError(f"{name} must be a whole number of {bounds}, got {value!r}")
-    return int(value)
