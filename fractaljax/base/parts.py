@@ -37,8 +37,7 @@ def number(
         if not (jnp.issubdtype(dtype, jnp.floating) or jnp.issubdtype(dtype, jnp.integer)):
             raise TypeError
         # An explicit dtype also strips weak types, which would compile every caller twice.
-        # Half precision, which no law here survives, counts as a plain number.
-        is_float_array = hasattr(value, "dtype") and dtype in (jnp.float32, jnp.float64)
+        is_float_array = hasattr(value, "dtype") and jnp.issubdtype(dtype, jnp.floating)
         traced = isinstance(value, jax.core.Tracer)
         # A value that is known while a program is traced stays known.
         with contextlib.nullcontext() if traced else jax.ensure_compile_time_eval():
@@ -63,9 +62,7 @@ def number(
     values = concrete(array)
     if values is None:
         return eqx.error_if(array, ~inside(array, jnp), f"{name} must be {wanted}")
-    # Compiled programs take what is smaller than any normal number for 0.
-    tiny = np.abs(values) < jnp.finfo(values.dtype).tiny
-    bad = values[~inside(np.where(tiny, 0, values), np)]
+    bad = values[~inside(values, np)]
     if bad.size:
         raise ValueError(f"{name} must be {wanted}, got {_digits(bad.flat[0])}")
     return array

@@ -188,7 +188,7 @@ def tangential_stiffness(E, nu, slip_ratio: jax.Array, root_area_moment: jax.Arr
 def dimensionless_normal_stiffness(D, A_r, a_e) -> jax.Array:
     """Eq. 31: K_n* = K_n/(E sqrt(A_a)) from A_r* = A_r/A_a and a_e* = a_e/A_a; any shape.
 
-    **Raises:** `ValueError` unless 2 < D < 3, A_r > 0 and a_e > 0.
+    **Raises:** `ValueError` unless 2 < D < 3, A_r > 0 and a_e > 0, which may be infinite.
     """
     D, moment = _root_area_moment_of_real_area(D, A_r, a_e)
     return normal_stiffness(D, 1.0, moment)
@@ -209,8 +209,11 @@ def dimensionless_tangential_stiffness(D, nu, A_r, a_e, slip_ratio) -> jax.Array
 
 
 def _root_area_moment_of_real_area(D, A_r, a_e):
-    D = number("D", D, above=2, below=3)
-    A_r, a_e = number("A_r", A_r, above=0), number("a_e", a_e, above=0)
+    D, A_r = number("D", D, above=2, below=3), number("A_r", A_r, above=0)
+    if jnp.issubdtype(getattr(a_e, "dtype", type(a_e)), jnp.floating):
+        # Towards D = 2 it overflows, and `contact_state` has infinity: nothing is elastic.
+        a_e = jnp.minimum(a_e, jnp.finfo(getattr(a_e, "dtype", float)).max)
+    a_e = number("a_e", a_e, above=0)
     log_a_l, log_a_e = jnp.log((3 - D) / (D - 1) * A_r), jnp.log(a_e)  # Eq. 28
     return D, area_moment(0.5, D, log_a_e, log_a_l - log_a_e)
 

@@ -706,7 +706,42 @@ def test_load_refusals():
 def test_the_closed_ends():
     """mu_m = 0 and mu_m = 0.9 belong to the domain, in both dtypes."""
     for mu_m in (0.0, 0.9, jnp.float32(0.9)):
-        assert np.isfinite(_state(**LOADED | {"mu_m": mu_m}).K_n)
+        assert np.isfinite(_state(**LOADED | {"mu_m": mu_m, "mu_s": 0.9}).K_n)
+
+
+def test_static_friction_is_the_largest():
+    """As in a friction law: mu_m beyond mu_s is refused, and the two may be equal."""
+    assert _state(1907.3, 0.25, 0.25).K_n == _state(1907.3, 0.4, 0.25).K_n
+    with pytest.raises(ValueError, match=r"^mu_s must be at least mu_m = 0.3, got 0.25$"):
+        _state(1907.3, 0.25, 0.3)
+
+
+def test_one_joint_at_a_time():
+    """Arrays are refused by name, where JAX would speak of a predicate."""
+    for name in LOADED:
+        with pytest.raises(ValueError, match=f"^{name} must be a s"):
+            _state(**LOADED | {name: np.array([0.5, 0.6])})
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"D": 2.0}, "D must be above 2 and below 3"),
+        ({"D": 3.0}, "D must be above 2 and below 3"),
+        ({"A_r": -1e-3}, "A_r must be above 0"),
+        ({"a_e": 0.0}, "a_e must be above 0"),
+        ({"nu": 0.6}, "nu must be at least 0 and at most 0.5"),
+        ({"slip_ratio": np.nan}, "slip_ratio must be finite"),
+    ],
+)
+def test_dimensionless_stiffness_refusals(changed, message):
+    given = {"D": 2.4, "nu": 0.3, "A_r": 1e-3, "a_e": 1e-5, "slip_ratio": 0.2} | changed
+    with pytest.raises(ValueError, match=f"^{message}, got"):
+        fj.dimensionless_tangential_stiffness(**given)
+    normal = {name: given[name] for name in ("D", "A_r", "a_e")}
+    if normal.keys() & changed.keys():
+        with pytest.raises(ValueError, match=f"^{message}, got"):
+            fj.dimensionless_normal_stiffness(**normal)
 
 
 @pytest.mark.parametrize(
@@ -768,6 +803,6 @@ def test_traced_refusal(name, bad, message):
 def test_outcomes_are_not_errors():
     """Every regime of `Regime` is returned with a message that says what it means."""
     assert brake_joint(G=1.342e-8).regime == fj.Regime.fully_plastic
-    assert brake_joint(mu_s=0.05).regime == fj.Regime.gross_slip
+    assert brake_joint(mu_s=0.05, mu_m=0.05).regime == fj.Regime.gross_slip
     assert "K_n = K_t = 0" in fj.Regime[fj.Regime.fully_plastic]
     assert "K_t = 0" in fj.Regime[fj.Regime.gross_slip]
