@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
-from fractaljax.report import comparison_table, cycle_table, scene_rows, stability_table, table
+from fractaljax.report import (
+    comparison_table,
+    cycle_table,
+    friction_remark,
+    scene_rows,
+    stability_table,
+    table,
+)
 from tools import motionless_scene, reference_cycle, reference_scene
 
 
@@ -153,3 +160,39 @@ def test_cycle_table_of_the_regularised_law():
     text = cycle_table(reference_scene(), moved)
     assert "off the exact law by  1.2e-02" in text and "switch" not in text
     assert "off the exact" not in cycle_table(reference_scene(), reference_cycle())
+
+
+UNCOMPUTABLE = [
+    ({"v_m": 1e-150}, "the friction at V is inf"),
+    ({"E": 1.7e308}, "K_n [N/m] is nan"),
+    ({"xi_1": 1e40}, "the damping of x1 [1/s] is 1.25664e+44"),
+    ({"mu_s": 1e100}, "the coupling mu^2 K_n K_t/m^2 [1/s^4] is 2.62034e+216"),
+    ({"omega_2": 1e160}, "(K_n/m + omega_2^2) [1/s^2] is inf"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), UNCOMPUTABLE)
+def test_what_cannot_be_computed_is_not_called_stable(changes, message):
+    """Found: NaN 1/s, (stable). Now one line that says what left the range."""
+    scene = fj.brake_scene().replace(**changes)
+    assert np.isnan(fj.growth_rate(scene)) and np.isnan(fj.margin(scene))
+    with pytest.raises(ValueError, match=f"computed in float64: {re.escape(message)}$"):
+        stability_table(scene)
+
+
+def test_a_growth_rate_of_zero_is_neither():
+    """Without damping rounding would decide."""
+    scene = fj.brake_scene().replace(xi_1=0.0, xi_2=0.0, mu_s=0.01, mu_m=0.01)
+    assert "+0  (0 to rounding: it neither grows nor dies out)" in stability_table(scene)
+
+
+def test_friction_beyond_its_law_is_remarked():
+    """Beyond sqrt(3) v_m the cubic exceeds mu_s."""
+    scene = fj.brake_scene()
+    speeds = 0.5 * np.sqrt(3) * np.array([0.0, 0.999, 1.0])
+    assert friction_remark(scene, speeds) == []
+    assert friction_remark(scene.replace(friction=fj.Coulomb(0.4)), 1e9) == []
+    (line,) = friction_remark(scene, np.array([0.1, 0.87, 0.5]))
+    assert line.startswith("remark: at a sliding speed of 0.87 m/s the friction law gives 0.40")
+    assert stability_table(scene.replace(V=5.0)).splitlines()[-1].startswith("remark: at a sliding")
+    assert "remark" not in stability_table(scene)

@@ -42,10 +42,12 @@ def reason(error: Exception) -> str | None:
     """What a failure that a user can cause means, in a line; None for any other."""
     if isinstance(error, OSError):
         return _about_file(error)
-    if isinstance(error, (RecursionError, MemoryError, ArithmeticError)):
-        words = {RecursionError: "too deeply nested", MemoryError: "not enough memory"}
-        kind = next((kind for kind in words if isinstance(error, kind)), None)
-        return f"{words[kind]}: {error}" if kind else f"a number is out of range: {error}"
+    if isinstance(error, RecursionError):
+        return "a file is too deeply nested"
+    if isinstance(error, MemoryError):
+        return f"not enough memory: {error}"
+    if isinstance(error, ArithmeticError):
+        return f"a number is out of range: {error}"
     text = str(error)
     if isinstance(error, (ValueError, TypeError)):
         return text

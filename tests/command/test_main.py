@@ -12,6 +12,8 @@ import pytest
 
 import fractaljax as fj
 import fractaljax.base.scene_file
+from fractaljax.__main__ import main
+from fractaljax.command.design import _LIMITS, _OPTIONS
 from fractaljax.report import cycle_table
 from tools import motionless_scene, reference_cycle, reference_scene, run_command as run
 
@@ -246,6 +248,20 @@ def test_friction_beyond_its_law(capsys, tmp_path):
         (["design", "--target", "low"], "invalid float value: 'low'"),
         (["design", "--envelope", "P"], "--envelope must be NAME=LOW:HIGH, got 'P'"),
         (["design", "--envelope", "P=1:x"], "--envelope P must be numbers, got 'x'"),
+        (["design", "--envelope", "P=1"], "--envelope P must be LOW:HIGH or at least two samples"),
+        (["design", "--envelope", "P=1:1"], "envelope of P must be (lower, upper), got (1, 1)"),
+        (["design", "--envelope", "P=nan:2"], "envelope of P must be finite, got nan"),
+        (
+            ["design", "--envelope", "P=1:2", "--envelope", "P=3:4"],
+            "--envelope has P more than onc",
+        ),
+        (["design", "--tolerance", "D=1", "lnG=1", "D=2"], "--tolerance has D more than once"),
+        (["design", "--seed", 1, "--seed", 2], "argument --seed: given more than once"),
+        (["design", "--seed", "1e20"], "argument --seed: invalid int value: '1e20'"),
+        (["design", "--seed", 10**20], "seed must be a whole number of at least 0 and at most"),
+        (["design", "--lattice", 200000], "lattice must be a whole number of at least 1 and at m"),
+        (["design", "--lattice", 2, "--starts", 5], "starts must be at most the 4 of the lattice"),
+        (["design", "--quantile", "nan"], "quantile must be at least 0.5 and at most 0.999, got "),
         (["design", "--envelope", "P=2:1"], "envelope of P must be (lower, upper), got (2, 1)"),
         (["design", "--envelope", "Q=1:2"], "envelope names 'Q', which the scene does not have"),
         (["design", "--tolerance", "D"], "--tolerance must be NAME=SIGMA, got 'D'"),
@@ -326,3 +342,95 @@ def test_runs_as_a_module_in_double_precision():
     )
     assert done.returncode == 0 and done.stderr == ""
     assert "+22.0801" in done.stdout
+
+
+def test_version(capsys):
+    """That of the package, and nothing else."""
+    assert run(capsys, "--version") == (0, f"fractaljax {fj.__version__}\n", "")
+
+
+def test_a_scene_that_cannot_be_computed(capsys, tmp_path):
+    """Exit status 2 and one line; found: NaN 1/s, (stable), exit status 0."""
+    fj.brake_scene().replace(v_m=1e-150).save("small.toml")
+    for command in ("stability", "cycle", "design"):
+        status, out, err = run(capsys, command, "small.toml")
+        assert (status, out) == (2, "")
+        assert err == "fractaljax: stability cannot be computed in float64: " + (
+            "the friction at V is inf\n"
+        )
+    assert [p.name for p in tmp_path.iterdir()] == ["small.toml"]
+
+
+def failing(error):
+    def fail(*_):
+        raise error
+
+    return fail
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (MemoryError("1 TiB"), "not enough memory: 1 TiB"),
+        (RecursionError("maximum recursion depth"), "a file is too deeply nested"),
+        (OverflowError("int too large"), "a number is out of range: int too large"),
+        (ZeroDivisionError("division by zero"), "a number is out of range: division by zero"),
+        (PermissionError(13, "Permission denied", "x"), "no permission for: x"),
+        (OSError(28, "No space left on device", "x"), "No space left on device: x"),
+        (OSError("disk full"), "disk full"),
+        (jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: of 1 TiB"), "not enough memory: RESO"),
+    ],
+)
+def test_every_expected_failure_is_one_line(capsys, monkeypatch, error, line):
+    monkeypatch.setattr("fractaljax.report.stability_table", failing(error))
+    status, out, err = run(capsys, "stability")
+    assert (status, out) == (2, "")
+    assert err.startswith(f"fractaljax: {line}") and err.count("\n") == 1
+
+
+@pytest.mark.parametrize("compile", [jax.jit, eqx.filter_jit])
+def test_a_check_that_fails_at_run_time_is_one_line(capsys, monkeypatch, compile):
+    """Not JAX's and Equinox's own accounts of the program, 18 lines of them."""
+    program = compile(lambda x: eqx.error_if(x, x > 0, "F must be below 0"))
+    monkeypatch.setattr(
+        "fractaljax.report.stability_table", lambda *_: jax.block_until_ready(program(np.ones(())))
+    )
+    assert run(capsys, "stability") == (2, "", "fractaljax: F must be below 0\n")
+
+
+def test_a_defect_keeps_its_traceback(monkeypatch):
+    monkeypatch.setattr("fractaljax.report.stability_table", failing(AttributeError("no x")))
+    with pytest.raises(AttributeError, match="no x"):
+        main(["stability"])
+
+
+def test_bad_values_for_any_option(capsys, tmp_path, monkeypatch):
+    """Random command lines: never a traceback, always one line, and refused before the search."""
+    monkeypatch.setattr("fractaljax.optimise.task.Task.judge", failing(ValueError("accepted")))
+    random, accepted = np.random.default_rng(12), 0
+    values = ["nan", "inf", "-inf", "0", "-1", "1e20", "1e400", "x", ":", "1:", "1:1", "2:1", "2.5"]
+    values += [
+        "P=1",
+        "P=nan:2",
+        "P=1:2",
+        "D=-1",
+        "=1",
+        "cvar:1",
+        "smooth:0",
+        "1_",
+        "é",
+        "10",
+        "1e-9",
+    ]
+    options = {"--D": 2, "--G": 2, "--sq-lengths": 2, "--envelope": 1, "--tolerance": 1}
+    options |= {f"--{name.replace('_', '-')}": 1 for name in (*_OPTIONS, *_LIMITS, "risk")}
+    for _ in range(300):
+        arguments = ["design", "--quiet"]
+        for name in random.choice(list(options), random.integers(1, 3), replace=False):
+            arguments += [name, *random.choice(values, options[name])]
+        status, out, err = run(capsys, *arguments)
+        assert (status, out) == (2, ""), arguments
+        assert err.startswith("fractaljax: ") and err.count("\n") == 1, arguments
+        accepted += err == "fractaljax: accepted\n"
+    assert 0 < accepted < 60
+    assert list(tmp_path.iterdir()) == []

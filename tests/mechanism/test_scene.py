@@ -179,3 +179,22 @@ def test_stiffness_by_structure():
     assert K_t == 0.5 * K_n and K_n == pytest.approx(float(reference[0]), rel=1e-14)
     assert reference[0] == pytest.approx(402628934.268313, rel=1e-14)
     assert reference[1] == pytest.approx(191682502.096783, rel=1e-14)
+
+
+def test_a_quantity_beside_the_part_that_holds_it():
+    """It is changed in the new part; found: the new part took its place and it was forgotten."""
+    scene, surface = fj.brake_scene(), fj.Surface(2.5, 1e-11)
+    new = scene.replace(surface=surface, D=2.6)
+    assert (new.contact.surface.D, new.contact.surface.G) == (2.6, 1e-11)
+    contact = fj.FractalContact(surface, scene.contact.material, 5.0)
+    new = scene.replace(contact=contact, P=7.0, G=1e-12)
+    assert (new.contact.P, new.contact.surface.D, new.contact.surface.G) == (7.0, 2.5, 1e-12)
+    new = scene.replace(contact=contact, surface=fj.Surface(2.7, 1e-9), D=2.8)
+    assert (new.contact.P, new.contact.surface.D, new.contact.surface.G) == (5.0, 2.8, 1e-9)
+    assert scene.replace(friction=fj.Coulomb(0.3), mu=0.4).friction.mu == 0.4
+    for part, name in (({"friction": fj.Coulomb(0.3)}, "mu_s"), ({"contact": FIXED}, "P")):
+        with pytest.raises(ValueError, match=f"^scene has no quantity '{name}'; it has"):
+            scene.replace(**part, **{name: 0.5})
+
+
+FIXED = fj.FixedContact(4e8, 2e8)

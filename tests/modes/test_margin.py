@@ -1,5 +1,7 @@
 """The margin of stability against Hurwitz determinants and roots in 40 digits, and its picture."""
 
+from fractions import Fraction
+
 import jax
 import jax.numpy as jnp
 import mpmath as mp
@@ -385,3 +387,38 @@ def test_smoothed_abscissa_of_the_picture():
     normal = np.array([[-0.1, 1, 0, 0], [-1, -0.1, 0, 0], [0, 0, -0.3, 2], [0, 0, -2, -0.3]])
     s = load_script(DOCS / "make_margin.py").smoothed_abscissa(normal, 0.01)
     assert 1 / (s + 0.1) + 1 / (s + 0.3) == pytest.approx(100, rel=1e-9)
+
+
+# --- signs where numbers leave their range --------------------------------------------------
+
+
+def exactly_stable(a, b, c_1, c_2, g) -> bool:
+    """By Routh and Hurwitz, in rational numbers: without any rounding."""
+    a, b, c_1, c_2, g = map(Fraction, (a, b, c_1, c_2, g))
+    a_3, a_2, a_1, a_0 = c_1 + c_2, a + b + c_1 * c_2, c_1 * b + c_2 * a, a * b + g
+    H_3 = a_3 * a_2 * a_1 - a_1**2 - a_3**2 * a_0
+    return min(a_3, a_2, a_1, a_0, H_3) > 0
+
+
+@pytest.mark.parametrize("decades", [6, 20, 100])
+def test_no_wrong_sign_over_hundreds_of_decades(decades):
+    """Right or NaN: of the margin always, of the growth rate beyond rounding of its eigenvalues."""
+    r, n = np.random.default_rng(decades), 1000
+    a = 10 ** r.uniform(-decades, decades, n)
+    b = a * np.where(r.random(n) < 0.3, 1, 10 ** r.uniform(-decades, decades, n))
+    omega = np.sqrt(a + b)
+    c_1, c_2 = (
+        omega * 10 ** r.uniform(-12, min(decades, 9), n) * np.where(r.random(n) < 0.2, -1, 1)
+        for _ in range(2)
+    )
+    g = np.minimum(a * b * 10 ** r.uniform(-decades, 4, n), 1e300)
+    lin = Linearised(*map(jnp.asarray, (a, b, c_1, c_2, g)))
+    growth, margin = np.asarray(_growths(lin)), np.asarray(_margins(lin))
+    stable = np.array([exactly_stable(*row) for row in zip(a, b, c_1, c_2, g, strict=True)])
+    known = np.isfinite(margin)
+    assert 0.3 * n < known.sum() and (np.isfinite(growth) == known).all()
+    assert ((margin > 0) == stable)[known].all()
+    size = omega + np.abs(c_1) + np.abs(c_2)
+    certain = known & (np.abs(growth) > 1e-6 * size)
+    assert ((growth < 0) == stable)[certain].all()
+    assert (~known == (np.maximum(abs(c_1), abs(c_2)) / omega > EPS**-0.5))[g < 1e3 * a * b].all()

@@ -1,6 +1,7 @@
 """A saved design says what was asked and what came of it, and runs again to the last bit."""
 
 import math
+import re
 import tomllib
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
-from fractaljax.optimise.design_file import read_design
+from fractaljax.optimise.design_file import _row, read_design
 
 SMALL: dict[str, Any] = dict(starts=4, lattice=8, progress=False)
 
@@ -125,3 +126,63 @@ def test_numbers_that_toml_can_hold(robust, tmp_path):
     odd.save(tmp_path / "run.toml")
     result = tomllib.loads((tmp_path / "run.toml").read_text())["result"]
     assert math.isnan(result["value"]) and result["growth_rate"] == -math.inf
+
+
+WRONG = [True, -1, 1.5, 10**30, math.nan, math.inf, "", "text", [], [1], ["a"], {}, {"a": 1}, [{}]]
+RIGHT = [  # of the wrong ones, what an option or a key may be after all
+    ("target", (-1, 1.5, 10**30)),
+    ("K_n_min", (1.5, 10**30)),
+    ("area_ratio_min", (1.5, 10**30)),
+    ("friction_slope", (True,)),
+    ("constraints", ([],)),
+    ("designed", ("", "text")),
+    ("jax", ("", "text")),
+    ("fractaljax", ("", "text")),
+]
+
+
+def test_wrong_kinds_are_refused_before_the_search(robust, tmp_path, monkeypatch):
+    """Every key of a file, and every option in it, with a value of the wrong type or sign."""
+    monkeypatch.setattr("fractaljax.optimise.design._choose_starts", None)
+    robust.save(tmp_path / "run.toml")
+    document = tomllib.loads((tmp_path / "run.toml").read_text())
+    document |= {"result": {}, "history": {}}
+    right = dict(RIGHT)
+    places = [(document, name) for name in document if name not in ("result", "history")]
+    places += [(document["options"], name) for name in document["options"]]
+    for table, name in places:
+        for value in WRONG:
+            if value in right.get(name, ()) and type(value) in map(type, right[name]):
+                continue
+            given, table[name] = table[name], value
+            tables = {key: x for key, x in document.items() if isinstance(x, dict)}
+            lines = [_row(key, x) for key, x in document.items() if key not in tables]
+            for key, entries in tables.items():
+                lines += [f"[{key}]", *(_row(inner, x) for inner, x in entries.items())]
+            (tmp_path / "wrong.toml").write_text("\n".join(lines))
+            table[name] = given
+            with pytest.raises((ValueError, TypeError)) as refused:
+                fj.repeat_design(tmp_path / "wrong.toml", {"coarse": coarse}, progress=False)
+            assert "\n" not in str(refused.value) and len(str(refused.value)) < 300
+
+
+def test_unknown_and_missing_entries(robust, tmp_path):
+    """Tables, options and arguments of constraints that are misspelt or gone."""
+    robust.save(tmp_path / "run.toml")
+    text = (tmp_path / "run.toml").read_text()
+    for old, new, message in (
+        ("[options]", "[option]", "the file has the unknown key 'option'"),
+        ("quantile = ", "quantil = ", "[options] has the unknown key 'quantil'"),
+        ("{ranges = ", "{range = ", "[options.envelope] has the unknown key 'range'"),
+        ("L_s = ", "L_x = ", "the constraint Roughness has the unknown key 'L_x'"),
+        ("risk = ", "# risk = ", "not a design file, it lacks 'risk'"),
+        (
+            '"coarse"',
+            '"fractaljax.nowhere:x"',
+            "the package has no function 'fractaljax.nowhere:x'",
+        ),
+    ):
+        assert old in text
+        (tmp_path / "wrong.toml").write_text(text.replace(old, new, 1))
+        with pytest.raises(ValueError, match=re.escape(message)):
+            read_design(tmp_path / "wrong.toml", {"coarse": coarse})
