@@ -1,9 +1,11 @@
 """Parts as TOML tables: every number beside its unit and meaning, every key accounted for."""
 
+import contextlib
 import dataclasses
+import errno
 import inspect
 import os
-import tempfile
+import secrets
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -168,14 +170,84 @@ def left_behind(target: Path, file: Path) -> bool:
 
 
 def write_whole(path: str | os.PathLike, content: bytes) -> None:
-    """Write a file through a temporary neighbour, so that it is there whole or not at all."""
-    target = Path(path)
-    handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=_temporary(target))
+    """Write a file through a temporary neighbour, so that it is there whole or not at all.
+
+    **Raises:** `OSError` naming the file.
+    """
+    write_together({path: content})
+
+
+def write_together(files: Mapping[Any, bytes]) -> list[Path]:
+    """Write files {path: content} that belong together; returns the paths of those replaced.
+
+    All are written and on the disk before the first takes its place, and on an error all are as
+    before. A process killed meanwhile may leave some of them missing (moved, under hidden names),
+    but never new files beside old ones; the last one is the last to come.
+
+    **Raises:** `OSError` naming the file.
+    """
+    # A link stays one: what it leads to is written.
+    targets = {Path(path): Path(os.path.realpath(path)) for path in files}
+    replaced = [path for path, target in targets.items() if target.exists()]
+    for path in replaced:
+        if not path.is_file():  # a folder, or a device that would become a file
+            raise FileExistsError(errno.EEXIST, "not a regular file", str(path))
+    new, moves, old = {}, [], []
+
+    def move(start, end):
+        moves.append((start, end))  # before it happens: a signal may come in between
+        os.replace(start, end)
+
     try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        os.chmod(temporary, 0o644)  # mkstemp makes it private
-        os.replace(temporary, target)
+        for (path, target), content in zip(targets.items(), files.values(), strict=True):
+            new[target] = _neighbour(target)
+            _write(new[target], content, path)
+        if len(new) == 1:
+            for target, file in new.items():
+                os.replace(file, target)
+        else:
+            for path in reversed(replaced):
+                move(targets[path], _neighbour(targets[path]))
+            old = [end for _, end in moves]
+            for target, file in new.items():
+                move(file, target)
     except BaseException:
-        os.unlink(temporary)
+        for start, end in reversed(moves):
+            with contextlib.suppress(OSError):  # the last one may not have happened
+                os.replace(end, start)
+        for file in new.values():
+            with contextlib.suppress(OSError):
+                file.unlink()
         raise
+    for file in old:
+        with contextlib.suppress(OSError):
+            file.unlink()
+    for folder in {target.parent for target in new}:
+        _sync(folder)
+    return replaced
+
+
+def _neighbour(target: Path) -> Path:
+    return target.with_name(f"{_temporary(target)}{secrets.token_hex(4)}")
+
+
+def _write(file: Path, content: bytes, name: Path) -> None:
+    """Write a new file, through to the disk; an error tells `name`."""
+    try:
+        with open(file, "xb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+    except OSError as error:
+        error.filename = str(name)
+        raise
+
+
+def _sync(folder: Path) -> None:
+    """Bring the names in a folder through to the disk, where the system can."""
+    with contextlib.suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

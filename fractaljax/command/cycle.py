@@ -47,14 +47,16 @@ def _run(arguments) -> int:
             throw=False,
         )
         found = cycle.result in (CycleResult.converged, CycleResult.inaccurate)
-        files = {}
         if found:
-            files["cycle.png"] = picture(plot.cycle(cycle))
-            files["cycle.csv"] = _orbit_text(cycle).encode()
-            write(files)
+            written = write(
+                {
+                    "cycle.png": picture(plot.cycle(cycle)),
+                    "cycle.csv": _orbit_text(cycle).encode(),
+                }
+            )
     print(cycle_table(scene, cycle))
     if found:
-        print(f"written to {arguments.out}: {', '.join(files)}")
+        print(written)
     return 0 if found else 1
 
 

@@ -1,5 +1,7 @@
 """`fractaljax design`: the nearest surface that is stable against small disturbances."""
 
+import sys
+import warnings
 from pathlib import Path
 
 from .output import csv_text, npy, output, picture
@@ -119,7 +121,11 @@ def _run(arguments) -> int:
         given = [name for name in _OWN if getattr(arguments, name) not in (None, False)]
         if given:
             raise ValueError(f"--repeat takes everything from its file, got {', '.join(given)} too")
-        scene, options = read_design(arguments.repeat)
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            scene, options = read_design(arguments.repeat)
+        for warning in found:
+            print(f"fractaljax: {warning.message}", file=sys.stderr)
     with output(arguments.out) as write:
         best = design(scene, **options, progress=not arguments.quiet)
         surfaces = best.topographies()
@@ -131,8 +137,8 @@ def _run(arguments) -> int:
             "topographies.png": picture(plot.topographies(best)),
             "topography.npy": npy(surfaces.after),
         }
-        write(files)
-    print(f"written to {arguments.out}: {', '.join(files)}")
+        written = write(files)
+    print(written)
     side, dx = len(surfaces.after), surfaces.dx
     print(f"topography.npy: {side} x {side} heights in m, dx = {dx:g} m\n")
     for line in _remarks(scene, options):
@@ -219,7 +225,10 @@ def _remarks(scene, options) -> list[str]:
 
 
 def _scene_text(best) -> str:
+    from ..base.versions import version_text
+
     lines = [f"# {best.outcome}", f"# growth rate {best.growth_rate:+.6g} 1/s"]
+    lines.append(f"# designed by {version_text()}")
     lines += [f"# not met: {name}" for name in best.violated]
     return "\n".join([*lines, best.scene.to_toml()])
 

@@ -68,11 +68,13 @@ def _run(arguments) -> int:
             files["scene.toml"] = _scene_text(base, read, found).encode()
         except ValueError as error:
             failure = error
-        write(files)
+        written = write(files)
     print(f"{read.source}\n{read.description}\n\n{found}\n")
-    print(f"written to {arguments.out}: {', '.join(files)}")
+    print(written)
     if failure is not None:
         print(f"no scene: {failure}")
+        if (arguments.out / "scene.toml").exists():
+            print(f"{arguments.out / 'scene.toml'} is of an earlier run")
         return 1
     path = shlex.quote(str(arguments.out / "scene.toml"))
     print(f"next: fractaljax design {path}{_bounds(found)}")

@@ -11,29 +11,36 @@ from pathlib import Path
 def output(folder: Path):
     """Make sure that files can be written to `folder`, and offer to write {name: content} there.
 
-    Where nothing has been written at the end, folders made for it are removed.
+    All of them or none; what writes them returns a line that says so, and what it replaced. The
+    folder is made when they are written, so that a command that is killed leaves none behind.
     """
-    from ..base.scene_file import write_whole
+    from ..base.scene_file import write_together
 
-    def write(files):
-        for name, content in files.items():
-            write_whole(folder / name, content)
+    def write(files) -> str:
+        with _made(folder):
+            replaced = write_together({folder / name: files[name] for name in files})
+        said = f"written to {folder}: {', '.join(files)}"
+        if not replaced:
+            return said
+        names = "all" if len(replaced) == len(files) else ", ".join(p.name for p in replaced)
+        return f"{said} ({names} replaced)"
 
-    created = _make_folder(folder)
+    with _made(folder), tempfile.TemporaryFile(dir=folder):
+        pass
+    yield write
+
+
+@contextlib.contextmanager
+def _made(folder: Path):
+    """A folder that is made if missing, and gone again if it is empty at the end."""
+    missing = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
-        yield write
+        folder.mkdir(parents=True, exist_ok=True)
+        yield
     finally:
-        with contextlib.suppress(OSError):  # no longer empty
-            for made in created:
+        for made in missing:
+            with contextlib.suppress(OSError):  # not empty, or never made
                 made.rmdir()
-
-
-def _make_folder(path: Path) -> list[Path]:
-    """Make sure that files can be written to a folder; returns those it made, innermost first."""
-    missing = [folder for folder in (path, *path.parents) if not folder.exists()]
-    path.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryFile(dir=path):
-        return missing
 
 
 def csv_text(titles, rows) -> str:

@@ -11,6 +11,7 @@ derived ones come last: K_t/K_n = 0.5 beside K_n = 1e8 N/m sets K_t = 5e7 N/m.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ import numpy as np
 from ..base.parts import Part, leaf, number, quantities, substitute
 from .scene import Scene
 
+_CHECKED_AT_ONCE = 1 << 16  # points of a grid
 STIFFNESS_RATIO, FREQUENCY_RATIO, FRICTION = "K_t/K_n", "omega_1/omega_2", "mu"
 
 
@@ -75,6 +77,36 @@ def replaced(scene: Scene, values: Mapping[str, Any]) -> Scene:
         for name, value in values.items()
     }
     return scene.replace(**_settings(scene, checked))
+
+
+def require_inside(scene: Scene, axes: Mapping[str, np.ndarray]) -> None:
+    """Refuse a grid of independent quantities, each with its values (n,), unless all is inside.
+
+    In batches: the grid is never made.
+
+    **Raises:** `ValueError` as `replaced`.
+    """
+    ends = {name: np.array([values.min(), values.max()]) for name, values in axes.items()}
+    # Domains are intervals, also of one quantity beside another, and all that moves a limit is
+    # monotonic, so that the corners decide; but for mu(V), by which `mu` scales the friction law.
+    _require_all_inside(scene, ends)
+    if FRICTION in axes:
+        law = {"V", *own_quantities(scene.friction)}
+        among = {name: values for name, values in axes.items() if name in law}
+        if among:
+            _require_all_inside(scene, {FRICTION: ends[FRICTION], **among})
+
+
+def _require_all_inside(scene, axes):
+    shape = tuple(values.size for values in axes.values())
+    points = math.prod(shape)
+    batch = min(points, _CHECKED_AT_ONCE)
+    for begin in range(0, points, batch):
+        # The last batch goes back to the one before: one shape compiles once.
+        begin = min(begin, points - batch)
+        places = np.unravel_index(np.arange(begin, begin + batch), shape)
+        values = {name: axes[name][i] for name, i in zip(axes, places, strict=True)}
+        replaced(scene, values)
 
 
 def substituted(scene: Scene, values: Mapping[str, Any]) -> Scene:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..base.parts import Part, Record, number, quantities, quantity, rebuild, require_scalar
-from ..base.scene_file import read, read_bounded, write_whole
+from ..base.scene_file import read, read_bounded, write_together
 from .damping import modal_damping, rayleigh_damping
 from .friction import Friction
 from .matrices import fitting, mass_matrix, square
@@ -231,8 +231,11 @@ class Structure(Record):
     def save(self, path: str | os.PathLike) -> None:
         """Write a TOML file, and beside it the matrices as a .npz file of the same name.
 
+        Both or neither: an error leaves the files of an earlier structure as they were.
+
         **Raises:** `OSError` if a file cannot be written; `ValueError` if the structure holds a
-        batch, or if `path` itself ends in .npz.
+        batch, if `path` itself ends in .npz, and if there is a .npz file of that name which the
+        TOML file at `path` does not name.
         """
         path = Path(path)
         matrices = path.with_suffix(".npz")
@@ -240,8 +243,22 @@ class Structure(Record):
             raise ValueError(f"path must be that of the TOML file, got {str(path)!r}")
         require_single(self)
         text = render_structure(self, matrices.name, JOINT_LAWS).encode()
-        write_whole(matrices, npz_of(self))
-        write_whole(path, text)
+        if matrices.exists() and not _names_matrices(path, matrices.name):
+            raise ValueError(
+                f"{matrices} is not of a structure saved as {path.name}: save under another name,"
+                " or remove it"
+            )
+        # The TOML file comes last, so that it never names matrices of another structure.
+        write_together({matrices: npz_of(self), path: text})
+
+
+def _names_matrices(path: Path, matrices: str) -> bool:
+    """Whether there is a structure's TOML file that has its matrices in the file `matrices`."""
+    try:
+        table = read(path.read_bytes()).get("structure")
+    except (OSError, ValueError):
+        return False
+    return isinstance(table, dict) and table.get("matrices") == matrices
 
 
 def load(path: str | os.PathLike) -> Scene | Structure:

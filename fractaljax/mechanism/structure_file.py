@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from .._version import __version__
 from ..base.scene_file import (
     parts_of,
     quoted,
@@ -213,7 +214,8 @@ def _matrix_market(path: Path) -> np.ndarray:
 
 def render_structure(structure, matrices: str, laws) -> str:
     """The TOML text of a structure whose matrices are in the file `matrices` beside it."""
-    lines = ["# A fractaljax structure, in SI units.", "", "[structure]"]
+    lines = [f"# A fractaljax structure, in SI units; written by fractaljax {__version__}."]
+    lines += ["", "[structure]"]
     lines.append(f"matrices = {quoted(matrices)}  # M, C, K and perhaps F")
     if structure.names is not None:
         lines += ["names = [", *(f"    {quoted(name)}," for name in structure.names), "]"]

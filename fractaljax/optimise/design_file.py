@@ -1,9 +1,10 @@
 """A design as a TOML file: the scene given, every option, what came of it, and the way there."""
 
-import importlib.metadata
+import importlib
 import inspect
 import math
 import os
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from ..base.scene_file import quoted, read, refuse_unknown, table_of, write_whole
+from ..base.versions import versions, versions_differ
 from ..mechanism.scene import Scene
 from . import constraints as known_constraints
 from .constraints import Constraint
@@ -37,6 +39,8 @@ def repeat_design(
 ) -> Design:
     """Run again what a file of `save_design` holds: with the same versions, to the last bit.
 
+    A file of other versions is run under a warning.
+
     Functions of the user's own, an objective or constraints, are in the file by name only: give
     them as `functions`, {name: function}.
 
@@ -50,9 +54,8 @@ def repeat_design(
 def design_text(best: Design) -> str:
     """The text of the file of a design."""
     dtype = best.initial.contact.surface.D.dtype
-    versions = {name: importlib.metadata.version(name) for name in (_PACKAGE, "jax")}
     lines = ["# A fractaljax design, in SI units: `fractaljax design --repeat` runs it again.", ""]
-    lines += [_row(name, version) for name, version in versions.items()]
+    lines += [_row(name, version) for name, version in versions().items()]
     lines += [_row("precision", str(dtype))]
     lines += [f"{name} = '''\n{scene.to_toml()}'''" for name, scene in _scenes(best).items()]
     options = dict(best.options)
@@ -87,7 +90,7 @@ def design_text(best: Design) -> str:
 def read_design(
     path: str | os.PathLike, functions: Mapping[str, Callable[[Scene], Any]] | None = None
 ) -> tuple[Scene, dict[str, Any]]:
-    """The scene given and the arguments of `design`; errors as `repeat_design`."""
+    """The scene given and the arguments of `design`; errors and warning as `repeat_design`."""
     if not isinstance(functions, Mapping) and functions is not None:
         raise TypeError(f"functions must be a mapping of names to functions, got {functions!r}")
     try:
@@ -96,11 +99,15 @@ def read_design(
         tables = [name for name, value in document.items() if not isinstance(value, str)]
         refuse_unknown("the file", tables, ("options", "result", "history"))
         options = table_of(document, "options")
-        return _scene(document), _options(options, dict(functions or {}))
+        found = _scene(document), _options(options, dict(functions or {}))
     except KeyError as error:
         raise ValueError(f"{path}: not a design file, it lacks {error}") from None
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
+    others = versions_differ(document)
+    if others:
+        warnings.warn(f"{path} was {others}: digits may differ", stacklevel=3)
+    return found
 
 
 def _scenes(best):

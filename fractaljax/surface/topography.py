@@ -15,10 +15,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..base.memory import require_memory
 from ..base.parts import concrete, number, ordered, require_scalar
 from .surfaces import Surface, frequency_count
 
 _BLOCK = 256  # waves in one product of matrices
+_ARRAYS_OF_WAVES = 8  # at once: steps, phases, heights
 _ROWS = 64  # frequencies whose phases are drawn at once: at gamma = 1.5 L/L_s up to 1e11
 
 
@@ -41,22 +43,28 @@ def topography(surface: Surface, L, n: int, *, key, L_s=None, M: int = 10) -> ja
     there are is structure: gamma must be known while a program is traced, and L and L_s as well
     where L_s is given. Phases are reduced exactly, so that float32 is off by 2e-5 Sq at most.
 
-    **Raises:** `ValueError` unless 0 < L_s <= L, n >= 2 and M >= 1, both whole, and for an array
-    of surfaces or keys; `TypeError` for what is none, and for a gamma, L or L_s that is traced.
+    **Raises:** `ValueError` unless 0 < L_s <= L, n >= 2 and M >= 1, both whole, for an array of
+    surfaces or keys, and for more points or waves than memory holds; `TypeError` for what is
+    none, and for a gamma, L or L_s that is traced.
     """
     if not isinstance(surface, Surface):
         raise TypeError(f"surface must be a Surface, got {surface!r}")
     require_scalar(surface)
     n, M = _whole("n", n, 2), _whole("M", M, 1)
+    size = surface.D.dtype.itemsize * n * (3 * n + 4 * _BLOCK)
+    require_memory(f"a topography of {n} x {n} points", size)
     L = _length("L", L)
     gamma = _known("gamma", surface.gamma)
     if L_s is None:
         ratio = n / 2
     else:
         L_s = _length("L_s", L_s)
-        ratio = _known("L", L) / _known("L_s", L_s)
+        with np.errstate(over="ignore"):
+            ratio = _known("L", L) / _known("L_s", L_s)
         L = ordered("L", L, "L_s", L_s)
+        number("L/L_s", ratio)
     count = int(frequency_count(gamma, ratio, np))
+    require_memory(f"{count} x {M} waves", 8 * count * M * _ARRAYS_OF_WAVES)
     angles = np.pi * np.arange(1, M + 1) / M
     directions = np.stack([np.cos(angles), np.sin(angles)])[:, None]
     steps = (float(gamma) ** np.arange(count))[None, :, None] * directions / n

@@ -1,11 +1,14 @@
-"""A sweep's batches as files of a folder, so that an interrupted sweep can be gone on with."""
+"""A sweep's batches as files of a folder, so that an interrupted sweep can be gone on with.
+
+Every batch is a .npz file whose ZIP comment is the SHA-256 of the sweep, the batch's number and all
+that comes before the comment: a file that is damaged, or that of another batch, is not read.
+"""
 
 import hashlib
 import io
 import json
 import os
-import re
-import zipfile
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,14 +17,18 @@ import jax
 import numpy as np
 
 from ..base.scene_file import left_behind, write_whole
+from ..base.versions import versions, versions_differ
+from .program import Program, array_digest
 
 _ABOUT = "sweep.json"
+_VERSIONS = "versions"  # of what wrote the folder, which may be others than these
 _MEANINGS = {
     "key": "measure or scene",
     "axes": "axes",
     "batch": "batch size",
     "arrays": "arrays of the measure",
 }
+_COMMENT = 2 + 64  # bytes: its length, and a SHA-256
 
 
 class Shards:
@@ -33,10 +40,13 @@ class Shards:
     def __init__(self, path: str | os.PathLike, about: Mapping[str, Any]):
         """Make the folder of the sweep that `about` describes, or go on with it.
 
+        Warns of a folder that other versions have written.
+
         **Raises:** `ValueError` for the folder of another sweep, or with other files in it.
         """
         self._folder = Path(path)
         self._folder.mkdir(parents=True, exist_ok=True)
+        self._sweep = json.dumps(about, sort_keys=True).encode()
         file = self._folder / _ABOUT
         # Another process of the same sweep may write the file between two of these questions.
         if not file.exists():
@@ -44,11 +54,20 @@ class Shards:
             others = [f for f in self._folder.iterdir() if not left_behind(file, f)]
             if others and not file.exists():
                 raise ValueError(f"out must be an empty folder or that of this sweep, got {path}")
-            write_whole(file, json.dumps(about).encode())
+            write_whole(file, json.dumps({**about, _VERSIONS: versions()}).encode())
         found = describe(path) or {}
-        differs = [meaning for key, meaning in _MEANINGS.items() if found.get(key) != about[key]]
+        # As texts: 0.0 and -0.0 are two values of an axis.
+        differs = [
+            meaning
+            for key, meaning in _MEANINGS.items()
+            if json.dumps(found.get(key)) != json.dumps(about[key])
+        ]
+        others = versions_differ(found.get(_VERSIONS, {}))
         if differs:
-            raise ValueError(f"out {path} holds another sweep: {', '.join(differs)} differ")
+            note = f" (it was {others})" if others else ""
+            raise ValueError(f"out {path} holds another sweep: {', '.join(differs)} differ{note}")
+        if others:
+            warnings.warn(f"out {path} was {others}: digits may differ", stacklevel=3)
 
     def has(self, k: int) -> bool:
         """Whether batch k is there."""
@@ -58,18 +77,26 @@ class Shards:
         """Keep the arrays of batch k."""
         content = io.BytesIO()
         np.savez(content, *arrays)
-        write_whole(self._file(k), content.getvalue())
+        held = content.getvalue()[:-2]  # a ZIP file ends in the length of its comment, here none
+        write_whole(self._file(k), held + self._comment(k, held))
 
     def read(self, k: int) -> list[np.ndarray]:
         """The arrays of batch k. **Raises:** `ValueError` naming a file that is damaged."""
         try:
-            # Read at once: NumPy leaves a damaged file open.
-            with np.load(io.BytesIO(self._file(k).read_bytes())) as found:
+            content = self._file(k).read_bytes()
+            held, comment = content[:-_COMMENT], content[-_COMMENT:]
+            if comment != self._comment(k, held):
+                raise ValueError("it is damaged, or no batch of this sweep")
+            with np.load(io.BytesIO(content)) as found:
                 return [found[name] for name in found.files]
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        except (OSError, ValueError) as error:
             raise ValueError(
                 f"{self._file(k)} cannot be read, remove it and sweep again: {error}"
             ) from None
+
+    def _comment(self, k: int, held: bytes) -> bytes:
+        digest = hashlib.sha256(self._sweep + b"%d" % k + held).hexdigest()
+        return len(digest).to_bytes(2, "little") + digest.encode()
 
     def _file(self, k: int) -> Path:
         return self._folder / f"{k:08d}.npz"
@@ -85,26 +112,31 @@ def describe(path: str | os.PathLike) -> dict[str, Any] | None:
         return None
     try:
         found = json.loads(file.read_bytes())
-        if not isinstance(found, dict) or set(found) != set(_MEANINGS):
+        if not isinstance(found, dict) or set(found) - {_VERSIONS} != set(_MEANINGS):
             raise ValueError("other keys than those of a sweep")
-    except (ValueError, UnicodeDecodeError) as error:
+        if not isinstance(found.get(_VERSIONS, {}), dict):
+            raise ValueError("its versions are no mapping")
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{file} does not describe a sweep: {error}") from None
     return found
 
 
-def description(measure, scene, axes: Mapping[str, np.ndarray], batch: int) -> dict[str, Any]:
-    """What sweep.json says of a sweep: equal for equal sweeps on any number of devices."""
-    traced = jax.make_jaxpr(measure, return_shape=True)(scene)
-    program, shapes = traced
-    text = re.sub(r" at 0x[0-9a-f]+", "", str(program))  # where functions lie in memory
-    content = hashlib.sha256(text.encode())
-    for array in [*program.consts, *jax.tree.leaves(scene)]:
-        content.update(np.asarray(array).tobytes())
+def description(
+    program: Program, scene, axes: Mapping[str, np.ndarray], batch: int
+) -> dict[str, Any]:
+    """What sweep.json says of a sweep: equal for equal sweeps on any number of devices.
+
+    **Raises:** `ValueError` for a measure that calls what is not in its program.
+    """
+    content = hashlib.sha256(program.key())
+    for array in jax.tree.leaves(scene):
+        content.update(array_digest(array))
     return {
         "key": content.hexdigest(),
         "axes": {name: values.tolist() for name, values in axes.items()},
         "batch": batch,
         "arrays": [
-            jax.tree_util.keystr(place) for place, _ in jax.tree_util.tree_leaves_with_path(shapes)
+            jax.tree_util.keystr(place)
+            for place, _ in jax.tree_util.tree_leaves_with_path(program.shapes)
         ],
     }

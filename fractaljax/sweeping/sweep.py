@@ -7,7 +7,6 @@ several processes share the work.
 
 import contextlib
 import functools
-import itertools
 import math
 import os
 from collections.abc import Callable, Sequence
@@ -18,15 +17,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from ..base.memory import require_memory
 from ..base.parts import require_scalar
 from ..mechanism.quantities import (
     axis_values,
-    replaced,
     require_independent,
-    substituted,
+    require_inside,
     with_optional,
 )
 from ..mechanism.scene import Scene
+from .program import Program
 from .shards import Shards, describe, description
 
 _POINTS = "points"  # the axis that devices share
@@ -49,19 +49,22 @@ def sweep(
     `**{"K_t/K_n": ratios}` (`quantities.py`), and its values (n,); the first one comes first in
     the result's shape. `measure` gives an array or any pytree of arrays, and so is the result: as
     NumPy arrays (n_1, n_2, ..., *shape of the measure's). `jax.jit` and `jax.grad` do not see
-    through it: what they act on is the measure.
+    through it: what they act on is the measure. It is traced once a sweep, with what it captures
+    as that is then; the compiled program serves every later sweep of an equal one.
 
     Points are evaluated `batch_size` at a time (8192 for every device), split evenly over
     `devices` (all that this process has), on each of which loops end by themselves.
 
     `out` names a folder that keeps the batches. The same sweep called again computes what is
-    missing; another one is refused. Under `jax.distributed` every process of a sweep must name
-    the same folder and computes its share of the batches; all of them return the whole.
+    missing; another one is refused, and one that other versions began is gone on with under a
+    warning. Under `jax.distributed` every process of a sweep must name the same folder and
+    computes its share of the batches; all of them return the whole.
 
     **Raises:** `ValueError` for no axis, an unknown name, two of one quantity, values that are not
     one-dimensional or outside their domain, a batch that does not divide by the devices, a scene
-    that holds arrays, a folder of another sweep, or several processes without a folder;
-    `TypeError` for what is not numeric.
+    that holds arrays, more values than memory, a folder of another sweep or with a damaged batch,
+    a measure that calls Python (`jax.pure_callback`) beside a folder, or several processes without
+    one; `TypeError` for what is not numeric; `OSError` if the folder cannot be written.
     """
     require_scalar(scene)
     names, grid = tuple(axes), _checked(scene, axes)
@@ -72,19 +75,20 @@ def sweep(
     if batch_size is None and out is not None and (begun := describe(out)) is not None:
         batch_size = begun["batch"]
     batch = _batch_size(batch_size, points, mesh.size)
+    program = Program(measure, names, scene, grid)
+    values = _Values(program.shapes, points, batch)
     kept = None
     if out is not None:
         named = dict(zip(names, grid, strict=True))
-        kept = Shards(out, description(measure, scene, named, batch))
+        kept = Shards(out, description(program, scene, named, batch))
     elif jax.process_count() > 1:
         raise ValueError("out must name a folder that all processes share, got None")
     whole = NamedSharding(mesh, PartitionSpec())
     fixed = jax.device_put((scene, [jnp.asarray(values) for values in grid]), whole)
 
     def arguments(k):
-        return measure, names, mesh, *fixed, _places(k * batch, batch, shape, mesh)
+        return program, mesh, *fixed, _places(k * batch, batch, shape, mesh)
 
-    values = _Values(_batch.eval_shape(*arguments(0)), points, batch)
     run = _in_memory if kept is None else functools.partial(_through_folder, kept)
     run(lambda k: _batch(*arguments(k)), values, progress and jax.process_index() == 0)
     return values.on_grid(shape)
@@ -93,9 +97,12 @@ def sweep(
 class _Values:
     """NumPy arrays for every array of a measure, filled batch by batch."""
 
-    def __init__(self, example, points: int, batch: int):
-        leaves, self._tree = jax.tree.flatten(example)  # of a batch
-        self._arrays = [np.empty((points, *leaf.shape[1:]), leaf.dtype) for leaf in leaves]
+    def __init__(self, shapes, points: int, batch: int):
+        leaves, self._tree = jax.tree.flatten(shapes)  # of a point
+        each = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in leaves)
+        require_memory(f"a sweep of {points} points", points * max(each, 1))
+        require_memory(f"a batch of {batch} points", batch * max(each, 1))
+        self._arrays = [np.empty((points, *leaf.shape), leaf.dtype) for leaf in leaves]
         self.points, self._batch = points, batch
         self.batches = -(-points // batch)
 
@@ -123,9 +130,7 @@ def _checked(scene: Scene, axes) -> list[np.ndarray]:
     for name, values in axes.items():
         grid.append(np.asarray(axis_values(scene, name, values)))
     require_independent(scene, tuple(axes))
-    # Domains are intervals, also of one quantity beside another: the corners decide.
-    corners = np.array(list(itertools.product(*((v.min(), v.max()) for v in grid))))
-    replaced(scene, dict(zip(axes, corners.T, strict=True)))
+    require_inside(scene, dict(zip(axes, grid, strict=True)))
     return grid
 
 
@@ -148,13 +153,12 @@ def _mesh(devices) -> Mesh:
     return Mesh(np.array(chosen), (_POINTS,))
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 2))
-def _batch(measure, names, mesh, scene, axes, places):
-    """`measure` at the points that lie at `places` (batch,) on each of the axes."""
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _batch(point, mesh, scene, axes, places):
+    """The program `point` at the points that lie at `places` (batch,) on each of the axes."""
 
     def one(scene, axes, places):
-        values = {name: axis[i] for name, axis, i in zip(names, axes, places, strict=True)}
-        return jax.tree.map(jnp.asarray, measure(substituted(scene, values)))
+        return point(scene, [axis[i] for axis, i in zip(axes, places, strict=True)])
 
     program = jax.vmap(one, (None, None, 0))
     if mesh.size > 1:
