@@ -73,8 +73,8 @@ class Program:
         for name, called in digest.python:
             if name not in _SHOWN and not _raises(called):
                 raise ValueError(
-                    f"out cannot tell this measure from others: its {name} calls what is not in"
-                    f" the traced program, {called!r}"
+                    f"out needs a measure that JAX traces as a whole: what its {name} does is not"
+                    " in the program"
                 )
         return digest.digest
 
@@ -134,6 +134,8 @@ class Digest:
             return "set", *sorted(repr(self._plain(member, name)) for member in x)
         if isinstance(x, Mapping):
             return "mapping", *sorted(repr((k, self._plain(value, name))) for k, value in x.items())
+        if isinstance(x, jax.tree_util.PyTreeDef):
+            return "tree", self._plain(x.node_data(), name), self._plain(x.children(), name)
         self.python.append((name, x))
         return type(x).__qualname__
 

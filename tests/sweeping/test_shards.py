@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from fractaljax.base.versions import versions
 from fractaljax.sweeping.shards import Shards, describe
 
 ABOUT = {"key": "1", "axes": {"D": [2.4]}, "batch": 4, "arrays": [""]}
@@ -19,7 +20,7 @@ def test_what_is_written_is_read(tmp_path):
     ):
         np.testing.assert_array_equal(found, given)
         assert found.dtype == given.dtype
-    assert describe(tmp_path / "new" / "folder") == ABOUT
+    assert describe(tmp_path / "new" / "folder") == ABOUT | {"versions": versions()}
     assert describe(tmp_path) is None
 
 
@@ -42,7 +43,7 @@ def test_a_sweep_killed_before_it_was_described(tmp_path):
     assert Shards(tmp_path, ABOUT).has(0)
 
 
-@pytest.mark.parametrize("content", [b"", b"[1]", b'{"key": 1}', b"\xff\xfe"])
+@pytest.mark.parametrize("content", [b"", b"[1]", b'{"key": 1}', b"\xff\xfe", b"[" * 9999])
 def test_a_description_that_is_none(tmp_path, content):
     (tmp_path / "sweep.json").write_bytes(content)
     with pytest.raises(ValueError, match=r"sweep\.json does not describe a sweep: "):
@@ -59,3 +60,34 @@ def test_a_damaged_batch(tmp_path, cut):
         ValueError, match=r"00000000\.npz cannot be read, remove it and sweep again"
     ):
         shards.read(0)
+
+
+def test_no_flipped_bit_is_read(tmp_path):
+    """Wherever it is in the file of a batch."""
+    shards = Shards(tmp_path, ABOUT)
+    shards.write(0, [np.arange(3.0)])
+    file = tmp_path / "00000000.npz"
+    content = file.read_bytes()
+    for place in range(len(content)):
+        damaged = bytearray(content)
+        damaged[place] ^= 1 << place % 8
+        file.write_bytes(damaged)
+        with pytest.raises(ValueError, match="it is damaged, or no batch of this sweep"):
+            shards.read(0)
+    file.write_bytes(content)
+    np.testing.assert_array_equal(shards.read(0)[0], np.arange(3.0))
+
+
+def test_batches_stay_in_their_place_and_sweep(tmp_path):
+    one, two = (Shards(tmp_path / name, ABOUT | {"key": name}) for name in "12")
+    one.write(0, [np.arange(3.0)])
+    for to, k in [(two, 0), (one, 1)]:
+        to._file(k).write_bytes(one._file(0).read_bytes())
+        with pytest.raises(ValueError, match="it is damaged, or no batch of this sweep"):
+            to.read(k)
+
+
+def test_signs_of_zero_are_other_axes(tmp_path):
+    Shards(tmp_path, ABOUT | {"axes": {"K_t": [0.0]}})
+    with pytest.raises(ValueError, match="holds another sweep: axes differ"):
+        Shards(tmp_path, ABOUT | {"axes": {"K_t": [-0.0]}})

@@ -1,16 +1,24 @@
 """Sweeps: the grid, batches of one shape, folders to go on with, devices and processes."""
 
+import errno
+import json
+import os
+import stat
 import subprocess
 import sys
 import textwrap
 from typing import Any
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import fractaljax as fj
+from fractaljax.base.versions import versions
 from fractaljax.sweeping.shards import Shards
+from fractaljax.sweeping.sweep import _batch
 
 SCENE = fj.brake_scene()
 D = np.linspace(2.35, 2.45, 5)
@@ -22,7 +30,7 @@ def measured(D, G):
     return np.array([[fj.growth_rate(SCENE.replace(D=d, G=g)) for g in G] for d in D])
 
 
-def grown(**options):
+def grown(D=D, **options):
     return fj.sweep(fj.growth_rate, SCENE, progress=False, D=D, G=G, **options)
 
 
@@ -76,9 +84,29 @@ def test_one_program_serves_every_batch_and_every_sweep_of_a_kind():
         traces.append(1)
         return fj.growth_rate(scene)
 
+    compiled = _batch._cache_size()
     fj.sweep(measure, SCENE, 4, False, D=D, G=G)
     fj.sweep(measure, SCENE.replace(P=2000.0), 4, False, D=D + 0.01, G=G)
-    assert len(traces) == 1
+    fj.sweep(lambda scene: fj.growth_rate(scene), SCENE, 4, False, D=D, G=G)
+    assert _batch._cache_size() <= compiled + 1
+    assert len(traces) == 2
+
+
+def test_what_a_measure_captures_is_taken_as_it_is_now(tmp_path):
+    factor = [1.0]
+
+    def measure(scene):
+        return factor[0] * scene.contact.surface.D
+
+    for out in (None, tmp_path):
+        factor[0] = 1.0
+        np.testing.assert_array_equal(fj.sweep(measure, SCENE, None, False, out=out, D=D), D)
+        factor[0] = 2.0
+        if out is None:
+            np.testing.assert_array_equal(fj.sweep(measure, SCENE, None, False, D=D), 2 * D)
+        else:
+            with pytest.raises(ValueError, match="holds another sweep: measure or scene differ"):
+                fj.sweep(measure, SCENE, None, False, out=out, D=D)
 
 
 def test_progress_goes_to_standard_error(capsys):
@@ -101,6 +129,12 @@ def test_progress_goes_to_standard_error(capsys):
         ({"D": [2.4, 3.1]}, "D must be above 2 and below 3, got 3.1"),
         ({"D": [2.4, np.nan]}, "D must be finite, got nan"),
         ({"mu_s": [0.4, 0.3], "mu_m": [0.2, 0.35]}, "mu_s must be at least mu_m = 0.35, got 0.3"),
+        # At the corners the friction law is above its minimum, which is inside.
+        ({"V": [0.05, 0.5, 0.95], "mu": [0.3, 1.2]}, "mu_m must be at most 0.9, got 1.2"),
+        (
+            {"D": [2.4], "v_m": [0.05, 0.15, 0.95], "P": [1e3, 2e3], "mu": [0.3, 1.2]},
+            "mu_m must be at most 0.9, got 1.2",
+        ),
     ],
 )
 def test_bad_axes(axes, said):
@@ -150,12 +184,83 @@ def test_an_interrupted_sweep_loses_one_batch(tmp_path, monkeypatch):
     assert written == [0, 1, 2, 3]
 
 
-def test_the_values_come_from_the_folder(tmp_path):
+def test_the_values_come_from_the_folder(tmp_path, monkeypatch):
     found = grown(batch_size=4, out=tmp_path)
     with np.load(tmp_path / "00000003.npz") as last:
         np.testing.assert_array_equal(last["arr_0"], found.ravel()[12:])
-    np.savez(tmp_path / "00000003.npz", arr_0=np.arange(3.0))
-    assert list(grown(batch_size=4, out=tmp_path).ravel()[12:]) == [0, 1, 2]
+    monkeypatch.setattr(Shards, "write", None)
+    np.testing.assert_array_equal(grown(batch_size=4, out=tmp_path), found)
+
+
+@pytest.mark.parametrize("batch", ["own", "shorter", "other", "elsewhere"])
+def test_a_batch_of_another_make_is_refused(tmp_path, batch):
+    """Whole files of the right name: by hand, too short, of another place, of another sweep."""
+    out, file = tmp_path / "sweep", tmp_path / "sweep" / "00000001.npz"
+    grown(batch_size=4, out=out)
+    if batch == "own":
+        np.savez(file, arr_0=np.arange(4.0))
+    elif batch == "shorter":
+        np.savez(file, arr_0=np.arange(1.0))
+    elif batch == "other":
+        file.write_bytes((out / "00000000.npz").read_bytes())
+    else:
+        fj.sweep(fj.growth_rate, SCENE, 4, False, out=tmp_path / "b", D=D + 1e-9, G=G)
+        file.write_bytes((tmp_path / "b" / "00000001.npz").read_bytes())
+    with pytest.raises(ValueError, match=r"00000001\.npz cannot be read, remove it and sweep again"):
+        grown(batch_size=4, out=out)
+    file.unlink()
+    np.testing.assert_array_equal(grown(batch_size=4, out=out), grown(batch_size=4))
+
+
+def test_a_folder_of_other_versions(tmp_path):
+    """Gone on with under a warning, one line; without any versions, in silence."""
+    found = grown(batch_size=4, out=tmp_path)
+    file = tmp_path / "sweep.json"
+    about = json.loads(file.read_text())
+    assert about["versions"] == versions()
+    file.write_text(json.dumps(about | {"versions": {"fractaljax": "0.0.9", "jax": "0.1"}}))
+    with pytest.warns(UserWarning) as warned:
+        again = grown(batch_size=4, out=tmp_path)
+    message = str(warned.pop().message)
+    assert "was written by fractaljax 0.0.9, jax 0.1, read by fractaljax" in message
+    assert "\n" not in message
+    np.testing.assert_array_equal(again, found)
+    with pytest.raises(ValueError, match=r"axes differ \(it was written by fractaljax 0\.0\.9"):
+        grown(batch_size=4, out=tmp_path, D=D + 1e-9)
+    del about["versions"]
+    file.write_text(json.dumps(about))
+    np.testing.assert_array_equal(grown(batch_size=4, out=tmp_path), found)
+
+
+@pytest.mark.parametrize("failing", range(1, 6))
+def test_a_full_disk_loses_one_batch(tmp_path, monkeypatch, failing):
+    """sweep.json, then four batches: the k-th that does not fit is named, the rest stays."""
+    out, fsync, files = tmp_path / "sweep", os.fsync, []
+
+    def full(handle):
+        if stat.S_ISREG(os.fstat(handle).st_mode):
+            files.append(handle)
+            if len(files) == failing:
+                raise OSError(errno.ENOSPC, "No space left on device")
+        fsync(handle)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(OSError, match="No space left on device: .*sweep"):
+            grown(batch_size=4, out=out)
+    kept = sorted(file.name for file in out.iterdir())
+    names = ["sweep.json", *(f"{k:08d}.npz" for k in range(4))]
+    assert kept == sorted(names[: failing - 1])
+    np.testing.assert_array_equal(grown(batch_size=4, out=out), grown(batch_size=4))
+
+
+def test_more_points_than_memory():
+    """Before any of it is taken."""
+    many = np.full(10**5, 2.4)
+    with pytest.raises(ValueError, match="a sweep of 1000000000000000 points would take 8.00e.15 b"):
+        fj.sweep(fj.growth_rate, SCENE, progress=False, D=many, G=many * 1e-10, P=many * 1e3)
+    with pytest.raises(ValueError, match="a batch of 1000000000000000 points would take"):
+        grown(batch_size=10**15)
 
 
 def test_a_folder_of_another_sweep_is_refused(tmp_path):
@@ -176,6 +281,18 @@ def test_a_folder_of_another_sweep_is_refused(tmp_path):
         other + "measure or scene, arrays of the measure differ"
     )
     assert sorted(file.name for file in tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize("jit", [jax.jit, eqx.filter_jit])
+def test_what_a_jitted_measure_captures_makes_another_sweep(tmp_path, jit):
+    def measure_for(a):
+        a = jnp.asarray(a)
+        return jit(lambda scene: a[0] + a[1] * scene.contact.surface.D)
+
+    found = fj.sweep(measure_for([0.0, 1.0]), SCENE, None, False, out=tmp_path, D=D)
+    np.testing.assert_array_equal(found, D)
+    with pytest.raises(ValueError, match="holds another sweep: measure or scene differ"):
+        fj.sweep(measure_for([100.0, 200.0]), SCENE, None, False, out=tmp_path, D=D)
 
 
 def test_two_equal_functions_are_one_sweep(tmp_path):
