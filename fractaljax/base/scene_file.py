@@ -169,15 +169,17 @@ def left_behind(target: Path, file: Path) -> bool:
     return file.name.startswith(_temporary(target))
 
 
-def write_whole(path: str | os.PathLike, content: bytes) -> None:
+def write_whole(path: str | os.PathLike, content: bytes, *, durable: bool = True) -> None:
     """Write a file through a temporary neighbour, so that it is there whole or not at all.
+
+    A file that is not `durable` may be lost or damaged by a power cut shortly afterwards.
 
     **Raises:** `OSError` naming the file.
     """
-    write_together({path: content})
+    write_together({path: content}, durable=durable)
 
 
-def write_together(files: Mapping[Any, bytes]) -> list[Path]:
+def write_together(files: Mapping[Any, bytes], *, durable: bool = True) -> list[Path]:
     """Write files {path: content} that belong together; returns the paths of those replaced.
 
     All are written and on the disk before the first takes its place, and on an error all are as
@@ -201,7 +203,7 @@ def write_together(files: Mapping[Any, bytes]) -> list[Path]:
     try:
         for (path, target), content in zip(targets.items(), files.values(), strict=True):
             new[target] = _neighbour(target)
-            _write(new[target], content, path)
+            _write(new[target], content, path, durable)
         if len(new) == 1:
             for target, file in new.items():
                 os.replace(file, target)
@@ -222,8 +224,9 @@ def write_together(files: Mapping[Any, bytes]) -> list[Path]:
     for file in old:
         with contextlib.suppress(OSError):
             file.unlink()
-    for folder in {target.parent for target in new}:
-        _sync(folder)
+    if durable:
+        for folder in {target.parent for target in new}:
+            _sync(folder)
     return replaced
 
 
@@ -231,13 +234,14 @@ def _neighbour(target: Path) -> Path:
     return target.with_name(f"{_temporary(target)}{secrets.token_hex(4)}")
 
 
-def _write(file: Path, content: bytes, name: Path) -> None:
-    """Write a new file, through to the disk; an error tells `name`."""
+def _write(file: Path, content: bytes, name: Path, durable: bool) -> None:
+    """Write a new file, where `durable` through to the disk; an error tells `name`."""
     try:
         with open(file, "xb") as stream:
             stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
+            if durable:
+                stream.flush()
+                os.fsync(stream.fileno())
     except OSError as error:
         error.filename = str(name)
         raise

@@ -1,7 +1,5 @@
 """`fractaljax design`: the nearest surface that is stable against small disturbances."""
 
-import sys
-import warnings
 from pathlib import Path
 
 from .output import csv_text, npy, output, picture
@@ -12,6 +10,7 @@ from .parsing import (
     low_and_high,
     number,
     pairs_of,
+    remarks,
 )
 
 _UNITS = {"G": "m", "growth_rate": "1/s", "K_n": "N/m", "K_t": "N/m"}  # of the history
@@ -121,11 +120,8 @@ def _run(arguments) -> int:
         given = [name for name in _OWN if getattr(arguments, name) not in (None, False)]
         if given:
             raise ValueError(f"--repeat takes everything from its file, got {', '.join(given)} too")
-        with warnings.catch_warnings(record=True) as found:
-            warnings.simplefilter("always")
+        with remarks():
             scene, options = read_design(arguments.repeat)
-        for warning in found:
-            print(f"fractaljax: {warning.message}", file=sys.stderr)
     with output(arguments.out) as write:
         best = design(scene, **options, progress=not arguments.quiet)
         surfaces = best.topographies()

@@ -1,8 +1,10 @@
 """What the commands share in reading their arguments, and how they refuse."""
 
 import argparse
+import contextlib
 import re
 import sys
+import warnings
 from pathlib import Path
 
 
@@ -68,6 +70,17 @@ def _about_file(error: OSError) -> str:
     if error.filename is None:
         return str(error)
     return f"{words.get(type(error), error.strerror)}: {error.filename}"
+
+
+@contextlib.contextmanager
+def remarks():
+    """Warnings as lines on standard error."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        warnings.showwarning = lambda message, *_, **__: print(
+            f"fractaljax: {message}", file=sys.stderr
+        )
+        yield
 
 
 def add_scene_file(parser) -> None:

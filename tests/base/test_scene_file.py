@@ -1,11 +1,13 @@
 """Scene files: what they refuse, in one line, and that none is ever half-written."""
 
+import errno
 import os
+import resource
 
 import pytest
 
 import fractaljax as fj
-from fractaljax.base.scene_file import write_whole
+from fractaljax.base.scene_file import write_together, write_whole
 
 GOOD = fj.brake_scene().to_toml()
 
@@ -90,7 +92,107 @@ def test_interrupted_write_keeps_the_old_file(tmp_path, monkeypatch):
             write_whole(path, b"new")
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
     write_whole(path, b"new")
-    assert path.read_text() == "new" and path.stat().st_mode & 0o777 == 0o644
+    assert path.read_text() == "new" and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o077, 0o600), (0o002, 0o664)])
+def test_files_have_the_mode_that_the_user_wants(tmp_path, umask, mode):
+    """Also where they replace a file."""
+    before = os.umask(umask)
+    try:
+        for _ in range(2):
+            write_whole(tmp_path / "scene.toml", b"new")
+            assert (tmp_path / "scene.toml").stat().st_mode & 0o777 == mode
+    finally:
+        os.umask(before)
+
+
+OLD = {"a": b"old a", "b": b"old b", "notes": b"mine"}  # c is not there yet
+NEW = {"a": b"new a", "b": b"new b", "c": b"new c"}
+CALLS = [("fsync", k) for k in range(1, 4)] + [("replace", k) for k in range(1, 6)]
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def put(folder, files=OLD):
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
+
+
+@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left"), KeyboardInterrupt()])
+@pytest.mark.parametrize(("name", "failing"), CALLS)
+def test_files_of_a_run_replace_those_of_another_together(
+    tmp_path, monkeypatch, name, failing, error
+):
+    """Whichever step fails, before or after it was taken, the folder is as it was."""
+    put(tmp_path)
+    call, count = getattr(os, name), [0]
+
+    def fail(*arguments):
+        count[0] += 1
+        if count[0] == failing:
+            if isinstance(error, KeyboardInterrupt):
+                call(*arguments)
+            raise error
+        call(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, name, fail)
+        with pytest.raises(type(error)):
+            write_together({tmp_path / file: content for file, content in NEW.items()})
+    assert count[0] >= failing and contents(tmp_path) == OLD
+    replaced = write_together({tmp_path / file: content for file, content in NEW.items()})
+    assert replaced == [tmp_path / "a", tmp_path / "b"]
+    assert contents(tmp_path) == OLD | NEW
+
+
+@pytest.mark.parametrize("failing", range(1, 6))
+def test_a_run_that_is_killed_leaves_no_mixture(tmp_path, monkeypatch, failing):
+    """Whatever the step after which nothing more is done: old files alone, or new ones alone."""
+    put(tmp_path)
+    replace, count = os.replace, [0]
+
+    def killed(*arguments):
+        count[0] += 1
+        if count[0] >= failing:
+            raise KeyboardInterrupt
+        replace(*arguments)
+
+    monkeypatch.setattr(os, "replace", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_together({tmp_path / file: content for file, content in NEW.items()})
+    left = {name: content for name, content in contents(tmp_path).items() if name in NEW}
+    assert left.items() <= OLD.items() or left.items() <= NEW.items()
+
+
+def test_the_disk_is_full(tmp_path):
+    """A limit on the size of files, as the system sets one: the message names the file."""
+    put(tmp_path)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+    try:
+        with pytest.raises(OSError, match="File too large") as caught:
+            write_together({tmp_path / "a": b"new", tmp_path / "b": bytes(2000)})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert caught.value.filename == str(tmp_path / "b")
+    assert contents(tmp_path) == OLD
+
+
+def test_what_is_no_file_is_not_replaced(tmp_path):
+    """A folder, and a device, which would become a file; a link leads to what is written."""
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "pipe")
+    for name in ("folder", "pipe"):
+        with pytest.raises(OSError, match=f"not a regular file: .*{name}"):
+            write_together({tmp_path / "a": b"new", tmp_path / name: b"new"})
+    assert not (tmp_path / "a").exists() and (tmp_path / "pipe").is_fifo()
+    (tmp_path / "file").write_bytes(b"old")
+    (tmp_path / "link").symlink_to("file")
+    write_whole(tmp_path / "link", b"new")
+    assert (tmp_path / "link").is_symlink() and (tmp_path / "file").read_bytes() == b"new"
 
 
 @pytest.mark.parametrize("content", ["D = = 3\n", "[contact\n", "a = 1\na = 2\n", 'x = "a\nb"\n'])

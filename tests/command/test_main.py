@@ -1,8 +1,11 @@
 """The command: what it prints and writes, and how it refuses."""
 
 import csv
+import errno
+import os
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import equinox as eqx
@@ -11,8 +14,6 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
-import fractaljax.base.scene_file
-from fractaljax.__main__ import main
 from fractaljax.command.design import _LIMITS, _OPTIONS
 from fractaljax.report import cycle_table
 from tools import motionless_scene, reference_cycle, reference_scene, run_command as run
@@ -319,20 +320,108 @@ def test_picture_that_fails_leaves_no_half_result(capsys, tmp_path, monkeypatch)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_second_file_that_fails_says_why(capsys, tmp_path, monkeypatch):
-    """The reason is that of the file, not that the folder could not be removed."""
-    write_whole = fractaljax.base.scene_file.write_whole
+def test_second_file_that_fails_leaves_an_earlier_run(capsys, tmp_path, monkeypatch):
+    """The reason is that of the file; the files of another run are all there still."""
+    fsync, synced = os.fsync, []
 
-    def fail(path, content):
-        if path.name == "cycle.csv":
-            raise OSError("disk full")
-        write_whole(path, content)
+    def fail(handle):
+        synced.append(handle)
+        if len(synced) == 2:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        fsync(handle)
 
+    def search(scene, start, **_):
+        return reference_cycle()
+
+    monkeypatch.setattr(sys.modules["fractaljax.motion.limit_cycle"], "limit_cycle", search)
     reference_scene().save("mine.toml")
-    monkeypatch.setattr("fractaljax.base.scene_file.write_whole", fail)
-    status, out, err = run(capsys, "cycle", "mine.toml")
-    assert (status, out, err) == (2, "", "fractaljax: disk full\n")
-    assert [p.name for p in (tmp_path / "fractaljax-cycle").iterdir()] == ["cycle.png"]
+    for earlier in (False, True):
+        folder = tmp_path / "new" / f"{earlier}"
+        if earlier:
+            assert run(capsys, "cycle", "mine.toml", "--out", folder)[0] == 0
+        before = {path: path.read_bytes() for path in folder.glob("*")}
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "fsync", fail)
+            synced.clear()
+            status, out, err = run(capsys, "cycle", "mine.toml", "--out", folder)
+        said = f"[Errno 28] No space left on device: '{folder / 'cycle.csv'}'"
+        assert (status, out, err) == (2, "", f"fractaljax: {said}\n")
+        assert {path: path.read_bytes() for path in folder.glob("*")} == before
+        assert (tmp_path / "new").exists() == earlier
+    out = run(capsys, "cycle", "mine.toml", "--out", folder)[1]
+    assert out.endswith(f"written to {folder}: cycle.png, cycle.csv (all replaced)\n")
+    (folder / "cycle.csv").unlink()
+    out = run(capsys, "cycle", "mine.toml", "--out", folder)[1]
+    assert out.endswith(f"written to {folder}: cycle.png, cycle.csv (cycle.png replaced)\n")
+
+
+def test_folder_that_cannot_be_made_leaves_nothing(capsys, tmp_path):
+    """Nor what was made on the way to it."""
+    status, out, err = run(capsys, "cycle", "--out", "a/b/" + 300 * "c")
+    assert (status, out) == (2, "") and "File name too long" in err and err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_repetition_of_a_run_of_other_versions(capsys, tmp_path):
+    """One line on standard error; the run goes on to what else is wrong with the file."""
+    from fractaljax.optimise.design_file import read_design
+
+    def noted(path):
+        warnings.warn(f"{path} was written by another", stacklevel=1)
+        raise ValueError("that is enough")
+
+    (tmp_path / "run.toml").write_text("")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("fractaljax.optimise.design_file.read_design", noted)
+        status, out, err = run(capsys, "design", "--repeat", "run.toml")
+    assert read_design is not noted
+    assert (status, out) == (2, "")
+    assert err == "fractaljax: run.toml was written by another\nfractaljax: that is enough\n"
+
+
+_PROGRAM = """
+import os, signal, sys, time
+import fractaljax.motion.limit_cycle as search
+from fractaljax.__main__ import main
+
+def limit_cycle(*_, **__):
+    print(sorted(os.listdir()), flush=True)
+    time.sleep(60)
+
+search.limit_cycle = limit_cycle
+sys.exit(main(["cycle", "--out", "a/b"]))
+"""
+
+
+def test_termination_leaves_nothing(tmp_path):
+    """SIGTERM as Ctrl-C: one line, exit status 143; a folder is made when there is what goes in."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", _PROGRAM],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "[]\n"
+    process.terminate()
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (143, "fractaljax: terminated, nothing written\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("output", "status", "message"),
+    [("| true", 141, "standard output was closed"), ("> /dev/full", 2, "No space left on device")],
+)
+def test_output_that_cannot_be_written(output, status, message):
+    """One line, however much is printed and whenever it fails."""
+    done = subprocess.run(
+        ["bash", "-c", f"{sys.executable} -m fractaljax scene {output}; exit ${{PIPESTATUS[0]}}"],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == status
+    assert message in done.stderr and done.stderr.count("\n") == 1
 
 
 def test_runs_as_a_module_in_double_precision():

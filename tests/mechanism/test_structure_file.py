@@ -1,3 +1,4 @@
+import errno
 import io
 import os
 import re
@@ -198,6 +199,51 @@ def test_save_refuses(tmp_path):
     with pytest.raises(OSError, match="nowhere"):
         two_joints(4).save(tmp_path / "nowhere" / "s.toml")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_save_leaves_matrices_of_others_alone(tmp_path):
+    """A .npz file belongs to the TOML file that names it."""
+    np.savez(tmp_path / "s.npz", mine=np.arange(3.0))
+    before = (tmp_path / "s.npz").read_bytes()
+    for text in [None, "", "[structure]\nmatrices = 'other.npz'", "structure = 3", "not = = toml"]:
+        if text is not None:
+            (tmp_path / "s.toml").write_text(text)
+        with pytest.raises(ValueError, match=r"s\.npz is not of a structure saved as s\.toml"):
+            two_joints(4).save(tmp_path / "s.toml")
+        assert (tmp_path / "s.npz").read_bytes() == before
+    two_joints(4).save(tmp_path / "t.toml")
+    with pytest.raises(ValueError, match=r"t\.npz is not of a structure saved as t\.txt"):
+        two_joints(4).save(tmp_path / "t.txt")
+
+
+@pytest.mark.parametrize(
+    ("name", "failing"), [("fsync", 1), ("fsync", 2)] + [("replace", k) for k in range(1, 5)]
+)
+def test_save_that_fails_leaves_the_old_structure(tmp_path, monkeypatch, name, failing):
+    """The TOML file and the matrices it names, whichever step fails."""
+    old, new = two_joints(4), two_joints(4).replace(K=2 * two_joints(4).K, V=0.7)
+    old.save(tmp_path / "s.toml")
+    call, count = getattr(os, name), [0]
+
+    def fail(*arguments):
+        count[0] += 1
+        if count[0] == failing:
+            raise OSError(errno.ENOSPC, "disk full")
+        call(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, name, fail)
+        with pytest.raises(OSError, match="disk full"):
+            new.save(tmp_path / "s.toml")
+    equal(fj.Structure.load(tmp_path / "s.toml"), old)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["s.npz", "s.toml"]
+    new.save(tmp_path / "s.toml")
+    equal(fj.Structure.load(tmp_path / "s.toml"), new)
+
+
+def test_the_file_says_who_wrote_it(tmp_path):
+    two_joints(4).save(tmp_path / "s.toml")
+    assert f"written by fractaljax {fj.__version__}." in (tmp_path / "s.toml").read_text()
 
 
 def test_load_tells_structures_from_scenes(folder):

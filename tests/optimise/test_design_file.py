@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
+from fractaljax.base.versions import version_text, versions
 from fractaljax.optimise.design_file import _row, read_design
 
 SMALL: dict[str, Any] = dict(starts=4, lattice=8, progress=False)
@@ -86,6 +87,23 @@ def test_single_precision_stays_single(tmp_path):
     scene, _ = read_design(tmp_path / "run.toml")
     assert scene.contact.surface.D.dtype == jnp.float32
     assert scene.contact.surface.G == single.contact.surface.G
+
+
+def test_files_of_other_versions(robust, tmp_path):
+    """Read under a warning of one line; without any versions, in silence."""
+    path = tmp_path / "run.toml"
+    robust.save(path)
+    own = [f'{name} = "{version}"' for name, version in versions().items()]
+    text = path.read_text()
+    assert text.splitlines()[2:4] == own
+    path.write_text(text.replace(own[0], 'fractaljax = "0.0.9"').replace(own[1], "jax = 3"))
+    with pytest.warns(UserWarning) as warned:
+        read_design(path, {"coarse": coarse})
+    message = str(warned.pop().message)
+    others = f"written by fractaljax 0.0.9, jax 3, read by {version_text()}"
+    assert message == f"{path} was {others}: digits may differ"
+    path.write_text(text.replace(own[0], "").replace(own[1], ""))
+    read_design(path, {"coarse": coarse})
 
 
 EDITS = [

@@ -318,6 +318,19 @@ def test_refusals_name_the_argument():
             ValueError,
             "key of jax.random, got an array of shape (2,)",
         ),
+        (
+            {"n": 2**40},
+            ValueError,
+            "1099511627776 x 1099511627776 points would take 2.90e+25 bytes",
+        ),
+        (
+            {"n": 10**400},
+            ValueError,
+            "points would take 2.40e+801 bytes of memory; this machine has",
+        ),
+        ({"M": 2**50}, ValueError, "4 x 1125899906842624 waves would take"),
+        ({"surface": fj.Surface(D, G, 1 + 3e-16)}, ValueError, " x 10 waves would take"),
+        ({"L": 1e300, "L_s": 1e-300}, ValueError, "L/L_s must be finite, got inf"),
         ({"surface": many}, ValueError, "D must be a scalar, got shape (2,)"),
         ({"surface": "rough"}, TypeError, "surface must be a Surface, got 'rough'"),
     ]:

@@ -1,9 +1,9 @@
 """Sweeps: the grid, batches of one shape, folders to go on with, devices and processes."""
 
+import builtins
 import errno
+import io
 import json
-import os
-import stat
 import subprocess
 import sys
 import textwrap
@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
+from fractaljax.base import scene_file
 from fractaljax.base.versions import versions
 from fractaljax.sweeping.shards import Shards
 from fractaljax.sweeping.sweep import _batch
@@ -206,7 +207,9 @@ def test_a_batch_of_another_make_is_refused(tmp_path, batch):
     else:
         fj.sweep(fj.growth_rate, SCENE, 4, False, out=tmp_path / "b", D=D + 1e-9, G=G)
         file.write_bytes((tmp_path / "b" / "00000001.npz").read_bytes())
-    with pytest.raises(ValueError, match=r"00000001\.npz cannot be read, remove it and sweep again"):
+    with pytest.raises(
+        ValueError, match=r"00000001\.npz cannot be read, remove it and sweep again"
+    ):
         grown(batch_size=4, out=out)
     file.unlink()
     np.testing.assert_array_equal(grown(batch_size=4, out=out), grown(batch_size=4))
@@ -235,18 +238,20 @@ def test_a_folder_of_other_versions(tmp_path):
 @pytest.mark.parametrize("failing", range(1, 6))
 def test_a_full_disk_loses_one_batch(tmp_path, monkeypatch, failing):
     """sweep.json, then four batches: the k-th that does not fit is named, the rest stays."""
-    out, fsync, files = tmp_path / "sweep", os.fsync, []
+    out, files = tmp_path / "sweep", []
+    open_file = builtins.open
 
-    def full(handle):
-        if stat.S_ISREG(os.fstat(handle).st_mode):
-            files.append(handle)
-            if len(files) == failing:
-                raise OSError(errno.ENOSPC, "No space left on device")
-        fsync(handle)
+    class Full(io.FileIO):
+        def write(self, _):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    def open_full(file, mode="r", **options):
+        files.append(file)
+        return (Full if len(files) == failing else open_file)(file, mode, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", full)
-        with pytest.raises(OSError, match="No space left on device: .*sweep"):
+        patch.setattr(scene_file, "open", open_full, raising=False)
+        with pytest.raises(OSError, match=r"No space left on device: .*sweep"):
             grown(batch_size=4, out=out)
     kept = sorted(file.name for file in out.iterdir())
     names = ["sweep.json", *(f"{k:08d}.npz" for k in range(4))]
@@ -257,7 +262,9 @@ def test_a_full_disk_loses_one_batch(tmp_path, monkeypatch, failing):
 def test_more_points_than_memory():
     """Before any of it is taken."""
     many = np.full(10**5, 2.4)
-    with pytest.raises(ValueError, match="a sweep of 1000000000000000 points would take 8.00e.15 b"):
+    with pytest.raises(
+        ValueError, match=r"a sweep of 1000000000000000 points would take 8\.00e.15 b"
+    ):
         fj.sweep(fj.growth_rate, SCENE, progress=False, D=many, G=many * 1e-10, P=many * 1e3)
     with pytest.raises(ValueError, match="a batch of 1000000000000000 points would take"):
         grown(batch_size=10**15)
