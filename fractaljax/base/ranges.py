@@ -10,4 +10,7 @@ def is_logarithmic(low: float, high: float) -> bool:
 
 def within(low: float, high: float, at: Any) -> Any:
     """The values (n,) at places (n,) from 0, at the low end of a range, to 1, at its high end."""
-    return low * (high / low) ** at if is_logarithmic(low, high) else low + (high - low) * at
+    # At 0 and 1 to the last bit: an end may be that of a domain.
+    if is_logarithmic(low, high):
+        return low ** (1 - at) * high**at
+    return low * (1 - at) + high * at

@@ -24,6 +24,13 @@ def test_both_ends_are_met(ends):
     np.testing.assert_allclose(found, ends, rtol=1e-15)
 
 
+def test_ends_are_met_to_the_last_bit():
+    """Beyond one by a rounding error, an envelope up to the end of a domain would be refused."""
+    random = np.random.default_rng(0)
+    for low, high in np.sort(10 ** random.uniform(-6, 2, (500, 2))):
+        assert within(low, high, np.array([0.0, 1.0])).tolist() == [low, high]
+
+
 def test_the_middle_is_the_arithmetic_or_the_geometric_mean():
     assert within(1.0, 3.0, 0.5) == 2
     assert within(1e-4, 1e-2, 0.5) == pytest.approx(1e-3, rel=1e-15)

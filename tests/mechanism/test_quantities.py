@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
+from fractaljax.mechanism import quantities
 from fractaljax.mechanism.quantities import (
     axis_values,
     known_quantities,
@@ -13,6 +14,7 @@ from fractaljax.mechanism.quantities import (
     own_quantities,
     replaced,
     require_independent,
+    require_inside,
     require_known,
     sliding_friction,
     substituted,
@@ -206,3 +208,41 @@ def test_single_precision_stays():
     scene = jax.tree.map(lambda x: x.astype(jnp.float32), reference_scene())
     moved = substituted(scene, {"mu": jnp.float32(0.3), "K_t/K_n": jnp.float32(0.4)})
     assert {leaf.dtype for leaf in jax.tree.leaves(moved)} == {jnp.dtype(jnp.float32)}
+
+
+def inside(check):
+    try:
+        check()
+    except ValueError:
+        return False
+    return True
+
+
+def test_a_grid_is_inside_where_every_point_is(monkeypatch):
+    """Random axes against the whole grid at once; of some the corners alone are inside."""
+    monkeypatch.setattr(quantities, "_CHECKED_AT_ONCE", 7)
+    random = np.random.default_rng(3)
+    ranges = {
+        "mu": (0.1, 1.6),
+        "V": (0.01, 1.5),
+        "v_m": (0.01, 1.5),
+        "D": (2.01, 2.99),
+    }
+    found = []
+    for _ in range(60):
+        names = random.permutation(list(ranges))[:3].tolist()
+        axes = {name: random.uniform(*ranges[name], 3) for name in names}
+        grid = [x.ravel() for x in np.meshgrid(*axes.values())]
+        ends = [np.array([x.min(), x.max()]) for x in axes.values()]
+        corners = [x.ravel() for x in np.meshgrid(*ends)]
+        whole, ends, asked = (
+            inside(lambda: check(BRAKE, values))  # noqa: B023
+            for check, values in [
+                (replaced, dict(zip(names, grid, strict=True))),
+                (replaced, dict(zip(names, corners, strict=True))),
+                (require_inside, axes),
+            ]
+        )
+        assert asked == whole
+        found.append((whole, ends))
+    assert {(True, True), (False, False), (False, True)} <= set(found)
