@@ -111,7 +111,7 @@ class Digest:
             return x
         if isinstance(x, (bool, np.bool_, int, np.integer)):
             return int(x)
-        if isinstance(x, (np.ndarray, np.generic, jax.Array)):
+        if hasattr(x, "dtype") and hasattr(x, "__array__"):  # of NumPy, of JAX, or in between
             return array_digest(x)
         if isinstance(x, (float, complex)):
             return repr(x)
