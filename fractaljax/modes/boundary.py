@@ -18,8 +18,9 @@ from ..base.parts import Record, flag, require_scalar, scalar, whole
 from ..base.ranges import is_logarithmic
 from ..mechanism.oscillator import linearise
 from ..mechanism.quantities import (
-    replaced,
+    own_quantities,
     require_independent,
+    require_inside,
     require_known,
     substituted,
     with_optional,
@@ -239,9 +240,7 @@ def hopf_boundary(
     windows = [_window(scene, which, window) for which, window in (("x", x), ("y", y))]
     names = (windows[0][0], windows[1][0])
     require_independent(scene, names)
-    # Domains are intervals: where all corners are inside, everything is.
-    for place in np.ndindex(2, 2):
-        replaced(scene, {w[0]: float(w[1 + end]) for w, end in zip(windows, place, strict=True)})
+    require_inside(scene, {window[0]: _decisive(scene, *window) for window in windows})
     scene = with_optional(scene, names)
     logarithmic = [is_logarithmic(*window[1:]) for window in windows]
     ends = np.array([window[1:] for window in windows])
@@ -259,6 +258,15 @@ def hopf_boundary(
         squeals=squeals,
         untraced=untraced,
     )
+
+
+def _decisive(scene, name, low, high) -> np.ndarray:
+    """The values of a range that decide whether all of it is inside the domain of the scene."""
+    own = own_quantities(scene)
+    # mu(V), by which mu scales the friction law, is least at V = v_m: between the ends, or at one.
+    other = {"V": "v_m", "v_m": "V"}.get(name)
+    least = float(own[other].value) if other in own else low
+    return np.array([low, min(max(least, low), high), high])
 
 
 def _branch(field, windows, points, start, end) -> Branch:
@@ -279,7 +287,7 @@ def _branch(field, windows, points, start, end) -> Branch:
 
 
 def _window(scene, which, window) -> Window:
-    """A range, checked; the domain of the scene is checked at the corners."""
+    """A range, checked; not yet against the domain of the scene."""
     if not (isinstance(window, (tuple, list)) and len(window) == 3 and isinstance(window[0], str)):
         raise ValueError(f"{which} must be (name, low, high), got {window!r}")
     name, *ends = window

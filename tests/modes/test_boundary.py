@@ -275,6 +275,10 @@ def test_bad_windows_are_refused_in_one_line(x, y, message):
 def test_other_bad_input_is_refused():
     with pytest.raises(ValueError, match="mu_s must be at least mu_m"):
         hopf_boundary(BRAKE, ("mu_s", 0.1, 0.9), ("D", 2.1, 2.9))
+    # At the corners mu_m is inside; mu(V) is least, and so the whole law scaled most, at V = v_m.
+    for name in ("V", "v_m"):
+        with pytest.raises(ValueError, match=r"mu_m must be at most 0\.9, got 1\.2"):
+            hopf_boundary(BRAKE, (name, 0.05, 0.95), ("mu", 0.3, 1.2))
     with pytest.raises(ValueError, match="lines must be a whole number of at least 2, got 1"):
         hopf_boundary(CONSTANT, ("mu", 0.1, 1.0), ("K_n", 1e8, 1e9), lines=1)
     many = CONSTANT.replace(mu=np.array([0.1, 0.2]))
