@@ -40,13 +40,13 @@ def main(argv: list[str] | None = None) -> int:
     try:
         with _ended_by(signal.SIGTERM):
             status = arguments.run(arguments)
-        if sys.stdout is not None:
+        if sys.stdout is not None:  # as where it was closed from the start
             sys.stdout.flush()
         return status
     except BrokenPipeError:
         _drop_output()
         print("fractaljax: standard output was closed", file=sys.stderr)
-        return 128 + signal.SIGPIPE
+        return 141  # as a shell says it of SIGPIPE
     except KeyboardInterrupt:
         print("fractaljax: interrupted, nothing written", file=sys.stderr)
         return 130
@@ -81,7 +81,8 @@ def _ended_by(number: signal.Signals):
 def _drop_output() -> None:
     """Forget output that cannot be written, which Python would try once more at its end."""
     try:
-        sys.stdout.flush()
+        if sys.stdout is not None:
+            sys.stdout.flush()
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 

@@ -72,9 +72,9 @@ def _run(arguments) -> int:
     print(f"{read.source}\n{read.description}\n\n{found}\n")
     print(written)
     if failure is not None:
-        print(f"no scene: {failure}")
         if (arguments.out / "scene.toml").exists():
             print(f"{arguments.out / 'scene.toml'} is of an earlier run")
+        print(f"no scene: {failure}")
         return 1
     path = shlex.quote(str(arguments.out / "scene.toml"))
     print(f"next: fractaljax design {path}{_bounds(found)}")

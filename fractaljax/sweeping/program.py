@@ -157,9 +157,9 @@ class Digest:
         lines: list[Any] = [[new(v) for v in (*jaxpr.constvars, *jaxpr.invars)]]
         for equation in jaxpr.eqns:
             name = equation.primitive.name
-            parameters = {
-                k: x for k, x in equation.params.items() if k in _MEANT.get(name, equation.params)
-            }
+            parameters = equation.params
+            if set(_MEANT.get(name, "?")) <= set(parameters):
+                parameters = {key: parameters[key] for key in _MEANT[name]}
             if name == "ffi_call":
                 self.python.append((name, equation.params["target_name"]))
             lines.append((name, *map(old, equation.invars), self._plain(parameters, name)))

@@ -64,7 +64,8 @@ class Shards:
         ]
         others = versions_differ(found.get(_VERSIONS, {}))
         if differs:
-            note = f" (it was {others})" if others else ""
+            began = others if _VERSIONS in found else "begun by an older fractaljax"
+            note = f" (it was {began})" if began else ""
             raise ValueError(f"out {path} holds another sweep: {', '.join(differs)} differ{note}")
         if others:
             warnings.warn(f"out {path} was {others}: digits may differ", stacklevel=3)

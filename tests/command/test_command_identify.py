@@ -118,6 +118,14 @@ def test_no_surface_of_the_model(capsys, p, message):
     assert out.splitlines()[-1].startswith("no scene: ") and message in out.splitlines()[-1]
     assert "next" not in out
     assert [p.name for p in Path("out").iterdir()] == ["identification.png"]
+    Path("out/scene.toml").write_text("")
+    lines = run(capsys, "identify", "z.npy", "--dx", DX, "--unit", "m", "--out", "out")[
+        1
+    ].splitlines()
+    assert lines[-3:-1] == [
+        "written to out: identification.png (all replaced)",
+        "out/scene.toml is of an earlier run",
+    ]
 
 
 def test_no_scene_for_what_is_not_fractal(capsys, monkeypatch):

@@ -386,13 +386,17 @@ def test_termination_leaves_nothing(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("output", "status", "message"),
-    [("| true", 141, "standard output was closed"), ("> /dev/full", 2, "No space left on device")],
+    ("arguments", "status", "message"),
+    [
+        ("scene | true", 141, "standard output was closed"),
+        ("scene > /dev/full", 2, "No space left on device"),
+        ("stability nowhere.toml >&-", 2, "nowhere.toml"),
+    ],
 )
-def test_output_that_cannot_be_written(output, status, message):
+def test_output_that_cannot_be_written(arguments, status, message):
     """One line, however much is printed and whenever it fails."""
     done = subprocess.run(
-        ["bash", "-c", f"{sys.executable} -m fractaljax scene {output}; exit ${{PIPESTATUS[0]}}"],
+        ["bash", "-c", f"{sys.executable} -m fractaljax {arguments}; exit ${{PIPESTATUS[0]}}"],
         capture_output=True,
         text=True,
     )

@@ -234,6 +234,14 @@ def test_a_folder_of_other_versions(tmp_path):
     del about["versions"]
     file.write_text(json.dumps(about))
     np.testing.assert_array_equal(grown(batch_size=4, out=tmp_path), found)
+    with pytest.raises(ValueError, match=r"axes differ \(it was begun by an older fractaljax\)"):
+        grown(batch_size=4, out=tmp_path, D=D + 1e-9)
+
+
+def test_axes_in_another_order_are_another_sweep(tmp_path):
+    fj.sweep(fj.growth_rate, SCENE, 4, False, out=tmp_path, D=D, G=G)
+    with pytest.raises(ValueError, match="holds another sweep: measure or scene, axes differ"):
+        fj.sweep(fj.growth_rate, SCENE, 4, False, out=tmp_path, G=G, D=D)
 
 
 @pytest.mark.parametrize("failing", range(1, 6))
