@@ -27,7 +27,7 @@ _MEANT = {
     "custom_vjp_call": ("call_jaxpr",),
     "checkpoint": ("jaxpr",),
     "custom_vmap_call": ("call", "rule"),
-    "reduce": ("jaxpr", "consts", "dimensions"),
+    "reduce": ("jaxpr", "dimensions"),
 }
 _SHOWN = ("debug_callback", "debug_print")  # give no value
 
