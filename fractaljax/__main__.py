@@ -80,11 +80,13 @@ def _ended_by(number: signal.Signals):
 
 def _drop_output() -> None:
     """Forget output that cannot be written, which Python would try once more at its end."""
+    stream = sys.stdout
+    if stream is None:
+        return
     try:
-        if sys.stdout is not None:
-            sys.stdout.flush()
+        stream.flush()
     except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from decimal import Decimal
 
 
 def require_memory(what: str, size: int) -> None:
-    """Refuse `what` takes `size` bytes where this machine has less memory altogether.
+    """Refuse `what`, which takes `size` bytes, where the machine has less memory altogether.
 
     **Raises:** `ValueError` with both sizes.
     """

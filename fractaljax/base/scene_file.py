@@ -184,7 +184,7 @@ def write_together(files: Mapping[Any, bytes], *, durable: bool = True) -> list[
 
     All are written and on the disk before the first takes its place, and on an error all are as
     before. A process killed meanwhile may leave some of them missing (moved, under hidden names),
-    but never new files beside old ones; the last one is the last to come.
+    but never new files beside old ones. They take their places in the order given.
 
     **Raises:** `OSError` naming the file.
     """

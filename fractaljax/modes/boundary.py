@@ -265,8 +265,9 @@ def _decisive(scene, name, low, high) -> np.ndarray:
     own = own_quantities(scene)
     # mu(V), by which mu scales the friction law, is least at V = v_m: between the ends, or at one.
     other = {"V": "v_m", "v_m": "V"}.get(name)
-    least = float(own[other].value) if other in own else low
-    return np.array([low, min(max(least, low), high), high])
+    value = own[other].value if other in own else None
+    least = low if value is None else min(max(float(value), low), high)
+    return np.array([low, least, high])
 
 
 def _branch(field, windows, points, start, end) -> Branch:

@@ -20,13 +20,14 @@ from ..mechanism.quantities import substituted
 
 # Settings of JAX that change numbers and need not show in a program.
 _SETTINGS = ("jax_enable_x64", "jax_threefry_partitionable", "jax_default_matmul_precision")
+_OWN_VMAP = "custom_vmap_call"
 # Of these operations other parameters change no value: shardings, rules of derivatives, names.
 _MEANT = {
     "jit": ("jaxpr", "compiler_options_kvs"),
     "custom_jvp_call": ("call_jaxpr",),
     "custom_vjp_call": ("call_jaxpr",),
     "checkpoint": ("jaxpr",),
-    "custom_vmap_call": ("call", "rule"),
+    _OWN_VMAP: ("call", "rule"),
     "reduce": ("jaxpr", "dimensions"),
 }
 _SHOWN = ("debug_callback", "debug_print")  # give no value
@@ -68,11 +69,12 @@ class Program:
 
         **Raises:** `ValueError` for a measure that calls Python or native functions while it runs.
         """
-        digest = self._digest
-        if any(name == "custom_vmap_call" for name, _ in digest.python):
-            digest = Digest(self._of_two())
+        digest, harmless = self._digest, _SHOWN
+        if any(name == _OWN_VMAP for name, _ in digest.python):
+            # What is left of them is not mapped, and so not by their rules.
+            digest, harmless = Digest(self._of_two()), (*_SHOWN, _OWN_VMAP)
         for name, called in digest.python:
-            if name not in _SHOWN and not _raises(called):
+            if name not in harmless and not _raises(called):
                 raise ValueError(
                     f"out needs a measure that JAX traces as a whole: what its {name} does is not"
                     " in the program"
@@ -151,15 +153,17 @@ class Digest:
 
         def old(variable):
             if isinstance(variable, Literal):
-                return _aval(variable.aval), array_digest(np.asarray(variable.val))
+                value = np.asarray(variable.val, variable.aval.dtype)
+                return _aval(variable.aval), array_digest(value)
             return numbers[variable]
 
         lines: list[Any] = [[new(v) for v in (*jaxpr.constvars, *jaxpr.invars)]]
         for equation in jaxpr.eqns:
             name = equation.primitive.name
-            parameters = equation.params
-            if set(_MEANT.get(name, "?")) <= set(parameters):
-                parameters = {key: parameters[key] for key in _MEANT[name]}
+            parameters, meant = equation.params, _MEANT.get(name)
+            # Of another version of JAX they may have other names: then all of them count.
+            if meant is not None and set(meant) <= set(parameters):
+                parameters = {key: parameters[key] for key in meant}
             if name == "ffi_call":
                 self.python.append((name, equation.params["target_name"]))
             lines.append((name, *map(old, equation.invars), self._plain(parameters, name)))

@@ -299,6 +299,21 @@ def test_what_cannot_be_told_is_refused(tmp_path, measure, name):
     assert not (tmp_path / "out").exists()
 
 
+def test_rules_of_what_is_not_mapped_do_not_count(tmp_path):
+    """The load is no axis: what it is given to is not mapped, and its rule not called."""
+    for factor in (1.0, 2.0):
+        f = jax.custom_batching.custom_vmap(lambda x: 3 * x)
+        f.def_vmap(lambda size, batched, x, factor=factor: (factor * x, True))
+        found = fj.sweep(
+            lambda scene, f=f: f(scene.contact.P) + D(scene),
+            SCENE,
+            progress=False,
+            out=tmp_path,
+            D=[2.3, 2.4],
+        )
+        np.testing.assert_allclose(found, 3 * 1907.3 + np.array([2.3, 2.4]), rtol=1e-15)
+
+
 def test_what_is_only_shown_is_not(tmp_path, capfd):
     def shown(scene):
         jax.debug.callback(lambda: None)
