@@ -16,6 +16,7 @@ from .motion.cycle import CycleResult, LimitCycle
 from .surface.roughness import roughness
 
 _ABSENT = "-"
+_STABLE = "stable against small disturbances"  # all that a growth rate can say
 _ROUNDING = 1e-14  # of the largest eigenvalue: growth rates below it have no sign
 _LEAST_DAMPED = 10  # stable modes of a structure that its table lists
 _MODES = {"+": "slips, dx/dt < V", "-": "slips, dx/dt > V", "stick": "sticks"}
@@ -83,13 +84,13 @@ def stability_table(scene: Scene, friction_slope: bool = True) -> str:
 def _verdict(modes: Stability) -> dict[str, str]:
     growth, margin = float(modes.growth_rate), float(modes.margin)
     growth, rounding = growth + 0.0, _ROUNDING * float(jnp.abs(modes.eigenvalues).max())
-    verdict = "it squeals" if growth > 0 else "stable"
+    verdict = "it squeals" if growth > 0 else _STABLE
     if abs(growth) <= rounding or growth * margin > 0:
         # Beside heavy damping or without any, rounding can decide on the sign of the growth rate;
         # that of the margin, if it has one, is right.
         verdict = "0 to rounding: it neither grows nor dies out"
         if margin != 0:
-            verdict = f"0 to rounding; {'it squeals' if margin < 0 else 'stable'} by its margin"
+            verdict = f"0 to rounding; by its margin {'it squeals' if margin < 0 else _STABLE}"
     return {"growth rate [1/s]": f"{growth:+.6g}  ({verdict})"}
 
 
@@ -163,7 +164,7 @@ def _structure_verdict(modes, unstable, unresolved) -> str:
     also = [f"{len(unresolved)} unresolved"] if unresolved else []
     if still.size:
         also.append(f"{still.size} eigenvalues 0 to +-{still.max():.1g} 1/s: rigid bodies")
-    verdict = "it squeals" if unstable else "stable" if not also else "else stable"
+    verdict = "it squeals" if unstable else f"else {_STABLE}" if also else _STABLE
     return "; ".join([verdict, *also] if unstable else [*also, verdict])
 
 

@@ -135,7 +135,11 @@ def test_cycle_table_without_a_cycle():
     text = cycle_table(scene, fj.limit_cycle(scene, throw=False))
     assert cells(text) == [
         ["result", "the motion dies out: the sliding equilibrium attracts it"],
-        ["growth rate [1/s]", f"{fj.growth_rate(scene):+.6g}", "(stable against small disturbances)"],
+        [
+            "growth rate [1/s]",
+            f"{fj.growth_rate(scene):+.6g}",
+            "(stable against small disturbances)",
+        ],
     ]
 
 

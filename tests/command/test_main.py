@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
+from fractaljax.__main__ import main
 from fractaljax.command.design import _LIMITS, _OPTIONS
 from fractaljax.report import cycle_table
 from tools import motionless_scene, reference_cycle, reference_scene, run_command as run

@@ -369,10 +369,10 @@ def test_the_command(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("C", "K", "verdict"),
     [
-        (0.1, 1e4, "0  (stable)"),
-        (0.0, 1e4, "0  (2 unresolved; else stable)"),
+        (0.1, 1e4, "0  (stable against small disturbances)"),
+        (0.0, 1e4, "0  (2 unresolved; else stable against small disturbances)"),
         (-0.1, 1e4, "2  (it squeals)"),
-        (0.1, 0.0, "1/s: rigid bodies; else stable)"),
+        (0.1, 0.0, "1/s: rigid bodies; else stable against small disturbances)"),
     ],
 )
 def test_the_verdict(tmp_path, capsys, C, K, verdict):
