@@ -92,7 +92,8 @@ def curvature(law: PowerLaw) -> tuple[float, float]:
         normal = np.linalg.inv(columns.T @ (weight[:, None] * columns))
         found = normal @ columns.T @ (weight * residual)
         scatter = _scatter(residual - columns @ found, variance, residual.size - 3)
-    return float(found[2]), float(np.sqrt(normal[2, 2]))
+    variance = float(normal[2, 2])  # of few bins rounding may leave nothing
+    return float(found[2]), float(np.sqrt(variance)) if variance > 0 else np.inf
 
 
 class _Bins:
