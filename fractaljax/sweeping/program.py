@@ -153,8 +153,8 @@ class Digest:
 
         def old(variable):
             if isinstance(variable, Literal):
-                value = np.asarray(variable.val, variable.aval.dtype)
-                return _aval(variable.aval), array_digest(value)
+                aval: Any = variable.aval
+                return _aval(aval), array_digest(np.asarray(variable.val, aval.dtype))
             return numbers[variable]
 
         lines: list[Any] = [[new(v) for v in (*jaxpr.constvars, *jaxpr.invars)]]
