@@ -1,10 +1,11 @@
 """Does a structure squeal: complex eigenvalues of matrices with joints attached.
 
-(s^2 M + s C + K) x = 0 in coordinates in which M is the identity (Cholesky) and in units of
-omega = sqrt(|K|), as one eigenvalue problem of size 2n: rows and columns are then of order one,
-whatever the units of the degrees of freedom, so that a float32 survives. Derivatives are those of
-distinct eigenvalues, ds = w dA v for left and right vectors w and v with w v = 1. Those of the
-vectors themselves are given as well, so that derivatives of every order are right.
+LAPACK solves (s^2 M + s C + K) x = 0 in coordinates in which M is the identity (Cholesky), as one
+eigenvalue problem of size 2n. Its left and right vectors y and x then correct each eigenvalue by
+y (s^2 M + s C + K) x, with y (2 s M + C) x = 1, and tell what rounding can have made of it:
+entry by entry, so that stiff parts take no digits from soft ones that hardly move them.
+Derivatives are those of distinct eigenvalues, ds = -y (s^2 dM + s dC + dK) x. Those of the vectors
+themselves are given as well, so that derivatives of every order are right.
 """
 
 from typing import Any, NamedTuple
@@ -36,8 +37,9 @@ class Mode(NamedTuple):
 class ComplexModes(Record):
     """Linear stability of a structure about steady sliding, as `stability` returns it.
 
-    A rigid-body mode has eigenvalue and damping ratio 0 exactly. `margin` is the least damping
-    ratio of all other modes: > 0 where they are all stable, but unlike that of a scene not smooth
+    `resolutions` are what rounding of M, C and K can make of the eigenvalues: a real part that is
+    smaller says nothing. A rigid-body mode, for which K x = 0 within that, has eigenvalue and
+    damping ratio 0 exactly. `margin` is the least damping ratio of all other modes: > 0 where they are all stable, but unlike that of a scene not smooth
     where modes cross or coalesce. A smooth measure needs a Lyapunov equation of size 2n for every
     value, which hundreds of degrees of freedom make dear.
     """
@@ -70,7 +72,8 @@ class ComplexModes(Record):
 
         **Raises:** `ValueError` for a batch.
         """
-        modes = [mode for mode in self._modes() if abs(mode.growth_rate) <= mode.resolution]
+        # Not "at most": where the range of numbers ends both may be NaN.
+        modes = [mode for mode in self._modes() if not abs(mode.growth_rate) > mode.resolution]
         return [mode for mode in modes if mode.growth_rate or mode.frequency]
 
     def least_damped(self, count: int = 10) -> list[Mode]:
