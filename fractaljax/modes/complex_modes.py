@@ -39,9 +39,10 @@ class ComplexModes(Record):
 
     `resolutions` are what rounding of M, C and K can make of the eigenvalues: a real part that is
     smaller says nothing. A rigid-body mode, for which K x = 0 within that, has eigenvalue and
-    damping ratio 0 exactly. `margin` is the least damping ratio of all other modes: > 0 where they are all stable, but unlike that of a scene not smooth
-    where modes cross or coalesce. A smooth measure needs a Lyapunov equation of size 2n for every
-    value, which hundreds of degrees of freedom make dear.
+    damping ratio 0 exactly. `margin` is the least damping ratio of all other modes: > 0 where they
+    are all stable, but unlike that of a scene not smooth where modes cross or coalesce. A smooth
+    measure needs a Lyapunov equation of size 2n for every value, which hundreds of degrees of
+    freedom make dear.
     """
 
     eigenvalues: jax.Array  # (2n,) complex [1/s], largest real part first
