@@ -636,9 +636,10 @@ def test_rounding_of_the_equilibrium_counts_in_the_resolution():
     """The slope of friction acts through K x_0 = F, of which a stiff spring leaves few digits."""
     K = 1e13 * np.outer([1, -1], [1, -1]) + np.diag([1e3, 1.1e3])
     joint = fj.Joint(fj.FixedContact(20.0, 10.0), fj.Stribeck(0.4, 0.2, 0.5), 0, 1, V=0.1)
-    structure = fj.Structure(np.eye(2), 0.1 * np.eye(2), K, joint, F=[30.0, -30.0])
+    structure = fj.Structure(np.eye(2), 0.1 * np.eye(2), K, joint, F=[30.0, 30.0])
     coulomb = structure.replace(friction=fj.Coulomb(0.35))
-    assert fj.stability(structure).resolutions.max() > 2 * fj.stability(coulomb).resolutions.max()
+    # Of the soft mode; the stiff one hardly moves under F.
+    assert fj.stability(structure).resolutions.min() > 2 * fj.stability(coulomb).resolutions.min()
 
 
 # Precision, units, batches, and what is not evaluated.
