@@ -20,7 +20,8 @@ def attractors(
 
     Two cycles are one if their periods and amplitudes agree to 1e-6. `starts` is (k, 4), [x1, x2,
     v1, v2] in m and m/s; by default 32 spread evenly in both directions about the equilibrium, up
-    to velocities of 2 V. The first start that led to each motion decides the order.
+    to velocities of 2 V. The first start that led to each motion decides the order; `rtol` and
+    `max_turns` are those of `limit_cycle`.
 
     **Raises:** `ValueError` for starts of another shape, and what `limit_cycle` raises.
     """

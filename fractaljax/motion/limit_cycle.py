@@ -197,7 +197,8 @@ def limit_cycle(
 
     A coarse run from `start`, turn by turn (from maximum to maximum of x1), finds the itinerary;
     Newton's method closes the orbit; every derivative is that of the closed orbit's equations.
-    A cycle of up to four turns counts as one. Derivatives with respect to `start` are zero.
+    A cycle of up to four turns counts as one. Derivatives with respect to `start` are zero. An
+    orbit that repels, but so little that the motion does not leave it, is given as `unstable`.
 
     **Arguments:**
 

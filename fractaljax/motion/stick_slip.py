@@ -11,8 +11,9 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from ..base.parts import number
+from ..base.parts import concrete, number
 from ..mechanism.friction import Friction
 from ..mechanism.oscillator import static_displacements
 from ..mechanism.scene import Scene, stiffness
@@ -167,14 +168,17 @@ def scaled_start(scene: Scene, system: StickSlip, start) -> jax.Array:
     return jax.lax.stop_gradient(y)
 
 
-def check_rtol(rtol: float | None, dtype: Any) -> float:
+def check_rtol(rtol: Any, dtype: Any) -> float:
     """A relative tolerance that means something in `dtype`; by default 1e-9, or the least one.
 
-    **Raises:** `ValueError` for one above 0.1, or below 4096 times the rounding error of `dtype`.
+    **Raises:** `ValueError` for one above 0.1, or below 4096 times the rounding error of `dtype`;
+    `TypeError` for what is no number, or is traced.
     """
     least = 4096 * float(jnp.finfo(dtype).eps)
     if rtol is None:
         return max(1e-9, least)
+    if isinstance(rtol, (bool, str)) or concrete(rtol) is None or np.ndim(rtol):
+        raise TypeError(f"rtol must be a number, got {rtol!r}")
     if not 0 < rtol <= 0.1:
         raise ValueError(f"rtol must be above 0 and at most 0.1, got {rtol!r}")
     if rtol < least:

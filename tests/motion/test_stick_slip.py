@@ -413,6 +413,16 @@ def test_rtol_refusals(bad):
         assert check_rtol(good, jnp.float64) == good
 
 
+@pytest.mark.parametrize("bad", [True, "1e-9", [1e-9], (1e-9, 1e-6)])
+def test_rtol_is_a_number(bad):
+    """Nothing else is taken for one."""
+    with pytest.raises(TypeError) as caught:
+        check_rtol(bad, jnp.float64)
+    assert str(caught.value) == f"rtol must be a number, got {bad!r}"
+    for good in (np.float64(1e-6), jnp.asarray(1e-6)):
+        assert check_rtol(good, jnp.float64) == 1e-6
+
+
 @pytest.mark.parametrize(
     ("dtype", "usual", "least", "bad"),
     [("float64", 1e-9, "9.1e-13", 1e-14), ("float32", 4096 * 2**-23, "0.00049", 1e-9)],
