@@ -79,14 +79,15 @@ def brief(value: Any) -> str:
 
 def whole(name: str, value: Any, least: int, most: float = math.inf) -> int:
     """`value` as an int, refused unless it is a whole number from `least` to `most`."""
-    listed = isinstance(value, (list, tuple))
-    array = np.empty(1) if listed else np.asarray(value)
-    plain = array.dtype.kind in "iuf" and array.ndim == 0
+    found = value
+    if isinstance(value, bool) or not isinstance(value, int):
+        found = np.empty(1) if isinstance(value, (list, tuple)) else np.asarray(value)
+    plain = isinstance(found, int) or (found.dtype.kind in "iuf" and found.ndim == 0)
     # Compared before it is converted: infinity and NaN are no whole numbers either.
-    if not (plain and least <= array <= most and array % 1 == 0):
-        bounds = f"at least {least}" + (f" and at most {most}" if most < math.inf else "")
-        raise ValueError(f"{name} must be a whole number of {bounds}, got {brief(value)}")
-    return int(array)
+    if not (plain and least <= found <= most and found % 1 == 0):
+        bound = f"at most {most}" if plain and found > most else f"at least {least}"
+        raise ValueError(f"{name} must be a whole number of {bound}, got {brief(value)}")
+    return int(found)
 
 
 def scalar(name: str, value: Any, **domain: float) -> jax.Array:
