@@ -15,7 +15,7 @@ import pytest
 
 import fractaljax as fj
 from fractaljax.__main__ import main
-from fractaljax.command.design import _LIMITS, _OPTIONS
+from fractaljax.command.design import _LIMITS, _OPTIONS, _remarks
 from fractaljax.report import cycle_table
 from tools import motionless_scene, reference_cycle, reference_scene, run_command as run
 
@@ -432,6 +432,16 @@ def test_a_scene_that_cannot_be_computed(capsys, tmp_path):
             "the friction at V is inf\n"
         )
     assert [p.name for p in tmp_path.iterdir()] == ["small.toml"]
+
+
+def test_a_design_remarks_on_friction_beyond_its_law():
+    """At the worst of the envelope, and of the scene itself; nothing where the law holds."""
+    scene = fj.brake_scene()
+    assert _remarks(scene, {}) == _remarks(scene, {"envelope": {"P": (1800.0, 2000.0)}}) == []
+    (line,) = _remarks(scene, {"envelope": {"V": (0.1, 2.0), "P": (1800.0, 2000.0)}})
+    assert line.startswith("remark: at a sliding speed of 2 m/s the friction law gives 4.3, above")
+    (line,) = _remarks(scene.replace(V=5.0), {"envelope": None})
+    assert "gives 73.15, above mu_s = 0.4" in line
 
 
 def failing(error):

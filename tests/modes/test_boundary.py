@@ -286,6 +286,15 @@ def test_other_bad_input_is_refused():
         hopf_boundary(many, ("mu", 0.1, 1.0), ("K_n", 1e8, 1e9))
 
 
+def test_what_cannot_be_computed_is_not_stable():
+    """Found: none found, stable, where friction overflows; and a critical friction of infinity."""
+    with pytest.raises(
+        ValueError, match=r"^stability cannot be computed at v_m = 1e-200, xi_1 = 0"
+    ):
+        hopf_boundary(FIXED, ("v_m", 1e-200, 2.0), ("xi_1", 0.0, 0.1))
+    assert np.isnan(fj.critical_friction(FIXED.replace(v_m=1e-150)))
+
+
 @pytest.mark.slow
 def test_single_precision():
     scene = jax.tree.map(lambda x: x.astype(jnp.float32), CONSTANT)
