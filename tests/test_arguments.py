@@ -1,5 +1,7 @@
 """Every public function refuses what it cannot mean, by name and in one line."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -95,7 +97,7 @@ DESIGN = {
 def test_a_design_is_refused_before_its_search(argument, monkeypatch):
     """The message has the argument's name, and comes before anything is searched for."""
     monkeypatch.setattr("fractaljax.optimise.design._choose_starts", None)
-    small = dict(scene=SCENE, lattice=8, starts=4, progress=False)
+    small: dict[str, Any] = dict(scene=SCENE, lattice=8, starts=4, progress=False)
     for bad in DESIGN[argument]:
         with pytest.raises((TypeError, ValueError)) as refused:
             fj.design(**small | {argument: bad})
@@ -113,17 +115,19 @@ def test_margin_takes_no_flag_for_a_growth_rate():
 
 
 def test_a_scene_is_asked_for_by_name():
-    structure = fj.Structure.from_scene(SCENE)
+    structure: Any = fj.Structure.from_scene(SCENE)
     for function in (fj.margin, fj.critical_friction, fj.stiffness, fj.growth_rate):
         for bad in (SURFACE, None, 1.0) + ((structure,) if function is not fj.growth_rate else ()):
             with pytest.raises(TypeError, match=r"^scene must be a Scene, got"):
                 function(bad)
-    for function in (fj.hopf_boundary, fj.modes_over):
+    functions: list[Any] = [fj.hopf_boundary, fj.modes_over]
+    for function in functions:
         with pytest.raises(TypeError, match=r"^scene must be a Scene, got"):
             function(structure, ("mu", 0.1, 0.5), ("P", 1.0, 2.0))
 
 
 def test_windows_and_axes():
+    bad: Any
     for bad in (1, None, "mu", ("mu",), {}, (1, [1.0])):
         with pytest.raises(TypeError, match=r"^x must be a name and its values"):
             fj.modes_over(SCENE, bad, ("P", [1.0]))

@@ -191,7 +191,7 @@ def test_a_quantity_beside_the_part_that_holds_it():
     assert (new.contact.P, new.contact.surface.D, new.contact.surface.G) == (7.0, 2.5, 1e-12)
     new = scene.replace(contact=contact, surface=fj.Surface(2.7, 1e-9), D=2.8)
     assert (new.contact.P, new.contact.surface.D, new.contact.surface.G) == (5.0, 2.8, 1e-9)
-    assert scene.replace(friction=fj.Coulomb(0.3), mu=0.4).friction.mu == 0.4
+    assert scene.replace(friction=fj.Coulomb(0.3), mu=0.4).friction.mu_s == 0.4
     for part, name in (({"friction": fj.Coulomb(0.3)}, "mu_s"), ({"contact": FIXED}, "P")):
         with pytest.raises(ValueError, match=f"^scene has no quantity '{name}'; it has"):
             scene.replace(**part, **{name: 0.5})
