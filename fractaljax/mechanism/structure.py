@@ -168,20 +168,22 @@ class Structure(Record):
         """A structure with M, C, K, F or quantities of its joints changed.
 
         `replace(D=2.5)` changes every joint that has a D, `replace(**{"left.D": 2.5})` the one
-        named left; where both are given, the latter counts there.
+        named left; where both are given, the latter counts there. A quantity given beside the part
+        that holds it is changed in the new part.
 
-        **Raises:** `ValueError` for a name the structure does not have, listing those it has, and
-        for values outside their domain.
+        **Raises:** `ValueError` for a name the structure does not have then, listing those it has,
+        and for values outside their domain.
         """
         own = {name: getattr(self, name) for name in ("M", "C", "K", "F")}
-        known = list(own)
-        joints = []
+        known, joints = list(own), []
         for name, joint in zip(self.joint_names, self.joints, strict=True):
-            plain = list(quantities(joint))
-            dotted = [f"{name}.{quantity}" for quantity in plain]
-            known += plain + dotted
-            pairs = [*zip(plain, plain, strict=True), *zip(dotted, plain, strict=True)]
-            joints.append(rebuild(joint, {q: changes[key] for key, q in pairs if key in changes}))
+            here = f"{name}."
+            own_changes = {
+                key[len(here) :]: changes[key] for key in changes if key.startswith(here)
+            }
+            joints.append(rebuild(joint, changes | own_changes))
+            plain = list(quantities(joints[-1]))
+            known += plain + [f"{here}{quantity}" for quantity in plain]
         known = list(dict.fromkeys(known))
         for name in changes:
             if name not in known:

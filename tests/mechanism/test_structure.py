@@ -103,6 +103,12 @@ def test_replace():
     assert isinstance(law.joints[0].friction, fj.Coulomb)
     assert law.replace(mu=0.3).joints[0].friction.mu_s == 0.3
     assert structure.replace(**{"left.normal": 0}).joints[0].normal == (0,)
+    surface, material = fj.brake_scene().contact.surface, fj.brake_scene().contact.material
+    fractal = {"left.contact": fj.FractalContact(surface, material, 5.0), "left.P": 7.0, "D": 2.6}
+    contact = structure.replace(**fractal).joints[0].contact
+    assert (contact.P, contact.surface.D) == (7.0, 2.6)
+    with pytest.raises(ValueError, match=r"structure has no quantity 'left.P'"):
+        structure.replace(**fractal).replace(**{"left.contact": fj.FixedContact(1, 1), "left.P": 1})
 
 
 def test_replace_refuses():
