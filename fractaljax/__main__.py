@@ -8,6 +8,7 @@ import sys
 import threading
 
 from ._version import __version__
+from .command.compiled import keep_compiled
 from .command.cycle import add_cycle
 from .command.design import add_design
 from .command.identify import add_identify
@@ -35,6 +36,7 @@ def main(argv: list[str] | None = None) -> int:
     import jax
 
     jax.config.update("jax_enable_x64", True)
+    keep_compiled()
     # A check that fails while a program runs is told below, without the traceback logged here.
     logging.getLogger("jax._src.callback").setLevel(logging.CRITICAL)
     try:

@@ -1,0 +1,34 @@
+"""Compiled programs kept on disk: nearly all of a command's first run is compilation."""
+
+import contextlib
+import os
+import sys
+import warnings
+from pathlib import Path
+
+
+def keep_compiled() -> None:
+    """Let JAX keep what it compiles in the user's cache folder; JAX_COMPILATION_CACHE_DIR moves it.
+
+    A cache is never a reason to fail: where none can be had, everything is compiled anew.
+    """
+    import jax
+
+    warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
+    if jax.config.jax_compilation_cache_dir is None:
+        with contextlib.suppress(OSError, RuntimeError):  # not writable, or no home
+            folder = _cache_folder()
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if os.access(folder, os.W_OK | os.X_OK):
+                jax.config.update("jax_compilation_cache_dir", str(folder))
+                jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+
+def _cache_folder() -> Path:
+    if sys.platform == "win32":
+        base = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
+    elif sys.platform == "darwin":
+        base = Path.home() / "Library" / "Caches"
+    else:
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "fractaljax" / "compiled"
