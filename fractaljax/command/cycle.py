@@ -46,7 +46,11 @@ def _run(arguments) -> int:
             max_turns=arguments.max_turns,
             throw=False,
         )
-        found = cycle.result in (CycleResult.converged, CycleResult.inaccurate)
+        found = cycle.result in (
+            CycleResult.converged,
+            CycleResult.inaccurate,
+            CycleResult.unstable,
+        )
         if found:
             written = write(
                 {
