@@ -134,12 +134,12 @@ def _run(arguments) -> int:
             "topography.npy": npy(surfaces.after),
         }
         written = write(files)
+    *table, promise = str(best).splitlines()
+    print("\n".join([*table, *_remarks(scene, options)]))
     print(written)
     side, dx = len(surfaces.after), surfaces.dx
-    print(f"topography.npy: {side} x {side} heights in m, dx = {dx:g} m\n")
-    for line in _remarks(scene, options):
-        print(line)
-    print(best)
+    print(f"topography.npy: {side} x {side} heights in m, dx = {dx:g} m")
+    print(promise)
     return 1 if best.violated else 0
 
 

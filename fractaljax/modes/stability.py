@@ -177,8 +177,9 @@ def _split(lin: Linearised) -> tuple[jax.Array, _Quadratic, _Quadratic]:
 
 def _roots(quadratic: _Quadratic):
     """Larger and smaller real part of the two roots, and their imaginary part."""
-    half = quadratic.u / 2
-    discriminant = half**2 - quadratic.v
+    half, size = quadratic.u / 2, positive_sqrt(quadratic.v)
+    # Where the roots are close, half^2 - v would be rounding, and another one in every kernel.
+    discriminant = jnp.where(size > 0, (half - size) * (half + size), half**2 - quadratic.v)
     apart = positive_sqrt(discriminant)
     # The root of smaller modulus from the product of both: -half + apart would cancel.
     far = jnp.where(half < 0, apart - half, -half - apart)

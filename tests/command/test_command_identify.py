@@ -164,7 +164,7 @@ def test_bounds_for_the_design(D, G, options):
     ("arguments", "message"),
     [
         ([], "required: file"),
-        (["nowhere.csv"], "No such file"),
+        (["nowhere.csv"], "no such file"),
         (["words.csv"], "words.csv: there is no line of numbers in it"),
         (["short.npy", "--dx", 1], "in which unit heights are: give it (--unit um)"),
         (["short.npy", "--unit", "um"], "give dx in metres (--dx 1e-6)"),
@@ -173,7 +173,7 @@ def test_bounds_for_the_design(D, G, options):
         (["short.npy", "--unit", "um", "--dx", 1], "z is too short"),
         (["flat.npy", "--unit", "um", "--dx", 1], "z has no roughness: it is constant"),
         (["flat.npy", "--unit", "um", "--dx", 1, "--scene", "fixed.toml"], "takes no surface"),
-        (["flat.npy", "--scene", "nowhere.toml"], "No such file"),
+        (["flat.npy", "--scene", "nowhere.toml"], "no such file"),
         (["good.csv", "--band", 1e9, 2e9], "band must rise and lie between"),
         (["good.csv", "--resolution", 0], "resolution must be above 0"),
         (["good.csv", "--out", "words.csv"], "File exists"),

@@ -96,7 +96,7 @@ def test_files_of_other_versions(robust, tmp_path):
     own = [f'{name} = "{version}"' for name, version in versions().items()]
     text = path.read_text()
     assert text.splitlines()[2:4] == own
-    path.write_text(text.replace(own[0], 'fractaljax = "0.0.9"').replace(own[1], "jax = 3"))
+    path.write_text(text.replace(own[0], 'fractaljax = "0.0.9"').replace(own[1], 'jax = "3"'))
     with pytest.warns(UserWarning) as warned:
         read_design(path, {"coarse": coarse})
     message = str(warned.pop().message)
