@@ -15,7 +15,7 @@ def keep_compiled() -> None:
     import jax
 
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
-    if jax.config.jax_compilation_cache_dir is None:
+    if jax.config.read("jax_compilation_cache_dir") is None:
         with contextlib.suppress(OSError, RuntimeError):  # not writable, or no home
             folder = _cache_folder()
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
