@@ -6,6 +6,8 @@ import sys
 import warnings
 from pathlib import Path
 
+_FOLDER = "jax_compilation_cache_dir"  # the setting
+
 
 def keep_compiled() -> None:
     """Let JAX keep what it compiles in the user's cache folder; JAX_COMPILATION_CACHE_DIR moves it.
@@ -15,12 +17,12 @@ def keep_compiled() -> None:
     import jax
 
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
-    if jax.config.read("jax_compilation_cache_dir") is None:
+    if getattr(jax.config, _FOLDER) is None:
         with contextlib.suppress(OSError, RuntimeError):  # not writable, or no home
             folder = _cache_folder()
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             if os.access(folder, os.W_OK | os.X_OK):
-                jax.config.update("jax_compilation_cache_dir", str(folder))
+                jax.config.update(_FOLDER, str(folder))
                 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 

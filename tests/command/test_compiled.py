@@ -15,7 +15,7 @@ SETTINGS = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_
 def unset(monkeypatch):
     """No folder is set; afterwards everything is as it was."""
     monkeypatch.setattr("sys.platform", "linux")
-    before = {name: jax.config.read(name) for name in SETTINGS}
+    before = {name: getattr(jax.config, name) for name in SETTINGS}
     jax.config.update("jax_compilation_cache_dir", None)
     yield
     for name, value in before.items():
@@ -26,22 +26,22 @@ def test_in_a_private_folder_of_the_user(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     keep_compiled()
     folder = tmp_path / "cache" / "fractaljax" / "compiled"
-    assert jax.config.read(SETTINGS[0]) == str(folder)
-    assert jax.config.read(SETTINGS[1]) == 0
+    assert getattr(jax.config, SETTINGS[0]) == str(folder)
+    assert getattr(jax.config, SETTINGS[1]) == 0
     assert stat.S_IMODE(os.stat(folder).st_mode) == 0o700
 
 
 def test_a_folder_that_is_set_stays(tmp_path):
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     keep_compiled()
-    assert jax.config.read(SETTINGS[0]) == str(tmp_path)
+    assert getattr(jax.config, SETTINGS[0]) == str(tmp_path)
 
 
 def test_without_a_folder_that_can_be_written(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     keep_compiled()
-    assert jax.config.read(SETTINGS[0]) is None
+    assert getattr(jax.config, SETTINGS[0]) is None
 
 
 def test_without_a_home(monkeypatch):
@@ -51,4 +51,4 @@ def test_without_a_home(monkeypatch):
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.setattr("pathlib.Path.home", nowhere)
     keep_compiled()
-    assert jax.config.read(SETTINGS[0]) is None
+    assert getattr(jax.config, SETTINGS[0]) is None
