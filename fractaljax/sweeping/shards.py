@@ -1,4 +1,4 @@
-"""A sweep's batches as files of a folder, so that an interrupted sweep can be gone on with.
+"""A sweep's batches as files of a folder, so that an interrupted sweep can be resumed.
 
 Every batch is a .npz file whose ZIP comment is the SHA-256 of the sweep, the batch's number and all
 that comes before the comment: a file that is damaged, or that of another batch, is not read.
@@ -38,7 +38,7 @@ class Shards:
     """
 
     def __init__(self, path: str | os.PathLike, about: Mapping[str, Any]):
-        """Make the folder of the sweep that `about` describes, or go on with it.
+        """Make the folder of the sweep that `about` describes, or resume it.
 
         Warns of a folder that other versions have written.
 
