@@ -1,31 +1,19 @@
 """Measured heights from files: text, NumPy's own, and instruments' formats."""
 
 import errno
-import io
-import math
 import os
 import stat
-import zipfile
 from pathlib import Path
 
 import numpy as np
-from numpy.lib import format as npy
 
-from .measurement import (
-    Measurement,
-    agreed,
-    map_on_grid,
-    measurement,
-    one_line,
-    profile_on_grid,
-    scale,
-)
+from ..base.numpy_file import read_npy, read_npz
+from .measurement import Measurement, agreed, map_on_grid, measurement, profile_on_grid, scale
 from .text import read_table
 
 _TEXTS = {".csv", ".tsv", ".txt", ".dat", ".xyz"}
 _ARRAYS = {".npy", ".npz"}
 _MOST_TEXT, _MOST_ARRAYS, _MOST = 2**28, 2**30, 2**31  # bytes; the last of instruments' formats
-_HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 
 
 def read_measurement(
@@ -123,14 +111,7 @@ def _read_text(path, content, dx, dy, unit, position_unit) -> Measurement:
 
 def _read_arrays(path, content, dx, dy, unit) -> Measurement:
     packed = path.suffix.lower() == ".npz"
-    try:
-        arrays = _unpacked(content) if packed else {"z": _array(content)}
-    except Exception as error:  # of many kinds, down to those of Python's tokenizer
-        reason = one_line(error)
-        raise ValueError(f"it is no sound file of numbers from NumPy: {reason}") from None
-    for name in ("z", "dx", "dy"):
-        if name in arrays and arrays[name].dtype.kind not in "iuf":
-            raise ValueError(f"{name} must be real numbers, got {arrays[name].dtype}")
+    arrays = read_npz(content, _MOST_ARRAYS) if packed else {"z": read_npy(content, "z")}
     if packed:
         if not {"z", "dx"} <= set(arrays):
             raise ValueError(f"it must hold z and dx in metres, got {', '.join(arrays)}")
@@ -140,35 +121,6 @@ def _read_arrays(path, content, dx, dy, unit) -> Measurement:
         z = arrays["z"].astype(float)
     shape = " x ".join(map(str, z.shape))
     return measurement(z * metre, dx, dy, f"{path.name}: array of {shape}")
-
-
-def _unpacked(content: bytes) -> dict[str, np.ndarray]:
-    """The arrays in the bytes of an NPZ file, by name."""
-    with zipfile.ZipFile(io.BytesIO(content)) as packed:
-        size = sum(member.file_size for member in packed.infolist())  # no more will be read
-        if size > _MOST_ARRAYS:
-            raise ValueError(f"it unpacks to {size} bytes, at most {_MOST_ARRAYS} are read")
-        names = packed.namelist()
-        if len(set(names)) < len(names):
-            raise ValueError(f"it holds two arrays of one name: {', '.join(names)}")
-        return {name.removesuffix(".npy"): _array(packed.read(name)) for name in names}
-
-
-def _array(content: bytes) -> np.ndarray:
-    """The array in the bytes of an NPY file, which must be as many as its header says."""
-    file = io.BytesIO(content)
-    version = npy.read_magic(file)
-    if version not in _HEADERS:
-        raise ValueError(f"version {version} of the format")
-    shape, columns_first, dtype = _HEADERS[version](file)
-    if dtype.kind not in "iuf":
-        return np.empty(0, dtype)  # its kind is refused
-    start = file.tell()
-    size = math.prod(shape) * dtype.itemsize
-    if size != len(content) - start:
-        raise ValueError(f"{size} bytes were to follow its header, {len(content) - start} do")
-    array = np.frombuffer(content, dtype, offset=start) if size else np.empty(0, dtype)
-    return array.reshape(shape, order="F" if columns_first else "C")
 
 
 def _number(arrays, name) -> float | None:

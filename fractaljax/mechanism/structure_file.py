@@ -3,10 +3,7 @@
 import bz2
 import gzip
 import io
-import lzma
-import math
 import struct
-import zipfile
 import zlib
 from pathlib import Path
 from typing import Any
@@ -14,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from .._version import __version__
+from ..base.numpy_file import read_npz
 from ..base.scene_file import (
     parts_of,
     quoted,
@@ -25,24 +23,9 @@ from ..base.scene_file import (
 from .matrix_market import read_matrix_market
 
 _LARGEST = 4000  # degrees of freedom; a sparse matrix of more is no reduced model
-_REDUCE = f"reduce the model to {_LARGEST} degrees of freedom at most"
 _LARGEST_FILE = 4 * 8 * _LARGEST**2
 
-# What Python's readers of compressed files and of NumPy's raise where bytes make no sense.
-_DAMAGED = (
-    zipfile.BadZipFile,
-    zlib.error,
-    lzma.LZMAError,
-    gzip.BadGzipFile,
-    struct.error,
-    EOFError,
-    LookupError,
-    TypeError,
-    AttributeError,
-    RuntimeError,  # NotImplementedError, for an unknown compression, and RecursionError
-    MemoryError,
-    OverflowError,
-)
+_DAMAGED = (zlib.error, struct.error, EOFError)  # of Python's readers of compressed files
 
 _ARRAYS = ("M", "C", "K", "F")
 _KEYS = ("matrices", "M", "C", "K", "rayleigh", "damping_ratio", "F", "names")
@@ -149,51 +132,13 @@ def _joint(name: str, table: dict[str, Any], laws) -> dict[str, Any]:
 
 
 def _npz(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a .npz file, none of which is read before its size and kind are known."""
-    content = read_bounded(path, _LARGEST_FILE)
+    """The arrays of a .npz file."""
     try:
-        with zipfile.ZipFile(io.BytesIO(content)) as file:
-            members = file.infolist()
-            names = [member.filename.removesuffix(".npy") for member in members]
-            refuse_unknown(path.name, names, _ARRAYS)
-            if len(set(names)) < len(names):
-                raise ValueError("it holds an array twice")
-            end = content.rfind(b"PK\5\6")
-            if int.from_bytes(content[end + 10 : end + 12], "little") != len(names):
-                raise ValueError("it is damaged: an array is lost")
-            return {
-                name: _npy(name, file, member) for name, member in zip(names, members, strict=True)
-            }
+        arrays = read_npz(read_bounded(path, _LARGEST_FILE), _LARGEST_FILE)
     except ValueError as error:
-        prefix = "" if str(error).startswith(path.name) else f"{path.name}: "
-        raise ValueError(f"{prefix}{error}") from None
-    except _DAMAGED:
-        raise ValueError(f"{path.name} is not a .npz file, or damaged") from None
-
-
-def _npy(name: str, file: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
-    if member.flag_bits & 1:
-        raise ValueError(f"{name} is encrypted")
-    if member.file_size > 8 * _LARGEST**2 + 10_000:
-        raise ValueError(f"{name} has {member.file_size} bytes; {_REDUCE}")
-    content = io.BytesIO(file.read(member))
-    version = np.lib.format.read_magic(content)
-    # Of version 3, for names in structured arrays, the header is read like that of version 2.
-    read_header = (
-        np.lib.format.read_array_header_1_0
-        if version == (1, 0)
-        else np.lib.format.read_array_header_2_0
-    )
-    shape, _, dtype = read_header(content)
-    if dtype.hasobject:
-        raise ValueError(f"Object arrays cannot be loaded, and {name} is one")
-    if not (dtype.kind in "iu" or (dtype.kind == "f" and dtype.itemsize in (4, 8))):
-        raise ValueError(f"{name} must be an array of real numbers, got {dtype} numbers")
-    if math.prod(shape) * dtype.itemsize != member.file_size - content.tell():
-        raise ValueError(f"{name} is damaged: it has not as many numbers as it says")
-    content.seek(0)
-    array = np.lib.format.read_array(content, allow_pickle=False)
-    return array.astype(dtype.newbyteorder("="))
+        raise ValueError(f"{path.name}: {error}") from None
+    refuse_unknown(path.name, arrays, _ARRAYS)
+    return arrays
 
 
 def _matrix_market(path: Path) -> np.ndarray:
