@@ -18,6 +18,10 @@ def pytest_configure(config):
     config.addinivalue_line("filterwarnings", f"ignore:{cache}")
     warnings.simplefilter("error")
     # Most of a run is compilation: workers, subprocesses and later runs share what is compiled.
+    from fractaljax.command.compiled import FIRST_QUIET_JAX
+
+    if jax.__version_info__ < FIRST_QUIET_JAX:
+        return
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         os.environ["JAX_COMPILATION_CACHE_DIR"] = str(config.cache.mkdir("jax"))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")

@@ -6,18 +6,21 @@ import sys
 import warnings
 from pathlib import Path
 
+# Older ones fill standard error with notes on the processor when they load what they kept.
+FIRST_QUIET_JAX = (0, 10, 2)
 _FOLDER = "jax_compilation_cache_dir"  # the setting
 
 
 def keep_compiled() -> None:
     """Let JAX keep what it compiles in the user's cache folder; JAX_COMPILATION_CACHE_DIR moves it.
 
-    A cache is never a reason to fail: where none can be had, everything is compiled anew.
+    A cache is never a reason to fail: where none can be had, or by a JAX before 0.10.2, everything
+    is compiled anew.
     """
     import jax
 
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
-    if getattr(jax.config, _FOLDER) is None:
+    if getattr(jax.config, _FOLDER) is None and jax.__version_info__ >= FIRST_QUIET_JAX:
         with contextlib.suppress(OSError, RuntimeError):  # not writable, or no home
             folder = _cache_folder()
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)

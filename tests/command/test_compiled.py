@@ -6,15 +6,16 @@ import stat
 import jax
 import pytest
 
-from fractaljax.command.compiled import keep_compiled
+from fractaljax.command.compiled import FIRST_QUIET_JAX, keep_compiled
 
 SETTINGS = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
 
 
 @pytest.fixture(autouse=True)
 def unset(monkeypatch):
-    """No folder is set; afterwards everything is as it was."""
+    """No folder is set, by a JAX that is quiet; afterwards everything is as it was."""
     monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.setattr("jax.__version_info__", FIRST_QUIET_JAX)
     before = {name: getattr(jax.config, name) for name in SETTINGS}
     jax.config.update("jax_compilation_cache_dir", None)
     yield
@@ -50,5 +51,12 @@ def test_without_a_home(monkeypatch):
 
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.setattr("pathlib.Path.home", nowhere)
+    keep_compiled()
+    assert getattr(jax.config, SETTINGS[0]) is None
+
+
+def test_not_by_a_jax_that_fills_standard_error(tmp_path, monkeypatch):
+    monkeypatch.setattr("jax.__version_info__", (0, 10, 1))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     keep_compiled()
     assert getattr(jax.config, SETTINGS[0]) is None

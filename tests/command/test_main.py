@@ -5,6 +5,7 @@ import errno
 import os
 import subprocess
 import sys
+import tempfile
 import warnings
 from pathlib import Path
 
@@ -376,16 +377,16 @@ sys.exit(main(["cycle", "--out", "a/b"]))
 
 def test_termination_leaves_nothing(tmp_path):
     """SIGTERM as Ctrl-C: one line, exit status 143; a folder is made when there is what goes in."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", _PROGRAM],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    assert process.stdout is not None
-    assert process.stdout.readline() == "[]\n"
-    process.terminate()
-    _, err = process.communicate(timeout=60)
+    with tempfile.TemporaryFile("w+") as errors:  # a pipe that nobody reads may fill up
+        process = subprocess.Popen(
+            [sys.executable, "-c", _PROGRAM], stdout=subprocess.PIPE, stderr=errors, text=True
+        )
+        assert process.stdout is not None
+        assert process.stdout.readline() == "[]\n"
+        process.terminate()
+        process.communicate(timeout=60)
+        errors.seek(0)
+        err = errors.read()
     assert (process.returncode, err) == (143, "fractaljax: terminated, nothing written\n")
     assert list(tmp_path.iterdir()) == []
 
