@@ -7,6 +7,8 @@ import zipfile
 import numpy as np
 from numpy.lib import format as npy
 
+from .parts import one_line
+
 # The header of version 3, for names in structured arrays, is read like that of version 2.
 _HEADERS = {(1, 0): npy.read_array_header_1_0}
 
@@ -66,5 +68,4 @@ def read_npz(content: bytes, most: int) -> dict[str, np.ndarray]:
 
 
 def _unsound(error: Exception) -> ValueError:
-    reason = " ".join(str(error).split())[:200] or type(error).__name__
-    return ValueError(f"it is no sound file of numbers from NumPy: {reason}")
+    return ValueError(f"it is no sound file of numbers from NumPy: {one_line(error)}")

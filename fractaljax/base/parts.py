@@ -77,6 +77,11 @@ def brief(value: Any) -> str:
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
+def one_line(error: Exception) -> str:
+    """An error of another package in one line."""
+    return " ".join(str(error).split())[:200] or type(error).__name__
+
+
 def whole(name: str, value: Any, least: int, most: float = math.inf) -> int:
     """`value` as an int, refused unless it is a whole number from `least` to `most`."""
     found = value

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from .measurement import Measurement, agreed, measurement, metres, one_line, profile_on_grid, scale
+from ..base.parts import one_line
+from .measurement import Measurement, agreed, measurement, metres, profile_on_grid, scale
 
 _ANY_BYTES = {"hgt": ".hgt", "nms": ".nms"}  # formats that only their suffix tells from others
 _MOST_UNPACKED, _MOST_POINTS = 2**31, 2**27  # bytes, and heights

@@ -84,11 +84,6 @@ def measurement(z: np.ndarray, dx, dy, source: str, **instrument) -> Measurement
     return Measurement(z, dx, dy, source, **instrument)
 
 
-def one_line(error: Exception) -> str:
-    """An error of another package in one line."""
-    return " ".join(str(error).split())[:200] or type(error).__name__
-
-
 def metres(unit: str, of: str = "") -> float:
     """One `unit` in metres; `of` says what it is the unit of.
 

@@ -6,13 +6,12 @@ import math
 import os
 import warnings
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from ..base.scene_file import quoted, read, refuse_unknown, table_of, write_whole
+from ..base.scene_file import quoted, read, read_bounded, refuse_unknown, table_of, write_whole
 from ..base.versions import versions, versions_differ
 from ..mechanism.scene import Scene
 from . import constraints as known_constraints
@@ -94,7 +93,7 @@ def read_design(
     if not isinstance(functions, Mapping) and functions is not None:
         raise TypeError(f"functions must be a mapping of names to functions, got {functions!r}")
     try:
-        document = read(Path(path).read_bytes())
+        document = read(read_bounded(path))
         # Versions are texts, of whatever packages.
         tables = [name for name, value in document.items() if not isinstance(value, str)]
         refuse_unknown("the file", tables, ("options", "result", "history"))

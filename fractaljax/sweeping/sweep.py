@@ -56,7 +56,7 @@ def sweep(
     `devices` (all that this process has), on each of which loops end by themselves.
 
     `out` names a folder that keeps the batches. The same sweep called again computes what is
-    missing; another one is refused, and one that other versions began is gone on with under a
+    missing; another one is refused, and one that other versions began is resumed under a
     warning. Under `jax.distributed` every process of a sweep must name the same folder and
     computes its share of the batches; all of them return the whole.
 

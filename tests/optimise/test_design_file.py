@@ -204,3 +204,8 @@ def test_unknown_and_missing_entries(robust, tmp_path):
         (tmp_path / "wrong.toml").write_text(text.replace(old, new, 1))
         with pytest.raises(ValueError, match=re.escape(message)):
             read_design(tmp_path / "wrong.toml", {"coarse": coarse})
+
+
+def test_a_file_without_an_end_is_refused():
+    with pytest.raises(ValueError, match=r"^/dev/zero: the file is larger than 10 MB"):
+        read_design("/dev/zero")
