@@ -1,59 +1,61 @@
 """From a machined surface to a stable mechanism, with gradients all the way back."""
 
 from . import plot as plot
-from ._version import __version__ as __version__
-from .measured.files import read_measurement as read_measurement
-from .measured.identify import Identification as Identification, identify as identify
-from .measured.measurement import Measurement as Measurement
-from .mechanism.contact import (
-    ContactState as ContactState,
-    FixedContact as FixedContact,
-    FractalContact as FractalContact,
-    Regime as Regime,
-    contact_load as contact_load,
-    contact_state as contact_state,
+from ._contact.contact import Contact as Contact, ContactState as ContactState, Regime as Regime
+from ._contact.dimensionless import (
     dimensionless_normal_stiffness as dimensionless_normal_stiffness,
     dimensionless_tangential_stiffness as dimensionless_tangential_stiffness,
 )
-from .mechanism.damping import modal_damping as modal_damping, rayleigh_damping as rayleigh_damping
-from .mechanism.friction import Coulomb as Coulomb, Stribeck as Stribeck
-from .mechanism.materials import Material as Material
-from .mechanism.oscillator import Oscillator as Oscillator, equilibrium as equilibrium
-from .mechanism.scene import Scene as Scene, brake_scene as brake_scene, stiffness as stiffness
-from .mechanism.structure import Joint as Joint, Structure as Structure
-from .modes.boundary import (
+from ._contact.fixed import FixedContact as FixedContact
+from ._contact.fractal import (
+    FractalContact as FractalContact,
+    contact_load as contact_load,
+    contact_state as contact_state,
+)
+from ._contact.material import Material as Material
+from ._design import constraints as constraints
+from ._design.design import (
+    Design as Design,
+    DesignResult as DesignResult,
+    design as design,
+    repeat_design as repeat_design,
+)
+from ._design.envelope import Envelope as Envelope
+from ._design.pareto import Front as Front, pareto as pareto
+from ._design.tolerance import Tolerance as Tolerance, squeal_probability as squeal_probability
+from ._dynamics.attractors import attractors as attractors
+from ._dynamics.cycle import CycleResult as CycleResult, LimitCycle as LimitCycle
+from ._dynamics.limit_cycle import limit_cycle as limit_cycle
+from ._dynamics.simulate import (
+    SimulationResult as SimulationResult,
+    Trajectory as Trajectory,
+    simulate as simulate,
+)
+from ._friction import Coulomb as Coulomb, Friction as Friction, Stribeck as Stribeck
+from ._identify.files import read_measurement as read_measurement
+from ._identify.identify import Identification as Identification, identify as identify
+from ._identify.measurement import Measurement as Measurement
+from ._mechanism.damping import modal_damping as modal_damping, rayleigh_damping as rayleigh_damping
+from ._mechanism.oscillator import Oscillator as Oscillator, equilibrium as equilibrium
+from ._mechanism.scene import Scene as Scene, brake_scene as brake_scene, stiffness as stiffness
+from ._mechanism.structure import Joint as Joint, Structure as Structure
+from ._stability.boundary import (
     Boundary as Boundary,
     Branch as Branch,
     BranchEnd as BranchEnd,
     hopf_boundary as hopf_boundary,
 )
-from .modes.complex_modes import ComplexModes as ComplexModes, assemble as assemble
-from .modes.critical_friction import critical_friction as critical_friction
-from .modes.maps import Modes as Modes, modes_over as modes_over
-from .modes.margin import margin as margin
-from .modes.stability import (
+from ._stability.critical_friction import critical_friction as critical_friction
+from ._stability.linearise import assemble as assemble
+from ._stability.margin import margin as margin
+from ._stability.stability import (
     Stability as Stability,
     growth_rate as growth_rate,
     stability as stability,
 )
-from .motion.attractors import attractors as attractors
-from .motion.cycle import CycleResult as CycleResult, LimitCycle as LimitCycle
-from .motion.limit_cycle import limit_cycle as limit_cycle
-from .motion.simulate import (
-    SimulationResult as SimulationResult,
-    Trajectory as Trajectory,
-    simulate as simulate,
-)
-from .optimise import constraints as constraints
-from .optimise.design import Design as Design, DesignResult as DesignResult, design as design
-from .optimise.design_file import repeat_design as repeat_design
-from .optimise.envelope import Envelope as Envelope
-from .optimise.pareto import Front as Front, pareto as pareto
-from .surface.roughness import Roughness as Roughness, roughness as roughness
-from .surface.surfaces import Surface as Surface
-from .surface.topography import topography as topography
-from .sweeping.stiffness_curves import (
-    StiffnessCurves as StiffnessCurves,
-    stiffness_over as stiffness_over,
-)
-from .sweeping.sweep import sweep as sweep
+from ._surface.roughness import Roughness as Roughness, roughness as roughness
+from ._surface.surface import Surface as Surface
+from ._surface.topography import topography as topography
+from ._sweep.result import Sweep as Sweep
+from ._sweep.sweep import sweep as sweep
+from ._version import __version__ as __version__

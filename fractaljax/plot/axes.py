@@ -1,27 +1,80 @@
-"""What every picture shares."""
+"""What the pictures share: figures, legends, lines, and axes with the name of a quantity."""
 
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from .._mechanism.quantities import label, unit
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist as Artist
+    from matplotlib.axes import Axes as Axes
+
+    from .figure import Figure as Figure
+else:
+    Artist = Axes = Figure = Any  # matplotlib is imported with the first picture
+
+DIRECTIONS = "along the belt", "normal to the belt"
 
 
-def new_figure(width: float = 8.4, height: float = 6.4) -> Any:
+def new_figure(width: float = 8.4, height: float = 6.4) -> Figure:
     """A figure outside pyplot, for axes of one's own; a notebook shows it. Sizes in inches."""
     from .figure import Figure
 
     return Figure((width, height))
 
 
-def new_axes():
-    """Axes of a new figure."""
-    return new_figure().add_subplot()
+def given_or_new(ax: Axes | None) -> Axes:
+    """The axes that were given, or those of a new figure."""
+    return new_figure().add_subplot() if ax is None else ax
 
 
-def legend_above(ax, handles):
+def legend_above(ax: Axes, handles: Iterable[Artist]) -> None:
     """The legend above the axes, where it hides nothing."""
-    ax.legend(
-        handles=handles,
-        loc="lower center",
-        bbox_to_anchor=(0.5, 1.01),
-        ncols=3,
-        fontsize="small",
-        frameon=False,
-    )
+    place: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.01)}
+    ax.legend(handles=list(handles), ncols=3, fontsize="small", frameon=False, **place)
+
+
+def lines(ax: Axes, x: np.ndarray, rows: Iterable[np.ndarray], names: Sequence[str]) -> list[Any]:
+    """A colour and style for each of the rows (n,) or (n, k) over x; the first line of each."""
+    import matplotlib as mpl
+
+    colours = mpl.colormaps["viridis"](np.linspace(0, 0.85, len(names)))
+    handles = []
+    for i, (row, name) in enumerate(zip(rows, names, strict=True)):
+        style = ("solid", "dashed", "dashdot", "dotted")[i % 4]
+        drawn = ax.plot(x, row, color=colours[i], ls=style, lw=1.6)
+        drawn[0].set_label(name)
+        handles.append(drawn[0])
+    return handles
+
+
+def value_of(x: Any, name: str, value: float) -> str:
+    """A quantity with its value, as a legend shows it: G = 1e-10 m."""
+    return f"{name} = {value:.3g} {unit(x, name)}".removesuffix(" -")
+
+
+def over_quantity(ax: Axes, which: str, x: Any, name: str, values: np.ndarray) -> None:
+    """Limits, scale and label of the "x" or "y" axis over the values (n,) of a quantity of x."""
+    scale = "log" if geometric(values) else "linear"
+    ax.set(**{f"{which}scale": scale, f"{which}label": label(x, name)})
+    if values[0] != values[-1]:
+        ax.set(**{f"{which}lim": (values[0], values[-1])})
+
+
+def geometric(values: Float[np.ndarray, " n"]) -> bool:
+    """Whether values are spaced evenly in the logarithm rather than as they are."""
+    low, high = values.min(), values.max()
+    return bool(low > 0 and np.median(values) < (np.sqrt(low * high) + (low + high) / 2) / 2)
+
+
+def component(direction: int, times: jax.Array, batch: int) -> int:
+    """The index of direction 1 or 2 of a motion, which must not be a batch of `batch` axes."""
+    if direction not in (1, 2):
+        raise ValueError(f"direction must be 1 or 2, got {direction!r}")
+    if times.ndim != batch:
+        raise ValueError("a picture shows one motion: index the batch first")
+    return direction - 1

@@ -4,35 +4,37 @@ from typing import Any
 
 import numpy as np
 
-from ..base.ranges import is_logarithmic
-from ..mechanism.quantities import label
-from ..modes.boundary import Boundary, BranchEnd
-from .axes import legend_above, new_axes
+from .._base.ranges import is_logarithmic
+from .._mechanism.quantities import label
+from .._stability.boundary import Boundary, BranchEnd
+from .axes import Axes, given_or_new, legend_above
 
 
-def boundary(result: Boundary, ax: Any = None) -> Any:
+def boundary(result: Boundary, ax: Axes | None = None) -> Axes:
     """The branches of a boundary, coloured by frequency [kHz], with ticks on the squealing side."""
     from matplotlib.collections import LineCollection
     from matplotlib.lines import Line2D
     from matplotlib.patheffects import withTickedStroke
 
-    ax = new_axes() if ax is None else ax
-    for name, window in (("x", result.x), ("y", result.y)):
-        getattr(ax, f"set_{name}scale")("log" if is_logarithmic(*window[1:]) else "linear")
-        getattr(ax, f"set_{name}lim")(window[1], window[2])
-        getattr(ax, f"set_{name}label")(label(result.scene, window[0]))
+    ax = given_or_new(ax)
+    for which, (name, low, high) in (("x", result.x), ("y", result.y)):
+        scale = "log" if is_logarithmic(low, high) else "linear"
+        ax.set(**{f"{which}scale": scale, f"{which}label": label(result.scene, name)})
+        ax.set(**{f"{which}lim": (low, high)})
     if not result.branches:
         words = "it squeals" if result.squeals else "stable"
         ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", va="center")
         return ax
-    ticks = withTickedStroke(angle=-90, spacing=9, length=0.7)
-    segments, frequencies = [], []
+    ticks = [withTickedStroke(angle=-90, spacing=9, length=0.7)]
+    segments, frequencies, broken = [], [], []
     for branch in result.branches:
-        style: dict[str, Any] = {"color": "0.25", "lw": 0.9, "path_effects": [ticks]}
-        ax.plot(branch.x, branch.y, **style)
+        ax.plot(branch.x, branch.y, color="0.25", lw=0.9, path_effects=ticks)
         points = np.stack([branch.x, branch.y], axis=-1)
         segments += list(np.stack([points[:-1], points[1:]], axis=1))
         frequencies.append((branch.frequency[:-1] + branch.frequency[1:]) / 2e3)
+        for point, end in ((points[0], branch.start), (points[-1], branch.end)):
+            if not bool((end == BranchEnd.window) | (end == BranchEnd.closed)):
+                broken.append(point)
     lines = LineCollection(segments, array=np.concatenate(frequencies), cmap="viridis", lw=2.6)
     ax.add_collection(lines, autolim=False)
     bar = ax.figure.colorbar(lines, ax=ax, pad=0.02)
@@ -41,14 +43,8 @@ def boundary(result: Boundary, ax: Any = None) -> Any:
         Line2D([], [], color="tab:cyan", lw=2.6, label="stability boundary"),
         Line2D([], [], color="0.25", marker="|", ls="none", label="ticks: it squeals on this side"),
     ]
-    broken = [
-        (branch.x[i], branch.y[i])
-        for branch in result.branches
-        for i, end in ((0, branch.start), (-1, branch.end))
-        if not bool((end == BranchEnd.window) | (end == BranchEnd.closed))
-    ]
     if broken:
-        style = {"mfc": "white", "mec": "k", "ls": "none", "label": "ends inside the window"}
-        handles += ax.plot(*np.transpose(broken), "o", ms=5, **style)
+        style: dict[str, Any] = {"mfc": "white", "mec": "k", "ls": "none", "ms": 5}
+        handles += ax.plot(*np.transpose(broken), "o", label="ends inside the window", **style)
     legend_above(ax, handles)
     return ax

@@ -1,22 +1,24 @@
 """How a quantity is distributed over samples."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
+from jaxtyping import ArrayLike
 
-from .axes import legend_above, new_axes
-
-_STYLES = ("solid", "dashed", "dashdot", "dotted")
+from .axes import Axes, given_or_new, legend_above
 
 
 def distribution(
-    samples: Mapping[str, Any], ax: Any = None, *, label: str, limit: float | None = None
-) -> Any:
+    samples: Mapping[str, ArrayLike],
+    ax: Axes | None = None,
+    *,
+    label: str,
+    limit: float | None = None,
+) -> Axes:
     """The share [-] of each set of samples (n,) that lies below every value, a line for each.
 
     `label` names the quantity with its unit, the keys name the sets, and `limit` is a value to
-    mark: with the growth rate and 0, what a line lacks to 1 there is the probability of squeal.
+    mark: of growth rates at 0, one minus the share is the probability of squeal.
 
     **Raises:** `ValueError` for none, a set that is empty or not of shape (n,), and values that are
     not finite.
@@ -27,11 +29,11 @@ def distribution(
     for name, values in checked.items():
         if values.ndim != 1 or not values.size or not np.isfinite(values).all():
             raise ValueError(f"samples {name!r} must be finite numbers (n,)")
-    ax = new_axes() if ax is None else ax
+    ax = given_or_new(ax)
     handles = []
     for i, (name, values) in enumerate(checked.items()):
-        style: dict[str, Any] = {"color": f"C{i}", "ls": _STYLES[i % 4], "lw": 1.8}
-        handles.append(ax.ecdf(values, label=name, **style))
+        style = ("solid", "dashed", "dashdot", "dotted")[i % 4]
+        handles.append(ax.ecdf(values, label=name, color=f"C{i}", ls=style, lw=1.8))
     if limit is not None:
         handles.append(ax.axvline(limit, color="0.35", lw=1, label=f"limit {limit:g}"))
     ax.set_ylim(-0.02, 1.02)

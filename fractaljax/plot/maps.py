@@ -1,247 +1,136 @@
-"""Maps of growth rate and frequency of both modes, and the views of the source's Figs. 7 to 10."""
+"""Maps of growth rate and frequency over two quantities, from a sweep of `stability`."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from ..mechanism.contact import Regime
-from ..modes.maps import Modes, source_modes
-from .axes import legend_above, new_axes, new_figure
+from .._contact.contact import Regime
+from .._mechanism.scene import Scene
+from .._sweep.result import Sweep
+from .._sweep.sweep import sweep
+from .axes import Artist, Axes, given_or_new, over_quantity
 
-_QUANTITIES = {"real": "real part [1/s]", "frequency": "frequency [kHz]"}
+_SHADES = {
+    "fully plastic": (Regime.fully_plastic, "0.80", "//"),
+    "gross slip": (Regime.gross_slip, "0.92", ".."),
+}
 
 
-def growth_map(modes: Modes, ax: Any = None) -> Any:
-    """Growth rate [1/s] as labelled contours: filled where the scene squeals, dashed where not.
+def growth_map(result: Sweep, ax: Axes | None = None) -> Axes:
+    """Growth rate [1/s] as labelled contours: filled where it squeals, dashed where it does not.
 
-    Hatched where a fractal joint is not elastic-plastic, and the growth rate another mechanism's.
+    From a sweep of `stability` or of `growth_rate`. Hatched where a fractal contact is not
+    elastic-plastic: there the growth rate is that of another mechanism.
 
-    **Raises:** `ValueError` unless x and y have two values or more.
+    **Raises:** `ValueError` unless the sweep has two axes, each with two values or more.
     """
     from matplotlib.ticker import MaxNLocator
 
-    ax = _map_axes(modes, ax)
-    growth = _growth(modes)
-    grid = np.asarray(modes.x), np.asarray(modes.y), growth
-    low, high = growth.min(), growth.max()
-    if high > 0:
-        levels = MaxNLocator(8).tick_values(0, high)
-        ax.contourf(*grid, levels, colors=_pale("YlOrBr", len(levels) - 1))
-        _labelled(ax, grid, levels[1:], linestyles="solid")
-    if low < 0:
+    ax, growth, handles = _start(result, ax)
+    if (high := growth.max()) > 0:
+        _fill(result, ax, growth, MaxNLocator(8).tick_values(0, high), "YlOrBr", skip=1)
+    if (low := growth.min()) < 0:
         levels = np.asarray(MaxNLocator(4).tick_values(low, min(high, 0)))
-        _labelled(ax, grid, levels[levels < 0], linestyles="dashed")
-    return _finish(modes, ax, "growth rate [1/s]")
+        _label(result, ax, growth, levels[levels < 0], linestyles="dashed")
+    return _finish(result, ax, growth, handles, "growth rate [1/s]")
 
 
-def frequency_map(modes: Modes, ax: Any = None, *, mode: int = 1) -> Any:
-    """Frequency [kHz] of the lower (1) or the higher (2) mode, and the stability boundary.
+def frequency_map(result: Sweep, ax: Axes | None = None, *, mode: int = 1) -> Axes:
+    """Frequency [kHz] of a mode of a sweep of `stability`, and the stability boundary.
 
-    **Raises:** `ValueError` for another mode, and as `growth_map`.
+    Mode 1 has the lowest frequency.
+
+    **Raises:** `ValueError` for a mode that there is not, and as `growth_map`.
     """
     from matplotlib.ticker import MaxNLocator
 
-    if mode not in (1, 2):
-        raise ValueError(f"mode must be 1 or 2, got {mode!r}")
-    ax = _map_axes(modes, ax)
-    frequency = np.asarray(modes.frequency[..., mode - 1]) / 1e3
-    grid = np.asarray(modes.x), np.asarray(modes.y), frequency
-    levels = MaxNLocator(10).tick_values(frequency.min(), frequency.max())
-    if frequency.min() < frequency.max():
-        ax.contourf(*grid, levels, colors=_pale("YlGnBu", len(levels) - 1))
-        _labelled(ax, grid, levels, linestyles="solid")
-    return _finish(modes, ax, f"frequency of mode {mode} [kHz]")
+    ax, growth, handles = _start(result, ax)
+    _, frequencies = vibration_modes(result)
+    if mode not in range(1, frequencies.shape[-1] + 1):
+        raise ValueError(f"mode must be from 1 to {frequencies.shape[-1]}, got {mode!r}")
+    frequency = frequencies[..., mode - 1] / 1e3
+    low, high = frequency.min(), frequency.max()
+    if low < high:
+        _fill(result, ax, frequency, MaxNLocator(10).tick_values(low, high), "YlGnBu")
+    return _finish(result, ax, growth, handles, f"frequency of mode {mode} [kHz]")
 
 
-def mode_lines(
-    modes: Modes, ax: Any = None, *, quantity: str = "real", at: Sequence[float] | None = None
-) -> Any:
-    """Real part or frequency of both modes over y, a colour for each of the values `at` of x.
+def vibration_modes(result: Sweep) -> tuple[np.ndarray, np.ndarray]:
+    """Real part [1/s] and frequency [Hz] of the n modes, (*grid, n), the lowest frequency first.
 
-    Without `at` four of them. They are the nearest there are: nothing is interpolated.
-
-    **Raises:** `ValueError` for a quantity that is neither "real" nor "frequency".
+    A mode is a conjugate pair of the 2n eigenvalues, or the slowest of the real ones.
     """
-    import matplotlib as mpl
-
-    ax = new_axes() if ax is None else ax
-    values, y, x = _layers(modes, quantity), np.asarray(modes.y), np.asarray(modes.x)
-    at = np.linspace(0, x[-1], 5)[1:] if at is None else at
-    columns = [int(np.abs(x - value).argmin()) for value in at]
-    colours = mpl.colormaps["viridis"](np.linspace(0, 0.85, len(columns)))
-    styles = ["solid", "dashed", "dashdot", "dotted"]
-    if quantity == "real":
-        ax.axhline(0, color="k", lw=0.8)
-    handles = []
-    for i, (column, colour) in enumerate(zip(columns, colours, strict=True)):
-        drawn = ax.plot(y, values[:, column], color=colour, ls=styles[i % 4], lw=1.5)
-        drawn[0].set_label(f"{modes.names[0]} = {x[column]:.3g}{_suffix(modes.units[0])}")
-        handles.append(drawn[0])
-    ax.set_xlim(y[0], y[-1])
-    ax.set_xlabel(_label(modes, 1))
-    ax.set_ylabel(f"{_QUANTITIES[quantity]} of both modes")
-    legend_above(ax, handles)
-    return ax
+    s: Any = np.asarray(result.values.eigenvalues)
+    kind = np.sign(-s.imag)  # upper half plane first, then the real axis
+    order = np.lexsort((-s.real, kind))[..., : s.shape[-1] // 2]
+    s = np.take_along_axis(s, order, axis=-1)
+    s = np.take_along_axis(s, np.argsort(s.imag, axis=-1, kind="stable"), axis=-1)
+    return s.real, s.imag / (2 * np.pi)
 
 
-def mode_surfaces(modes: Modes, ax: Any = None, *, quantity: str = "real") -> Any:
-    """Real part or frequency of both modes as two surfaces over x and y; `ax` has to be 3D.
-
-    **Raises:** `ValueError` for a quantity that is neither "real" nor "frequency".
-    """
+def shade_regimes(ax: Axes, x: np.ndarray, y: np.ndarray, regime: Regime) -> list[Artist]:
+    """Hatch where a joint (n, m) is fully plastic or slips as a whole; what the legend shows."""
     from matplotlib.patches import Patch
 
-    values = _layers(modes, quantity)
-    if ax is None:
-        ax = new_figure().add_subplot(projection="3d")
-    x, y = np.meshgrid(np.asarray(modes.x), np.asarray(modes.y))
     handles = []
-    words = ("lower", "upper") if quantity == "real" else ("mode 1", "mode 2")
-    for layer, colour, word in zip((0, 1), ("#9ecae1", "#d95f0e"), words, strict=True):
-        z = values[..., layer]
-        ax.plot_surface(
-            x, y, z, color=colour, rcount=40, ccount=40, lw=0.3, edgecolor="0.25", alpha=0.9
-        )
-        handles.append(Patch(facecolor=colour, edgecolor="0.25", label=word))
-    ax.set_xlabel(_label(modes, 0))
-    ax.set_ylabel(_label(modes, 1))
-    ax.set_zlabel(_QUANTITIES[quantity])
-    ax.view_init(elev=18, azim=-125)
-    legend_above(ax, handles)
-    return ax
+    for words, (member, grey, hatch) in _SHADES.items():
+        inside = np.asarray(regime == member)
+        if inside.any():
+            style: dict[str, Any] = {"hatches": [hatch], "colors": [grey]}
+            ax.contourf(x, y, inside.T.astype(float), levels=[0.5, 1.5], **style)
+            handles.append(Patch(facecolor=grey, hatch=hatch, edgecolor="0.3", label=words))
+    return handles
 
 
-def modes(result: Modes) -> Any:
-    """Growth rate, real parts, and the frequency of each mode; returns the figure."""
-    figure = new_figure(11.2, 9.2)
-    upper, lower = figure.subplots(2, 2)
-    growth_map(result, upper[0])
-    mode_lines(result, upper[1])
-    frequency_map(result, lower[0], mode=1)
-    frequency_map(result, lower[1], mode=2)
-    return figure
+def regime_of(scene: Scene) -> Regime:
+    """The regime of a fractal contact."""
+    return scene.contact.state(scene.friction.mu_s, scene.friction.mu_m).regime
 
 
-def source_figure(number: int) -> Any:
-    """The source's Fig. 7, 8, 9 or 10, as maps; returns the figure.
-
-    **Raises:** `ValueError` for another number.
-    """
-    if number in (7, 8):
-        return modes(source_modes(str(number)))
-    if number not in (9, 10):
-        raise ValueError(f"number must be 7, 8, 9 or 10, got {number!r}")
-    figure = new_figure(11.2, 9.2 if number == 9 else 17)
-    rows = figure.subplots(2, 2).reshape(4, 1) if number == 9 else figure.subplots(4, 2)
-    for letter, row in zip("abcd", rows, strict=True):
-        panel = source_modes(f"9{letter}")
-        for mode, ax in enumerate(row, start=1):
-            _ = growth_map(panel, ax) if number == 9 else frequency_map(panel, ax, mode=mode)
-            ax.set_title(f"({letter}) {ax.get_title(loc='left')}", fontsize="medium", loc="left")
-    return figure
-
-
-# ---------------------------------------------------------------------------------------------
-# What they share
-# ---------------------------------------------------------------------------------------------
+def _start(result, ax):
+    """Axes, the growth rate (n, m), masked where inelastic, and the hatched regimes."""
+    shape = tuple(map(len, result.points))
+    if len(shape) != 2 or min(shape) < 2:
+        raise ValueError(f"a map needs two axes of two values or more, got a grid of {shape}")
+    ax = given_or_new(ax)
+    x, y = result.points
+    over_quantity(ax, "x", result.scene, result.names[0], x)
+    over_quantity(ax, "y", result.scene, result.names[1], y)
+    growth = np.asarray(getattr(result.values, "growth_rate", result.values))
+    if not (isinstance(result.scene, Scene) and result.scene.contact.fractal):
+        return ax, growth, []
+    axes: Any = result.axes
+    regime = sweep(regime_of, result.scene, progress=False, **axes).values
+    inelastic = np.asarray(regime != Regime.elastic_plastic)
+    if not inelastic.all():
+        growth = np.ma.masked_where(inelastic, growth)
+    return ax, growth, shade_regimes(ax, x, y, regime)
 
 
-def _map_axes(modes, ax):
-    """Axes with the scales, limits and labels of a grid that contours can be drawn on."""
-    if min(modes.x.size, modes.y.size) < 2:
-        shape = modes.y.size, modes.x.size
-        raise ValueError(f"a map needs two values a side at least, got a grid of shape {shape}")
-    ax = new_axes() if ax is None else ax
-    for i, (values, axis) in enumerate([(modes.x, "x"), (modes.y, "y")]):
-        values = np.asarray(values)
-        ax.set(**{f"{axis}label": _label(modes, i), f"{axis}lim": (values[0], values[-1])})
-        if _geometric(values):
-            ax.set(**{f"{axis}scale": "log"})
-    return ax
-
-
-def _geometric(values):
-    """Whether values are even in the logarithm, and not as they are."""
-    if values.size < 3 or values.min() <= 0 or _even(values):
-        return False
-    return _even(np.log(values))
-
-
-def _even(values):
-    steps = np.diff(values)
-    return bool(np.allclose(steps, steps[0], rtol=1e-3, atol=0))
-
-
-def _label(modes, i):
-    return f"{modes.names[i]} [{modes.units[i]}]"
-
-
-def _suffix(unit):
-    return "" if unit == "-" else f" {unit}"
-
-
-def _layers(modes, quantity):
-    """(m, n, 2): what a name stands for, in the units of its label."""
-    if quantity not in _QUANTITIES:
-        raise ValueError(f"quantity must be 'real' or 'frequency', got {quantity!r}")
-    values = np.asarray(getattr(modes, quantity))
-    # Layers of real parts cross no more than those of frequencies do: each has its own order.
-    return values / 1e3 if quantity == "frequency" else np.sort(values, axis=-1)
-
-
-def _pale(name, count):
-    """Colours of a map that gets darker, so pale that black lines and words are read on them."""
+def _fill(result, ax, values, levels, name, skip=0):
     import matplotlib as mpl
 
-    return mpl.colormaps[name](np.linspace(0.05, 0.6, count))
+    # So pale that black lines and labels stay readable.
+    colours = mpl.colormaps[name](np.linspace(0.05, 0.6, len(levels) - 1))
+    ax.contourf(*result.points, values.T, levels, colors=colours)
+    _label(result, ax, values, levels[skip:], linestyles="solid")
 
 
-def _labelled(ax, grid, levels, linestyles):
-    lines = ax.contour(*grid, levels, colors="0.25", linewidths=0.7, linestyles=linestyles)
-    ax.clabel(lines, fontsize="x-small", fmt=lambda level: f"{level:g}")
+def _label(result, ax, values, levels, linestyles):
+    style: dict[str, Any] = {"colors": "0.25", "linewidths": 0.7, "linestyles": linestyles}
+    contours = ax.contour(*result.points, values.T, levels, **style)
+    ax.clabel(contours, fontsize="x-small", fmt=lambda level: f"{level:g}")
 
 
-def _growth(modes):
-    """The growth rate where the joint is elastic: elsewhere it is that of another mechanism."""
-    growth = np.asarray(modes.growth_rate)
-    if modes.regime is None:
-        return growth
-    inelastic = np.asarray(modes.regime != Regime.elastic_plastic)
-    return growth if inelastic.all() else np.ma.masked_where(inelastic, growth)
+def _finish(result, ax, growth, handles, title):
+    """The stability boundary; above the axes the title at the left, the legend at the right."""
+    from matplotlib.lines import Line2D
 
-
-def _finish(modes, ax, title):
-    """Boundary, regimes, and above the axes what is shown at the left and a legend at the right."""
+    if growth.min() < 0 < growth.max():
+        ax.contour(*result.points, growth.T, [0.0], colors="k", linewidths=2)
+        handles = [Line2D([], [], color="k", lw=2, label="stability boundary"), *handles]
     ax.set_title(title, fontsize="medium", loc="left")
-    handles = [*_boundary(modes, ax), *_regimes(modes, ax)]
     if handles:
         place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.99)}
         ax.legend(handles=handles, ncols=3, fontsize="small", frameon=False, **place)
     return ax
-
-
-def _boundary(modes, ax):
-    from matplotlib.lines import Line2D
-
-    growth = _growth(modes)
-    if not growth.min() < 0 < growth.max():
-        return []
-    ax.contour(modes.x, modes.y, growth, [0.0], colors="k", linewidths=2)
-    return [Line2D([], [], color="k", lw=2, label="stability boundary")]
-
-
-def _regimes(modes, ax):
-    from matplotlib.patches import Patch
-
-    handles = []
-    for regime, grey, hatch, label in [
-        (Regime.fully_plastic, "0.80", "//", "fully plastic"),
-        (Regime.gross_slip, "0.92", "..", "gross slip"),
-    ]:
-        inside = None if modes.regime is None else np.asarray(modes.regime == regime)
-        if inside is not None and inside.any():
-            style: dict[str, Any] = {"hatches": [hatch], "colors": [grey]}
-            ax.contourf(modes.x, modes.y, inside.astype(float), levels=[0.5, 1.5], **style)
-            handles.append(Patch(facecolor=grey, hatch=hatch, edgecolor="0.3", label=label))
-    return handles

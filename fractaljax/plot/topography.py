@@ -3,12 +3,15 @@
 from typing import Any
 
 import numpy as np
+from jaxtyping import ArrayLike, Float
 
-from ..optimise.design import Design
-from .axes import new_axes, new_figure
+from .._design.design import Design
+from .axes import Axes, Figure, given_or_new, new_figure
 
 
-def topography(z: Any, dx: float, ax: Any = None, *, dy: float | None = None) -> Any:
+def topography(
+    z: Float[ArrayLike, "n m"], dx: float, ax: Axes | None = None, *, dy: float | None = None
+) -> Axes:
     """Heights [um] of a map z (n, m) [m] about their mean; x [um] along its first axis.
 
     Points are dx [m] apart, and dy (dx, if not given) along the second axis; NaN is left white.
@@ -21,14 +24,13 @@ def topography(z: Any, dx: float, ax: Any = None, *, dy: float | None = None) ->
     steps = dx, dx if dy is None else dy
     if not all(np.isfinite(step) and step > 0 for step in steps):
         raise ValueError(f"dx and dy must be above 0, got {steps[0]!r} and {steps[1]!r}")
-    ax = new_axes() if ax is None else ax
-    heights = _about_mean(z)
+    ax, heights = given_or_new(ax), _about_mean(z)
     image = _draw(ax, heights, steps, np.nanmin(heights), np.nanmax(heights))
     ax.figure.colorbar(image, ax=ax, pad=0.02).set_label("height about the mean [µm]")
     return ax
 
 
-def topographies(design: Design, **options: Any) -> Any:
+def topographies(design: Design, **options: Any) -> Figure:
     """The given and the designed surface side by side, at one colour scale; returns the figure.
 
     `options` are those of `Design.topographies`.
@@ -37,14 +39,14 @@ def topographies(design: Design, **options: Any) -> Any:
     heights = [_about_mean(z) for z in (surfaces.before, surfaces.after)]
     low, high = min(z.min() for z in heights), max(z.max() for z in heights)
     figure = new_figure(11.2, 5.4)
-    words = "given surface", "designed surface" if not design.violated else "best found"
-    scenes = design.initial, design.scene
-    figure.get_layout_engine().set(wspace=0.06)
+    figure.set_layout_engine("constrained", wspace=0.06)
     axes = figure.subplots(1, 2, sharey=True)
-    for ax, z, word, scene in zip(axes, heights, words, scenes, strict=True):
+    names = "given surface", "best found" if design.violated else "designed surface"
+    scenes = design.initial, design.scene
+    for ax, z, name, scene in zip(axes, heights, names, scenes, strict=True):
         image = _draw(ax, z, (surfaces.dx, surfaces.dx), low, high)
         surface = scene.contact.surface
-        ax.set_title(f"{word}: D = {surface.D:.5g}, G = {surface.G:.4g} m", fontsize="medium")
+        ax.set_title(f"{name}: D = {surface.D:.5g}, G = {surface.G:.4g} m", fontsize="medium")
         ax.label_outer()
     figure.colorbar(image, ax=axes, pad=0.02).set_label("height about the mean [µm]")
     return figure

@@ -1,0 +1,1 @@
+"""Checked numbers, safe functions, batches and files: what every other package builds on."""

@@ -1,0 +1,238 @@
+"""The parts of a scene: frozen pytrees of named, checked quantities."""
+
+import contextlib
+import dataclasses
+import functools
+import math
+import operator
+from collections.abc import Iterator, Mapping
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Float
+
+Numbers = Float[Array, "..."]  # of one scene, or of a batch of any shape
+_PartT = TypeVar("_PartT", bound="Part")
+
+
+# --- checks --------------------------------------------------------------------------------
+
+
+def number(
+    name: str,
+    value: ArrayLike,
+    *,
+    above: float = -math.inf,
+    at_least: float = -math.inf,
+    below: float = math.inf,
+    at_most: float = math.inf,
+) -> Numbers:
+    """`value` as a floating-point array of any shape, checked against its domain.
+
+    `above` and `below` are strict. NaN and infinity are always refused. A concrete value raises
+    with its name, the bound and the value; a traced one raises when the compiled program runs.
+
+    **Raises:** `TypeError` unless `value` is real and numeric; `ValueError` outside the domain.
+    """
+    array = _floating(name, value)
+    domain = [
+        ("above", operator.gt, above),
+        ("at least", operator.ge, at_least),
+        ("below", operator.lt, below),
+        ("at most", operator.le, at_most),
+    ]
+    domain = [(word, holds, bound) for word, holds, bound in domain if math.isfinite(bound)]
+    wanted = " and ".join(f"{word} {bound:g}" for word, _, bound in domain) or "finite"
+
+    def outside(x):
+        inside = (holds(x, bound) for _, holds, bound in domain)
+        return ~functools.reduce(operator.and_, inside, abs(x) < math.inf)
+
+    values = concrete(array)
+    if values is None:
+        return eqx.error_if(array, outside(array), f"{name} must be {wanted}")
+    bad = values[outside(values)]
+    if bad.size:
+        raise ValueError(f"{name} must be {wanted}, got {bad.flat[0].item()!r}")
+    return array
+
+
+def _floating(name: str, value: Any) -> Numbers:
+    if isinstance(value, (bool, np.bool_, str, bytes, np.ma.MaskedArray)) or value is None:
+        raise TypeError(f"{name} must be a number, got {brief(value)}")
+    try:
+        dtype = jnp.result_type(value)
+        if not (jnp.issubdtype(dtype, jnp.floating) or jnp.issubdtype(dtype, jnp.integer)):
+            raise TypeError
+        # An explicit dtype strips weak types, which would compile every caller twice.
+        keeps = hasattr(value, "dtype") and jnp.issubdtype(dtype, jnp.floating)
+        # A value known at trace time stays known.
+        traced = isinstance(value, Tracer)
+        with contextlib.nullcontext() if traced else jax.ensure_compile_time_eval():
+            return jnp.asarray(value, dtype=dtype if keeps else float)
+    except (TypeError, ValueError, OverflowError):
+        raise TypeError(f"{name} must be a real number, got {brief(value)}") from None
+
+
+def scalar(name: str, value: ArrayLike, **domain: float) -> Float[Array, ""]:
+    """As `number`, for a single number."""
+    array = number(name, value, **domain)
+    if array.ndim:
+        raise ValueError(f"{name} must be a single number, got shape {array.shape}")
+    return array
+
+
+def ordered(name: str, value: Numbers, other_name: str, other: Numbers) -> Numbers:
+    """`value`, refused as in `number` unless it is at least `other` everywhere."""
+    values, others = concrete(value), concrete(other)
+    if values is None or others is None:
+        return eqx.error_if(value, value < other, f"{name} must be at least {other_name}")
+    values, others = np.broadcast_arrays(values, others)
+    if (below := values < others).any():
+        got, bound = values[below][0].item(), others[below][0].item()
+        raise ValueError(f"{name} must be at least {other_name} = {bound!r}, got {got!r}")
+    return value
+
+
+def whole(name: str, value: Any, least: int, most: float = math.inf) -> int:
+    """`value` as an int, refused unless it is a whole number from `least` to `most`."""
+    found = value if isinstance(value, int) else np.asarray(value).tolist()
+    plain = isinstance(found, (int, float)) and not isinstance(found, bool)
+    if not (plain and least <= found <= most and found % 1 == 0):
+        bound = f"at most {most}" if plain and found > most else f"at least {least}"
+        raise ValueError(f"{name} must be a whole number of {bound}, got {brief(value)}")
+    return int(found)
+
+
+def flag(name: str, value: Any) -> bool:
+    """`value` as a bool.
+
+    **Raises:** `TypeError` unless it is True or False.
+    """
+    if not isinstance(value, (bool, np.bool_)):
+        raise TypeError(f"{name} must be True or False, got {brief(value)}")
+    return bool(value)
+
+
+def require_kind(name: str, value: Any, kind: type) -> None:
+    """Refuse what is not an instance of `kind`."""
+    if not isinstance(value, kind):
+        article = "an" if kind.__name__[0] in "AEIOU" else "a"
+        raise TypeError(f"{name} must be {article} {kind.__name__}, got {brief(value)}")
+
+
+def concrete(array: jax.Array) -> np.ndarray | None:
+    """The values of an array; None while a compiled program is being traced."""
+    # Inside an eager `jax.grad` the primal is concrete, and a message can name it.
+    primal = jax.lax.stop_gradient(array) if isinstance(array, Tracer) else array
+    return None if isinstance(primal, Tracer) else np.asarray(primal)
+
+
+def raise_unless(wanted: Any, outcome: Any) -> Any:
+    """`outcome` if its `result` is the member `wanted`; else `RuntimeError` with its message."""
+    result = outcome.result
+    if concrete(result._value) is None:
+        return result.error_if(outcome, result != wanted)
+    if bool(result != wanted):
+        raise RuntimeError(result._enumeration[result])
+    return outcome
+
+
+def brief(value: Any) -> str:
+    """`value` as messages show it: one line of at most 80 characters."""
+    try:
+        text = " ".join(repr(value).split())
+    except ValueError:  # Python refuses to print integers of thousands of digits
+        return "a very large integer"
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def one_line(error: Exception) -> str:
+    """An error of another package in one line."""
+    return " ".join(str(error).split())[:200] or type(error).__name__
+
+
+# --- parts ---------------------------------------------------------------------------------
+
+
+def quantity(unit: str, meaning: str, *, log: bool = False) -> Any:
+    """A numeric field of a `Part`, with its unit and its meaning for files and tables.
+
+    `log` marks a scale: it is designed and swept on a logarithmic axis.
+    """
+    return eqx.field(metadata={"unit": unit, "meaning": meaning, "log": log})
+
+
+class Record(eqx.Module):
+    """A frozen pytree whose repr shows its numbers, not only their types."""
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({', '.join(self._shown())})"
+
+    def _shown(self) -> Iterator[str]:
+        for field in dataclasses.fields(self):
+            if not field.repr:
+                continue
+            value = getattr(self, field.name)
+            if isinstance(value, jax.Array) and not isinstance(value, Tracer):
+                value = value.item() if value.ndim == 0 else np.asarray(value)
+            yield f"{field.name}={value!r}"
+
+
+class Part(Record):
+    """A part of a scene: its numeric leaves are named quantities in SI units."""
+
+
+def quantities(part: Part) -> dict[str, tuple[str, ...]]:
+    """Every named quantity and sub-part below `part`, with the attribute path that leads to it."""
+    found = {}
+    for field in dataclasses.fields(part):
+        value = getattr(part, field.name)
+        found[field.name] = (field.name,)
+        if isinstance(value, Part):
+            found |= {name: (field.name, *path) for name, path in quantities(value).items()}
+    return found
+
+
+def leaf(part: Part, path: tuple[str, ...]) -> Any:
+    """The value at the attribute path `path` below `part`."""
+    return functools.reduce(getattr, path, part)
+
+
+def rebuild(part: _PartT, changes: Mapping[str, Any]) -> _PartT:
+    """`part` built anew, checks included, with named quantities changed wherever they live.
+
+    Where a part is itself among the changes, the quantities in it are changed in the new part.
+    """
+    arguments, changed = {}, False
+    for field in dataclasses.fields(part):
+        old = getattr(part, field.name)
+        new = changes.get(field.name, old)
+        if isinstance(new, Part):
+            new = rebuild(new, {name: x for name, x in changes.items() if name != field.name})
+        changed |= new is not old
+        arguments[field.name] = new
+    return type(part)(**arguments) if changed else part
+
+
+def substitute(part: _PartT, changes: Mapping[str, Any]) -> _PartT:
+    """Like `rebuild`, without checks: for inner loops over values known to be valid."""
+    paths = quantities(part)
+    chosen = [paths[name] for name in changes]
+    return eqx.tree_at(
+        lambda tree: [leaf(tree, path) for path in chosen], part, list(changes.values())
+    )
+
+
+def require_scalar(part: Part) -> None:
+    """Refuse a part that holds arrays: the laws take one scene, `jax.vmap` takes many."""
+    for name, path in quantities(part).items():
+        value = leaf(part, path)
+        if isinstance(value, jax.Array) and value.ndim:
+            raise ValueError(
+                f"{name} must be a scalar, got shape {value.shape}; use jax.vmap for many scenes"
+            )

@@ -1,0 +1,13 @@
+"""Aligned text."""
+
+
+def table(titles: list[str], columns: list[dict[str, str]]) -> str:
+    """Columns with the same rows as aligned text, row names at the left."""
+    lines = [["", *titles], *([name, *(c[name] for c in columns)] for name in columns[0])]
+    if not any(titles):
+        lines = lines[1:]
+    widths = [max(len(cell) for cell in cells) for cells in zip(*lines, strict=True)]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
+        for line in lines
+    )

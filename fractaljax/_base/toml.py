@@ -1,0 +1,165 @@
+"""TOML files: one annotated writer, one reader, and parts as tables of quantities."""
+
+import contextlib
+import dataclasses
+import inspect
+import json
+import os
+import tomllib
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any, NamedTuple, cast
+
+from .parts import Part, brief
+
+Laws = Mapping[str, Mapping[str, type[Part]]]  # by field, then by the name of the law
+
+
+class Noted(NamedTuple):
+    """A value with a comment beside it; without a value the key itself is commented out."""
+
+    value: Any
+    comment: str
+
+
+# --- writing ------------------------------------------------------------------------------
+
+
+def write_toml(comment: str, document: Mapping[str, Any]) -> str:
+    """The text of a TOML file: mappings are tables, None is left out, `Noted` gets a comment."""
+    return "\n".join([f"# {comment}", *_table("", document)]) + "\n"
+
+
+def _table(name: str, table: Mapping[str, Any]) -> list[str]:
+    inner = {key: value for key, value in table.items() if isinstance(value, Mapping)}
+    rows = [_row(key, x) for key, x in table.items() if key not in inner and x is not None]
+    header = [f"[{name}]"] if name and (rows or not inner) else []
+    lines = ["", *header, *rows] if header or rows else []
+    for key, value in inner.items():
+        lines += _table(f"{name}.{_key(key)}" if name else _key(key), value)
+    return lines
+
+
+def _row(key: str, value: Any) -> str:
+    value, comment = value if isinstance(value, Noted) else (value, "")
+    note = f"  # {comment}" if comment else ""
+    return f"# {_key(key)} ={note}" if value is None else f"{_key(key)} = {_value(value)}{note}"
+
+
+def _key(name: str) -> str:
+    bare = name.isascii() and name.replace("_", "").replace("-", "").isalnum()
+    return name if bare else _quoted(name)
+
+
+def _value(value: Any) -> str:
+    match value:
+        case str():
+            lines = "\n" in value and value.replace("\n", "").isprintable() and "'''" not in value
+            return f"'''\n{value}'''" if lines else _quoted(value)
+        case bool() | int():
+            return str(value).lower()
+        case Mapping():
+            return "{" + ", ".join(_row(key, inner) for key, inner in value.items()) + "}"
+        case list() | tuple():
+            return "[" + ", ".join(map(_value, value)) + "]"
+    return repr(float(value))
+
+
+def _quoted(text: str) -> str:
+    # JSON and TOML escape alike, but for DEL.
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", r"\u007f")
+
+
+def part_table(part: Part, laws: Laws) -> dict[str, Any]:
+    """The table of a part: numbers with unit and meaning, and its own parts as tables in it.
+
+    **Raises:** `ValueError` for a part of a kind that `laws` does not have.
+    """
+    table = {}
+    for field in dataclasses.fields(part):
+        name, value = field.name, getattr(part, field.name)
+        if isinstance(value, Part):
+            table[name] = part_table(value, laws)
+            if name in laws:
+                table[name] = _law(name, type(value), laws[name]) | table[name]
+        elif "unit" in field.metadata:
+            table[name] = Noted(value, "{unit}: {meaning}".format(**field.metadata))
+        else:
+            table[name] = value
+    return table
+
+
+def _law(name: str, kind: type[Part], kinds: Mapping[str, type[Part]]) -> dict[str, Any]:
+    if kind not in kinds.values():
+        known = ", ".join(known.__name__ for known in kinds.values())
+        raise ValueError(f"a file holds as {name} one of {known}, got {kind.__name__}")
+    law = next(law for law in kinds if kinds[law] is kind)
+    return {"law": Noted(law, "or " + ", ".join(f'"{other}"' for other in kinds if other != law))}
+
+
+# --- reading ------------------------------------------------------------------------------
+
+
+def read_toml(content: bytes) -> dict[str, Any]:
+    """The tables of a TOML file. **Raises:** `ValueError` saying where it is not TOML."""
+    try:
+        return tomllib.loads(content.decode())
+    except ValueError as error:
+        raise ValueError(f"not a TOML file: {error}") from None
+
+
+@contextlib.contextmanager
+def naming(path: str | os.PathLike) -> Iterator[None]:
+    """Errors in the content of a file become one `ValueError` that begins with its name."""
+    try:
+        yield
+    except RecursionError:
+        raise ValueError(f"{path}: its tables or arrays are nested too deeply") from None
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def table_at(document: Mapping[str, Any], key: str, inside: str = "") -> dict[str, Any]:
+    """The table `key` of `document`, whose own name in the file is `inside` ("joints.", say)."""
+    if key not in document:
+        raise ValueError(f"the table [{inside}{key}] is missing")
+    if not isinstance(document[key], dict):
+        raise ValueError(f"[{inside}{key}] must be a table, got {brief(document[key])}")
+    return document[key]
+
+
+def refuse_unknown(where: str, given: Collection[str], known: Collection[str]) -> None:
+    """Refuse a key in `given` that is not in `known`; `where` names the table."""
+    for key in given:
+        if key not in known:
+            raise ValueError(f"{where} has the unknown key {key!r}; known are {', '.join(known)}")
+
+
+def read_part(kind: type[Part], table: Mapping[str, Any], laws: Laws, name: str = "") -> Any:
+    """The part of this kind in the table `name` of a file, or in the whole file.
+
+    **Raises:** `ValueError` or `TypeError` naming the table and the key that is unknown, missing
+    or outside its domain.
+    """
+    where, inside = (f"[{name}]", f"{name}.") if name else ("the file", "")
+    fields = {field.name: field.type for field in dataclasses.fields(kind)}
+    refuse_unknown(where, table, fields)
+    given, parameters = dict(table), inspect.signature(kind.__init__).parameters
+    for key, inner in fields.items():
+        if key in laws or (isinstance(inner, type) and issubclass(inner, Part)):
+            below = dict(table_at(table, key, inside))
+            if key in laws:
+                inner = _kind(f"{inside}{key}", below.pop("law", ""), laws[key])
+            given[key] = read_part(cast(type[Part], inner), below, laws, f"{inside}{key}")
+        elif key not in table and parameters[key].default is inspect.Parameter.empty:
+            raise ValueError(f"{where} lacks the key {key!r}")
+    try:
+        return kind(**given)
+    except (ValueError, TypeError) as error:
+        raise type(error)(f"{where} {error}" if name else str(error)) from None
+
+
+def _kind(name: str, law: Any, kinds: Mapping[str, type[Part]]) -> type[Part]:
+    if not isinstance(law, str) or law not in kinds:
+        choices = " or ".join(f'"{choice}"' for choice in kinds)
+        raise ValueError(f"[{name}] law must be {choices}, got {brief(law)}")
+    return kinds[law]

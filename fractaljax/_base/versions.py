@@ -1,0 +1,25 @@
+"""The package versions that results depend on: stored with a run, compared when it is read."""
+
+from collections.abc import Mapping
+
+import jax
+
+from .._version import __version__
+
+
+def versions() -> dict[str, str]:
+    """The version of each package."""
+    return {"fractaljax": __version__, "jax": jax.__version__}
+
+
+def version_text() -> str:
+    """`versions` as text: `fractaljax 0.1.0, jax 0.10.2`."""
+    return ", ".join(f"{name} {version}" for name, version in versions().items())
+
+
+def versions_differ(found: Mapping[str, str]) -> str | None:
+    """The versions in `found` that differ from these, as text; None if none does."""
+    others = [
+        f"{name} {found[name]}" for name, own in versions().items() if found.get(name, own) != own
+    ]
+    return f"written by {', '.join(others)}, read by {version_text()}" if others else None

@@ -1,0 +1,1 @@
+"""The commands of `fractaljax`. Each adds its own parser, which holds the function that it runs."""

@@ -1,0 +1,105 @@
+"""`fractaljax stability`, `cycle` and `scene`."""
+
+from pathlib import Path
+
+from .output import csv_text, output, picture
+from .parsing import add_constant_friction, add_scene_file, load_scene
+
+_SAMPLES = 512  # of one period
+
+
+def add_stability(commands) -> None:
+    """Add `fractaljax stability`."""
+    parser = commands.add_parser(
+        "stability", help="print the stability of a scene", description=_stability.__doc__
+    )
+    add_scene_file(parser)
+    add_constant_friction(parser)
+    parser.set_defaults(run=_stability)
+
+
+def _stability(arguments) -> int:
+    """Print the joint, the critical mode and the eigenvalues of a scene.
+
+    Of a structure (a file with a table of that name): the joints, and the modes that are unstable
+    or least damped.
+    """
+    from .._mechanism.scene import brake_scene
+    from .._mechanism.structure import Structure, load
+    from .._stability.summary import stability_table, structure_table
+
+    subject = brake_scene() if arguments.scene is None else load(arguments.scene)
+    slope = not arguments.constant_friction
+    if isinstance(subject, Structure):
+        print(structure_table(subject, slope))
+    else:
+        print(stability_table(subject, slope))
+    return 0
+
+
+def add_cycle(commands) -> None:
+    """Add `fractaljax cycle`."""
+    parser = commands.add_parser(
+        "cycle", help="find the stick-slip limit cycle", description=_cycle.__doc__
+    )
+    add_scene_file(parser)
+    parser.add_argument("--out", type=Path, default=Path("fractaljax-cycle"), metavar="FOLDER")
+    parser.add_argument(
+        "--start",
+        type=float,
+        nargs=4,
+        metavar=("X1", "X2", "V1", "V2"),
+        help="where the motion starts [m, m, m/s, m/s]; else near the sliding equilibrium",
+    )
+    parser.add_argument("--rtol", type=float, help="of period and states; default 1e-9")
+    parser.add_argument(
+        "--max-returns", type=int, help="of the Poincare map before giving up; default 5000"
+    )
+    parser.set_defaults(run=_cycle)
+
+
+def _cycle(arguments) -> int:
+    """Find the limit cycle that the motion ends in; write cycle.png and cycle.csv."""
+    from .. import plot
+    from .._dynamics.limit_cycle import CycleResult, limit_cycle
+    from .._dynamics.summary import cycle_table
+    from .._stability.stability import require_computable
+
+    scene = load_scene(arguments)
+    require_computable(scene)
+    options = {name: getattr(arguments, name) for name in ("start", "rtol", "max_returns")}
+    options = {name: value for name, value in options.items() if value is not None}
+    with output(arguments.out) as write:
+        cycle = limit_cycle(scene, **options, throw=False)
+        exists = CycleResult.converged, CycleResult.inaccurate, CycleResult.unstable
+        found = cycle.result in exists
+        if found:
+            figure, table = picture(plot.cycle(cycle)), _orbit_text(cycle).encode()
+            written = write({"cycle.png": figure, "cycle.csv": table})
+    print(cycle_table(scene, cycle))
+    if found:
+        print(written)
+    return 0 if found else 1
+
+
+def _orbit_text(cycle) -> str:
+    t, states = cycle.orbit(_SAMPLES)
+    titles = ["time [s]", "x1 [m]", "x2 [m]", "v1 [m/s]", "v2 [m/s]"]
+    rows = zip(t.tolist(), states.tolist(), strict=True)
+    return csv_text(titles, ([time, *state] for time, state in rows))
+
+
+def add_scene(commands) -> None:
+    """Add `fractaljax scene`."""
+    parser = commands.add_parser(
+        "scene", help="print a scene file to start from", description=_scene.__doc__
+    )
+    parser.set_defaults(run=_scene)
+
+
+def _scene(arguments) -> int:
+    """Print the reference brake as a scene file."""
+    from .._mechanism.scene import brake_scene
+
+    print(brake_scene().to_toml(), end="")
+    return 0

@@ -1,0 +1,217 @@
+"""`fractaljax design`: the nearest design that is stable against small disturbances."""
+
+import inspect
+from pathlib import Path
+
+from .output import csv_text, npy, output, picture
+from .parsing import add_constant_friction, add_scene_file, low_and_high, number, pairs_of, remarks
+
+_UNITS = {"G": "m", "growth_rate": "1/s", "K_n": "N/m", "K_t": "N/m"}  # of the history
+_LIMITS = {  # option: class of `fractaljax.constraints`, and its meaning
+    "sq": ("Roughness", "Sq of the surface [m]"),
+    "elastic-share": ("ElasticShare", "share of the load on elastic contacts"),
+    "real-area": ("RealContactArea", "real contact area [m^2]"),
+    "damping-ratio": ("DampingRatio", "least damping ratio"),
+    "frequency": ("Frequency", "frequencies of all modes [Hz]"),
+}
+_OPTIONS = {  # plain arguments of `design`
+    "target": (float, "largest growth rate allowed [1/s]"),
+    "K_n_min": (float, "least normal stiffness allowed [N/m]"),
+    "area_ratio_min": (float, "least a_l/a_e"),
+    "slip_ratio_max": (float, "largest Q_e/(mu_s P)"),
+    "quantile": (float, "of the scatter; default 0.95"),
+    "starts": (int, "designs that the solver starts from"),
+    "lattice": (int, "designs a side that starts are chosen from"),
+    "seed": (int, "of the draws as machined; default 0"),
+}
+_SEVERAL = {
+    "bounds": ("NAME=LOW:HIGH", "bounds on any quantities; default D and G"),
+    "envelope": (
+        "NAME=LOW:HIGH",
+        "ranges, or NAME=V1,V2,V3 measured together, that the design withstands",
+    ),
+    "tolerance": ("NAME=SIGMA", "standard deviations as machined, of D and lnG, say"),
+}
+
+
+def add_design(commands) -> None:
+    """Add `fractaljax design`."""
+    parser = commands.add_parser(
+        "design",
+        help="find the nearest design that is stable against small disturbances",
+        description=_run.__doc__,
+    )
+    add_scene_file(parser)
+    add_constant_friction(parser)
+    parser.add_argument("--out", type=Path, default=Path("fractaljax-design"), metavar="FOLDER")
+    for name, unit in (("D", ""), ("G", " [m]")):
+        ends = ("LOW", "HIGH")
+        parser.add_argument(
+            f"--{name}", type=float, nargs=2, metavar=ends, help=f"bounds on {name}{unit}"
+        )
+    for name, (form, meaning) in _SEVERAL.items():
+        parser.add_argument(f"--{name}", action="extend", nargs="+", metavar=form, help=meaning)
+    for name, (kind, meaning) in _OPTIONS.items():
+        parser.add_argument(f"--{name.replace('_', '-')}", type=kind, help=meaning)
+    parser.add_argument("--risk", help="worst (the default), smooth, smooth:T or cvar:ALPHA")
+    for name, (_, meaning) in _LIMITS.items():
+        parser.add_argument(f"--{name}", metavar="LOW:HIGH", help=f"{meaning}; one may be absent")
+    parser.add_argument(
+        "--sq-lengths",
+        type=float,
+        nargs=2,
+        metavar=("L", "L_S"),
+        help="longest and shortest wavelength that --sq counts [m]; default 1e-3 1e-6",
+    )
+    parser.add_argument(
+        "--repeat", type=Path, metavar="FILE", help="run again what a run.toml holds, nothing else"
+    )
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+    kept = {"repeat", "quiet", "out", "help"}  # beside --repeat
+    own = [action.dest for action in parser._actions if action.dest not in kept]
+    parser.set_defaults(run=_run, own=own)
+
+
+def _run(arguments) -> int:
+    """Find the nearest design stable against small disturbances; write scene, run and pictures.
+
+    The files: design.toml, run.toml and history.csv. Of a scene with a fractal surface also
+    design.png, where D and G are designed, topographies.png with the surfaces before and after, and
+    topography.npy with the heights of the designed one [m].
+    """
+    from .. import plot
+    from .._design.design import design
+    from .._design.design_file import design_text, read_design, save_design
+    from .._mechanism.scene import brake_scene
+    from .._mechanism.structure import Structure, load
+
+    if arguments.repeat is None:
+        x = brake_scene() if arguments.scene is None else load(arguments.scene)
+        options = _options(arguments)
+    else:
+        given = [name for name in arguments.own if getattr(arguments, name) not in (None, False)]
+        if given:
+            raise ValueError(f"--repeat takes everything from its file, got {', '.join(given)} too")
+        with remarks():
+            x, options = read_design(arguments.repeat)
+    with output(arguments.out) as write:
+        best = design(x, **options, progress=not arguments.quiet)
+        files, heights = {}, []
+        if not isinstance(x, Structure):
+            files = {
+                "design.toml": _scene_text(best).encode(),
+                "run.toml": design_text(best).encode(),
+            }
+        files["history.csv"] = _history_text(best).encode()
+        if best.has_surface and set(best.bounds) <= {"D", "G"}:
+            files["design.png"] = picture(plot.design(best).figure)
+        if best.has_surface:
+            surfaces = best.topographies()
+            files["topographies.png"] = picture(plot.topographies(best))
+            files["topography.npy"] = npy(surfaces.after)
+            side, dx = len(surfaces.after), surfaces.dx
+            heights = [f"topography.npy: {side} x {side} heights in m, dx = {dx:g} m"]
+        written = write(files)
+        if isinstance(x, Structure):
+            best.scene.save(arguments.out / "design.toml")
+            save_design(best, arguments.out / "run.toml")
+    *table, promise = str(best).splitlines()
+    print("\n".join([*table, *_remarks(x, options), written, *heights, promise]))
+    return 1 if best.violated else 0
+
+
+def _options(arguments) -> dict:
+    """The arguments of `design` that a command asks for."""
+    from .._design.envelope import Envelope
+    from .._design.problem import DEFAULT_BOUNDS
+
+    options = {name: getattr(arguments, name) for name in _OPTIONS}
+    options = {name: value for name, value in options.items() if value is not None}
+    options |= {"friction_slope": not arguments.constant_friction}
+    options["bounds"] = {
+        name: tuple(ends) for name in ("D", "G") if (ends := getattr(arguments, name))
+    }
+    if arguments.bounds is None:
+        options["bounds"] = DEFAULT_BOUNDS | options["bounds"]
+    else:
+        for name, text in pairs_of("--bounds", arguments.bounds, _SEVERAL["bounds"][0]).items():
+            options["bounds"][name] = tuple(_numbers(f"--bounds {name}", text, ":"))
+    options["constraints"] = _constraints(arguments)
+    if arguments.risk is not None:
+        kind, _, value = arguments.risk.partition(":")
+        options["risk"] = (kind, number("--risk", value)) if value else kind
+    if arguments.envelope is not None:
+        ranges, samples = {}, {}
+        for name, text in pairs_of("--envelope", arguments.envelope, "NAME=LOW:HIGH").items():
+            into, separator = (ranges, ":") if ":" in text else (samples, ",")
+            into[name] = _numbers(f"--envelope {name}", text, separator)
+            if len(into[name]) < 2:
+                raise ValueError(
+                    f"--envelope {name} must be LOW:HIGH or at least two samples, got {text!r}"
+                )
+        options["envelope"] = Envelope(ranges, samples)
+    if arguments.tolerance is not None:
+        pairs = pairs_of("--tolerance", arguments.tolerance, "NAME=SIGMA")
+        options["tolerance"] = {
+            f"ln {name[2:]}" if name.startswith("ln") else name: number("--tolerance", text)
+            for name, text in pairs.items()
+        }
+    return options
+
+
+def _numbers(option, text, separator) -> list[float]:
+    return [number(option, value) for value in text.split(separator)]
+
+
+def _constraints(arguments) -> list:
+    from .._design import constraints
+
+    if arguments.sq_lengths is not None and arguments.sq is None:
+        raise ValueError("--sq-lengths needs --sq")
+    more: dict = dict(zip(("L", "L_s"), arguments.sq_lengths or (1e-3, 1e-6), strict=True))
+    more["friction_slope"] = not arguments.constant_friction
+    found = []
+    for name, (kind, _) in _LIMITS.items():
+        limits = low_and_high(f"--{name}", getattr(arguments, name.replace("-", "_")))
+        if limits is None:
+            continue
+        law = getattr(constraints, kind)
+        takes = inspect.signature(law).parameters
+        asked = dict(zip(("at_least", "at_most"), limits, strict=True))
+        if asked.get("at_most") is not None and "at_most" not in takes:
+            raise ValueError(f"--{name} has a lower limit only: LOW:")
+        found.append(law(**{key: x for key, x in (asked | more).items() if key in takes}))
+    return found
+
+
+def _remarks(x, options) -> list[str]:
+    """What `friction_remark` says of a scene, over its envelope."""
+    from .._design.envelope import Envelope
+    from .._mechanism.quantities import replaced
+    from .._mechanism.scene import Scene
+    from .._stability.summary import friction_remark
+
+    if not isinstance(x, Scene):
+        return []
+    if options.get("envelope") is not None:
+        envelope = Envelope.of(options["envelope"])
+        values = envelope.values(envelope.grid())
+        x = replaced(x, dict(zip(envelope.names, values.T, strict=True)))
+    return friction_remark(x, x.oscillator.V)
+
+
+def _scene_text(best) -> str:
+    from .._base.versions import version_text
+
+    lines = [f"# {best.outcome}", f"# growth rate {best.growth_rate:+.6g} 1/s"]
+    lines.append(f"# designed by {version_text()}")
+    lines += [f"# not met: {name}" for name in best.violated]
+    return "\n".join([*lines, best.scene.to_toml()])
+
+
+def _history_text(best) -> str:
+    titles = [f"{name} [{_UNITS[name]}]" if name in _UNITS else name for name in best.history]
+    columns = [column.tolist() for column in best.history.values()]
+    return csv_text(
+        ["step", *titles], ([i, *row] for i, row in enumerate(zip(*columns, strict=True)))
+    )

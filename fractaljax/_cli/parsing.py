@@ -1,0 +1,136 @@
+"""How the commands read their arguments and report errors."""
+
+import argparse
+import contextlib
+import re
+import sys
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .._mechanism.scene import Scene
+
+
+class _Once(argparse.Action):
+    """Stores a value, and refuses a second one."""
+
+    given = False
+
+    def __call__(self, parser, namespace, values, option_string=None):
+        if self.given:
+            raise argparse.ArgumentError(self, "given more than once")
+        self.given = True
+        setattr(namespace, self.dest, values)
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that reports an error in one line and takes negative numbers of any form."""
+
+    def __init__(self, *arguments, **options):
+        super().__init__(*arguments, **options)
+        self.register("action", None, _Once)
+        # Older Pythons take -1e-5 for an option.
+        self._negative_number_matcher = re.compile(r"-\.?\d")
+
+    def error(self, message):
+        refuse(message)
+
+
+def refuse(message: str) -> None:
+    """One line on standard error, and exit status 2."""
+    print(f"fractaljax: {' '.join(message.split())}", file=sys.stderr)
+    raise SystemExit(2)
+
+
+_FILE_ERRORS = {
+    FileNotFoundError: "no such file",
+    IsADirectoryError: "a folder, not a file",
+    NotADirectoryError: "not a folder",
+    PermissionError: "no permission for",
+}
+
+
+def reason(error: Exception) -> str | None:
+    """The message of an error that a user can cause, or None for a defect of the program."""
+    text = str(error)
+    match error:
+        case OSError(filename=None):
+            return text
+        case OSError():
+            return f"{_FILE_ERRORS.get(type(error), error.strerror)}: {error.filename}"
+        case RecursionError():
+            return "a file is too deeply nested"
+        case MemoryError():
+            return f"not enough memory: {text}"
+        case ArithmeticError():
+            return f"a number is out of range: {text}"
+        case ValueError() | TypeError():
+            return text
+    # Raised by a compiled program: one line of JAX's long account of it.
+    if checked := re.search(r"EquinoxRuntimeError: (.+)", text):
+        return checked[1]
+    return f"not enough memory: {text}" if text.startswith("RESOURCE_EXHAUSTED") else None
+
+
+@contextlib.contextmanager
+def remarks():
+    """Warnings as lines on standard error."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        warnings.showwarning = lambda message, *_, **__: print(
+            f"fractaljax: {message}", file=sys.stderr
+        )
+        yield
+
+
+def add_scene_file(parser) -> None:
+    """The optional argument `scene`."""
+    parser.add_argument(
+        "scene", nargs="?", type=Path, help="a scene file; else the reference brake"
+    )
+
+
+def add_constant_friction(parser) -> None:
+    """The option `--constant-friction`."""
+    parser.add_argument(
+        "--constant-friction",
+        action="store_true",
+        help="leave out the slope of the friction law (the source's Eq. 43)",
+    )
+
+
+def load_scene(arguments) -> "Scene":
+    """The scene of the file that is given; else the reference brake."""
+    from .._mechanism.scene import Scene, brake_scene
+
+    return brake_scene() if arguments.scene is None else Scene.load(arguments.scene)
+
+
+def low_and_high(option: str, text: str | None) -> tuple[float | None, ...] | None:
+    """LOW:HIGH as two numbers, None where one is absent; LOW alone is LOW:."""
+    if text is None:
+        return None
+    low, _, high = text.partition(":")
+    return tuple(number(option, end) if end else None for end in (low, high))
+
+
+def pairs_of(option: str, texts: list[str], form: str) -> dict[str, str]:
+    """Several NAME=VALUE by name; `form` is how the message writes one."""
+    found = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        if not (name and value):
+            raise ValueError(f"{option} must be {form}, got {text!r}")
+        if name in found:
+            raise ValueError(f"{option} has {name} more than once")
+        found[name] = value
+    return found
+
+
+def number(option: str, text: str) -> float:
+    """The number that `option` was given as a text."""
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"{option} must be numbers, got {text!r}") from None

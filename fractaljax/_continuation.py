@@ -1,0 +1,240 @@
+"""Curves of zeros by pseudo-arclength continuation: n - 1 smooth equations in n unknowns.
+
+A step along the tangent, then Newton steps back onto the curve the shortest way: a fold is a point
+like any other. In two unknowns `trace` finds all curves in the unit square that cross a lattice.
+"""
+
+import dataclasses
+import enum
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+_NEWTON_STEPS = 12
+_STRAIGHT, _BENT = 0.03, 0.15  # angles between tangents [rad] that lengthen and halve the step
+_BISECTIONS = 30  # towards a zero on an edge of the lattice
+
+
+class CurveEnd(enum.Enum):
+    """Why a curve ends."""
+
+    closed = "where it began"
+    edge = "at the edge of the box"
+    stuck = "where Newton's method fails however short the step"
+    long = "after the largest number of points"
+
+
+class Curve(NamedTuple):
+    """Points (k, n) along a curve, and why it ends at the first and at the last of them."""
+
+    points: np.ndarray
+    start: CurveEnd
+    end: CurveEnd
+
+
+@dataclasses.dataclass(frozen=True)
+class Continuation:
+    """The curves of `equations` in a box, and how to follow them.
+
+    `equations(u)` gives the residual (n - 1,) and the Jacobian (n - 1, n) at u (n,). The tangent t
+    has det [t; Jacobian] > 0: in two unknowns the residual is negative on its right. Where that
+    orientation flips there is another sheet, or a branch point. An `oriented` curve ends there;
+    any other passes straight through.
+    """
+
+    equations: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+    low: np.ndarray  # (n,) of the box, perhaps infinite
+    high: np.ndarray
+    valid: Callable[[np.ndarray], bool] = lambda u: True  # whether a zero belongs to the curve
+    tolerance: float = 1e-12  # distance from the zero
+    oriented: bool = True
+    longest: float = 1 / 64  # steps
+    shortest: float = 1e-7
+    most: int = 5000  # points each way
+
+    def tangent(self, jacobian: np.ndarray) -> np.ndarray:
+        """The unit vector t (n,) with Jacobian t = 0 and det [t; Jacobian] > 0."""
+        t = np.linalg.qr(jacobian.T, mode="complete")[0][:, -1]
+        return t * np.linalg.slogdet(np.vstack([t, jacobian]))[0]
+
+    def corrected(self, u: np.ndarray, fixed: int | None = None):
+        """The zero that Newton's method finds from u, and the Jacobian there; None if it fails.
+
+        By steps of least length, with the coordinate `fixed` held.
+        """
+        free = np.arange(len(u)) != (-1 if fixed is None else fixed)
+        best, found = np.inf, None
+        for _ in range(_NEWTON_STEPS):
+            residual, jacobian = self.equations(u)
+            if not (np.isfinite(residual).all() and np.isfinite(jacobian).all()):
+                return None
+            step, _, rank, _ = np.linalg.lstsq(jacobian[:, free], -residual)
+            size = np.linalg.norm(step)
+            if size >= best:
+                break  # down to rounding
+            if rank < len(residual) or size > 4 * self.longest:
+                return None
+            best, found = size, (u, jacobian)
+            u = u.copy()
+            u[free] += step
+        return found if best <= self.tolerance and found and self.valid(found[0]) else None
+
+    def curve(self, u: np.ndarray, jacobian: np.ndarray) -> Curve:
+        """The whole curve through a zero u, along its tangent."""
+        ahead = self.tangent(jacobian)
+        onward, end = self._follow(u, ahead, 1)
+        if end is CurveEnd.closed:
+            return Curve(np.array(onward), end, end)
+        backward, start = self._follow(u, -ahead, -1)
+        return Curve(np.array(backward[:0:-1] + onward), start, end)
+
+    def _follow(self, u, ahead, sign):
+        """Points from u, starting in the direction `ahead`: `sign` times the tangent."""
+        points, length = [u], self.longest / 4
+        while len(points) < self.most:
+            step = self._step(u, ahead, length, sign)
+            if step is None:
+                length /= 2
+                if length < self.shortest:
+                    return points, CurveEnd.stuck
+                continue
+            reached, turned, angle, leaves = step
+            if len(points) > 2 and self._passes(points[0] - u, ahead, reached - u):
+                return [*points, points[0]], CurveEnd.closed
+            if not (leaves and np.linalg.norm(reached - u) < self.shortest):
+                points.append(reached)
+            if leaves:
+                return points, CurveEnd.edge
+            u, ahead = reached, turned
+            if angle < _STRAIGHT:
+                length = min(1.5 * length, self.longest)
+        return points, CurveEnd.long
+
+    def _step(self, u, ahead, length, sign):
+        """The next point, its direction, the angle to it, whether on the edge; None if too long."""
+        target, fixed = u + length * ahead, None
+        leaves = not self._inside(target)
+        if leaves:
+            share, fixed, side = self._way_out(u, target)
+            target = u + share * length * ahead
+            target[fixed] = side
+        found = self.corrected(target, fixed)
+        if found is None:
+            return None
+        reached, turned = found[0], sign * self.tangent(found[1])
+        if not self.oriented and turned @ ahead < 0:
+            turned = -turned
+        angle = np.arccos(np.clip(turned @ ahead, -1, 1))
+        along = (reached - u) @ ahead
+        fits = self._inside(reached) and 0 <= along <= 2 * length and angle <= _BENT
+        return (reached, turned, angle, leaves) if fits else None
+
+    def _inside(self, u) -> bool:
+        return bool(((u >= self.low) & (u <= self.high)).all())
+
+    def _way_out(self, u, target):
+        """Share of the way to a target outside at which it leaves the box, coordinate and side."""
+        return min(
+            ((side - u[i]) / (target[i] - u[i]), i, side)
+            for i in range(len(u))
+            for side, outside in (
+                (self.low[i], target[i] < self.low[i]),
+                (self.high[i], target[i] > self.high[i]),
+            )
+            if outside
+        )
+
+    def _passes(self, start, ahead, step) -> bool:
+        """Whether a step passes the start of the curve, both relative to where it begins."""
+        along = start @ ahead
+        aside = np.linalg.norm(start - along * ahead)
+        near = aside < 0.1 * np.linalg.norm(step) + self.shortest
+        return bool(near and 0 < along <= step @ ahead)
+
+
+# --- all curves in the unit square --------------------------------------------------------
+
+Values = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+def trace(curves: Continuation, values: Values, lines: int) -> tuple[list[Curve], bool, int]:
+    """The curves of one equation in the unit square that cross one of `lines` lines each way.
+
+    `values` gives residuals (k,) and gradients (k, 2) at points (k, 2). Also returned: whether the
+    residual is negative at (0, 0), and the number of crossings from which no curve was found.
+    """
+    found, failed = [], []
+    seeds, negative = _crossings(values, lines)
+    for seed in seeds:
+        edges = np.flatnonzero((seed == 0) | (seed == 1))
+        start = curves.corrected(seed, int(edges[0]) if len(edges) else None)
+        if start is None:
+            failed.append(seed)
+            continue
+        # In the same direction: the other side of a narrow tongue is another curve.
+        along = curves.tangent(start[1])
+        if any((_passing(curve, seed, curves.shortest) @ along > 0).any() for curve in found):
+            continue
+        curve = curves.curve(*start)
+        if len(curve.points) > 1:
+            found.append(curve)
+    missed = [p for p in failed if not any(len(_passing(c, p, curves.shortest)) for c in found)]
+    return found, negative, len(missed)
+
+
+def _crossings(values, lines):
+    """Zeros (k, 2) on the lines of a lattice, those on the edge of the square first."""
+    side = np.linspace(0, 1, lines)
+    grid = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1)
+    value, slope = values(grid.reshape(-1, 2))
+    value, slope = value.reshape(lines, lines), slope.reshape(lines, lines, 2)
+    positive, negative = [], []
+    for axis in range(2):
+        places, v, s = (np.moveaxis(x, axis, 0) for x in (grid, value, slope[..., axis]))
+        ends = places[:-1].reshape(-1, 2), places[1:].reshape(-1, 2)
+        low, high = (v[:-1] < 0).ravel(), (v[1:] < 0).ravel()
+        differ = low != high
+        first, last = ends[0][differ], ends[1][differ]
+        positive.append(np.where(low[differ, None], last, first))
+        negative.append(np.where(low[differ, None], first, last))
+        # Two zeros between two lines: the value falls towards 0 from either end.
+        sign = np.where(low, -1.0, 1.0)
+        dips = ~differ & (sign * s[:-1].ravel() < 0) & (sign * s[1:].ravel() > 0)
+        first, last, sign = ends[0][dips], ends[1][dips], sign[dips]
+        inside = _beyond(values, first, last, axis, sign)
+        through = ~np.isnan(inside[:, 0])
+        swapped = (sign < 0)[through, None]
+        for end in (first, last):
+            positive.append(np.where(swapped, inside[through], end[through]))
+            negative.append(np.where(swapped, end[through], inside[through]))
+    positive, negative = np.concatenate(positive), np.concatenate(negative)
+    for _ in range(_BISECTIONS):
+        middle = (positive + negative) / 2
+        below = (values(middle)[0] < 0)[:, None]
+        positive, negative = np.where(below, positive, middle), np.where(below, middle, negative)
+    middle = (positive + negative) / 2
+    within = np.minimum(middle, 1 - middle).min(axis=1) > 0
+    return middle[np.argsort(within, kind="stable")], bool(value[0, 0] < 0)
+
+
+def _beyond(values, first, last, axis, sign):
+    """Points (k, 2) between `first` and `last` where the value has the other sign; else NaN."""
+    found = np.full_like(first, np.nan)
+    for _ in range(_BISECTIONS):
+        middle = (first + last) / 2
+        value, slope = values(middle)
+        other = (value < 0) != (sign < 0)
+        found[other] = middle[other]
+        falls = (sign * slope[:, axis] < 0)[:, None]
+        first, last = np.where(falls, middle, first), np.where(falls, last, middle)
+    return found
+
+
+def _passing(curve, p, shortest):
+    """The steps of a curve that pass p, within the error of its polyline."""
+    begin, step = curve.points[:-1], np.diff(curve.points, axis=0)
+    length = np.maximum(np.linalg.norm(step, axis=1), shortest**2)
+    along = np.clip(((p - begin) * step).sum(axis=1) / length**2, 0, 1)
+    off = np.linalg.norm(begin + along[:, None] * step - p, axis=1)
+    return step[off < 0.1 * length + 10 * shortest]

@@ -1,0 +1,237 @@
+"""Requirements on a scene, for `design(constraints=...)`: at most 0 where they are met.
+
+Each is called with a scene and gives its residual, a scalar of order one, continuous and with a
+slope on both sides of every regime boundary: one that asks for elastic contacts keeps growing with
+ln(a_e/a_l) below the critical area, where the quantity itself no longer changes.
+"""
+
+import abc
+import math
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from .._base.parts import Record, flag, scalar
+from .._contact.contact import ContactState
+from .._mechanism.mechanism import Mechanism
+from .._mechanism.scene import Scene, stiffness
+from .._stability.margin import least_damping_ratio
+from .._stability.stability import stability
+from .._surface.roughness import root_mean_square_height
+from .._surface.surface import Surface
+
+Limit = Any  # a scalar, or None where there is none
+
+
+class Constraint(Record):
+    """A quantity of a scene that must lie within limits; a pytree, its limits are its leaves.
+
+    **Raises:** `ValueError` without a limit, for one outside its domain, or in the wrong order.
+    """
+
+    at_least: Limit
+    at_most: Limit
+
+    symbol: ClassVar[str]
+    unit: ClassVar[str] = ""
+    domain: ClassVar[dict[str, float]] = {"above": 0}
+    # Whether the quantity is constant in a fully plastic joint, which lacks elastic contacts.
+    flat_if_plastic: ClassVar[bool] = False
+
+    def __init__(self, at_least: ArrayLike | None = None, at_most: ArrayLike | None = None):
+        if at_least is None and at_most is None:
+            raise ValueError(f"{self.symbol} needs at_least or at_most")
+        self.at_least, self.at_most = (
+            None if limit is None else scalar(f"{self.symbol} {which}", limit, **self.domain)
+            for which, limit in [("at_least", at_least), ("at_most", at_most)]
+        )
+        low, high = self.at_least, self.at_most
+        if low is not None and high is not None and not low < high:
+            raise ValueError(
+                f"{self.symbol} at_least must be below at_most, got {at_least!r}, {at_most!r}"
+            )
+
+    @abc.abstractmethod
+    def measure(self, scene: Scene) -> Array:
+        """The quantity itself, in SI units."""
+
+    def below(self, value: Array) -> Array:
+        """The residual of `at_least` at a value."""
+        return 1 - value / self.at_least
+
+    def above(self, value: Array) -> Array:
+        """The residual of `at_most` at a value."""
+        return value / self.at_most - 1
+
+    def __call__(self, scene: Scene) -> Float[Array, ""]:
+        value, sides = self.measure(scene), []
+        if self.at_least is not None:
+            lacking: Any = 0.0
+            if self.flat_if_plastic and scene.contact.fractal:
+                lacking = jnp.maximum(-_state(scene, self.symbol).log_area_ratio, 0)
+            sides.append(self.below(value) + lacking)
+        if self.at_most is not None:
+            sides.append(self.above(value))
+        return sides[0] if len(sides) == 1 else jnp.maximum(*sides)
+
+    @property
+    def name(self) -> str:
+        """What is required, as results show it: `K_n >= 4e+08 N/m`."""
+        unit = f" {self.unit}" if self.unit else ""
+        if self.at_least is None:
+            return f"{self.symbol} <= {self.at_most:.6g}{unit}"
+        if self.at_most is None:
+            return f"{self.symbol} >= {self.at_least:.6g}{unit}"
+        return f"{self.at_least:.6g} <= {self.symbol} <= {self.at_most:.6g}{unit}"
+
+
+def _surface(scene: Mechanism, symbol: str) -> Surface:
+    if not isinstance(scene, Scene) or not scene.contact.fractal:
+        raise ValueError(f"{symbol} needs a FractalContact: a FixedContact has no surface")
+    return scene.contact.surface
+
+
+def _state(scene: Mechanism, symbol: str) -> ContactState:
+    _surface(scene, symbol)
+    assert isinstance(scene, Scene)
+    return scene.contact.state(scene.friction.mu_s, scene.friction.mu_m)
+
+
+class _LogConstraint(Constraint):
+    """A scale: its residuals are logarithms."""
+
+    def below(self, value):
+        return jnp.log(self.at_least / value)
+
+    def above(self, value):
+        return jnp.log(value / self.at_most)
+
+
+class NormalStiffness(Constraint):
+    """K_n [N/m] of at least some value > 0."""
+
+    symbol: ClassVar[str] = "K_n"
+    unit: ClassVar[str] = "N/m"
+    flat_if_plastic: ClassVar[bool] = True
+
+    def __init__(self, at_least: ArrayLike):
+        super().__init__(at_least)
+
+    def measure(self, scene):
+        return stiffness(scene)[0]
+
+
+class ElasticShare(Constraint):
+    """Share of the load on elastic contacts, 1 - `plastic_share`, of at least some value."""
+
+    symbol: ClassVar[str] = "elastic share"
+    domain: ClassVar[dict[str, float]] = {"above": 0, "below": 1}
+    flat_if_plastic: ClassVar[bool] = True
+
+    def __init__(self, at_least: ArrayLike):
+        super().__init__(at_least)
+
+    def measure(self, scene):
+        return 1 - _state(scene, self.symbol).plastic_share
+
+
+class RealContactArea(_LogConstraint):
+    """Real contact area A_r [m^2] within limits (Eq. 28).
+
+    Fully plastic, A_r is P/H for every surface, the least there is.
+    """
+
+    symbol: ClassVar[str] = "A_r"
+    unit: ClassVar[str] = "m^2"
+    flat_if_plastic: ClassVar[bool] = True
+
+    def measure(self, scene):
+        return _state(scene, self.symbol).A_r
+
+
+class Roughness(_LogConstraint):
+    """Sq [m] of the surface within limits, over wavelengths from L to L_s < L [m].
+
+    See `root_mean_square_height`.
+    """
+
+    L: Float[Array, ""]
+    L_s: Float[Array, ""]
+
+    symbol: ClassVar[str] = "Sq"
+    unit: ClassVar[str] = "m"
+
+    def __init__(
+        self,
+        at_least: ArrayLike | None = None,
+        at_most: ArrayLike | None = None,
+        *,
+        L: ArrayLike,
+        L_s: ArrayLike,
+    ):
+        super().__init__(at_least, at_most)
+        self.L = scalar("L", L, above=0)
+        self.L_s = scalar("L_s", L_s, above=0)
+        if not self.L_s < self.L:
+            raise ValueError(f"L_s must be below L, got {L_s!r} and {L!r}")
+
+    def measure(self, scene):
+        return root_mean_square_height(_surface(scene, self.symbol), self.L, self.L_s)
+
+
+class DampingRatio(Constraint):
+    """Least damping ratio -Re/|lambda| of all eigenvalues, of at least some value.
+
+    Of a structure, of all but rigid-body modes.
+    """
+
+    friction_slope: bool = eqx.field(static=True)
+
+    symbol: ClassVar[str] = "damping ratio"
+    domain: ClassVar[dict[str, float]] = {"above": -1, "below": 1}
+
+    def __init__(self, at_least: ArrayLike, *, friction_slope: bool = True):
+        super().__init__(at_least)
+        self.friction_slope = flag("friction_slope", friction_slope)
+
+    def measure(self, scene):
+        return least_damping_ratio(stability(scene, self.friction_slope).eigenvalues)
+
+    def below(self, value):
+        return jnp.arcsinh((self.at_least - value) / 1e-3)  # the size that they have at squeal
+
+
+class Frequency(Constraint):
+    """Frequencies [Hz] of all modes within limits: the lowest at least, the highest at most.
+
+    Of all, since the critical one jumps where modes cross.
+    """
+
+    friction_slope: bool = eqx.field(static=True)
+
+    symbol: ClassVar[str] = "frequencies"
+    unit: ClassVar[str] = "Hz"
+
+    def __init__(
+        self,
+        at_least: ArrayLike | None = None,
+        at_most: ArrayLike | None = None,
+        *,
+        friction_slope: bool = True,
+    ):
+        super().__init__(at_least, at_most)
+        self.friction_slope = flag("friction_slope", friction_slope)
+
+    def measure(self, scene):
+        """The lowest and the highest frequency (2,) [Hz]; 0 for an overdamped mode."""
+        modes = stability(scene, self.friction_slope).eigenvalues
+        ordered = jnp.sort(jnp.abs(modes.imag)) / (2 * math.pi)
+        return jnp.stack([ordered[0], ordered[-1]])
+
+    def below(self, value):
+        return super().below(value[0])
+
+    def above(self, value):
+        return super().above(value[1])

@@ -1,0 +1,415 @@
+"""The best scene or structure inside bounds that is stable against small disturbances.
+
+Many designs are screened by one compiled program. From the best of distinct basins a solver lands
+on the constraints, and the best of all that meet every requirement, evaluated afresh, is the
+answer (`search.py`). What is required is in `problem.py`.
+"""
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import ScalarLike
+
+from .._base.parts import Record, brief, flag, scalar, whole
+from .._base.table import table
+from .._mechanism.mechanism import Mechanism
+from .._mechanism.quantities import replaced
+from .._mechanism.scene import Scene
+from .._stability.stability import growth_rate, require_computable
+from .._surface.roughness import Roughness, roughness
+from .._surface.topography import Topographies, topography
+from . import constraints as limits
+from .design_file import read_design, save_design
+from .envelope import Envelope, condition_text
+from .problem import DEFAULT_BOUNDS, DesignProblem, describe, state_problem
+from .search import (
+    Evaluation,
+    Evaluator,
+    OnAverage,
+    Search,
+    Solver,
+    WorstCase,
+    best_of,
+    choose_starts,
+    expected_shortfall,
+    screened_designs,
+    slsqp,
+)
+from .summary import comparison_table
+from .tolerance import Tolerance, squeal_probability
+
+_STARTS = 12
+# Designs a side that are screened, in one variable and in more, and what memory holds of them.
+_LATTICE = {False: (1024, 48), True: (256, 24)}  # whether under many conditions
+_LATTICE_MAX = 1_000_000, 1000
+_STARTS_MAX = 10_000
+_SEED_MAX = 2**63 - 1  # of a JAX key
+_TEMPERATURE = 0.02  # of the smooth maximum over an envelope
+_ACTIVE = 1e-4  # a requirement met by less than this is called active
+_WAVELENGTHS = (1e-3, 1e-6)  # [m], of the roughness that is reported
+
+
+class DesignResult(eqx.Enumeration):
+    """How a design ended; an outcome, raised by nobody."""
+
+    found = "found: the best surface that meets every requirement"
+    unchanged = "unchanged: the given surface meets every requirement already"
+    infeasible = "infeasible: no surface inside the bounds was found to meet every requirement"
+
+
+class Design(Record):
+    """What `design` returns; numbers in SI units, arrays as NumPy. Printed, it is a table."""
+
+    scene: Any  # the designed scene or structure; if infeasible, the best one found
+    initial: Any
+    value: float  # the objective at `scene`: by default d^2, the squared scaled distance
+    growth_rate: float  # [1/s], of `scene` itself
+    active: tuple[str, ...]  # requirements met with nothing to spare
+    violated: tuple[str, ...]  # requirements not met, none unless infeasible
+    result: DesignResult  # a member of DesignResult
+    history: Mapping[str, np.ndarray]  # one row an evaluation on the way to `scene`, as it is
+    bounds: Mapping[str, tuple[float, float]]
+    target: float  # largest growth rate allowed [1/s]
+    K_n_min: float  # least normal stiffness allowed [N/m], of the stiffest joint
+    friction_slope: bool
+    starts: int  # designs that the solver started from, 0 if unchanged
+    failed_starts: int  # how many of them ended without meeting every requirement
+    options: Mapping[str, Any]  # the arguments of `design`, for another run
+    growth_rates: tuple[float, float] | None = None  # as required, before and after [1/s]
+    worst: Mapping[str, float] | None = None  # condition of the most pressing requirement
+    worst_of: Mapping[str, Mapping[str, float]] | None = None  # of every requirement
+    squeal_probability: float | None = None  # as machined
+    squeal_probability_error: float | None = None  # its standard error
+    initial_squeal_probability: float | None = None
+
+    @property
+    def outcome(self) -> str:
+        """The result in words."""
+        return DesignResult[self.result]
+
+    @property
+    def has_surface(self) -> bool:
+        """Whether it is a scene with a fractal surface."""
+        return isinstance(self.scene, Scene) and self.scene.contact.fractal
+
+    @property
+    def wavelengths(self) -> tuple[float, float]:
+        """Longest and shortest [m] that roughness counts: of a limit on Sq, or 1 mm and 1 um."""
+        for asked in self.options["constraints"]:
+            if isinstance(asked, limits.Roughness):
+                return float(asked.L), float(asked.L_s)
+        return _WAVELENGTHS
+
+    def roughness(
+        self, L: ScalarLike | None = None, L_s: ScalarLike | None = None
+    ) -> tuple[Roughness, Roughness]:
+        """Sq [m], Sa [m] and Sdq of the given and of the designed surface, as `roughness` says.
+
+        Over wavelengths from L to L_s [m], by default those of `wavelengths`.
+        """
+        longest, shortest = self.wavelengths
+        band = longest if L is None else L, shortest if L_s is None else L_s
+        before, after = (roughness(surface, *band) for surface in self._surfaces())
+        return before, after
+
+    def topographies(self, n: int = 1024, *, L=None, L_s=None, M=10, key=None) -> Topographies:
+        """Both surfaces on a grid of n x n points with the same phases, to see the difference.
+
+        L and L_s [m] are by default those of `wavelengths`, but L_s no less than 2 L/n, and `key`
+        that of the design's seed; the rest, and errors, as `topography`.
+        """
+        longest, shortest = self.wavelengths
+        L = longest if L is None else L
+        key = jax.random.key(self.options["seed"]) if key is None else key
+        if L_s is None and 2 * L / n < shortest:
+            L_s = shortest
+        before, after = (
+            np.asarray(topography(surface, L, n, key=key, L_s=L_s, M=M))
+            for surface in self._surfaces()
+        )
+        return Topographies(before, after, float(L) / n)
+
+    def _surfaces(self):
+        if not self.has_surface:
+            raise ValueError("roughness and topographies need a scene with a FractalContact")
+        return self.initial.contact.surface, self.scene.contact.surface
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write scenes, options, results and history to a TOML file, for `repeat_design`.
+
+        **Raises:** `OSError` if the file cannot be written.
+        """
+        save_design(self, path)
+
+    def __repr__(self) -> str:
+        shown = self.initial, self.scene, self.friction_slope, self.active, self.wavelengths
+        lines = [comparison_table(*shown, designed=tuple(self.bounds))]
+        if self.has_surface:
+            L, L_s = self.wavelengths
+            lines.append(f"Sq and Sdq: wavelengths from {L:g} to {L_s:g} m")
+        lines += self._under_conditions()
+        lines += [f"not met: {name}" for name in self.violated]
+        growth = self.growth_rate if self.growth_rates is None else self.growth_rates[1]
+        promise = "not stable: small disturbances grow"
+        if growth < 0:
+            promise = "stable against small disturbances; a larger kick may still end in squeal"
+        return "\n".join([*lines, self.outcome, promise])
+
+    def _under_conditions(self) -> list[str]:
+        """What the envelope and the tolerance make of it, before and after, and the worst."""
+        if self.growth_rates is None:
+            return []
+        envelope, tolerance = self.options["envelope"], self.options["tolerance"]
+        words, rows = [], [{}, {}]
+        if envelope is not None:
+            words.append(f"over {envelope}")
+        if tolerance is not None:
+            sigmas = tolerance.standard_deviations.items()
+            words.append("where " + ", ".join(f"{n} scatters by {s:g}" for n, s in sigmas))
+        for row, growth in zip(rows, self.growth_rates, strict=True):
+            row["growth rate as required [1/s]"] = f"{growth:+.6g}"
+        if self.squeal_probability is not None:
+            error = f" +- {self.squeal_probability_error:.1g}"
+            rows[0]["probability of squeal"] = f"{self.initial_squeal_probability:.3g}"
+            rows[1]["probability of squeal"] = f"{self.squeal_probability:.3g}{error}"
+        lines = ["", "; ".join(words), table(["before", "after"], rows)]
+        if self.worst is not None:
+            lines.append(f"worst at {condition_text(self.worst)}")
+        return lines
+
+
+def design(
+    x: Mechanism,
+    bounds: Mapping[str, Sequence[float]] | None = None,
+    objective: Callable[[Any], Any] | None = None,
+    target: float | None = None,
+    K_n_min: float | None = None,
+    constraints: Sequence[Callable[[Any], Any]] = (),
+    *,
+    envelope: Envelope | Mapping[str, Any] | None = None,
+    risk: str | tuple[str, float] = "worst",
+    tolerance: Any = None,
+    quantile: float = 0.95,
+    area_ratio_min: float = 2.0,
+    slip_ratio_max: float = 0.9,
+    friction_slope: bool = True,
+    solver: Solver | None = None,
+    starts: int | None = None,
+    lattice: int | None = None,
+    seed: int = 0,
+    progress: bool = True,
+) -> Design:
+    """Find by gradients the scene or structure inside `bounds` that is best and meets all that is
+    required of it.
+
+    `bounds` maps any named quantity to (lower, upper): D, G, P, mu_s, omega_1, "K_t/K_n" and so on
+    of a `Scene`, "left.D", or "D" for all joints that have one, of a `Structure`; by default D and
+    G. Scales, such as G, P and stiffness, are moved in logarithms.
+
+    Best is, without an `objective`, nearest to the given quantities: the least sum of
+    (dq/(q_hi - q_lo))^2, with ln q for scales. An objective is any function of a scene that `jax`
+    can differentiate, and is minimised.
+
+    The requirements: growth rate <= `target` [1/s], by default minus half the least damping rate
+    without friction (min xi_i omega_i of a scene); every function of a scene in `constraints` <= 0,
+    of order one, as those of `fractaljax.constraints` are; and the bounds. Of every fractal contact
+    whose stiffness the bounds move: K_n >= `K_n_min` [N/m], by default its own; a_l >=
+    `area_ratio_min` a_e; Q_e <= `slip_ratio_max` mu_s P, not with a given stiffness ratio. The
+    growth rate is that of small disturbances: a larger kick may still end in a limit cycle.
+
+    With an `envelope`, a range (lower, upper) or samples of any quantities by name (see
+    `Envelope`), every requirement holds, and an objective is taken, over all its conditions:
+    `risk="worst"`, at the worst; `"smooth"` or ("smooth", T), a log-sum-exp of temperature T
+    that is at least the worst; ("cvar", alpha), the mean of the worst 1 - alpha of them.
+    With a `tolerance`, standard deviations {"D": ..., "ln G": ...} of any quantities, a `Tolerance`
+    with their covariance, or an `Identification`, every requirement holds, and an objective is
+    taken, at its `quantile`, at each condition of the envelope by itself. The probability of squeal
+    counts 100,000 draws by `seed`, each at a condition drawn evenly from the envelope.
+
+    `solver(objective, constraints, start, bounds)`, by default SciPy's SLSQP (see `slsqp`), lands
+    from `starts` designs, by default 12: those given, the most promising of `lattice` a side (48,
+    or 24 with an envelope or a tolerance; 1024 or 256 in one variable; lattice^2 designs of a
+    low-discrepancy set in more than two variables), and an even spread. The same arguments give
+    the same design. A request that cannot be met is a result, not an error: see `Design.result`.
+
+    **Raises:** `ValueError` for bounds on what `x` lacks, empty, inverted or without its own value,
+    for an envelope of what it lacks or the design moves, and for options outside their domain.
+    """
+    envelope = None if envelope is None else Envelope.of(envelope)
+    tolerance = None if tolerance is None else Tolerance.of(tolerance)
+    bounds = DEFAULT_BOUNDS if bounds is None else bounds
+    progress = flag("progress", progress)
+    if solver is not None and not callable(solver):
+        raise TypeError(f"solver must be a function, got {brief(solver)}")
+    whole("seed", seed, 0, _SEED_MAX)
+    stated: dict[str, Any] = dict(
+        objective=objective,
+        target=target,
+        K_n_min=K_n_min,
+        constraints=constraints,
+        envelope=envelope,
+        tolerance=tolerance,
+        quantile=quantile,
+        area_ratio_min=area_ratio_min,
+        slip_ratio_max=slip_ratio_max,
+        friction_slope=friction_slope,
+    )
+    averaged = _averaged(risk, envelope)
+    problem = state_problem(x, bounds, **stated)
+    evaluator = evaluator_of(problem, envelope, averaged)
+    count, designs = screened(problem, starts, lattice)
+    options = {"bounds": dict(bounds), **stated, "risk": risk, "solver": solver}
+    options |= {"starts": starts, "lattice": lattice, "seed": seed}
+    own = np.asarray(problem.start, float)
+    before = evaluator.evaluate(own[None])
+    if not np.isfinite(before.rows).all() and isinstance(x, Scene):
+        require_computable(x, problem.friction_slope)
+    if objective is None and before.worst[0] <= 0:
+        return _conclude(x, problem, options, before, before, own[None], 0, 0)
+    us, scale = choose_starts(own, designs, evaluator.screen(designs), count)
+    slack = slack_of(problem, robust=envelope is not None or tolerance is not None)
+    search = Search(evaluator, solver or slsqp, slack, 1.0 if objective is None else scale)
+    path, after, failed = best_of(search, us, progress)
+    return _conclude(x, problem, options, before, after, path, len(us), failed)
+
+
+def screened(problem: DesignProblem, starts: int | None, lattice: int | None):
+    """How many designs to start from, and those (n, v) to choose them from."""
+    variables = len(problem.names)
+    robust = bool(problem.conditions) or problem.scatter is not None
+    if lattice is None:
+        lattice = _LATTICE[robust][min(variables, 2) - 1]
+    lattice = whole("lattice", lattice, 1, _LATTICE_MAX[min(variables, 2) - 1])
+    count = lattice ** min(variables, 2)
+    starts = whole("starts", min(_STARTS, count) if starts is None else starts, 1, _STARTS_MAX)
+    if starts > count:
+        raise ValueError(f"starts must be at most the {count} of the lattice, got {starts}")
+    return starts, screened_designs(lattice, variables)
+
+
+def slack_of(problem: DesignProblem, robust: bool) -> float:
+    """By how much requirements are overfulfilled, so that rounding cannot undo them.
+
+    Nor can a condition between those that an envelope was searched at.
+    """
+    eps = float(np.finfo(problem.low.dtype).eps)
+    return max(1e-6 if robust else 1e-9, 3e4 * eps)
+
+
+def _averaged(risk, envelope: Envelope | None) -> tuple[np.ndarray, float | np.ndarray] | None:
+    """The places that an average over an envelope is taken at, and its `OnAverage.risk`."""
+    pair = (risk, None) if isinstance(risk, str) else risk
+    kind, number = pair if isinstance(pair, (tuple, list)) and len(pair) == 2 else (None, None)
+    if kind == "worst" and number is None:
+        return None
+    if kind == "smooth":
+        number = _TEMPERATURE if number is None else number
+        number = float(scalar("temperature of risk", number, above=0))
+    elif kind == "cvar" and number is not None:
+        number = float(scalar("alpha of risk", number, at_least=0, below=1))
+    else:
+        raise ValueError(
+            f'risk must be "worst", "smooth", ("smooth", T) or ("cvar", alpha), got {brief(risk)}'
+        )
+    if envelope is None:
+        raise ValueError(f"risk {risk!r} needs an envelope")
+    if kind == "smooth":
+        return envelope.coarse_grid(), number
+    places = envelope.cells()
+    return places, expected_shortfall(len(places), number)
+
+
+def evaluator_of(problem: DesignProblem, envelope: Envelope | None, averaged=None) -> Evaluator:
+    """What evaluates designs over all conditions that are asked for."""
+    if envelope is None:
+        return Evaluator(problem)
+    return (
+        WorstCase(problem, envelope)
+        if averaged is None
+        else (OnAverage(problem, envelope, *averaged))
+    )
+
+
+def _conclude(
+    x: Mechanism,
+    problem: DesignProblem,
+    options: Mapping[str, Any],
+    before: Evaluation,
+    after: Evaluation,
+    path: np.ndarray,
+    starts: int,
+    failed: int,
+) -> Design:
+    """How every requirement stands at the end of `path` (s, v); unchanged without a start."""
+    final = x
+    if starts:
+        # exp(ln G) and the scaling back may end a rounding beyond a bound.
+        ends = {
+            name: np.asarray(np.clip(value, *options["bounds"][name]), problem.low.dtype)
+            for name, value in problem.values(path[-1]).items()
+        }
+        final = replaced(x, ends)
+    names, envelope, tolerance = (problem.residual_names, options["envelope"], options["tolerance"])
+    residuals = dict(zip(names, after.residuals[0].tolist(), strict=True))
+    for name, place in zip(problem.names, path[-1].tolist(), strict=True):
+        residuals |= {f"{name} >= lower bound": -place, f"{name} <= upper bound": place - 1}
+    violated = tuple(name for name, residual in residuals.items() if not residual <= 0)
+    active = max(_ACTIVE, 100 * slack_of(problem, robust=False))
+    more: dict[str, Any] = {}
+    if envelope is not None or tolerance is not None:
+        i = names.index("growth_rate <= target")
+        more["growth_rates"] = tuple(
+            float(problem.target + problem.growth_scale * np.sinh(evaluation.residuals[0, i]))
+            for evaluation in (before, after)
+        )
+    if after.places is not None and envelope is not None:
+        at = [envelope.condition(place) for place in after.places[0, 1:]]
+        more["worst_of"] = dict(zip(names, at, strict=True))
+        more["worst"] = at[int(np.argmax(after.residuals[0]))]
+    if tolerance is not None:
+        draw = dict(friction_slope=problem.friction_slope, seed=options["seed"])
+        first, last = (squeal_probability(s, tolerance, envelope, **draw) for s in (x, final))
+        more["initial_squeal_probability"] = first.value
+        more |= {"squeal_probability": last.value, "squeal_probability_error": last.standard_error}
+    result = DesignResult.found if starts else DesignResult.unchanged
+    return Design(
+        scene=final,
+        initial=x,
+        value=float(after.values[0]),
+        growth_rate=float(growth_rate(final, problem.friction_slope)),
+        active=tuple(name for name, r in residuals.items() if -active <= r <= 0),
+        violated=violated,
+        result=DesignResult.infeasible if violated else result,
+        history=describe(problem, path),
+        bounds={name: (float(low), float(high)) for name, (low, high) in options["bounds"].items()},
+        target=float(problem.target),
+        K_n_min=max(map(float, problem.K_n_min), default=0.0),
+        friction_slope=problem.friction_slope,
+        starts=starts,
+        failed_starts=failed,
+        options=options,
+        **more,
+    )
+
+
+def repeat_design(
+    path: str | os.PathLike,
+    functions: Mapping[str, Callable[[Any], Any]] | None = None,
+    *,
+    progress: bool = True,
+) -> Design:
+    """Run again what a file of `Design.save` holds: with the same versions, to the last bit.
+
+    A file of other versions is run under a warning. Functions of the user's own, an objective,
+    constraints or a solver, are in the file by name only: give them as `functions`,
+    {name: function}.
+
+    **Raises:** `OSError` if the file cannot be read; `ValueError` naming the file for anything
+    unknown or missing in it, and for a precision that JAX is not set to.
+    """
+    x, options = read_design(path, functions)
+    return design(x, **options, progress=progress)

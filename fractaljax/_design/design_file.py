@@ -1,0 +1,186 @@
+"""A design as a TOML file: what was given, every option, how it ended, and the way there."""
+
+import importlib
+import inspect
+import os
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._base.files import read_bounded, write_whole
+from .._base.parts import brief
+from .._base.toml import naming, read_toml, refuse_unknown, table_at, write_toml
+from .._base.versions import versions, versions_differ
+from .._mechanism.mechanism import Mechanism
+from .._mechanism.scene import Scene
+from .._mechanism.structure import Structure
+from . import constraints as known_constraints
+from .constraints import Constraint
+from .envelope import Envelope
+from .problem import state_problem
+from .tolerance import Tolerance
+
+_PACKAGE = __name__.split(".")[0]
+OPTIONS = (*[*inspect.signature(state_problem).parameters][1:], "risk", "solver", "starts")
+OPTIONS += ("lattice", "seed")  # the arguments of `design` that a file holds
+_NOT_RESULTS = {"scene", "initial", "result", "history", "options"}  # of the fields of a `Design`
+
+
+def save_design(best: Any, path: str | os.PathLike) -> None:
+    """Write a `Design` to a file that `repeat_design` runs again.
+
+    A structure, given and designed, has files of its own beside it: `run.given.toml` of `run.toml`.
+
+    **Raises:** `OSError` if a file cannot be written.
+    """
+    for name, x in _ends(best).items():
+        if isinstance(x, Structure):
+            x.save(_beside(Path(path), name))
+    write_whole(path, design_text(best, Path(path)).encode())
+
+
+def design_text(best: Any, path: Path = Path("run.toml")) -> str:
+    """The text of the file of a `Design`, to be written to `path`."""
+    options = dict(best.options)
+    for name in ("objective", "solver"):
+        options[name] = options[name] and _function_name(options[name])
+    options["constraints"] = [_constraint_table(asked) for asked in options["constraints"]]
+    if (envelope := options["envelope"]) is not None:
+        options["envelope"] = {"ranges": envelope.ranges, "samples": envelope.samples}
+    if (tolerance := options["tolerance"]) is not None:
+        options["tolerance"] = {
+            "names": tolerance.names,
+            "covariance": np.asarray(tolerance.covariance, float).tolist(),
+        }
+    heads = dict(versions()) | {"precision": str(jax.tree.leaves(best.initial)[0].dtype)}
+    for name, x in _ends(best).items():
+        heads[name] = x.to_toml() if isinstance(x, Scene) else _beside(path, name).name
+    tables = {
+        "options": {name: options[name] for name in OPTIONS},
+        "result": {"outcome": best.outcome}
+        | {name: value for name, value in vars(best).items() if name not in _NOT_RESULTS},
+        "history": {name: column.tolist() for name, column in best.history.items()},
+    }
+    return write_toml(
+        "A fractaljax design, in SI units: `fractaljax design --repeat` runs it again.",
+        heads | tables,
+    )
+
+
+def read_design(
+    path: str | os.PathLike, functions: Mapping[str, Callable[[Any], Any]] | None = None
+) -> tuple[Mechanism, dict[str, Any]]:
+    """What was given and the arguments of `design`; errors and warning as `repeat_design`."""
+    if not isinstance(functions, Mapping) and functions is not None:
+        raise TypeError(f"functions must be a mapping of names to functions, got {functions!r}")
+    with naming(path):
+        document = read_toml(read_bounded(path))
+        # Versions are texts, of whatever packages.
+        tables = [name for name, value in document.items() if not isinstance(value, str)]
+        refuse_unknown("the file", tables, ("options", "result", "history"))
+        options = table_at(document, "options")
+        try:
+            found = _given(document, Path(path)), _options(options, dict(functions or {}))
+        except KeyError as error:
+            raise ValueError(f"not a design file, it lacks {error}") from None
+    if others := versions_differ(document):
+        warnings.warn(f"{path} was {others}: digits may differ", stacklevel=3)
+    return found
+
+
+def _ends(best) -> dict[str, Any]:
+    return {"given": best.initial, "designed": best.scene}
+
+
+def _beside(path: Path, name: str) -> Path:
+    return path.with_name(f"{path.stem}.{name}.toml")
+
+
+def _given(document, path: Path) -> Mechanism:
+    text = _text("given", document["given"])
+    beside = _beside(path, "given")
+    x = Structure.load(beside) if text == beside.name else Scene.from_toml(text)
+    precision = document["precision"]
+    if precision not in ("float32", "float64"):
+        raise ValueError(f"precision must be float32 or float64, got {brief(precision)}")
+    dtype = jnp.dtype(precision)
+    if dtype == jnp.float64 and not jax.config.read("jax_enable_x64"):
+        raise ValueError('the design is in float64: jax.config.update("jax_enable_x64", True)')
+    return jax.tree.map(lambda leaf: leaf.astype(dtype), x)
+
+
+def _text(name: str, value) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{name} must be a text, got {brief(value)}")
+    return value
+
+
+def _options(table, functions) -> dict[str, Any]:
+    """The arguments of `design`, which checks their values itself."""
+    refuse_unknown("[options]", table, OPTIONS)
+    options = dict(table)
+    options["bounds"] = table_at(options, "bounds", "options.")
+    for name in ("objective", "solver"):
+        if name in options:
+            options[name] = _function(options[name], functions)
+    for name, kind in (("envelope", Envelope), ("tolerance", Tolerance)):
+        if name in options:
+            given = table_at(options, name, "options.")
+            known = inspect.signature(kind).parameters
+            refuse_unknown(f"[options.{name}]", given, known)
+            options[name] = kind(**given)
+    if isinstance(options["risk"], list):
+        options["risk"] = tuple(options["risk"])
+    constraints = options["constraints"]
+    if not (isinstance(constraints, list) and all(isinstance(c, dict) for c in constraints)):
+        raise TypeError(f"constraints must be a list of tables, got {brief(constraints)}")
+    options["constraints"] = [_constraint(asked, functions) for asked in constraints]
+    return options
+
+
+def _function_name(function) -> str:
+    module = getattr(function, "__module__", None) or ""
+    name = getattr(function, "__name__", repr(function))
+    return f"{module}:{name}" if module.split(".")[0] == _PACKAGE else name
+
+
+def _function(name: str, functions):
+    """The function of this name: one of those given, or of this package."""
+    if _text("a function's name", name) in functions:
+        return functions[name]
+    module, _, member = name.partition(":")
+    if module.split(".")[0] != _PACKAGE or not member:
+        raise ValueError(f"the function {name!r} is not in the file: give it in `functions`")
+    try:
+        return getattr(importlib.import_module(module), member)
+    except (ImportError, AttributeError):
+        raise ValueError(f"the package has no function {name!r}") from None
+
+
+def _constraint_table(asked) -> dict[str, Any]:
+    if not isinstance(asked, Constraint):
+        return {"function": _function_name(asked)}
+    fields = {name: value for name, value in vars(asked).items() if value is not None}
+    return {"kind": type(asked).__name__} | {
+        name: value if isinstance(value, bool) else float(value) for name, value in fields.items()
+    }
+
+
+def _constraint(table, functions):
+    if "function" in table:
+        return _function(table["function"], functions)
+    fields = dict(table)
+    kind = getattr(known_constraints, _text("the kind of a constraint", fields.pop("kind")), None)
+    if not (isinstance(kind, type) and issubclass(kind, Constraint)) or inspect.isabstract(kind):
+        raise ValueError(f"there is no constraint {table['kind']!r}")
+    known = inspect.signature(kind).parameters
+    refuse_unknown(f"the constraint {kind.__name__}", fields, known)
+    for name, parameter in known.items():
+        if parameter.default is inspect.Parameter.empty and name not in fields:
+            raise ValueError(f"the constraint {kind.__name__} lacks {name!r}")
+    return kind(**fields)

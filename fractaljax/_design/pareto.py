@@ -1,0 +1,167 @@
+"""Trade-offs: the designs at which one objective cannot fall unless another one rises.
+
+The second objective becomes a requirement, at most a limit. A family of limits between its least
+and the value it has where the first objective is least gives the front (epsilon-constraint).
+"""
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._base.parts import Record, brief, flag, scalar, whole
+from .._mechanism.mechanism import Mechanism
+from .._mechanism.quantities import replaced
+from .constraints import Constraint
+from .design import Design, design, screened, slack_of
+from .problem import DesignProblem, describe, state_problem
+from .search import Evaluator, Search, best_of, slsqp
+
+_STARTS = 6  # of each member of the front
+_POINTS_MAX = 1000
+
+
+class Front(Record):
+    """What `pareto` returns, ordered from the least first to the least second objective."""
+
+    first: np.ndarray  # (n,), in the units of the objectives
+    second: np.ndarray  # (n,)
+    quantities: Mapping[str, np.ndarray]  # (n,) each: D and G of a surface, all that is designed
+    names: tuple[str, str]
+    ends: tuple[Design, Design]  # the designs for either objective alone
+    failed: int  # members of the family without a design that meets every requirement
+
+    def scene(self, i: int) -> Any:
+        """The scene or structure of member i."""
+        values = {name: column[i] for name, column in self.quantities.items()}
+        return replaced(self.ends[0].initial, values)
+
+    @property
+    def D(self) -> np.ndarray:
+        """(n,)"""
+        return self.quantities["D"]
+
+    @property
+    def G(self) -> np.ndarray:
+        """(n,) [m]"""
+        return self.quantities["G"]
+
+
+class _Second(Constraint):
+    """The second objective as a requirement, in units of its range."""
+
+    scale: Float[Array, ""]
+    objective: Callable[[Any], Any] = eqx.field(static=True)
+
+    symbol: ClassVar[str] = "second objective"
+    domain: ClassVar[dict[str, float]] = {}
+
+    def __init__(self, objective, at_most, scale):
+        super().__init__(at_most=at_most)
+        self.objective, self.scale = objective, scalar("scale", scale, above=0)
+
+    def measure(self, scene):
+        return self.objective(scene)
+
+    def above(self, value):
+        return (value - self.at_most) / self.scale
+
+
+def pareto(
+    x: Mechanism,
+    first: Callable[[Any], Any],
+    second: Callable[[Any], Any],
+    *,
+    points: int = 16,
+    names: Sequence[str] = ("first objective", "second objective"),
+    progress: bool = True,
+    **options: Any,
+) -> Front:
+    """The front of two objectives, both functions of a scene or structure that are minimised.
+
+    `options` are those of `design`, but for `objective`, `starts`, `envelope` and `risk`: bounds,
+    target, K_n_min, constraints, tolerance and so on hold for every member.
+
+    **Raises:** `ValueError` for fewer than three points, where no design meets the requirements,
+    for objectives without a trade-off, and as `design`.
+    """
+    from tqdm import tqdm
+
+    points = whole("points", points, 3, _POINTS_MAX)
+    if not (isinstance(names, (tuple, list)) and len(names) == 2):
+        raise TypeError(f"names must be those of both objectives, got {brief(names)}")
+    for name, objective in zip(("first", "second"), (first, second), strict=True):
+        if not callable(objective):
+            raise TypeError(f"{name} must be a function of a scene, got {brief(objective)}")
+    progress = flag("progress", progress)
+    refused = sorted({"objective", "starts", "envelope", "risk"} & set(options))
+    if refused:
+        raise ValueError(f"pareto does not take {', '.join(refused)}")
+    asked: dict[str, Any] = {**options, "progress": False}
+    ends = design(x, objective=first, **asked), design(x, objective=second, **asked)
+    for name, end in zip(names, ends, strict=True):
+        if end.violated:
+            raise ValueError(
+                f"no design meets every requirement, seen at the least {name}: "
+                f"{', '.join(end.violated)}"
+            )
+    made = ends[0].options
+    shared = [*inspect.signature(state_problem).parameters][1:]
+    stated = {name: made[name] for name in shared}
+    own = made["constraints"]
+
+    def problem_at(limit: float, scale: float) -> DesignProblem:
+        limited = _Second(second, limit, scale)
+        return state_problem(x, **stated | {"objective": first, "constraints": (*own, limited)})
+
+    problem = problem_at(0.0, 1.0)
+    places = np.stack([problem.scaled(end.scene) for end in ends])
+    rows = Evaluator(problem).evaluate(places).rows
+    (high, low), scale = rows[:, -1].tolist(), float(np.ptp(rows[:, 0])) or 1.0
+    if not high > low:
+        raise ValueError(f"the least {names[0]} and the least {names[1]} are one design")
+    _, designs = screened(problem, None, made["lattice"])
+    known = Evaluator(problem).evaluate(designs)
+    solver, slack = made["solver"] or slsqp, slack_of(problem, robust=False)
+    found = []
+    for share in tqdm(np.linspace(1, 0, points), desc="pareto", disable=not progress):
+        limit = low + share * (high - low)
+        residuals = np.column_stack(
+            [known.residuals[:, :-1], (known.residuals[:, -1] - limit) / (high - low)]
+        )
+        merit = known.values / scale + 10 * np.maximum(residuals, 0).sum(axis=1)
+        promising = designs[np.argsort(np.nan_to_num(merit, nan=np.inf), kind="stable")]
+        between = share * places[0] + (1 - share) * places[1]
+        starts = np.concatenate([places, between[None], promising[: _STARTS - 3]])
+        evaluator = Evaluator(problem_at(limit, high - low))
+        path, _, _ = best_of(Search(evaluator, solver, slack, scale), starts, progress=False)
+        # The last limit leaves no room for the slack: there is the second end alone.
+        us = np.stack([path[-1], *places])
+        ends_here = evaluator.evaluate(us)
+        meets = ends_here.worst <= 0
+        if meets.any():
+            u = us[np.where(meets, ends_here.values, np.inf).argmin()]
+            found.append((*Evaluator(problem).evaluate(u[None]).rows[0, (0, -1)].tolist(), u))
+    best = sorted(
+        (member for member in found if not any(_beats(other, member) for other in found)),
+        key=lambda member: member[0],
+    )
+    first_values, second_values, us = (np.array(column) for column in zip(*best, strict=True))
+    numbers = describe(problem, us)
+    shown = [name for name in ("D", "G", *problem.names) if name in numbers]
+    return Front(
+        first=first_values,
+        second=second_values,
+        quantities={name: numbers[name] for name in shown},
+        names=(names[0], names[1]),
+        ends=ends,
+        failed=points - len(found),
+    )
+
+
+def _beats(other, member) -> bool:
+    """Whether a member is as good in the first objective and better in the second."""
+    return other[0] <= member[0] and other[1] < member[1]

@@ -1,0 +1,433 @@
+"""A design problem: what is moved, what is best, and what is required, as one compiled program.
+
+A design is scaled variables u in [0, 1]^v, linear in a quantity or, where it is a scale, in its
+logarithm. Every requirement is a residual: at most 0 where it is met, of order one, continuous and
+informative on both sides of every regime boundary. A fully plastic joint knows by ln(a_l/a_e) how
+far it is from carrying load elastically. Where quantities scatter, a residual is its quantile.
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._base.batches import in_batches
+from .._base.parts import brief, flag, require_scalar, scalar, substitute
+from .._contact.fixed import FixedContact
+from .._mechanism.mechanism import Mechanism
+from .._mechanism.quantities import (
+    known_quantities,
+    moved_by,
+    own_quantities,
+    replaced,
+    require_independent,
+    substituted,
+    value_of,
+    with_optional,
+)
+from .._mechanism.scene import Scene
+from .._mechanism.structure import Structure, require_single
+from .._stability.stability import growth_rate
+from .constraints import Constraint
+from .envelope import Envelope
+from .tolerance import Tolerance, nodes, quantile
+
+DEFAULT_BOUNDS: dict[str, tuple[float, float]] = {"D": (2.1, 2.9), "G": (1e-12, 1e-8)}
+
+_BATCH = 32  # designs, each at one condition, evaluated at once
+
+
+class Scatter(eqx.Module):
+    """The quadrature over a tolerance, and the quantile that counts."""
+
+    tolerance: Tolerance
+    base: Float[Array, " k"]  # what the quantities are where nothing moves them
+    shifts: Float[Array, "n k"]
+    weights: Float[Array, " n"]
+    level: Float[Array, ""]
+
+
+class DesignProblem(eqx.Module):
+    """What a design asks; problems that differ in leaves alone share one compiled program."""
+
+    x: Any  # the given scene or structure
+    low: Float[Array, " v"]  # bounds of the variables, logarithms of scales
+    high: Float[Array, " v"]
+    start: Float[Array, " v"]  # the given design, scaled
+    own_condition: Float[Array, " c"]  # what the quantities of the envelope are in `x`
+    target: Float[Array, ""]  # largest growth rate allowed [1/s]
+    growth_scale: Float[Array, ""]
+    K_n_min: tuple[Float[Array, ""], ...]  # of each of the contacts
+    area_ratio_min: Float[Array, ""]
+    slip_ratio_max: Float[Array, ""]
+    constraints: tuple[Constraint | None, ...]  # None where `functions` has a plain function
+    scatter: Scatter | None
+    names: tuple[str, ...] = eqx.field(static=True)
+    logarithmic: tuple[bool, ...] = eqx.field(static=True)
+    contacts: tuple[str, ...] = eqx.field(static=True)  # fractal ones that the design moves
+    objective: Callable[[Any], Any] | None = eqx.field(static=True)
+    functions: tuple[Callable[[Any], Any] | None, ...] = eqx.field(static=True)
+    friction_slope: bool = eqx.field(static=True)
+    conditions: tuple[str, ...] = eqx.field(static=True)  # quantities of the envelope
+
+    # --- in JAX: one design at one condition ---------------------------------------------
+
+    def quantities(self, u: Float[Array, " v"]) -> dict[str, Array]:
+        """The designed quantities at scaled variables u."""
+        values = self.low + u * (self.high - self.low)
+        return {
+            name: jnp.exp(value) if logarithmic else value
+            for name, logarithmic, value in zip(self.names, self.logarithmic, values, strict=True)
+        }
+
+    def moved(self, u: Float[Array, " v"], condition: Float[Array, " c"], shift=None) -> Any:
+        """The scene or structure at scaled variables u, a condition and perhaps a shift (k,)."""
+        values = self.quantities(u) | dict(zip(self.conditions, condition, strict=True))
+        if self.scatter is not None and shift is not None:
+            tolerance = self.scatter.tolerance
+            base = dict(zip(tolerance.quantities, self.scatter.base, strict=True))
+            values |= tolerance.scattered(base | values, shift)
+        return substituted(self.x, values)
+
+    def _row(self, u, condition, shift=None):
+        """Objective and residuals (1 + k,), and the numbers that describe a design, by name."""
+        x = self.moved(u, condition, shift)
+        states = {
+            name: part.contact.state(part.friction.mu_s, part.friction.mu_m)
+            for name, part in parts_with_contacts(x).items()
+            if part.contact.fractal
+        }
+        growth = growth_rate(_with_stiffness(x, states), self.friction_slope)
+        model, stiff = [], []
+        for name, K_n_min in zip(self.contacts, self.K_n_min, strict=True):
+            state = states[name]
+            model.append(2 * (jnp.log(self.area_ratio_min) - state.log_area_ratio))
+            if state.slip_ratio is not None:
+                model.append(10 * (state.slip_ratio - self.slip_ratio_max))
+            stiff.append((K_n_min - state.K_n) / jnp.where(K_n_min > 0, K_n_min, 1))
+        pressing = jnp.arcsinh((growth - self.target) / self.growth_scale)
+        own = [jnp.asarray(asked(x)) for asked in self.asked]
+        value = jnp.sum((u - self.start) ** 2) if self.objective is None else self.objective(x)
+        surface = own_quantities(x) if "" in states else {}
+        numbers = {name: surface[name].value for name in ("D", "G") if surface}
+        numbers |= self.quantities(u)
+        numbers |= {"objective": value, "growth_rate": growth}
+        for name, state in states.items():
+            for key in ("K_n", "K_t", "log_area_ratio", "slip_ratio"):
+                if getattr(state, key) is not None:
+                    numbers[_dot(name) + key] = getattr(state, key)
+        return jnp.stack([value, *model, pressing, *stiff, *own]), numbers
+
+    def at(self, u: Float[Array, " v"], condition: Float[Array, " c"]):
+        """As `_row`; quantiles, and no more than the row, where quantities scatter.
+
+        The default objective is the distance of the design as ordered, without scatter.
+        """
+        if self.scatter is None:
+            return self._row(u, condition)
+        rows = jax.vmap(lambda shift: self._row(u, condition, shift)[0])(self.scatter.shifts)
+        row = quantile(rows, self.scatter.weights, self.scatter.level)
+        return (row if self.objective is not None else row.at[0].set(rows[0, 0])), {}
+
+    # --- in NumPy: many ------------------------------------------------------------------
+
+    @property
+    def asked(self) -> list[Any]:
+        """The constraints of the user, in their order."""
+        pairs = zip(self.constraints, self.functions, strict=True)
+        return [function if constraint is None else constraint for constraint, function in pairs]
+
+    @property
+    def model_residuals(self) -> int:
+        """How many residuals, the first, keep the joints inside the model."""
+        return sum(_slips(self.x, name) + 1 for name in self.contacts)
+
+    @property
+    def residual_names(self) -> list[str]:
+        """The requirements, as results show them and in their order."""
+        model, stiff = [], []
+        for name in self.contacts:
+            of = f"{name}: " if name else ""
+            model.append(f"{of}a_l >= area_ratio_min a_e")
+            model += [f"{of}Q_e <= slip_ratio_max mu_s P"] * _slips(self.x, name)
+            stiff.append(f"{of}K_n >= K_n_min")
+        own = [
+            asked.name if isinstance(asked, Constraint) else getattr(asked, "__name__", repr(asked))
+            for asked in self.asked
+        ]
+        return [*model, "growth_rate <= target", *stiff, *own]
+
+    def values(self, u: np.ndarray) -> dict[str, float]:
+        """The designed quantities at scaled variables u (v,), to rounding."""
+        low, high = np.asarray(self.low, float), np.asarray(self.high, float)
+        unscale = {
+            name: math.exp if log else float
+            for name, log in zip(self.names, self.logarithmic, strict=True)
+        }
+        return {
+            name: unscale[name](v)
+            for name, v in zip(self.names, low + u * (high - low), strict=True)
+        }
+
+    def scaled(self, x: Mechanism) -> np.ndarray:
+        """The scaled variables (v,) of a scene or structure."""
+        values = np.array([float(value_of(x, name)) for name in self.names])
+        values = np.where(self.logarithmic, np.log(np.abs(values)), values)
+        low, high = np.asarray(self.low, float), np.asarray(self.high, float)
+        return np.clip((values - low) / (high - low), 0, 1)
+
+
+# Nearly all of a first design is compilation: a quick one, whose programs run as fast.
+_jit = functools.partial(
+    jax.jit,
+    compiler_options={
+        "xla_backend_optimization_level": 1,
+        "xla_cpu_use_fusion_emitters": False,
+    },
+)
+
+
+def linearise(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray):
+    """Rows (n, 1 + k), their Jacobians (n, 1 + k, v), and what describes designs us (n, v).
+
+    Each design is at a condition (n, c).
+    """
+    rows, jacobians, numbers = _in_batches(_linearise, problem, us, conditions)
+    return rows.astype(float), jacobians.astype(float), numbers
+
+
+def evaluate(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray) -> np.ndarray:
+    """Objective and residuals (n, 1 + k) of designs us (n, v), each at a condition (n, c)."""
+    if not problem.conditions and problem.scatter is None:
+        return linearise(problem, us, conditions)[0]  # compiled already
+    return _in_batches(_evaluate, problem, us, conditions).astype(float)
+
+
+def describe(problem: DesignProblem, us: np.ndarray) -> dict[str, np.ndarray]:
+    """Quantities and results (n,) of designs us (n, v), as they are, without scatter."""
+    nominal = dataclasses.replace(problem, scatter=None)
+    own = np.broadcast_to(np.asarray(problem.own_condition), (len(us), len(problem.conditions)))
+    return linearise(nominal, us, own)[2]
+
+
+def _in_batches(program, problem, us, conditions):
+    dtype = problem.low.dtype
+    pairs = np.asarray(us, dtype), np.asarray(conditions, dtype)
+    return in_batches(functools.partial(program, problem), _BATCH, *pairs)
+
+
+def linearised(problem: DesignProblem, us, conditions):
+    """What `linearise` compiles."""
+
+    def one(u, condition):
+        def row(u):
+            row, numbers = problem.at(u, condition)
+            return row, (row, numbers)
+
+        jacobian, (value, numbers) = jax.jacfwd(row, has_aux=True)(u)
+        return value, jacobian, numbers
+
+    return jax.vmap(one)(us, conditions)
+
+
+_linearise = _jit(linearised)
+
+
+@_jit
+def _evaluate(problem: DesignProblem, us, conditions):
+    return jax.vmap(lambda u, condition: problem.at(u, condition)[0])(us, conditions)
+
+
+# --- scenes and structures alike -------------------------------------------------------------
+
+
+def parts_with_contacts(x: Mechanism) -> dict[str, Any]:
+    """The joints of a structure by name; a scene, with contact and friction itself, as ""."""
+    if isinstance(x, Structure):
+        return dict(zip(x.joint_names, x.joints, strict=True))
+    return {"": x}
+
+
+def _dot(name: str) -> str:
+    return f"{name}." if name else ""
+
+
+def _slips(x, name) -> bool:
+    """Whether a contact has a tangential law, which slips."""
+    return parts_with_contacts(x)[name].contact.stiffness_ratio is None
+
+
+def _with_stiffness(x, states):
+    """`x` with contacts of known stiffness where their states (by name) are known already."""
+    parts, zero = parts_with_contacts(x), FixedContact(0.0, 0.0)
+    for name, state in states.items():
+        known = substitute(zero, {"K_n": state.K_n, "K_t": state.K_t})
+        parts[name] = eqx.tree_at(lambda part: part.contact, parts[name], known)
+    if isinstance(x, Structure):
+        return eqx.tree_at(lambda s: s.joints, x, tuple(parts.values()))
+    return parts[""]
+
+
+def _moved_contacts(x, names) -> tuple[str, ...]:
+    """The fractal contacts whose stiffness these quantities move."""
+    moved = {each for name in names for each in moved_by(x, name)}
+    found = []
+    for name, part in parts_with_contacts(x).items():
+        own = {*own_quantities(part.contact), *own_quantities(part.friction)}
+        if part.contact.fractal and moved & {_dot(name) + each for each in own}:
+            found.append(name)
+    return tuple(found)
+
+
+def _least_damping(x) -> tuple[float, float]:
+    """The least damping rate [1/s] without friction, and the least frequency [rad/s]."""
+    if isinstance(x, Scene):
+        o = x.oscillator
+        omega = np.array([o.omega_1, o.omega_2], float)
+        return float((np.array([o.xi_1, o.xi_2]) * omega).min()), float(omega.min())
+    M, C, K = (np.asarray(X, float) for X in (x.M, x.C, x.K))
+    for joint in x.joints:
+        stiffness = joint.stiffness()
+        for each, dofs in zip(stiffness, (joint.normal, joint.tangential), strict=True):
+            d = np.asarray(x.direction(dofs), float)
+            K = K + float(each) * np.outer(d, d)
+    n = len(M)
+    A = np.block([[np.zeros((n, n)), np.eye(n)], [-np.linalg.solve(M, K), -np.linalg.solve(M, C)]])
+    s = np.linalg.eigvals(A)
+    return max(0.0, float(-s.real.max())), float(np.abs(s).min())
+
+
+# --- checks --------------------------------------------------------------------------------
+
+
+def state_problem(
+    x: Mechanism,
+    bounds: Mapping[str, Sequence[float]],
+    *,
+    objective: Callable[[Any], Any] | None,
+    target: float | None,
+    K_n_min: float | None,
+    constraints: Sequence[Callable[[Any], Any]],
+    envelope: Envelope | None,
+    tolerance: Tolerance | None,
+    quantile: float,
+    area_ratio_min: float,
+    slip_ratio_max: float,
+    friction_slope: bool,
+) -> DesignProblem:
+    """Check the arguments of `design` that state a problem, which that documents."""
+    if isinstance(x, Scene):
+        require_scalar(x)
+    elif isinstance(x, Structure):
+        require_single(x)
+    else:
+        raise TypeError(f"x must be a Scene or a Structure, got {brief(x)}")
+    if objective is not None and not callable(objective):
+        raise TypeError(f"objective must be a function of a scene, got {brief(objective)}")
+    if not isinstance(constraints, (list, tuple)) or not all(map(callable, constraints)):
+        raise TypeError(
+            f"constraints must be a list of functions of a scene, got {brief(constraints)}"
+        )
+    bounds = checked_bounds(x, bounds)
+    numbers: dict[str, Any] = dict(
+        area_ratio_min=scalar("area_ratio_min", area_ratio_min, at_least=1),
+        slip_ratio_max=scalar("slip_ratio_max", slip_ratio_max, above=0, at_most=1),
+    )
+    level = scalar("quantile", quantile, at_least=0.5, at_most=0.999)
+    ranges: dict[str, Sequence[float]] = dict(bounds)
+    conditions = ()
+    if envelope is not None:
+        envelope.check(x, tuple(bounds))
+        conditions = envelope.names
+        ranges |= envelope.ranges | envelope.samples
+    scatter = None
+    if tolerance is not None:
+        tolerance.check(x, ranges)
+        z, weights = nodes(len(tolerance.names))
+        base = np.array([float(value_of(x, name)) for name in tolerance.quantities])
+        shifts = tolerance.shifts(z)
+        scatter = Scatter(
+            tolerance, jnp.asarray(base), jnp.asarray(shifts), jnp.asarray(weights), level
+        )
+    everything = dict.fromkeys([*ranges, *(tolerance.quantities if tolerance else ())])
+    require_independent(x, tuple(everything))
+    logarithmic = tuple(_is_scale(x, name) and low > 0 for name, (low, _) in bounds.items())
+    low, high, own = (
+        np.array([math.log(v) if log else v for v, log in zip(column, logarithmic, strict=True)])
+        for column in (*zip(*bounds.values(), strict=True), [float(value_of(x, n)) for n in bounds])
+    )
+    damping, frequency = _least_damping(x)
+    own_condition = np.array([float(value_of(x, name)) for name in conditions])
+    x = with_optional(x, tuple(everything))
+    contacts = _moved_contacts(x, bounds)
+    least = 0.0 if K_n_min is None else scalar("K_n_min", K_n_min, at_least=0)
+    dtype = jax.tree.leaves(x)[0].dtype
+    numbers |= dict(
+        low=low,
+        high=high,
+        start=(own - low) / (high - low),
+        own_condition=own_condition,
+        target=-damping / 2 if target is None else scalar("target", target),
+        growth_scale=max(damping, 1e-4 * frequency),
+        K_n_min=(least,) * len(contacts),
+        constraints=tuple(c if isinstance(c, Constraint) else None for c in constraints),
+        scatter=scatter,
+    )
+    # In the precision of the scene, whatever that of the arguments.
+    numbers = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), numbers)
+    problem = DesignProblem(
+        x=x,
+        **numbers,
+        names=tuple(bounds),
+        logarithmic=logarithmic,
+        contacts=contacts,
+        objective=objective,
+        functions=tuple(None if isinstance(c, Constraint) else c for c in constraints),
+        friction_slope=flag("friction_slope", friction_slope),
+        conditions=conditions,
+    )
+    if K_n_min is not None or not contacts:
+        return problem
+    given = describe(problem, np.asarray(problem.start)[None])
+    own = tuple(jnp.asarray(given[_dot(name) + "K_n"][0], dtype) for name in contacts)
+    return dataclasses.replace(problem, K_n_min=own)
+
+
+def checked_bounds(x: Mechanism, bounds: Mapping[str, Sequence[float]]) -> dict[str, tuple]:
+    """Bounds by name, each (lower, upper), in their domain and around the value that `x` has."""
+    if not isinstance(bounds, Mapping):
+        raise TypeError(f"bounds must be a mapping, got {brief(bounds)}")
+    known = known_quantities(x)
+    for name in bounds:
+        if name not in known:
+            raise ValueError(f"bounds on {brief(name)}: there are {', '.join(known)}")
+    if not bounds:
+        raise ValueError("bounds must name a quantity, got none")
+    checked = {}
+    for name, given in bounds.items():
+        if not isinstance(given, (tuple, list, np.ndarray)) or not np.ndim(given):
+            raise TypeError(f"bounds on {name} must be (lower, upper), got {brief(given)}")
+        ends = tuple(float(scalar(f"{name} bound", end)) for end in given)
+        for end in ends:
+            replaced(x, {name: end})  # refuses an end outside the domain of the model
+        if not (len(ends) == 2 and ends[0] < ends[1]):
+            raise ValueError(f"bounds on {name} must be (lower, upper), got {given!r}")
+        value = float(value_of(x, name))
+        if not ends[0] <= value <= ends[1]:
+            raise ValueError(
+                f"{name} must lie inside its bounds [{ends[0]:g}, {ends[1]:g}], got {value:g}"
+            )
+        checked[name] = ends
+    return checked
+
+
+def _is_scale(x, name) -> bool:
+    own = own_quantities(x)
+    return name in own and own[name].log

@@ -1,0 +1,472 @@
+"""From screened starts onto the constraints, under one condition or the worst of many.
+
+The worst case is found by exchange: a design is solved for a few working conditions; then the worst
+of the whole envelope are sought, for each requirement, and where they are worse than the working
+ones they join them, and it is solved again. (A. G. Blankenship and J. E. Falk, "Infinitely
+constrained optimization problems", 1976.)
+"""
+
+import concurrent.futures
+import dataclasses
+import queue
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from .envelope import Envelope
+from .problem import DesignProblem, evaluate, linearise
+from .tolerance import low_discrepancy
+
+Solver = Callable[[Callable, Callable, np.ndarray, np.ndarray], np.ndarray]
+
+_LIKELY = 8  # conditions of a first guess at the worst
+_ROUNDS = 12  # of the exchange
+_NEW = 1e-7  # by which a condition must be worse than the working ones
+_NEAR = 0.05  # a requirement met by more than this on the grid is met between its points
+_UNKNOWN = 1e3  # stands for a residual without a number
+_PENALTY = 10.0  # of unmet requirements, by which starts are ranked
+
+
+def slsqp(objective: Callable, constraints: Callable, start: np.ndarray, bounds: np.ndarray):
+    """The default solver: SciPy's sequential quadratic programming.
+
+    Any other has this signature: `objective(z)` gives a value and its gradient (n,),
+    `constraints(z)` residuals (k,), at most 0 where met, and their Jacobian (k, n); `start` (n,),
+    `bounds` (n, 2). It returns a point (n,).
+    """
+    from scipy.optimize import minimize
+
+    limits = {
+        "type": "ineq",
+        "fun": lambda z: -constraints(z)[0],
+        "jac": lambda z: -constraints(z)[1],
+    }
+    options = {"ftol": 1e-12, "maxiter": 100}
+    found = minimize(
+        objective,
+        start,
+        jac=True,
+        bounds=bounds,
+        constraints=[limits],
+        method="SLSQP",
+        options=options,
+    )
+    return found.x
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluation:
+    """Objective and residuals of n designs, and the places where each is at its worst."""
+
+    rows: np.ndarray  # (n, 1 + k)
+    places: np.ndarray | None = None  # (n, 1 + k, 1 + ranges)
+
+    @property
+    def values(self) -> np.ndarray:
+        """The objective (n,)."""
+        return self.rows[:, 0]
+
+    @property
+    def residuals(self) -> np.ndarray:
+        """(n, k), at most 0 where met."""
+        return self.rows[:, 1:]
+
+    @property
+    def worst(self) -> np.ndarray:
+        """The largest residual (n,); infinite without a number, or without a value."""
+        return np.nan_to_num(self.rows[:, 1:].max(axis=1) + 0 * self.rows[:, 0], nan=np.inf)
+
+    def of(self, i: int) -> "Evaluation":
+        """That of one design alone, still with a leading axis."""
+        places = None if self.places is None else self.places[i : i + 1]
+        return Evaluation(self.rows[i : i + 1], places)
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluator:
+    """A problem at one condition."""
+
+    problem: DesignProblem
+
+    @property
+    def working(self) -> np.ndarray:
+        """The conditions (m, c) that a design is first solved for."""
+        return np.zeros((1, 0))
+
+    def evaluate(self, us: np.ndarray) -> Evaluation:
+        """Designs us (n, v), over all conditions."""
+        return Evaluation(evaluate(self.problem, us, np.zeros((len(us), 0))))
+
+    def screen(self, us: np.ndarray) -> np.ndarray:
+        """Objective and residuals (n, 1 + k), roughly: to choose starts by."""
+        return np.nan_to_num(self._at_all(us, self.working), nan=np.inf).max(axis=1)
+
+    @property
+    def minimax(self) -> bool:
+        """Whether the objective is the largest of those at many conditions."""
+        return False
+
+    def average(self, rows: np.ndarray, jacobians: np.ndarray):
+        """What a design must keep to, from rows (m, 1 + k) at conditions and their Jacobians."""
+        return rows, jacobians
+
+    def exchange(self, us: np.ndarray, working: list[np.ndarray]) -> list[np.ndarray]:
+        """Conditions (m, c) at which each of us (n, v) is worse than at all its working ones."""
+        return [conditions[:0] for conditions in working]
+
+    def _at_all(self, us, conditions):
+        """Rows (n, m, 1 + k) of every design at every condition."""
+        n, m = len(us), len(conditions)
+        flat = evaluate(self.problem, np.repeat(us, m, axis=0), np.tile(conditions, (n, 1)))
+        return flat.reshape(n, m, -1)
+
+
+@dataclasses.dataclass(frozen=True)
+class WorstCase(Evaluator):
+    """Every requirement at every condition of an envelope, the objective at its worst."""
+
+    envelope: Envelope
+
+    @property
+    def working(self):
+        return self.envelope.values(self.envelope.likely(_LIKELY))
+
+    @property
+    def minimax(self):
+        return self.problem.objective is not None
+
+    def evaluate(self, us):
+        envelope = self.envelope
+        grid = envelope.grid()
+        each = np.nan_to_num(self._at_all(us, envelope.values(grid)), nan=np.inf)
+        best, rows = each.argmax(axis=1), each.max(axis=1)
+        near = rows > -_NEAR
+        near[:, 0] = self.problem.objective is not None
+        which, column = np.nonzero(near)
+
+        def residual(places, i):
+            found = evaluate(self.problem, us[which[i]], envelope.values(places))
+            return np.nan_to_num(found, nan=np.inf)[np.arange(len(i)), column[i]]
+
+        places = grid[best]
+        places[near], rows[near] = envelope.climb(residual, places[near], rows[near])
+        return Evaluation(rows, places)
+
+    def exchange(self, us, working):
+        found, new = self.evaluate(us), []
+        assert found.places is not None
+        counts = [len(conditions) for conditions in working]
+        known = evaluate(self.problem, np.repeat(us, counts, axis=0), np.concatenate(working))
+        pieces = np.split(np.nan_to_num(known, nan=np.inf), np.cumsum(counts)[:-1])
+        for rows, places, piece in zip(found.rows, found.places, pieces, strict=True):
+            worse = rows > piece.max(axis=0) + _NEW
+            worse[1:] &= rows[1:] > 0
+            new.append(self.envelope.values(np.unique(places[worse], axis=0)))
+        return new
+
+
+@dataclasses.dataclass(frozen=True)
+class OnAverage(Evaluator):
+    """An average of each requirement over fixed, equally likely conditions.
+
+    `risk` is a temperature T, of T ln sum exp(r/T), which is at least the largest residual, or
+    weights (m,) of the ordered residuals.
+    """
+
+    envelope: Envelope
+    places: np.ndarray
+    risk: float | np.ndarray
+
+    @property
+    def working(self):
+        return self.envelope.values(self.places)
+
+    def screen(self, us):
+        likely = self.envelope.values(self.envelope.likely(_LIKELY))
+        return np.nan_to_num(self._at_all(us, likely), nan=np.inf).max(axis=1)
+
+    def evaluate(self, us):
+        each = self._at_all(us, self.working)
+        rows = np.stack([self._average(rows)[0] for rows in each])
+        return Evaluation(rows, self.places[np.nan_to_num(each, nan=np.inf).argmax(axis=1)])
+
+    def average(self, rows, jacobians):
+        row, weights = self._average(rows)
+        return row[None], np.einsum("mk,mkv->kv", weights, jacobians)[None]
+
+    def _average(self, rows):
+        """The columns of rows (m, 1 + k) on average, and the derivative (m, 1 + k) by them."""
+        row, weights = averaged(rows, self.risk)
+        if self.problem.objective is None:
+            row[0], weights[:, 0] = rows[0, 0], np.arange(len(rows)) == 0
+        return row, weights
+
+
+def averaged(rows: np.ndarray, risk: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Columns of rows (m, k) on average (k,) as `OnAverage` has it, and their weights (m, k)."""
+    if np.ndim(risk):
+        weights = np.empty_like(rows)
+        np.put_along_axis(weights, rows.argsort(axis=0), np.asarray(risk)[:, None], axis=0)
+        return (weights * rows).sum(axis=0), weights
+    largest = rows.max(axis=0)
+    shares = np.exp((rows - largest) / risk)
+    total = shares.sum(axis=0)
+    return largest + risk * np.log(total), shares / total
+
+
+def expected_shortfall(count: int, alpha: float) -> np.ndarray:
+    """Weights (count,) of ordered, equally likely values: the mean of the worst 1 - alpha."""
+    edges = np.clip(np.arange(count + 1) / count, alpha, 1)
+    return np.diff(edges) / (1 - alpha)
+
+
+# --- starts --------------------------------------------------------------------------------
+
+
+def screened_designs(lattice: int, variables: int) -> np.ndarray:
+    """Scaled designs (n, v): a lattice, in more than two variables a low-discrepancy set."""
+    if variables > 2:
+        return low_discrepancy(lattice**2, variables)
+    side = (np.arange(lattice) + 0.5) / lattice
+    axes = np.meshgrid(*[side] * variables, indexing="ij")
+    return np.stack([axis.ravel() for axis in axes], axis=1)
+
+
+def choose_starts(own: np.ndarray, designs: np.ndarray, rows: np.ndarray, count: int):
+    """Starts (count, v) and the scale of the objective.
+
+    The given design first, then the most promising of distinct basins, then an even spread.
+    """
+    from scipy.spatial import KDTree
+
+    values, finite, scale = rows[:, 0], np.isfinite(rows[:, 0]), 1.0
+    if finite.any():
+        low, high = np.quantile(values[finite], [0.1, 0.9])
+        scale = float(high - low) or 1.0
+    merit = values / scale + _PENALTY * np.maximum(rows[:, 1:], 0).sum(axis=1)
+    merit = np.where(finite, merit, np.inf)
+    variables = designs.shape[1]
+    neighbours = min(3**variables if variables < 3 else 4 * variables, len(designs))
+    near = KDTree(designs).query(designs, neighbours)[1].reshape(len(designs), -1)
+    basin = np.isfinite(merit) & (merit <= merit[near].min(axis=1))
+    ranked = np.argsort(merit, kind="stable")
+    ranked = np.concatenate([ranked[basin[ranked]], ranked[~basin[ranked]]])
+    promising, rest = ranked[: count // 2], np.sort(ranked[count // 2 :])
+    even = rest[np.linspace(0, len(rest) - 1, count - count // 2).astype(int)][1:]
+    return np.concatenate([own[None], designs[promising], designs[even]])[:count], scale
+
+
+# --- landing on the constraints ------------------------------------------------------------
+
+
+class _Functions:
+    """What a solver asks, from one evaluation at each point: minimise f subject to c <= 0.
+
+    Rows (m, 1 + k) have their columns in `aim` minimised at their largest, by a variable of its own
+    (`extra`) where there are several, and those in `limited` met with some slack, so that rounding
+    cannot undo it.
+    """
+
+    def __init__(self, rows_at: Callable, aim, limited, slack: float, scale: float, extra: bool):
+        self.rows_at, self.aim, self.limited = rows_at, aim, limited
+        self.slack, self.scale, self.extra = slack, scale, extra
+        self.seen: list[np.ndarray] = []
+        self._rows = None
+
+    def at(self, z):
+        """Rows and their Jacobians at z, which is u (v,) or, with the extra variable, (u, t)."""
+        u = np.clip(z[:-1] if self.extra else z, 0, 1)
+        if self._rows is None or not np.array_equal(self.seen[-1], u):
+            rows, jacobians = self.rows_at(u)
+            rows = np.nan_to_num(rows, nan=_UNKNOWN, posinf=_UNKNOWN, neginf=-_UNKNOWN)
+            scale = np.where(np.arange(rows.shape[1]) == 0, self.scale, 1)
+            jacobians = np.nan_to_num(jacobians, posinf=0, neginf=0)
+            self._rows = rows / scale, jacobians / scale[:, None]
+            self.seen.append(u.copy())
+        return self._rows
+
+    def objective(self, z):
+        """Value and gradient."""
+        if self.extra:
+            return z[-1], np.eye(len(z))[-1]
+        rows, jacobians = self.at(z)
+        return rows[0, 0], jacobians[0, 0].copy()  # solvers write into it
+
+    def constraints(self, z):
+        """Residuals and their Jacobian, compressed where they are not of order one."""
+        (rows, jacobians), v = self.at(z), len(z) - self.extra
+        c, slopes = rows[:, self.limited].ravel(), jacobians[:, self.limited].reshape(-1, v)
+        size = np.maximum(np.abs(c + self.slack), 1)
+        c = np.where(size > 1, np.sign(c) * (1 + np.log(size)), c + self.slack)
+        slopes = slopes / size[:, None]
+        if self.extra:
+            aimed, aim_slopes = rows[:, self.aim].ravel(), jacobians[:, self.aim].reshape(-1, v)
+            c = np.append(c, aimed - z[-1])
+            by_t = np.append(np.zeros(len(slopes)), -np.ones(len(aimed)))
+            slopes = np.column_stack([np.concatenate([slopes, aim_slopes]), by_t])
+        return c, slopes
+
+
+def in_lockstep(tasks: Sequence[Callable], answer: Callable[[list], list]) -> list:
+    """The results of tasks, each a function of `ask`, run side by side.
+
+    What all of them ask next is answered at once, in this thread: one call of a compiled program
+    costs about as much for many designs as for one.
+    """
+    asked, replies = queue.SimpleQueue(), [queue.SimpleQueue() for _ in tasks]
+
+    def run(i):
+        def ask(question):
+            asked.put((i, question))
+            reply = replies[i].get()
+            if isinstance(reply, BaseException):
+                raise reply
+            return reply
+
+        try:
+            return tasks[i](ask)
+        finally:
+            asked.put((i, None))
+
+    with concurrent.futures.ThreadPoolExecutor(max(1, len(tasks))) as pool:
+        results, running = [pool.submit(run, i) for i in range(len(tasks))], len(tasks)
+        try:
+            while running:
+                questions = dict(asked.get() for _ in range(running))
+                pending = [i for i in sorted(questions) if questions[i] is not None]
+                running = len(pending)
+                answers = answer([questions[i] for i in pending]) if pending else []
+                for i, reply in zip(pending, answers, strict=True):
+                    replies[i].put(reply)
+        except BaseException as error:  # the others wait for a reply
+            for reply in replies:
+                reply.put(error)
+            raise
+        return [result.result() for result in results]
+
+
+@dataclasses.dataclass(frozen=True)
+class Search:
+    """Solves from many starts side by side."""
+
+    evaluator: Evaluator
+    solver: Solver
+    slack: float
+    scale: float = 1.0  # of the objective
+
+    def solve(self, starts: np.ndarray, progress: bool) -> tuple[list[np.ndarray], Evaluation]:
+        """The way (s, v) from every start (n, v), and what its ends are, evaluated afresh.
+
+        Where none meets every requirement they end inside the model, if that is possible, and
+        there as close as can be to all the rest.
+        """
+        paths = self.land([start[None] for start in starts], progress=progress)
+        found, problem = self._ends(paths), self.evaluator.problem
+        if (found.worst <= 0).any():
+            return paths, found
+        model = np.arange(len(problem.residual_names)) < problem.model_residuals
+        # Into the model, on to the rest of the requirements, and if they hold to the objective.
+        for violated in (model, ~model, None):
+            outside = (found.residuals[:, model] > 0).any(axis=1)
+            going = found.worst <= 0 if violated is None else outside == (violated is model)
+            chosen = np.flatnonzero(going)
+            for i, path in zip(
+                chosen, self.land([paths[i] for i in chosen], violated), strict=True
+            ):
+                paths[i] = path
+            found = self._ends(paths)
+        return paths, found
+
+    def _ends(self, paths) -> Evaluation:
+        return self.evaluator.evaluate(np.array([path[-1] for path in paths]))
+
+    def land(self, paths: list[np.ndarray], violated=None, progress: bool = False):
+        """Ways (s, v) continued to the least objective that meets every requirement.
+
+        With some requirements (k,) marked as violated, to the least of their largest residual that
+        meets those before them.
+        """
+        from tqdm import tqdm
+
+        columns = np.arange(1 + len(self.evaluator.problem.residual_names))
+        aim = columns == 0 if violated is None else np.append(False, violated)
+        limited = columns > 0 if violated is None else (columns > 0) & (columns < aim.argmax())
+        with tqdm(total=len(paths), desc="design", unit="start", disable=not progress) as bar:
+
+            def landing(path):
+                def task(ask):
+                    found = self._land(path, aim, limited, ask)
+                    bar.update()
+                    return found
+
+                return task
+
+            return in_lockstep([landing(path) for path in paths], self._answer)
+
+    def _land(self, path, aim, limited, ask):
+        path, working = list(path), self.evaluator.working
+        extra = not aim[0] or self.evaluator.minimax
+        for _ in range(_ROUNDS):
+            functions = _Functions(
+                lambda u, working=working: ask(("linearise", u, working)),
+                aim,
+                limited,
+                self.slack,
+                self.scale,
+                extra,
+            )
+            start, bounds = path[-1], np.tile([0.0, 1.0], (len(path[-1]), 1))
+            if extra:
+                largest = functions.at(np.append(start, 0))[0][:, aim].max()
+                start = np.append(start, largest)
+                bounds = np.append(bounds, [[-np.inf, np.inf]], axis=0)
+            z = self.solver(functions.objective, functions.constraints, start, bounds)
+            path += [*functions.seen, np.clip(np.asarray(z, float)[: len(path[-1])], 0, 1)]
+            new = ask(("exchange", path[-1], working))
+            if not len(new):
+                break
+            working = np.concatenate([working, new])
+        return np.array(path)
+
+    def _answer(self, questions):
+        """For designs (v,) at working conditions (m, c): rows and Jacobians, or new conditions."""
+        replies: dict[int, Any] = {}
+        for kind in ("linearise", "exchange"):
+            asked = [i for i, question in enumerate(questions) if question[0] == kind]
+            us = np.array([questions[i][1] for i in asked])
+            working = [questions[i][2] for i in asked]
+            if asked:
+                reply = self.evaluator.exchange if kind == "exchange" else self._linearise
+                replies |= zip(asked, reply(us, working), strict=True)
+        return [replies[i] for i in range(len(questions))]
+
+    def _linearise(self, us, working):
+        counts = [len(conditions) for conditions in working]
+        many = np.repeat(us, counts, axis=0)
+        found = linearise(self.evaluator.problem, many, np.concatenate(working))[:2]
+        pieces = (np.split(x, np.cumsum(counts)[:-1]) for x in found)
+        return [self.evaluator.average(*piece) for piece in zip(*pieces, strict=True)]
+
+
+def best_of(search: Search, starts: np.ndarray, progress: bool):
+    """The way (s, v) to the best end, what it is, and how many starts failed.
+
+    The first of those whose ends are equally good: the given design leads the starts, and its way
+    begins where the reader does.
+    """
+    paths, found = search.solve(starts, progress)
+    failed = found.worst > 0
+    if failed.all():
+        model = found.residuals[:, : search.evaluator.problem.model_residuals]
+        outside = np.maximum(np.nan_to_num(model.max(axis=1, initial=0), nan=np.inf), 0)
+        best = int(np.lexsort((found.worst, outside))[0])
+        return paths[best], found.of(best), len(starts)
+    values = np.where(failed, np.inf, found.values)
+    best = int(np.flatnonzero(values <= values.min() + 1e-8 * abs(values.min()))[0])
+    # A solver may have stopped early: once more from where it is.
+    (again,) = search.land([paths[best]])
+    polished = search.evaluator.evaluate(again[-1:])
+    if polished.worst[0] <= 0 and polished.values[0] < values[best]:
+        return again, polished, int(failed.sum())
+    return paths[best], found.of(best), int(failed.sum())

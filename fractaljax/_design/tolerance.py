@@ -1,0 +1,239 @@
+"""Scatter of quantities as machined: quantiles over a fixed quadrature, and draws at random.
+
+The scatter is normal, with any covariance. The nodes of the quadrature are a lattice of a normal
+distribution twice as wide, weighted back, so that the tails which decide a quantile are well
+resolved. The same nodes serve every design, so that a quantile is continuous in the design.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from .._base.batches import in_batches
+from .._base.parts import Record, brief, number, scalar
+from .._mechanism.mechanism import Mechanism
+from .._mechanism.quantities import known_quantities, replaced, substituted, value_of, with_optional
+from .._mechanism.structure import Structure
+from .._stability.stability import growth_rate
+from .envelope import Envelope
+
+_NODES = 55  # in one and two dimensions: a Fibonacci number, whose lattice is the best of its size
+_WIDENING = 2.0  # of the distribution that the nodes are drawn from
+_MOST = 6  # quantities that scatter
+_REACH = 6.0  # standard deviations that must stay inside the domain of a quantity
+_SAMPLES = 100_000
+_EIGENVALUES_AT_ONCE = 1 << 15
+
+
+class Tolerance(Record):
+    """Scatter of named quantities: `Tolerance(("D", "ln G"), covariance)`, covariance (k, k).
+
+    "ln G" scatters ln G. `Tolerance.of` takes a mapping of independent standard deviations and an
+    `Identification`, whose D and ln G are strongly correlated.
+
+    **Raises:** `ValueError` unless the covariance is symmetric, positive semidefinite and not 0.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    covariance: Float[Array, "k k"]
+
+    def __init__(self, names: Sequence[str], covariance: ArrayLike):
+        self.names = tuple(names)
+        given = covariance if hasattr(covariance, "dtype") else np.asarray(covariance)
+        self.covariance = number("covariance", given)
+        if self.covariance.shape != (len(self.names),) * 2 or not self.names:
+            raise ValueError(
+                f"tolerance must name the rows of its covariance, got {len(self.names)} names and "
+                f"shape {self.covariance.shape}"
+            )
+        C = np.asarray(self.covariance)
+        spread = np.sqrt(np.maximum(np.diagonal(C), 0))
+        scale = np.outer(spread, spread)
+        small = 1e-9 + 1e3 * np.finfo(C.dtype).eps
+        correlation = np.divide(C, scale, out=np.zeros_like(C), where=scale > 0)
+        if not (np.abs(C - C.T) <= small * scale).all() or (
+            np.linalg.eigvalsh(correlation)[0] < -small * len(C)
+        ):
+            raise ValueError("tolerance must have a symmetric, positive semidefinite covariance")
+        if not spread.any():
+            raise ValueError("tolerance must be above 0 for some quantity, got 0 for all")
+
+    @classmethod
+    def of(cls, given: Any) -> "Tolerance":
+        """A tolerance, a mapping of names to standard deviations, or an identification."""
+        if isinstance(given, Tolerance):
+            return given
+        if hasattr(given, "D_standard_error") and hasattr(given, "covariance"):
+            return cls(("D", "ln G"), given.covariance)
+        if not isinstance(given, Mapping):
+            raise TypeError(
+                f"tolerance must be a mapping, a Tolerance or an Identification, got {brief(given)}"
+            )
+        if not given:
+            raise ValueError("tolerance must name a quantity, got none")
+        sigmas = {n: float(scalar(f"tolerance of {n}", s, at_least=0)) for n, s in given.items()}
+        names = [name for name in sigmas if sigmas[name] > 0] or [*sigmas]
+        return cls(names, np.diag([sigmas[name] ** 2 for name in names]))
+
+    @property
+    def standard_deviations(self) -> dict[str, float]:
+        """By name, as given: {"D": ..., "ln G": ...}."""
+        return dict(zip(self.names, np.sqrt(np.diagonal(self.covariance)).tolist(), strict=True))
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """The names without "ln "."""
+        return tuple(name.removeprefix("ln ") for name in self.names)
+
+    def check(self, x: Mechanism, ranges: Mapping[str, Sequence[float]]) -> None:
+        """Refuse names that `x` lacks, and a scatter that leaves a domain within six deviations.
+
+        `ranges` are those inside which a quantity is moved otherwise.
+        """
+        known = known_quantities(x)
+        for name, (given, sigma) in zip(
+            self.quantities, self.standard_deviations.items(), strict=True
+        ):
+            if name not in known:
+                raise ValueError(f"tolerance names {given!r}; there are {', '.join(known)}")
+            value = float(value_of(x, name))
+            low, high = min(ranges.get(name, (value,))), max(ranges.get(name, (value,)))
+            if name == given:
+                low, high = low - _REACH * sigma, high + _REACH * sigma
+            else:
+                low, high = low * math.exp(-_REACH * sigma), high * math.exp(_REACH * sigma)
+            try:
+                replaced(x, {name: np.array([low, high])})
+            except ValueError as error:
+                raise ValueError(
+                    f"tolerance of {given} leaves its domain within {_REACH:g} deviations: {error}"
+                ) from None
+        if len(self.names) > _MOST:
+            raise ValueError(f"tolerance takes at most {_MOST} quantities, got {len(self.names)}")
+
+    def shifts(self, deviates: np.ndarray) -> np.ndarray:
+        """Shifts (n, k) of the quantities, or of their logarithms, from standard normal deviates.
+
+        Correlated by the Cholesky factor of the correlation matrix, which may be singular.
+        """
+        C = np.asarray(self.covariance, float)
+        sigma = np.sqrt(np.diagonal(C))
+        unit = np.where(sigma > 0, sigma, 1)
+        correlation = C / np.outer(unit, unit)
+        np.fill_diagonal(correlation, 1 + 1e-14)
+        return deviates @ np.linalg.cholesky(correlation).T * sigma
+
+    def scattered(self, values: Mapping[str, Any], shift: Any) -> dict[str, Any]:
+        """The quantities at `values` by name, moved by shifts (k,), or (k, n) for values (n,)."""
+        return {
+            name: values[name] + by if name == given else values[name] * jnp.exp(by)
+            for name, given, by in zip(self.quantities, self.names, shift, strict=True)
+        }
+
+
+def low_discrepancy(count: int, dimensions: int) -> np.ndarray:
+    """Points (count, dimensions) that fill the unit cube evenly: a lattice of one generator.
+
+    Its steps are powers of 1/g with g^dimensions = g + 1, as in R. Roberts' sequence; in the plane
+    it is the Fibonacci lattice.
+    """
+    i, g = np.arange(count), 2.0
+    for _ in range(50):
+        g = (1 + g) ** (1 / dimensions)
+    steps = [1, *np.round(count * g ** -np.arange(1.0, dimensions))]
+    return np.stack([(step * i % count + 0.5) / count for step in steps], axis=1)
+
+
+def nodes(dimensions: int) -> tuple[np.ndarray, np.ndarray]:
+    """Standard normal deviates (n, dimensions) and their weights (n,), which sum to 1."""
+    from scipy.special import ndtri
+
+    z = ndtri(low_discrepancy(_NODES * 2 ** max(dimensions - 2, 0), dimensions))
+    # Zero mean and unit covariance exactly.
+    z = z - z.mean(axis=0)
+    z = np.linalg.solve(np.linalg.cholesky(z.T @ z / len(z)), z.T).T
+    weights = np.exp(-(z**2).sum(axis=1) * (_WIDENING**2 - 1) / 2)
+    return z * _WIDENING, weights / weights.sum()
+
+
+def quantile(values: Float[Array, "n ..."], weights: Float[Array, " n"], level) -> Array:
+    """The weighted `level`-quantile of values (n, ...) with weights (n,).
+
+    The mean of the quantile function over level +- (1 - level)/2: continuous in the values, with a
+    derivative that mixes those of several nodes.
+    """
+    half = (1 - level) / 2
+    order = jnp.argsort(values, axis=0)
+    below = jnp.cumsum(weights[order], axis=0)
+    below = below / below[-1:]  # 1 exactly at the end, whatever the rounding of the weights
+    reached = jnp.clip((below - level + half) / (2 * half), 0, 1)
+    share = jnp.diff(reached, axis=0, prepend=jnp.zeros_like(reached[:1]))
+    return jnp.sum(share * jnp.take_along_axis(values, order, axis=0), axis=0)
+
+
+# --- probability of squeal ----------------------------------------------------------------
+
+
+class SquealProbability(NamedTuple):
+    """A share of draws, and its standard error, which is not 0 where all or nothing squeals."""
+
+    value: float
+    standard_error: float
+
+
+@eqx.filter_jit
+def _squeals(x, names, values, friction_slope):
+    def one(row):
+        return growth_rate(substituted(x, dict(zip(names, row, strict=True))), friction_slope) > 0
+
+    return jax.vmap(one)(values)
+
+
+def squeal_probability(
+    x: Mechanism,
+    tolerance: Any,
+    envelope: Envelope | Mapping[str, Any] | None = None,
+    *,
+    friction_slope: bool = True,
+    samples: int = _SAMPLES,
+    seed: int = 0,
+) -> SquealProbability:
+    """The probability that `x` as machined or identified squeals: growth rate > 0.
+
+    `tolerance` is an `Identification`, a `Tolerance` or a mapping of standard deviations; with an
+    `envelope` every draw is at a condition drawn evenly from it.
+
+    **Raises:** `ValueError` for quantities that `x` lacks, or scattered beyond their domain.
+    """
+    tolerance, values = Tolerance.of(tolerance), {}
+    if envelope is not None:
+        envelope = Envelope.of(envelope)
+        envelope.check(x, ())
+        drawn = envelope.values(envelope.drawn(samples, seed))
+        values = dict(zip(envelope.names, drawn.T, strict=True))
+    tolerance.check(x, {name: (column.min(), column.max()) for name, column in values.items()})
+    x = with_optional(x, (*values, *tolerance.quantities))
+    for name in tolerance.quantities:
+        values.setdefault(name, np.full(samples, float(value_of(x, name))))
+    random = np.random.default_rng([seed, 0])
+    shifts = tolerance.shifts(random.standard_normal((samples, len(tolerance.names))))
+    values |= tolerance.scattered(values, shifts.T)
+    dtype = jax.tree.leaves(x)[0].dtype
+    rows = np.stack([np.asarray(column, dtype) for column in values.values()], axis=1)
+    batch = max(64, _EIGENVALUES_AT_ONCE // (x.n if isinstance(x, Structure) else 2) ** 2)
+    squeals = in_batches(
+        lambda rows: _squeals(x, tuple(values), rows, friction_slope), min(batch, samples), rows
+    )
+    return proportion(int(squeals.sum()), samples)
+
+
+def proportion(hits: int, count: int) -> SquealProbability:
+    """A proportion and its standard error, which is not zero where all or nothing was hit."""
+    smoothed = (hits + 1) / (count + 2)
+    return SquealProbability(hits / count, math.sqrt(smoothed * (1 - smoothed) / count))

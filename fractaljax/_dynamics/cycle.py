@@ -1,0 +1,159 @@
+"""A limit cycle: its numbers, its orbit, its spectrum and its switches."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float, Int
+
+from .._base.parts import Record, concrete
+from .shooting import UNUSED, Segments, flow
+from .stick_slip import StickSlip, units
+
+_SQUARINGS = 40  # of a monodromy matrix
+
+
+class CycleResult(eqx.Enumeration):
+    """How the search for a limit cycle ended."""
+
+    converged = "a limit cycle was found"
+    depends_on_eps = (
+        "a limit cycle of the regularised law, which still differs from the exact law's: "
+        "choose a smaller regularisation"
+    )
+    inaccurate = "a limit cycle was found, but not to rtol: ask for more segments"
+    unstable = "a limit cycle was found, but it repels: nearby motions leave it"
+    equilibrium = "the motion dies out: the sliding equilibrium attracts it"
+    diverged = "the motion grows beyond all bounds"
+    not_periodic = "the motion does not repeat within four returns (a longer period, or none)"
+    too_stiff = (
+        "the regularised law takes more than max_steps steps: allow more, choose a solver such as "
+        "diffrax.Kvaerno5, or leave the regularisation out"
+    )
+    exhausted = (
+        "the motion nearly repeats, but has not settled within max_returns: allow more of them"
+    )
+
+
+def repels(
+    monodromy: Float[Array, "4 4"], rate: Float[Array, "4"], error: Float[Array, ""]
+) -> Bool[Array, ""]:
+    """Whether small deviations from an orbit grow, by more than the error of their growth.
+
+    The monodromy maps the orbit's own `rate` onto itself. Its error is how far it misses that,
+    plus the relative `error` of the orbit.
+    """
+    along = rate / jnp.linalg.norm(rate)
+    missed = jnp.max(jnp.abs(jnp.sum(monodromy * along[None], axis=1) - along))
+    across = jnp.eye(4, dtype=along.dtype) - along[:, None] * along[None]
+
+    def square(_, carry):
+        # The matrix to the power of 2^k, scaled to 1, and the logarithm of its scale.
+        power, log = carry
+        size = jnp.max(jnp.abs(power))
+        power = power / jnp.where(size > 0, size, 1)
+        return power @ power, 2 * (log + jnp.log(size))
+
+    start = across @ monodromy @ across, jnp.zeros_like(error)
+    _, log = jax.lax.fori_loop(0, _SQUARINGS, square, start)
+    tolerance = 10 * (missed + error) + 1e3 * jnp.finfo(along.dtype).eps
+    return log / 2.0**_SQUARINGS > tolerance
+
+
+class Switch(Record):
+    """One change of the contact state, as `LimitCycle.switches` lists them."""
+
+    time: float  # after `state` [s]
+    direction: int  # which one switches, 1 or 2
+    before: str  # "+" (slip, dx/dt < V), "-" (slip, dx/dt > V) or "stick"
+    after: str
+
+
+class Orbit(eqx.Module):
+    """The motion along the segments of a periodic orbit."""
+
+    segments: Segments
+
+    def at(self, system: StickSlip, times) -> Float[Array, "4 n"]:
+        """Scaled states at scaled times (n,) within one period."""
+        segments = self.segments
+        ends = jnp.cumsum(segments.duration)
+        k = jnp.searchsorted(
+            jax.lax.stop_gradient(ends), jax.lax.stop_gradient(times), side="right"
+        )
+        k = jnp.minimum(k, len(ends) - 1)
+        after = times - (ends - segments.duration)[k]
+        return flow(system, segments.y[:, k], after, segments.s[:, k])
+
+
+class LimitCycle(Record):
+    """A limit cycle, as `limit_cycle` returns it. NaN throughout where there is none."""
+
+    period: Float[Array, ""]  # [s]
+    amplitude: Float[Array, "2"]  # peak to peak, one value a direction [m]
+    velocity_min: Float[Array, "2"]  # of dx/dt [m/s]
+    velocity_max: Float[Array, "2"]  # [m/s]
+    stick_fraction: Float[Array, "2"]  # of the period in stick (regularised: abs(v) < eps)
+    tension_fraction: Float[Array, ""]  # of the period with K_n x2 < 0: the contact pulls
+    state: Float[Array, "4"]  # [x1, x2, v1, v2] on the cycle, where x1 is largest [m, m/s]
+    error: Float[Array, ""]  # estimated relative error of period and states
+    returns: Int[Array, ""]  # of the Poincare map (maxima of x1) in one period
+    regularisation_error: Float[Array, ""]  # largest relative difference from the exact law
+    result: CycleResult
+    _monodromy: Float[Array, "4 4"] = eqx.field(repr=False)
+    _system: StickSlip = eqx.field(repr=False)
+    _orbit: Any = eqx.field(repr=False)  # Orbit, or regularised.SmoothOrbit
+
+    @property
+    def multipliers(self) -> Complex[Array, "4"]:
+        """The Floquet multipliers, largest modulus first; one of them is 1."""
+        # Computed only when asked for: eigenvalues have no second derivative in JAX.
+        values = jnp.linalg.eigvals(self._monodromy)
+        order = jnp.argsort(-jnp.abs(jax.lax.stop_gradient(values)), axis=-1)
+        return jnp.take_along_axis(values, order, axis=-1)
+
+    @property
+    def frequency(self) -> Float[Array, ""]:
+        """1/period [Hz]."""
+        return 1 / self.period
+
+    def orbit(self, n: int = 512) -> tuple[Float[Array, " n"], Float[Array, "n 4"]]:
+        """Times [s] and states [m, m/s], evenly spaced over one period from `state`."""
+        system = self._system
+        share = jnp.arange(n) / n
+        y = self._orbit.at(system, share * self.period * system.omega)
+        y = jnp.where(jnp.isfinite(self.period), y, jnp.nan)
+        return share * self.period, (y * units(system)[:, None]).T
+
+    def spectrum(self, n: int = 512) -> tuple[Float[Array, " n/2"], Float[Array, "n/2 2"]]:
+        """Harmonics: frequencies [Hz] and peak amplitudes [m] of x1 and x2.
+
+        The Fourier coefficients of n samples of the orbit, without the mean.
+        """
+        _, states = self.orbit(n)
+        lines = jnp.abs(jnp.fft.rfft(states[:, :2], axis=0)) / n * 2
+        harmonics = jnp.arange(1, n // 2 + 1)
+        return harmonics / self.period, lines[1 : n // 2 + 1]
+
+    def switches(self) -> list[Switch]:
+        """Every change of contact state in one period, in order, with its time.
+
+        **Raises:** `ValueError` for a batch of cycles, inside a compiled program, and for the
+        regularised law, which has none.
+        """
+        if concrete(self.period) is None or self.period.ndim:
+            raise ValueError("switches() needs one cycle, outside of jit: index the batch first")
+        if not isinstance(self._orbit, Orbit):
+            raise ValueError("a regularised cycle has no switches")
+        segments, names = self._orbit.segments, {1: "+", -1: "-", 0: "stick"}
+        used = np.asarray(segments.guard) != UNUSED
+        states = np.asarray(segments.s)[:, used].astype(int)
+        times = np.cumsum(np.asarray(segments.duration)[used]) / float(self._system.omega)
+        found = []
+        for k, time in enumerate(times):
+            before, after = states[:, k], np.roll(states, -1, axis=1)[:, k]
+            for i in np.flatnonzero(before != after):
+                found.append(Switch(float(time), int(i) + 1, names[before[i]], names[after[i]]))
+        return found

@@ -1,0 +1,183 @@
+"""The regularised friction law, tanh(v/eps) in place of sgn v, by diffrax and optimistix.
+
+Its motion is smooth, so its limit cycle solves y(T) = y, u1 = 0. But it is the cycle of another
+mechanism, and nothing in it tells how far that is from the exact law's.
+"""
+
+import functools
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix
+from jaxtyping import Array, Float
+
+from .._mechanism.scene import Scene
+from .cycle import CycleResult, LimitCycle, repels
+from .events import Cubic
+from .stick_slip import StickSlip, scaled_start, stick_slip, units
+
+_SETTLING = 64  # slowest periods of the transient
+_LONGEST = 4  # most returns in one period
+_SAME = 1e-5  # scaled: states no further apart repeat
+_TOLERANCE = 1e-3  # of the relative difference from the exact law's cycle
+DENSE = diffrax.SaveAt(t0=True, steps=True, dense=True)
+
+
+def field(t, y, args) -> Float[Array, "4"]:
+    """dy/dt of the regularised system in scaled units; `args` is (system, eps) with eps in m/s."""
+    system, eps = args
+    signs = jnp.tanh(system.V * (1 - y[2:]) / eps)
+    return jnp.stack([y[2], y[3], *system.accelerations(y, signs)])
+
+
+def solve(system: StickSlip, eps, y, until, *, solver, rtol, **options) -> Any:
+    """diffrax's solution from y over [0, until] in scaled time; differentiable in both modes."""
+    solver = diffrax.Tsit5() if solver is None else solver
+    options = {"adjoint": diffrax.DirectAdjoint(), "throw": False} | options
+    options["stepsize_controller"] = diffrax.PIDController(rtol=rtol, atol=rtol)
+    term = diffrax.ODETerm(field)
+    return diffrax.diffeqsolve(term, solver, 0.0, until, None, y, (system, eps), **options)
+
+
+def nodes(solution) -> tuple[Float[Array, " n"], Float[Array, "n 4"]]:
+    """Times and states of the steps taken; unused ones repeat the last."""
+    used = jnp.isfinite(solution.ts)
+    last = jnp.maximum(jnp.sum(used) - 1, 0)
+    return (
+        jnp.where(used, solution.ts, solution.ts[last]),
+        jnp.where(used[:, None], solution.ys, solution.ys[last]),
+    )
+
+
+class SmoothOrbit(eqx.Module):
+    """The motion over one period, as diffrax's dense solution."""
+
+    solution: Any
+
+    def at(self, system: StickSlip, times) -> Float[Array, "4 n"]:
+        """Scaled states at scaled times (n,) within one period."""
+        return jax.vmap(self.solution.evaluate, out_axes=1)(times)
+
+
+def _settle(system: StickSlip, eps, y, solver, rtol, max_steps):
+    """State and period where the motion from y nearly repeats, the number of returns in between.
+
+    Also whether each was reached within `max_steps` steps.
+    """
+    slowest = 2 * jnp.pi / jnp.sqrt(jnp.minimum(system.a, 1 - system.a))
+    run = functools.partial(solve, system, eps, solver=solver, adjoint=diffrax.ForwardMode())
+    maximum = diffrax.Event(lambda t, y, args, **_: y[2], optimistix.Newton(rtol, rtol), False)
+
+    def next_return(y, _):
+        found = run(y, 8 * slowest, rtol=rtol, max_steps=max_steps, event=maximum)
+        y = found.ys[0].at[2].set(0)
+        return y, (y, found.ts[0], found.result != diffrax.RESULTS.max_steps_reached)
+
+    steps = _SETTLING * max_steps
+    settled = run(y, _SETTLING * slowest, rtol=max(rtol, 1e-7), max_steps=steps)
+    _, (ends, times, within) = jax.lax.scan(next_return, settled.ys[0], length=1 + _LONGEST)
+    apart = jnp.max(jnp.abs(ends[1:] - ends[:1]), axis=1)
+    returns = 1 + jnp.argmax(apart <= 2 * jnp.min(apart) + _SAME)
+    followed = (settled.result == diffrax.RESULTS.successful) & jnp.all(within)
+    return (ends[0], jnp.cumsum(times[1:])[returns - 1]), returns, followed
+
+
+def _cubics(h, x, rate) -> Cubic:
+    return Cubic.through(x[:-1], x[1:], h * rate[:-1], h * rate[1:])
+
+
+def extremes(times, states, rates) -> Float[Array, "2 4"]:
+    """Smallest and largest value of each component over the steps of a solution."""
+    h = jnp.diff(times)[:, None]
+    cubics = _cubics(h, states, rates), _cubics(h, -states, -rates)
+    low, high = (jnp.min(c(jax.lax.stop_gradient(c.minimum()[0])), axis=0) for c in cubics)
+    return jnp.stack([low, -high])
+
+
+def share_below_zero(times, values, rates) -> Float[Array, ""]:
+    """The share of the time in which a quantity, given with its rate at the steps, is negative."""
+    h = jnp.diff(times)
+    starts, ends = values[:-1] < 0, values[1:] < 0
+    sign = jnp.where(starts, -1, 1)
+    cubic = jax.tree.map(lambda k: sign * k, _cubics(h, values, rates))
+    zero = jax.lax.stop_gradient(cubic.root_before(jnp.ones_like(h)))
+    # One Newton step from the zero carries its derivative.
+    slope = jax.lax.stop_gradient(cubic.slope(zero))
+    zero = zero - cubic(zero) / jnp.where(slope == 0, 1, slope)
+    below = jnp.where(starts == ends, starts, jnp.where(starts, zero, 1 - zero))
+    return jnp.sum(below * h) / times[-1]
+
+
+@eqx.filter_jit
+def regularised_cycle(
+    scene: Scene, start, eps, exact: LimitCycle, solver, rtol: float, max_steps: int
+) -> LimitCycle:
+    """The limit cycle of the regularised law from a start (4,), beside the `exact` law's.
+
+    The arguments are those of `limit_cycle`, with eps in m/s.
+    """
+    system = stick_slip(scene)
+    options = {"solver": solver, "max_steps": max_steps}
+    frozen = jax.lax.stop_gradient((system, eps, scaled_start(scene, system, start)))
+    guess, returns, followed = _settle(*frozen, solver, rtol, max_steps)
+
+    def gap(unknown, args):
+        (y, period), (system, eps) = unknown, args
+        return solve(system, eps, y, period, rtol=rtol, **options).ys[0] - y, y[2]
+
+    # Looser than the integration, whose adaptive steps make the gap rough.
+    newton = optimistix.Newton(rtol=10 * rtol, atol=10 * rtol)
+    root = optimistix.root_find(gap, newton, guess, (system, eps), max_steps=16, throw=False)
+    y, period = root.value
+    near = jnp.max(jnp.abs(y - guess[0])) < 0.2 * (1 + jnp.max(jnp.abs(guess[0])))
+    # An equilibrium is periodic as well, with any period.
+    moves = jnp.max(jnp.abs(field(0.0, y, (system, eps)))) > 1e-4
+    found = (root.result == optimistix.RESULTS.successful) & near & (period > 0) & moves
+
+    solution = solve(system, eps, y, period, rtol=rtol, saveat=DENSE, **options)
+    times, states = nodes(solution)
+    rates = jax.vmap(lambda y: field(0.0, y, (system, eps)))(states)
+    low, high = extremes(times, states, rates) * units(system)[None]
+    width = eps / system.V
+    stuck = [
+        share_below_zero(times, (1 - u) ** 2 - width**2, 2 * (u - 1) * rate)
+        for u, rate in zip(states.T[2:], rates.T[2:], strict=True)
+    ]
+
+    def end(y):
+        # Tangents are less accurate than states at the same tolerance.
+        return solve(system, eps, y, period, rtol=rtol / 10, **options).ys[0]
+
+    monodromy = jax.jacfwd(end)(y)
+    numbers = jnp.stack([period / system.omega, *(high - low)[:2]])
+    difference = jnp.abs(numbers / jnp.stack([exact.period, *exact.amplitude]) - 1)
+    difference = jax.lax.stop_gradient(jnp.max(difference))
+    error = jnp.asarray(rtol, y.dtype)
+    unstable = repels(*jax.lax.stop_gradient((monodromy, rates[0])), error)
+    status = CycleResult.where(unstable, CycleResult.unstable, CycleResult.converged)
+    status = CycleResult.where(difference <= _TOLERANCE, status, CycleResult.depends_on_eps)
+    lost = CycleResult.where(followed, CycleResult.not_periodic, CycleResult.too_stiff)
+    status = CycleResult.where(found, status, lost)
+
+    def only(value):
+        return jnp.where(found, value, jnp.nan)
+
+    return LimitCycle(
+        period=only(numbers[0]),
+        amplitude=only(numbers[1:]),
+        velocity_min=only(low[2:]),
+        velocity_max=only(high[2:]),
+        stick_fraction=only(jnp.stack(stuck)),
+        tension_fraction=only(share_below_zero(times, states[:, 1], rates[:, 1])),
+        state=only(y * units(system)),
+        error=only(error),
+        returns=returns,
+        regularisation_error=only(difference),
+        result=status,
+        _monodromy=only(monodromy),
+        _system=system,
+        _orbit=SmoothOrbit(solution),
+    )

@@ -1,0 +1,365 @@
+"""The motion from a start: stick and slip by the exact law, every switch resolved.
+
+A first pass finds the steps: their lengths and contact states. A second pass repeats them. There
+the length of a step that ends in a switch is a function of its start, by one Newton step from the
+known length. So derivatives pass through switches, and no search is differentiated.
+"""
+
+import functools
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Int, ScalarLike
+
+from .._base.parts import Record, concrete, number, raise_unless, require_scalar, scalar, whole
+from .._mechanism.scene import Scene
+from .events import NONE, Cubic, guards_and_rates, without_start
+from .shooting import flow
+from .stick_slip import SECTION, StickSlip, check_rtol, start_state, stick_slip, units
+
+if TYPE_CHECKING:
+    from diffrax import AbstractSolver
+
+_REJECTIONS = 20  # of a step whose error is above rtol
+_MOST_GUESSES = 60  # of the time of an event; usually four suffice
+
+
+class SimulationResult(eqx.Enumeration):
+    """How a simulation ended."""
+
+    reached = "the end time was reached"
+    out_of_steps = "max_steps were used up before the end time"
+    diverged = "the motion grew beyond all bounds"
+
+
+class Trajectory(Record):
+    """The motion of a scene, as `simulate` returns it; unused steps repeat the last state."""
+
+    times: Float[Array, " n"]  # at the ends of the steps [s]
+    states: Float[Array, "n 4"]  # [x1, x2, v1, v2] [m, m/s]
+    contact_states: Float[Array, "n 2"]  # from each time on: +1, -1 slip forward, backward, 0 stick
+    result: SimulationResult
+    _system: StickSlip = eqx.field(repr=False)
+    _solution: Any = eqx.field(repr=False)  # diffrax's, of the regularised law
+
+    @property
+    def end(self) -> Float[Array, "4"]:
+        """The last state [m, m/s]."""
+        return self.states[-1]
+
+    def at(self, times: ArrayLike | Sequence[float]) -> Float[Array, "k 4"]:
+        """States at `times` (k,) [s] from 0 to the end of the simulation.
+
+        **Raises:** `ValueError` for times of another shape or outside; `RuntimeError` inside a
+        compiled program.
+        """
+        times = self._inside(number("times", jnp.asarray(times)))
+        scale = units(self._system)
+        if self._solution is not None:
+            states = jax.vmap(self._solution.evaluate)(times * self._system.omega)
+            return states * scale[None]
+        known = jax.lax.stop_gradient((self.times, times))
+        k = jnp.clip(jnp.searchsorted(*known, side="right") - 1, 0, len(self.times) - 1)
+        after = (times - self.times[k]) * self._system.omega
+        start, s = (self.states[k] / scale[None]).T, self.contact_states[k].T
+        return (flow(self._system, start, after, s) * scale[:, None]).T
+
+    def _inside(self, times) -> Array:
+        if times.ndim != 1:
+            raise ValueError(f"times must have shape (k,), got {times.shape}")
+        last = self.times[-1]
+        # The end is known up to rounding: t1 itself is inside.
+        outside = (times < 0) | (times > last * (1 + 8 * jnp.finfo(last.dtype).eps))
+        wanted = "times must be from 0 to the end of the simulation"
+        found, given = concrete(outside), concrete(times)
+        if found is None or given is None:
+            return eqx.error_if(times, outside, wanted)
+        if found.any():
+            raise ValueError(f"{wanted}, {float(last)!r}, got {given[found][0].item()!r}")
+        return times
+
+    def switches(self) -> list[tuple[float, int, int, int]]:
+        """Every switch: time [s], direction (1 or 2), contact state before, contact state after."""
+        states, times = np.asarray(self.contact_states), np.asarray(self.times)
+        return [
+            (float(times[k + 1]), int(i) + 1, int(states[k, i]), int(states[k + 1, i]))
+            for k, i in np.argwhere(states[1:] != states[:-1])
+        ]
+
+
+def _event(system: StickSlip, y, s, h, g_0, g_1, d_0, d_1):
+    """When the first switch happens in a step: its time and guard.
+
+    The cubics through the guards g and their rates d at both ends say where to look. The
+    eighth-order flow decides, also whether a guard that dips towards zero and rises reaches it.
+    """
+    # One lane a guard: each has its own time t.
+    lanes = jnp.broadcast_to(y[:, None], (4, SECTION)), jnp.broadcast_to(s[:, None], (2, SECTION))
+
+    def pick(values):
+        return jnp.diagonal(values[:SECTION])
+
+    def at(t):
+        """Guards and their rates after t, and a function for their second derivatives."""
+        along = flow(system, lanes[0], t, lanes[1])
+        rate = system.field(along, lanes[1])
+
+        def curve():
+            change = jax.jvp(lambda y: system.field(y, lanes[1]), (along,), (rate,))[1]
+            return pick(system.guards(change, lanes[1], 0.0))
+
+        value, slope = system.guards(along, lanes[1]), system.guards(rate, lanes[1], 0.0)
+        return pick(value), pick(slope), curve
+
+    # In its contact state every guard starts above zero, up to rounding.
+    rounding = 16 * jnp.finfo(y.dtype).eps * (1 + jnp.max(jnp.abs(y)) + jnp.abs(system.f))
+    late = g_0 < -rounding
+    g_0 = jnp.maximum(g_0, 0)
+    d_0 = jnp.where((g_0 <= rounding) & (d_0 >= -rounding), jnp.maximum(d_0, 0), d_0)
+    rising = d_0 >= 0
+    cubic = Cubic.through(g_0, g_1, d_0, d_1)
+    theta, inside = cubic.minimum()
+
+    def lower(_, t):
+        _, rate, curve = at(t)
+        bend = curve()
+        return jnp.clip(t - rate / jnp.where(bend == 0, 1, bend), 0, h)
+
+    bottom = jnp.where(inside, jax.lax.fori_loop(0, 3, lower, theta * h), 0)
+    depth, _, curve = at(bottom)
+    bend = curve()
+    dips = inside & (depth < -rounding)
+    end = jnp.where(dips, bottom, h)
+    falls = dips | (g_1 < 0)
+    t = without_start(cubic, rising).root_before(end / h) * h
+    # A shallow dip is a parabola. From afar Newton's method would confuse its two roots.
+    half = jnp.sqrt(2 * jnp.maximum(-depth, 0) / jnp.where(bend > 0, bend, 1))
+    shallow = dips & (bend > 0) & (depth > -1e-2)
+    t = jnp.where(shallow, jnp.clip(bottom - half, 0, bottom), t)
+    t = jnp.where(dips & (t >= bottom), bottom / 2, t)
+
+    def searching(carry):
+        *_, found, count = carry
+        return ~jnp.all(found) & (count < _MOST_GUESSES)
+
+    def refine(carry):
+        t, low, high, found, count = carry
+        value, rate, _ = at(t)
+        low, high = jnp.where(value > 0, t, low), jnp.where(value > 0, high, t)
+        # A guard that rises first has a root at the start of the step, which does not count:
+        # Newton's method is for its quotient by t.
+        slope = jnp.where(rising, rate - value / jnp.where(t == 0, 1, t), rate)
+        guess = t - value / jnp.where(slope == 0, 1, slope)
+        between = (guess >= low) & (guess <= high)
+        guess = jnp.where(between, guess, (low + high) / 2)
+        near = (jnp.abs(guess - t) <= close) | (jnp.abs(value) <= close)
+        return jnp.where(found, t, guess), low, high, found | near, count + 1
+
+    close = 2 * jnp.finfo(y.dtype).eps
+    start = t, jnp.zeros_like(t), end, ~falls | late, 0
+    t, *_ = jax.lax.while_loop(searching, refine, start)
+    # A step of zero length would be repeated forever.
+    t = jnp.where(rising, jnp.maximum(t, 1e-12 * h), t)
+    t = jnp.where(late, 0, jnp.where(falls, t, jnp.inf))
+    first = jnp.min(t)
+    hit = first <= h
+    return jnp.where(hit, first, h), jnp.where(hit, jnp.argmin(t), NONE)
+
+
+def _smooth_step(system: StickSlip, y, s, longest, left, rtol):
+    """A step in contact state s, as long as rtol allows: the state it ends in, and its length."""
+    h = jnp.minimum(longest / jnp.maximum(1, 2 * system.stiffness(y)), left)
+    allowed = rtol * (1 + jnp.max(jnp.abs(y)))
+
+    def step(h):
+        y_1, error = flow(system, y, h, s, error=True)
+        return y_1, h, jnp.max(jnp.abs(error)) / allowed
+
+    def rejected(carry):
+        (*_, error), count = carry
+        return ~(error <= 1) & (count < _REJECTIONS)
+
+    def shorter(carry):
+        (_, h, error), count = carry
+        return step(h * jnp.where(error < 1e5, 0.9 * error ** (-1 / 8), 0.2)), count + 1
+
+    (y_1, h, _), _ = jax.lax.while_loop(rejected, shorter, (step(h), 0))
+    return y_1, h
+
+
+def _step(system: StickSlip, y, s, longest, left, rtol):
+    """A step up to the first switch: state, contact state, length, and the guard that ended it."""
+    y_1, h = _smooth_step(system, y, s, longest, left, rtol)
+    g_0, d_0 = guards_and_rates(system, y, s, h, system.field(y, s))
+    g_1, d_1 = guards_and_rates(system, y_1, s, h, system.field(y_1, s))
+    ends = [x[:SECTION] for x in (g_0, g_1, d_0, d_1)]
+    cubic = Cubic.through(*ends)
+    theta, dips = cubic.minimum()
+    # A cubic well above zero has no event to look for.
+    near = (jnp.minimum(cubic(theta), ends[1]) < 0.05) & (dips | (ends[1] < 0.05))
+    dt, guard = jax.lax.cond(
+        jnp.any(near | (ends[0] < 0)),
+        lambda: _event(system, y, s, h, *ends),
+        lambda: (h, jnp.array(NONE)),
+    )
+    end = jnp.where(guard == NONE, y_1, flow(system, y, dt, s))
+    return *system.switch(end, s, guard), dt, guard
+
+
+class _Steps(eqx.Module):
+    """What the first pass finds."""
+
+    duration: Float[Array, " n"]
+    s: Float[Array, "2 n"]
+    guard: Int[Array, " n"]
+    count: Int[Array, ""]
+    result: SimulationResult
+
+
+@functools.partial(jax.jit, static_argnames="max_steps")
+def _find_steps(system: StickSlip, y, end, h, rtol, *, max_steps: int) -> _Steps:
+    limit = 1e3 * (1 + jnp.max(jnp.abs(y)))
+
+    def running(carry):
+        y, _, t, k, *_ = carry
+        return (t < end) & (k < max_steps) & (jnp.max(jnp.abs(y)) < limit)
+
+    def body(carry):
+        y, s, t, k, duration, states, guards = carry
+        y, s_new, dt, guard = _step(system, y, s, h, end - t, rtol)
+        # Otherwise rounding could leave some time after the last step.
+        t = jnp.where((guard == NONE) & (dt >= end - t), end, t + dt)
+        recorded = duration.at[k].set(dt), states.at[:, k].set(s), guards.at[k].set(guard)
+        return y, s_new, t, k + 1, *recorded
+
+    n = max_steps
+    empty = jnp.zeros(n, y.dtype), jnp.ones((2, n), y.dtype), jnp.full(n, NONE)
+    start = y, system.contact_state(y), jnp.zeros((), y.dtype), 0, *empty
+    _, s, t, count, duration, states, guards = jax.lax.while_loop(running, body, start)
+    result = SimulationResult.where(
+        count >= n, SimulationResult.out_of_steps, SimulationResult.diverged
+    )
+    result = SimulationResult.where(t >= end, SimulationResult.reached, result)
+    # Unused steps keep the last contact state.
+    states = jnp.where(jnp.arange(n)[None] < count, states, s[:, None])
+    return _Steps(duration, states, guards, jnp.asarray(count), result)
+
+
+@jax.jit
+def _repeat(system: StickSlip, y, end, steps: _Steps) -> Trajectory:
+    """The steps once more, differentiably."""
+    last = jnp.where(steps.result == SimulationResult.reached, steps.count - 1, -1)
+
+    def body(carry, step):
+        y, t = carry
+        k, dt, s, s_new, guard = step
+        # The last step ends at the end, wherever the switches before it move.
+        dt = jnp.where(k == last, end - t, dt)
+        y_1 = flow(system, y, dt, s)
+        rate = system.field(y_1, s)
+        own = jnp.arange(SECTION + 1) == guard
+        value = jnp.sum(jnp.where(own, system.guards(y_1, s), 0))
+        slope = jnp.sum(jnp.where(own, system.guards(rate, s, 0.0), 0))
+        # Zero, with minus the derivative of the time at which the guard is zero.
+        off = value - jax.lax.stop_gradient(value)
+        late = off / jax.lax.stop_gradient(jnp.where(slope == 0, 1, slope))
+        y_2, _ = system.switch(y_1 - late * rate, s, guard)
+        return (y_2, t + dt - late), (y_2, t + dt - late, s_new)
+
+    following = jnp.concatenate([steps.s[:, 1:], steps.s[:, -1:]], axis=1)
+    moves = jnp.arange(len(steps.duration)), steps.duration, steps.s.T, following.T, steps.guard
+    _, (states, times, after) = jax.lax.scan(body, (y, jnp.zeros_like(end)), moves)
+    return Trajectory(
+        times=jnp.concatenate([jnp.zeros(1, y.dtype), times]) / system.omega,
+        states=jnp.concatenate([y[None], states]) * units(system)[None],
+        contact_states=jnp.concatenate([steps.s[:, :1].T, after]),
+        result=steps.result,
+        _system=system,
+        _solution=None,
+    )
+
+
+@eqx.filter_jit
+def _regularised(system: StickSlip, y, end, eps, solver, rtol, max_steps: int) -> Trajectory:
+    from diffrax import RESULTS
+
+    from .regularised import DENSE, nodes, solve
+
+    options = {"solver": solver, "rtol": rtol, "max_steps": max_steps, "saveat": DENSE}
+    solution = solve(system, eps, y, end, **options)
+    times, states = nodes(solution)
+    sliding = system.V * (1 - states[:, 2:])
+    far = jnp.max(jnp.abs(states[-1])) > 1e3 * (1 + jnp.max(jnp.abs(y)))
+    reached = solution.result == RESULTS.successful
+    result = SimulationResult.where(
+        reached, SimulationResult.reached, SimulationResult.out_of_steps
+    )
+    result = SimulationResult.where(far, SimulationResult.diverged, result)
+    return Trajectory(
+        times=times / system.omega,
+        states=states * units(system)[None],
+        contact_states=jnp.where(jnp.abs(sliding) < eps, 0, jnp.sign(sliding)),
+        result=result,
+        _system=system,
+        _solution=solution,
+    )
+
+
+def simulate(
+    scene: Scene,
+    start: ArrayLike | Sequence[float],
+    t1: ScalarLike,
+    *,
+    regularisation: ScalarLike | None = None,
+    solver: "AbstractSolver | None" = None,
+    rtol: float | None = None,
+    max_steps: int = 4096,
+    throw: bool = True,
+) -> Trajectory:
+    """The motion from `start` over the time `t1`, by the exact law of dry friction.
+
+    Eighth-order steps of equal length, each cut where the contact state changes. Derivatives with
+    respect to the scene, `start` and `t1` are those of the motion with its switches.
+
+    **Arguments:**
+
+    - `scene`: one scene; `jax.vmap` takes many.
+    - `start`: (4,), [x1, x2, v1, v2] in m and m/s.
+    - `t1`: end time [s], above 0.
+    - `regularisation`: eps [m/s], to replace sgn v by tanh(v/eps); a contact state is then 0 where
+      abs(v) < eps. The motion depends on eps: `limit_cycle` compares with the exact law.
+    - `solver`: a diffrax solver for the regularised law, Tsit5 by default; an implicit one, such
+      as Kvaerno5, for a small eps.
+    - `rtol`: relative tolerance of a step, 1e-9 by default and at least 9.1e-13; in float32 both
+      are 4.9e-4. Errors grow with the distance between nearby motions.
+    - `max_steps`: most steps; one oscillation takes about 30.
+    - `throw`: raise unless the end is reached; otherwise `result` says why.
+
+    **Raises:** `ValueError` for a start of another shape, an argument outside its domain or an
+    rtol that the precision cannot hold; `RuntimeError` if `throw`.
+    """
+    require_scalar(scene)
+    start = start_state(start)
+    t1 = scalar("t1", t1, above=0)
+    n = whole("max_steps", max_steps, 1)
+    system = stick_slip(scene)
+    y, end = start / units(system), t1 * system.omega
+    rtol = check_rtol(rtol, y.dtype)
+    if regularisation is not None:
+        eps = number("regularisation", regularisation, above=0)
+        trajectory = _regularised(system, y, end, eps, solver, rtol, n)
+    else:
+        h = jnp.asarray(min(0.25 * (rtol / 1e-9) ** 0.125, 0.5), y.dtype)
+        frozen = jax.lax.stop_gradient((system, y, end))
+        steps = _find_steps(*frozen, h, rtol, max_steps=n)
+        if concrete(steps.count) is not None:
+            # The second pass, in one of few lengths, so that little is compiled.
+            used = min(n, 1 << max(int(steps.count) - 1, 15).bit_length())
+            shorter = steps.duration[:used], steps.s[:, :used], steps.guard[:used]
+            steps = eqx.tree_at(lambda x: (x.duration, x.s, x.guard), steps, shorter)
+        trajectory = _repeat(system, y, end, steps)
+    return raise_unless(SimulationResult.reached, trajectory) if throw else trajectory

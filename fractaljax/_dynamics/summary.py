@@ -1,0 +1,63 @@
+"""Limit cycles as printed tables."""
+
+import jax.numpy as jnp
+
+from .._base.table import table
+from .._mechanism.scene import Scene
+from .._stability.stability import stability
+from .._stability.summary import friction_remark, verdict
+from .cycle import CycleResult, LimitCycle
+
+_CONTACT_STATES = {"+": "slips, dx/dt < V", "-": "slips, dx/dt > V", "stick": "sticks"}
+
+
+def cycle_table(scene: Scene, cycle: LimitCycle) -> str:
+    """The result of the search for one limit cycle, its numbers and its switches."""
+    found = {"result": str(CycleResult[cycle.result])} | verdict(stability(scene))
+    if not jnp.isfinite(cycle.period):
+        return table([""], [found])
+    whole = found | {
+        "period [ms]": f"{cycle.period * 1e3:.6g}",
+        "frequency [Hz]": f"{cycle.frequency:.6g}",
+        "returns in a period": f"{cycle.returns}",
+        "contact pulls": f"{cycle.tension_fraction:.2%} of the period",
+        "estimated error": f"{cycle.error:.1e}",
+    }
+    regularised = cycle.regularisation_error != 0
+    if regularised:
+        whole["off the exact law by"] = f"{cycle.regularisation_error:.1e}"
+    # Rounded first, and + 0: a multiplier of zero has a sign at random.
+    multipliers = (jnp.round(cycle.multipliers, 6) + 0).tolist()
+    whole |= {
+        f"Floquet multiplier {i}": f"{s.real:+.6f} {s.imag:+.6f}i  (modulus {abs(s):.6f})"
+        for i, s in enumerate(multipliers, start=1)
+    }
+    directions = [
+        {
+            "peak to peak [m]": f"{cycle.amplitude[i]:.6g}",
+            "least dx/dt [m/s]": f"{cycle.velocity_min[i]:+.6g}",
+            "largest dx/dt [m/s]": f"{cycle.velocity_max[i]:+.6g}",
+            "sticks": f"{cycle.stick_fraction[i]:.2%} of the period",
+        }
+        for i in range(2)
+    ]
+    tables = [table([""], [whole]), table(["x1, along the belt", "x2, normal to it"], directions)]
+    switches = [] if regularised else cycle.switches()
+    if switches:
+        tables.append(_switching(switches, cycle.period))
+    relative = scene.oscillator.V - jnp.stack([cycle.velocity_min, cycle.velocity_max])
+    tables += friction_remark(scene, jnp.abs(relative).max())
+    return "\n\n".join(tables)
+
+
+def _switching(switches, period) -> str:
+    columns = {
+        "time [ms]": [f"{at.time * 1e3:.6f}" for at in switches],
+        "of the period": [f"{at.time / period:.2%}" for at in switches],
+        "direction": [f"x{at.direction}" for at in switches],
+        "before": [_CONTACT_STATES[at.before] for at in switches],
+        "after": [_CONTACT_STATES[at.after] for at in switches],
+    }
+    names = [f"switch {i}" for i in range(1, len(switches) + 1)]
+    rows = [dict(zip(names, cells, strict=True)) for cells in columns.values()]
+    return table(list(columns), rows) + "\ntime 0: x1 is largest"

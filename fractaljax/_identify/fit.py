@@ -1,0 +1,230 @@
+"""A power law through a measured spectrum: gamma quasi-likelihood over logarithmic bins.
+
+The means of bins are fitted, not their logarithms, which few ordinates or discrete waves would
+bias. Bins are one ratio gamma wide and averaged over ln f, each ordinate relative to the law: then
+every bin holds each wave of Eq. 13 once, wherever in the bin it is.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from .._base.parts import Record
+from .spectrum import Spectrum
+
+FLAT_DEVIATION = (
+    0.35  # standard deviation of the unknown flat share, relative to the law at Nyquist
+)
+_SPREAD = 0.15  # the flat share's own variance, relative to that of its prior
+_SCATTER_ROUNDS = 4
+_STEPS = 20
+
+
+class PowerLaw(Record):
+    """A (f/f_N)^-p, f_N the Nyquist frequency, beside a flat share, as fitted to bins."""
+
+    log_A: float  # ln of m^3
+    p: float
+    flat: float  # in units of A
+    covariance: Float[np.ndarray, "3 3"]  # of (ln A, p, flat)
+    f: Float[np.ndarray, " bins"]  # 1/m
+    error: Float[np.ndarray, " bins"]  # relative standard error of each
+    ratio: Float[np.ndarray, " bins"]  # of measured and fitted power
+    slope: Float[np.ndarray, "bins 3"]  # d(ln of the fit)/d(ln A, p, flat)
+    scatter: float  # relative variance of a bin beyond that of its ordinates
+    deviance: float
+    nyquist: float
+    aliased: bool
+    kind: str = eqx.field(static=True)  # "profile" or "map"
+
+    def __call__(self, f) -> np.ndarray:
+        """The fit, flat share included, at frequencies f [1/m]."""
+        u = np.asarray(f) / self.nyquist
+        flat = self.flat * _level(u, self.kind)
+        return np.exp(self.log_A) * (shape(u, self.p, self.aliased) + flat)
+
+    @property
+    def power(self) -> np.ndarray:
+        """Measured power of the bins [m^3]."""
+        return self.ratio * self(self.f)
+
+    @property
+    def D(self) -> float:
+        """Fractal dimension (7 - p)/2."""
+        return (7 - self.p) / 2
+
+    @property
+    def D_standard_error(self) -> float:
+        """Half of that of p."""
+        return float(np.sqrt(self.covariance[1, 1])) / 2
+
+
+def _level(u, kind):
+    """A flat spectrum: over |f|, radial bins grow with f."""
+    return np.ones_like(u) if kind == "profile" else u
+
+
+def shape(u: np.ndarray, p: float, aliased: bool) -> np.ndarray:
+    """u^-p, u = f/f_N; aliased: sum over all integers j of |u + 2j|^-p."""
+    from scipy.special import zeta
+
+    if not aliased:
+        return u**-p
+    s = max(p, 1.02)  # the sum diverges at 1
+    return u**-p + 2**-p * (zeta(s, 1 + u / 2) + zeta(s, 1 - u / 2))
+
+
+def bin_edges(band: tuple[float, float], ratio: float) -> np.ndarray:
+    """Edges [1/m], one `ratio` apart from the upper end down; the rest is one more bin."""
+    low, high = band
+    whole = int(np.floor(np.log(high / low) / np.log(ratio) + 1e-9))
+    edges = high * ratio ** -np.arange(whole + 1.0)
+    if low < edges[-1] * (1 - 1e-9):
+        if edges[-1] / low > np.sqrt(ratio) or whole == 0:
+            edges = np.append(edges, low)
+        else:
+            edges[-1] = low
+    return edges[::-1]
+
+
+class _Bins:
+    """Means over the bins of a band."""
+
+    def __init__(self, spectrum: Spectrum, band, ratio):
+        low, high = band[0] * (1 - 1e-9), band[1] * (1 + 1e-9)
+        inside = (spectrum.f >= low) & (spectrum.f <= high)
+        edges = bin_edges(band, ratio)
+        self.f, self.power, count, self.weight, self.spread = (
+            getattr(spectrum, name)[inside] for name in ("f", "power", "count", "weight", "spread")
+        )
+        which = np.clip(np.searchsorted(edges, self.f, side="left") - 1, 0, edges.size - 2)
+        _, self.start = np.unique(which, return_index=True)
+        self.total = np.add.reduceat(self.weight, self.start)
+        self.variance = np.add.reduceat(self.weight**2 / count, self.start) / self.total**2
+
+    def __call__(self, values):
+        return np.add.reduceat(self.weight * values, self.start) / self.total
+
+
+def fit(
+    spectrum: Spectrum,
+    band: tuple[float, float],
+    ratio: float,
+    *,
+    aliased: bool = False,
+    flat_mean: float = 0.0,
+    flat_deviation: float = FLAT_DEVIATION,
+    scatter: float | None = None,
+    factor: Callable | None = None,
+) -> PowerLaw:
+    """The power law of a spectrum over a band [1/m], in bins of `ratio`.
+
+    Waves beyond the Nyquist frequency follow the same law (`aliased`), or are unknown: a flat share
+    of either sign, with a normal prior of `flat_mean` and `flat_deviation` in units of the law at
+    Nyquist. (Aliased power is flat in the band, and so is the lack of waves that a profile should
+    cross at an angle.) A given `scatter` is not estimated: deviances of laws that share it compare.
+    A `factor(f, p)` multiplies the law.
+    """
+    bins = _Bins(spectrum, band, ratio)
+    u = bins.f / spectrum.nyquist
+    level = _level(u, spectrum.kind)
+
+    def law(p):
+        # A window smears by half its mean square width times the relative second derivative.
+        curve = p * (p + 1) if spectrum.kind == "profile" else (p + 1) ** 2
+        smeared = shape(u, p, aliased) * (1 + curve / 2 * bins.spread / bins.f**2)
+        return smeared if factor is None else smeared * factor(bins.f, p)
+
+    def relative(at):
+        """Measured over fitted power, and the slope of ln(fit), of each bin."""
+        log_A, p, flat = at
+        only = law(p)
+        whole = only + flat * level
+        grown = (law(p + 1e-6) - only) / 1e-6
+        ratios = bins(bins.power / np.exp(log_A) / whole)
+        return ratios, np.stack([np.ones_like(ratios), bins(grown / whole), bins(level / whole)], 1)
+
+    mean = np.array([0.0, 0.0, flat_mean])
+    prior = np.diag([0.0, 0.0, 1 / flat_deviation**2])
+
+    def solve(at, variance):
+        """Fisher scoring."""
+        for _ in range(_STEPS):
+            ratios, slope = relative(at)
+            weighted = slope.T / variance
+            score = weighted @ (ratios - 1) - prior @ (at - mean)
+            step = np.linalg.solve(weighted @ slope + prior, score)
+            step *= min(1.0, 0.7 / np.abs(step[:2]).max())
+            at = at + step
+            at[1] = np.clip(at[1], 0.05, 8.0)
+            if at[2] < 0:  # the sum stays positive
+                at[2] = max(at[2], -0.8 * (law(at[1]) / level).min())
+            if np.abs(step).max() < 1e-6:
+                break
+        return at, *relative(at)
+
+    at = np.array([np.log(bins(bins.power / law(2.0)).mean()), 2.0, flat_mean])
+    estimated, ratios, slope = scatter or 0.0, *relative(at)
+    for _ in range(_SCATTER_ROUNDS):
+        at, ratios, slope = solve(at, bins.variance + estimated)
+        if scatter is not None:
+            break
+        before, estimated = estimated, _scatter(ratios - 1, bins.variance, ratios.size - 2.5)
+        if abs(before - estimated) <= 1e-3 * estimated:
+            break
+    variance = bins.variance + estimated
+    data = slope.T / variance @ slope
+    inverse = np.linalg.inv(data + prior)
+    # The prior of the flat share is wide, but its actual scatter about the mean is smaller.
+    covariance = inverse @ (data + _SPREAD * prior) @ inverse
+    deviance = 2 * np.sum((ratios - 1 - np.log(np.maximum(ratios, 1e-300))) / variance)
+    deviance += ((at[2] - flat_mean) / flat_deviation) ** 2
+    log_A, p, flat = map(float, at)
+    return PowerLaw(
+        log_A=log_A,
+        p=p,
+        flat=flat,
+        covariance=covariance,
+        f=np.exp(bins(np.log(bins.f))),
+        error=np.sqrt(variance),
+        ratio=ratios,
+        slope=slope,
+        scatter=estimated,
+        deviance=float(deviance),
+        nyquist=spectrum.nyquist,
+        aliased=aliased,
+        kind=spectrum.kind,
+    )
+
+
+def _scatter(residual, variance, freedom) -> float:
+    """The common variance beside `variance` that explains the size of the residuals."""
+    from scipy.optimize import root_scalar
+
+    def excess(scatter):
+        return np.sum(residual**2 / (variance + scatter)) - freedom
+
+    if freedom <= 0 or excess(0.0) <= 0:
+        return 0.0
+    most = float(np.sum(residual**2) / freedom)
+    return root_scalar(excess, bracket=(0.0, 2 * most), xtol=1e-14 * most).root
+
+
+def curvature(law: PowerLaw) -> tuple[float, float]:
+    """c of a factor exp(c ln^2 f) that the bins ask for, and its standard error.
+
+    The local exponent changes by 2 c ln(f_2/f_1) from one end of the band to the other.
+    """
+    log_f = np.log(law.f / law.f.mean())
+    columns = np.concatenate([law.slope[:, :2], (log_f**2)[:, None]], axis=1)
+    variance, residual, scatter = law.error**2 - law.scatter, law.ratio - 1, law.scatter
+    normal, found = np.zeros((3, 3)), np.zeros(3)
+    for _ in range(3):  # the bend accounts for some of the scatter
+        weighted = columns.T / (variance + scatter)
+        normal = np.linalg.inv(weighted @ columns)
+        found = normal @ weighted @ residual
+        scatter = _scatter(residual - columns @ found, variance, residual.size - 3)
+    left = float(normal[2, 2])  # rounding may leave nothing of few bins
+    return float(found[2]), float(np.sqrt(left)) if left > 0 else np.inf

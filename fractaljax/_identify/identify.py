@@ -1,0 +1,194 @@
+"""D and G of a measured profile or map, with standard errors."""
+
+import math
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from .._base.parts import Record
+from .._surface.surface import Surface
+from .band import HIGHEST, LOWEST, PER_RESOLUTION, chosen_band, given_band
+from .fit import PowerLaw
+from .preparation import checked, prepared, spacing
+from .quantisation import quantisation_limit
+from .spectrum import Spectrum, log_mean_cosine_power, map_spectra, profile_spectrum
+from .structure_function import StructureFunction, structure_function
+from .stylus import tip_limit
+from .warnings import height_warnings, quantisation_warnings, result_warnings, spectrum_warnings
+
+
+class Identification(Record):
+    """The fractal parameters of a measurement, and how well they are known.
+
+    G is that of Eq. 13, as the contact law takes it.
+    """
+
+    D: float
+    G: float  # m
+    D_standard_error: float
+    ln_G_standard_error: float
+    covariance: Float[np.ndarray, "2 2"]  # of (D, ln G)
+    G_profile: float  # m: by Majumdar's and Bhushan's formula
+    gamma: float
+    band: tuple[float, float]  # 1/m
+    limit: float  # 1/m: of the instrument, or the Nyquist frequency
+    aliased: bool
+    noise_floor: float  # m^3
+    law: PowerLaw
+    spectrum: Spectrum
+    structure_function: StructureFunction
+    missing: int
+    outliers: int
+    unused: int
+    warnings: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def decades(self) -> float:
+        """Decades of frequency in the band."""
+        return math.log10(self.band[1] / self.band[0])
+
+    @property
+    def G_standard_error(self) -> float:
+        """Of G [m], to first order; where that of ln G is not small, use that one."""
+        return self.G * self.ln_G_standard_error
+
+    @property
+    def surface(self) -> Surface:
+        """As a part of a scene. **Raises:** `ValueError` unless 2 < D < 3."""
+        return Surface(self.D, self.G, self.gamma)
+
+    def __repr__(self) -> str:
+        from .._base.table import table
+
+        other, (low, high) = self.structure_function, self.band
+        rows = {
+            "D": f"{self.D:.4f} +- {self.D_standard_error:.4f}",
+            "G [m]": f"{self.G:.4g}  (ln G +- {self.ln_G_standard_error:.2g})",
+            "G by the profile formula [m]": f"{self.G_profile:.4g}",
+            "D by structure function": f"{other.D:.4f} +- {other.D_standard_error:.4f}",
+            "band [1/m]": f"{low:.4g} to {high:.4g}  ({self.decades:.2f} decades)",
+            "wavelengths [m]": f"{1 / high:.4g} to {1 / low:.4g}",
+            "finer waves": "aliased" if self.aliased else "not aliased",
+            "missing heights": f"{self.missing}",
+            "outliers": f"{self.outliers}",
+            "unused heights": f"{self.unused}",
+        }
+        return "\n".join([table([""], [rows]), *(f"warning: {each}" for each in self.warnings)])
+
+
+def identify(
+    z: ArrayLike,
+    dx: float,
+    dy: float | None = None,
+    *,
+    band: tuple[float, float] | None = None,
+    resolution: float | None = None,
+    stylus_radius: float | None = None,
+    aliased: bool | None = None,
+    gamma: float = 1.5,
+) -> Identification:
+    """D and G of heights z [m], a profile (n,) or a map (n, m), from their power spectrum.
+
+    Points are dx [m] apart along the first axis, dy (default dx) along the second; NaN is missing.
+    The surface is taken to be that of Eq. 13, a profile a cut through it.
+
+    - `band`: lowest and highest frequency [1/m] of the fit; chosen by default.
+    - `resolution` [m]: lateral resolution, or the cut-off wavelength of a Gaussian filter.
+    - `stylus_radius` [m] of the tip. Both limit a band that is chosen.
+    - `aliased`: whether waves finer than two points are sampled, and so aliased, or averaged out;
+      decided from the spectrum by default.
+    - `gamma` of Eq. 13, also the ratio of the ends of a bin: waves may come in steps of it.
+
+    **Raises:** `ValueError` for heights that are too few, flat, complex, infinite or not (n,) or
+    (n, m); distances not above 0; a band that is empty or outside the data, or that the instrument
+    leaves empty.
+    """
+    z = checked(z)
+    dx = spacing("dx", dx)
+    dy = dx if dy is None else spacing("dy", dy)
+    steps = (dx, dy)[: z.ndim]
+    ratio = float(Surface(2.5, 1e-9, gamma).gamma)
+    heights = prepared(z)
+    if z.ndim == 1:
+        spectra, lines = (profile_spectrum(heights.segments, dx),), heights.segments
+        length = dx * max(segment.size for segment in lines)
+    else:
+        spectra, lines = map_spectra(heights.segments[0], dx, dy), [*heights.segments[0].T]
+        length = min(z.shape[0] * dx, z.shape[1] * dy)
+    spectrum = spectra[0]
+    top = spectrum.nyquist
+    if resolution is not None:
+        top = min(top, 1 / (PER_RESOLUTION * spacing("resolution", resolution)))
+    if stylus_radius is not None:
+        top = min(top, tip_limit(spectrum, length, ratio, spacing("stylus_radius", stylus_radius)))
+    limit, least = quantisation_limit(heights.known, steps), 2 * LOWEST / length
+    if band is None:
+        usable = top if limit < least else min(top, limit)
+        chosen = chosen_band(spectrum, length, ratio, usable)
+        wanted = min(top, HIGHEST[spectrum.kind] * spectrum.nyquist)
+    else:
+        chosen = given_band(band, spectrum, length, ratio, top)
+        wanted = chosen.high
+    if aliased is not None:
+        chosen = chosen._replace(
+            noise=chosen.noise._replace(aliased=bool(aliased), undecided=False)
+        )
+    noise, ends = chosen.noise, (chosen.low, chosen.high)
+    law = noise.fit(spectrum, ends, ratio)
+    log_G, log_G_profile, covariance = _parameters(law, ratio)
+    other = structure_function(
+        lines,
+        dx,
+        ends,
+        end=None if noise.aliased else min(spectrum.nyquist, 2 * top),
+        noise=noise.floor * spectrum.nyquist * (1 if z.ndim == 1 else 2 / math.pi),
+    )
+    errors = np.sqrt(np.diag(covariance))
+    warnings = [
+        *chosen.warnings,
+        *spectrum_warnings(law, chosen, spectra, ratio),
+        *height_warnings(heights.known, steps),
+        *quantisation_warnings(heights.known, limit, chosen.high, wanted, least),
+        *result_warnings(law.D, errors, other, heights),
+    ]
+    with np.errstate(over="ignore"):
+        G, G_profile = map(float, np.exp([log_G, log_G_profile]))
+    return Identification(
+        D=law.D,
+        G=G,
+        D_standard_error=float(errors[0]),
+        ln_G_standard_error=float(errors[1]),
+        covariance=covariance,
+        G_profile=G_profile,
+        gamma=ratio,
+        band=ends,
+        limit=top,
+        aliased=noise.aliased,
+        noise_floor=noise.floor,
+        law=law,
+        spectrum=spectrum,
+        structure_function=other,
+        missing=heights.missing,
+        outliers=heights.outliers,
+        unused=heights.unused,
+        warnings=tuple(warnings),
+    )
+
+
+def _parameters(law: PowerLaw, gamma: float) -> tuple[float, float, np.ndarray]:
+    """ln G, ln G by the profile formula, and the covariance of (D, ln G).
+
+    D = (7 - p)/2, and A f_N^p = m(p) G^(3-p)/2 of a profile, without m(p) of a map. The profile
+    formula is A f_N^p = G^(2(D_s-1))/(2 ln gamma), D_s = D - 1.
+    """
+    from scipy.special import digamma
+
+    p, profile = law.p, law.kind == "profile"
+    log_m, log_f = log_mean_cosine_power(p), math.log(law.nyquist)
+    log_G = (law.log_A + math.log(2) + p * log_f - profile * log_m) / (3 - p)
+    by_p = (log_f - profile * (digamma(p / 2) - digamma((p + 1) / 2)) / 2 + log_G) / (3 - p)
+    slope = np.array([[0.0, -0.5], [1 / (3 - p), by_p]])
+    covariance = slope @ law.covariance[:2, :2] @ slope.T
+    return log_G, log_G + (log_m + math.log(math.log(gamma))) / (3 - p), covariance

@@ -1,0 +1,141 @@
+"""Measured heights made ready for a spectrum: checks, spikes, gaps."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+FEWEST = 128  # points of a profile: a decade of frequencies between tilt and Nyquist
+FEWEST_ACROSS = 48  # points of each side of a map
+_SHORT = 4  # points: a longer gap divides a profile
+_MOST_MISSING = 0.5  # of a map
+_ABSURD = 1e50  # m, and 1/m: squares of larger numbers lose their digits
+_ROUNDING = 1e-12  # of the largest height
+_SPIKE_ROUNDS = 3
+_SPIKE = 8.0  # robust standard deviations of a height from the mean of its neighbours
+
+
+class Heights(NamedTuple):
+    """Heights without gaps, and what was changed."""
+
+    segments: list[np.ndarray]  # contiguous segments of a profile, or one map
+    missing: int  # NaN in the input
+    outliers: int  # spikes taken out
+    unused: int  # points in segments that are too short
+    known: np.ndarray  # the input without spikes, NaN where missing
+
+
+def spacing(name: str, value: float) -> float:
+    """A length [m]. **Raises:** `ValueError` unless it is above 0, finite and within reason."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise TypeError(f"{name} must be a number in m, got {value!r}") from None
+    if not (math.isfinite(number) and number > 0):
+        raise ValueError(f"{name} must be above 0 and finite, in m, got {value!r}")
+    if not 1 / _ABSURD < number < _ABSURD:
+        raise ValueError(f"{name} must be a length in m, got {value!r}")
+    return number
+
+
+def checked(z: ArrayLike) -> np.ndarray:
+    """Heights in float64, (n,) or (n, m), NaN where masked. **Raises:** `ValueError`."""
+    z = np.ma.filled(z, np.nan) if np.ma.isMaskedArray(z) else np.asarray(z)
+    if z.dtype.kind not in "fiu":
+        raise ValueError(f"z must be real heights in m, got an array of {z.dtype}")
+    if z.ndim not in (1, 2):
+        raise ValueError(f"z must be a profile (n,) or a map (n, m), got shape {z.shape}")
+    fewest, kind = (FEWEST, "a profile") if z.ndim == 1 else (FEWEST_ACROSS, "each side of a map")
+    if min(z.shape) < fewest:
+        raise ValueError(f"z is too short: {kind} needs {fewest} points, got shape {z.shape}")
+    z = z.astype(float)
+    if np.isinf(z).any():
+        raise ValueError(f"z must be finite (NaN where missing), got {np.isinf(z).sum()} infinite")
+    if np.isnan(z).all():
+        raise ValueError("z holds no heights: all are NaN")
+    largest = np.nanmax(np.abs(z))
+    if largest > 0 and not 1 / _ABSURD < largest < _ABSURD:
+        raise ValueError(f"z must be heights in m, got up to {largest:.3g}")
+    return z
+
+
+def prepared(z: np.ndarray) -> Heights:
+    """Spikes become gaps. Short gaps are interpolated, longer ones divide a profile.
+
+    **Raises:** `ValueError` if too little is left, or nothing but a constant or a ramp.
+    """
+    _refuse_flat(z)
+    missing = int(np.isnan(z).sum())
+    z = _without_spikes(z)
+    outliers = int(np.isnan(z).sum()) - missing
+    if z.ndim == 2:
+        share = np.isnan(z).mean()
+        if share > _MOST_MISSING:
+            raise ValueError(f"z has too many gaps: {share:.0%} of the map are missing")
+        return Heights([_interpolated(z)], missing, outliers, 0, z)
+    known = np.flatnonzero(~np.isnan(z))
+    runs = np.split(known, np.flatnonzero(np.diff(known) > _SHORT + 1) + 1)
+    segments = [_interpolated(z[run[0] : run[-1] + 1]) for run in runs]
+    sizes = np.array([segment.size for segment in segments])
+    if sizes.max() < FEWEST:
+        raise ValueError(
+            f"z has too many gaps: {FEWEST} points in a row are needed (gaps of up to {_SHORT} are "
+            f"interpolated), the longest segment has {sizes.max()}"
+        )
+    used = sizes >= max(FEWEST // 2, sizes.max() / 8)
+    kept = [segment for segment, use in zip(segments, used, strict=True) if use]
+    return Heights(kept, missing, outliers, int(sizes[~used].sum()), z)
+
+
+def _refuse_flat(z):
+    known = np.nonzero(~np.isnan(z))
+    heights = z[known]
+    plane = np.stack([np.ones(heights.size), *(axis.astype(float) for axis in known)], 1)
+    residual = heights - plane @ np.linalg.lstsq(plane, heights, rcond=None)[0]
+    smallest = _ROUNDING * np.abs(heights).max()
+    if np.abs(residual).max() <= smallest:
+        kind = "constant" if np.ptp(heights) <= smallest else "a ramp"
+        raise ValueError(f"z has no roughness: it is {kind}")
+
+
+def _without_spikes(z):
+    """NaN for heights much further from the mean of their neighbours than most are."""
+    from scipy import ndimage
+
+    cross = ndimage.generate_binary_structure(z.ndim, 1)
+    for _ in range(_SPIKE_ROUNDS):
+        known = ~np.isnan(z)
+        size = np.where(known, np.abs(_from_neighbours(_interpolated(z))), 0.0)
+        # Most of a quantised profile may be straight, so the median alone is too small a scale.
+        usual = max(1.4826 * np.median(size[known]), 0.3 * np.quantile(size[known], 0.9))
+        # A spike shifts the means of its neighbours as well: only the largest counts.
+        largest = ndimage.maximum_filter(size, footprint=cross, mode="constant")
+        spikes = (size > _SPIKE * usual) & (size >= largest) & (usual > 0)
+        if not spikes.any():
+            break
+        z = np.where(spikes, np.nan, z)
+    return z
+
+
+def _from_neighbours(z):
+    """Height above the mean of the two neighbours, averaged over the axes; 0 at the ends."""
+    away = np.zeros(z.shape)
+    for axis in range(z.ndim):
+        inner = np.moveaxis(away, axis, 0)[1:-1]
+        inner -= np.diff(np.moveaxis(z, axis, 0), 2, axis=0) / 2
+    return away / z.ndim
+
+
+def _interpolated(z):
+    """Gaps filled linearly along each axis, the mean of both in a map, level beyond the ends."""
+
+    def fill(line):
+        known = np.flatnonzero(~np.isnan(line))
+        return np.interp(np.arange(line.size), known, line[known]) if known.size else line
+
+    if not np.isnan(z).any():
+        return z
+    filled = np.stack([np.apply_along_axis(fill, axis, z) for axis in range(z.ndim)])
+    ways = (~np.isnan(filled)).sum(axis=0)
+    return np.where(ways > 0, np.nansum(filled, axis=0) / np.maximum(ways, 1), np.nanmean(z))

@@ -1,0 +1,92 @@
+"""The structure function V(tau) = <(z(x + tau) - z(x))^2> of a profile: a second estimate.
+
+Of a spectrum C f^-p, 1 < p < 3, it is 2 C int_0^inf f^-p (1 - cos 2 pi f tau) df, which is
+
+    V = pi C (2 pi tau)^(p-1)/(Gamma(p) sin(pi (p-1)/2))
+
+Tilt adds a term in tau^2. Second differences, W(tau) = <(z(x + tau) - 2 z(x) + z(x - tau))^2>
+= 4 V(tau) - V(2 tau), are blind to tilt, so W is measured.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from .._base.parts import Record
+from .spectrum import log_mean_cosine_power
+
+_BLOCKS = 10  # for the standard error
+_SHARED = 1.4  # waves longer than a block are in several, which then agree too well
+_TINY = 1e-300  # m^2
+_SHORTEST, _SHARE, _LAGS = 4, 12, 12  # lags from 4 points to a twelfth of the length, 12 of them
+
+
+class StructureFunction(Record):
+    """D and G by the structure function alone."""
+
+    tau: Float[np.ndarray, " lags"]  # m
+    W: Float[np.ndarray, " lags"]  # m^2, of second differences
+    D: float
+    G: float  # m
+    D_standard_error: float  # approximate: ten blocks, each left out once
+
+
+def second_differences(p: float, tau: np.ndarray, end: float | None = None) -> np.ndarray:
+    """W/C at distances tau [m] for C f^-p, up to the frequency `end` [1/m] if there is one."""
+    from scipy.special import gammaln
+
+    V = math.pi * (2 * math.pi * tau) ** (p - 1) / math.sin(math.pi * (p - 1) / 2)
+    W = (4 - 2 ** (p - 1)) * V / math.exp(gammaln(p))
+    return W if end is None else W - 6 * end ** (1 - p) / (p - 1)
+
+
+def structure_function(
+    lines: list[np.ndarray],
+    dx: float,
+    band: tuple[float, float],
+    *,
+    end: float | None,
+    noise: float = 0.0,
+) -> StructureFunction:
+    """Of lines without gaps, `dx` [m] apart in each: D and G from distances within a band [1/m].
+
+    Heights may have no waves above the frequency `end` [1/m]. White noise of mean square `noise`
+    [m^2] is subtracted.
+    """
+    shortest = max(math.ceil(1 / (band[1] * dx) - 1e-9), _SHORTEST)
+    longest = min(max(z.size for z in lines) // _SHARE, int(0.4 / (band[0] * dx)))
+    longest = max(longest, 2 * shortest)
+    lags = np.unique(np.rint(np.geomspace(shortest, longest, _LAGS)).astype(int))
+    sums, counts = np.zeros((2, _BLOCKS, lags.size))
+    for z in lines:
+        for j, lag in enumerate(lags[2 * lags < z.size - _BLOCKS]):
+            squares = (z[2 * lag :] - 2 * z[lag:-lag] + z[: -2 * lag]) ** 2
+            edges = np.arange(_BLOCKS) * squares.size // _BLOCKS
+            sums[:, j] += np.add.reduceat(squares, edges)
+            counts[:, j] += np.diff(edges, append=squares.size)
+    tau = lags * dx
+
+    def estimate(blocks):
+        W = np.maximum(sums[blocks].sum(axis=0) / counts[blocks].sum(axis=0) - 6 * noise, _TINY)
+        return W, *_fit(tau, W, end)
+
+    every = np.arange(_BLOCKS)
+    W, p, log_C = estimate(every)
+    others = [estimate(np.delete(every, i))[1] for i in every]
+    error = _SHARED * math.sqrt((_BLOCKS - 1) * np.var(others)) / 2
+    with np.errstate(over="ignore"):  # C = m(p) G^(3-p)/2
+        G = float(np.exp((log_C + math.log(2) - log_mean_cosine_power(p)) / (3 - p)))
+    return StructureFunction(tau, W, (7 - p) / 2, G, error)
+
+
+def _fit(tau, W, end) -> tuple[float, float]:
+    """p and ln C by least squares of ln W over ln tau, each lag as long as its step."""
+    from scipy.optimize import fminbound
+
+    def difference(p):
+        return np.log(W) - np.log(np.maximum(second_differences(p, tau, end), _TINY))
+
+    p: Any = fminbound(lambda p: difference(p).var(), 1.005, 2.995, xtol=1e-9)
+    return float(p), float(difference(p).mean())

@@ -1,0 +1,131 @@
+"""Plain text: a header, then the same number of columns in every line."""
+
+import io
+import math
+import re
+from array import array
+from collections.abc import Iterator
+
+import numpy as np
+
+from .units import known_unit
+
+_SEPARATORS = (";", "\t", ",", None)  # None: white space
+_COMMENTS = ("#", "%", "//", "!")
+_GAPS = {"", "nan", "na", "n/a", "null", "none", "bad", "invalid"}
+_LONGEST_LINE = 2**23  # characters
+# No leading zeros: in 1,034.5 a comma separates thousands.
+_NUMBER = re.compile(r"[-+]?((0|[1-9]\d*)(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
+_LIKE_A_NUMBER = re.compile(r"[-+.\"]*\d")
+# Bracketed, z [nm], or last, z/nm, z_nm, z in nm, but not the unit of a quantity, 5 nm.
+_UNIT = re.compile(r"[\[(]\s*([^\[\]()]+?)\s*[\])]$|(?:^|[/_]\s*|[^\W\d]\s+)([^\s/_\[\]()]+)$")
+
+
+def text_encoding(content: bytes) -> str | None:
+    """UTF-16 with a byte order mark, UTF-8 or else Latin-1; None if it is not text."""
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return "utf-16"
+    if b"\0" in content:
+        return None
+    try:
+        content.decode("utf-8")
+    except UnicodeDecodeError:
+        return "latin-1"
+    return "utf-8-sig"
+
+
+def read_table(content: bytes, encoding: str) -> tuple[np.ndarray, list[str | None]]:
+    """The numbers, (rows, columns) with NaN for gaps, and the unit of each column or None.
+
+    The first line of numbers sets the separator. Any other comma is a decimal comma.
+
+    **Raises:** `ValueError` naming the line that is not like the first, or if none holds numbers.
+    """
+    header: list[str] = []
+    numbers, columns, separator, marks = array("d"), 0, None, set()
+    for at, line in _lines(content, encoding):
+        if not columns:
+            fitting = [s for s in _SEPARATORS if _is_data(line, s)]
+            if not fitting:
+                header.append(line)
+                continue
+            separator, columns = fitting[0], len(_cells(line, fitting[0]))
+            _refuse_damaged(header, separator)
+        if line.lstrip().startswith(_COMMENTS) or (columns > 1 and not line.strip()):
+            continue
+        cells = _cells(line, separator)
+        if len(cells) != columns:
+            raise ValueError(f"line {at} has {len(cells)} columns, the first one has {columns}")
+        for cell in cells:
+            value = _number(cell)
+            if value is None or math.isinf(value):
+                why = "is not a number" if value is None else "is too large"
+                raise ValueError(f"line {at}: {cell[:40]!r} {why}")
+            numbers.append(value)
+        marks.update(mark for mark in ".," if separator != "," and mark in line)
+    if not columns:
+        raise ValueError("there is no line of numbers in it")
+    if len(marks) > 1:
+        raise ValueError("it mixes decimal points and decimal commas")
+    table = np.array(numbers).reshape(-1, columns)
+    width = int(np.flatnonzero(~np.isnan(table).all(axis=0))[-1]) + 1  # separators may end lines
+    return table[:, :width], _units(header, separator, width)
+
+
+def _lines(content: bytes, encoding: str) -> Iterator[tuple[int, str]]:
+    if encoding == "utf-16":
+        content, encoding = content.decode(encoding).encode(), "utf-8"
+    file = io.TextIOWrapper(io.BytesIO(content.rstrip(b"\r\n ")), encoding)
+    for at, line in enumerate(file, start=1):
+        if len(line) > _LONGEST_LINE:
+            raise ValueError(f"line {at} is longer than {_LONGEST_LINE} characters")
+        yield at, line.rstrip("\n")
+
+
+def _cells(line: str, separator: str | None) -> list[str]:
+    cells = [cell.strip() for cell in line.split(separator)] or [""]
+    return cells if separator == "," else [cell.replace(",", ".") for cell in cells]
+
+
+def _number(cell: str) -> float | None:
+    """A number, NaN for a gap, or None."""
+    if _NUMBER.fullmatch(cell):
+        return float(cell)
+    return math.nan if cell.strip("-*").lower() in _GAPS else None
+
+
+def _is_data(line: str, separator: str | None) -> bool:
+    """Whether the line holds nothing but gaps and at least one number."""
+    values = [_number(cell) for cell in _cells(line, separator)]
+    present = separator is None or separator in line
+    return present and None not in values and any(value == value for value in values)
+
+
+def _refuse_damaged(header: list[str], separator: str | None):
+    """The line above the numbers must be a title, not a damaged line of numbers."""
+    at, line = max(
+        ((at, line) for at, line in enumerate(header, 1) if line.strip()), default=(0, "#")
+    )
+    if line.lstrip().startswith(_COMMENTS):
+        return
+    if any(_LIKE_A_NUMBER.match(cell) for cell in _cells(line, separator)):
+        raise ValueError(f"line {at} is neither a title nor numbers: {line[:40]!r}")
+
+
+def _units(header: list[str], separator: str | None, columns: int) -> list[str | None]:
+    """From the last line that names the columns, or else the only unit in the header."""
+    lines = [line.strip().lstrip("".join(_COMMENTS)).strip() for line in header]
+    for line in reversed(lines):
+        units = [_unit(cell.strip('"')) for cell in _cells(line, separator) if cell]
+        if len(units) == columns and any(units):
+            return units
+    alone = {unit for unit in map(_unit, lines) if unit and known_unit(unit)}
+    return [alone.pop() if len(alone) == 1 else None] * columns
+
+
+def _unit(title: str) -> str | None:
+    """The unit at the end of a title; in brackets, also an unknown one."""
+    found = _UNIT.search(title)
+    if found is None:
+        return None
+    return found[1] or (found[2] if known_unit(found[2]) else None)

@@ -1,0 +1,43 @@
+"""Units of length, and what a file says against what the user says."""
+
+UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "pm": 1e-12, "Å": 1e-10}
+UNITS |= dict.fromkeys(("µm", "μm", "micron", "microns", "micrometer", "micrometre"), 1e-6)
+UNITS |= {"nanometer": 1e-9, "nanometre": 1e-9, "angstrom": 1e-10}
+
+
+def known_unit(word: str) -> str | None:
+    """The key of `UNITS` for a word, in any case if it has more than two letters, or None."""
+    spellings = (word, word.lower() if len(word) > 2 else word)
+    return next((spelling for spelling in spellings if spelling in UNITS), None)
+
+
+def metres(unit: str, of: str = "") -> float:
+    """One `unit` in metres; `of` says what it is the unit of.
+
+    **Raises:** `ValueError` listing the known units.
+    """
+    known = known_unit(unit.strip())
+    if known is None:
+        raise ValueError(f"the unit{of} must be one of {', '.join(UNITS)}, got {unit!r}")
+    return UNITS[known]
+
+
+def scale(own: str | None, given: str | None, what: str, option: str) -> float:
+    """The unit of `what` in metres, from the file or from `option`.
+
+    **Raises:** `ValueError` if neither says it, if both differ, and as `metres`.
+    """
+    found = [None if unit is None else metres(unit, f" of {what}") for unit in (own, given)]
+    unit = agreed(f"the unit of {what}", *found)
+    if unit is None:
+        raise ValueError(f"the file does not say in which unit {what} are: give it ({option} um)")
+    return unit
+
+
+def agreed(name: str, own: float | None, given: float | None) -> float | None:
+    """The file's value, or the given one where it has none. They must not differ."""
+    if own is None or given is None:
+        return given if own is None else own
+    if abs(own - given) > 1e-6 * abs(own):
+        raise ValueError(f"{name} is {own:g} m in the file, got {given:g}")
+    return own

@@ -1,0 +1,180 @@
+"""Warnings: reasons to doubt an identification, one line each."""
+
+import itertools
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from .band import Band
+from .fit import PowerLaw, curvature, fit
+from .preparation import Heights
+from .quantisation import FEWEST, differences, rounding
+from .spectrum import Spectrum
+from .structure_function import StructureFunction
+
+DISQUALIFYING = ("not fractal", "too few levels")  # begin warnings that leave D and G no meaning
+_SIGMAS = 3.0
+_DISAGREES = 0.05  # in D, where both standard errors are tiny
+_VAGUE = 2.0  # standard error of ln G
+_MANY = 0.02  # share of all heights
+_BENDS = 0.2  # change of D along the band
+_ROUGH = 0.5  # scatter of bins beyond that of their ordinates: peaks rather than a law
+_FEW_DECADES = 1.0  # with less, a factor of 2 at one end of the band moves D by more than 0.15
+_LONG, _SHORT = 1.0, 1e-12  # m: beyond what instruments scan, and below what they resolve
+_STEEP = 30.0  # rms slope
+_LAY = 0.25  # in ln of the power: a difference of directions
+_EXACT = 1e-9  # of the range: rounding errors
+_CLIPPED = 0.005  # share of the heights
+_CHANCE = 5  # times as many as at the next level, and points
+_STRAIGHT = 0.01  # share of the heights
+_JUMP = 10.0  # robust standard deviations of a difference of neighbours
+
+
+def spectrum_warnings(
+    law: PowerLaw, band: Band, spectra: tuple[Spectrum, ...], ratio: float
+) -> Iterator[str]:
+    """Of a spectrum and its fit; of a map, also of the spectra along x and along y."""
+    ends = band.low, band.high
+    decades = math.log10(band.high / band.low)
+    if decades < _FEW_DECADES - 1e-9:
+        yield f"too few decades: the band spans {decades:.2f}, at least {_FEW_DECADES:g} is wanted"
+    if law.f.size >= 5:
+        c, error = curvature(law)
+        low, high = law.D + c * np.log(np.array(ends) / law.f.mean())
+        if abs(c) > _SIGMAS * error and abs(high - low) > _BENDS:
+            yield (
+                f"not fractal over the band: the slope bends from D = {low:.3g} at its lower to "
+                f"{high:.3g} at its upper end ({abs(c) / error:.2g} standard errors)"
+            )
+    if math.sqrt(law.scatter) > _ROUGH:
+        yield (
+            f"not fractal over the band: bins scatter by {math.sqrt(law.scatter):.0%} about the "
+            "power law, more than chance explains"
+        )
+    if band.noise.undecided:
+        other = fit(spectra[0], ends, ratio, aliased=not law.aliased)
+        if abs(other.D - law.D) > law.D_standard_error:
+            yes, no = (law, other) if law.aliased else (other, law)
+            yield (
+                "waves finer than two points may be aliased: "
+                f"D = {yes.D:.3f} if so, {no.D:.3f} if not; set aliased="
+            )
+    if len(spectra) > 1:
+        yield from _anisotropy(*(band.noise.fit(each, ends, ratio) for each in spectra[1:]))
+
+
+def _anisotropy(x: PowerLaw, y: PowerLaw):
+    bins = min(x.ratio.size, y.ratio.size)
+    change = np.log(x.power[-bins:] / y.power[-bins:])
+    weight = 1 / (x.error[-bins:] ** 2 + y.error[-bins:] ** 2)
+    level, error = np.average(change, weights=weight), 1 / math.sqrt(weight.sum())
+    if abs(level) > max(_SIGMAS * error, _LAY):
+        yield (
+            f"anisotropic: waves along x have {math.exp(level):.3g} times the power of those "
+            f"along y ({abs(level) / error:.2g} standard errors)"
+        )
+    both = math.hypot(x.D_standard_error, y.D_standard_error)
+    if abs(x.D - y.D) > max(_SIGMAS * both, _BENDS / 2):
+        yield f"anisotropic: D = {x.D:.3f} along x, {y.D:.3f} along y"
+
+
+def height_warnings(z: np.ndarray, steps: tuple[float, ...]) -> Iterator[str]:
+    """Sizes that no instrument measures, clipped heights and jumps.
+
+    z (n,) or (n, m) with NaN for gaps, `steps` [m] between points along its axes.
+    """
+    rms, slope = float(np.nanstd(z)), 0.0
+    for axis, step in enumerate(steps):
+        change = differences(np.moveaxis(z, axis, 0), 1)
+        if change.size:
+            slope = max(slope, float(np.sqrt(np.mean(change**2))) / step)
+    length = max(n * step for n, step in zip(z.shape, steps, strict=True))
+    odd = [
+        (length > _LONG, f"it is {length:.3g} m long"),
+        (min(steps) < _SHORT, f"its points are {min(steps):.3g} m apart"),
+        (not _SHORT <= rms <= _LONG, f"its rms height is {rms:.3g} m"),
+        (slope > _STEEP, f"its rms slope is {slope:.3g}"),
+    ]
+    if any(is_odd for is_odd, _ in odd):
+        yield f"the units may be wrong: {', '.join(words for is_odd, words in odd if is_odd)}"
+    levels = np.unique(z[~np.isnan(z)])
+    for what, end, next_one in (("largest", *levels[[-1, -2]]), ("smallest", *levels[:2])):
+        count, others = np.sum(z == end), np.sum(z == next_one)
+        if count >= max(_CHANCE * others, _CHANCE, _CLIPPED * z.size):
+            yield f"clipped: {count / z.size:.1%} of the heights are the {what} one, {end:.4g} m"
+    for axis in range(z.ndim):
+        change = np.diff(np.moveaxis(z, axis, 0), axis=0)
+        if z.ndim == 2:  # the mean over a line
+            change = change[np.isfinite(change).any(axis=1)]
+            change = np.nanmean(change, axis=1)
+        change = change[np.isfinite(change)]
+        away = np.abs(change - np.median(change)) if change.size else np.zeros(1)
+        usual = 1.4826 * np.median(away)
+        if away.max() > _JUMP * usual > 0:
+            yield (
+                f"a jump of {away.max():.3g} m, {away.max() / usual:.2g} times the usual change: "
+                "are these two scans?"
+            )
+            return
+
+
+def quantisation_warnings(
+    z: np.ndarray, limit: float, high: float, wanted: float, lowest: float
+) -> Iterator[str]:
+    """Of heights z whose steps count above `limit` [1/m], in a band up to `high`.
+
+    Without steps the band would reach `wanted`. No band is left where `limit` is below `lowest`.
+    """
+    known = z[~np.isnan(z)]
+    levels = np.unique(known)
+    heights = "heights are quantised, clipped or interpolated"
+    if 2 * levels.size < known.size:
+        heights = (
+            f"heights have only {levels.size} levels (step {np.median(np.diff(levels)):.3g} m)"
+        )
+    if limit < lowest:
+        yield f"too few levels: {heights}, D and G are meaningless"
+    elif limit < high * (1 - 1e-9):
+        yield f"{heights}: D and G are in doubt, the band goes beyond {limit:.3g} 1/m"
+    elif limit < wanted * (1 - 1e-9):
+        yield f"{heights}: the band ends at {high:.3g} 1/m"
+    elif limit == math.inf:
+        yield from _held(z)
+
+
+def _held(z):
+    """Heights equal to or in line with their neighbours, more often than any other change."""
+    for axis, order in itertools.product(range(z.ndim), (2, 1)):
+        found = np.abs(differences(np.moveaxis(z, axis, 0), order))
+        if found.size < FEWEST:
+            continue
+        exact = max(_EXACT * found.max(), rounding(z))
+        rest = np.sort(found[found > exact])
+        flat = 1 - rest.size / found.size
+        same = np.searchsorted(rest, rest + exact, "right") - np.arange(rest.size)
+        if flat - same.max(initial=0) / found.size > _STRAIGHT and rest.size < found.size - 3:
+            alike = "in line with their neighbours" if order == 2 else "equal to their neighbour"
+            yield f"{flat:.1%} of the heights are {alike}: clipped, held or interpolated"
+            return
+
+
+def result_warnings(
+    D: float, errors: np.ndarray, other: StructureFunction, heights: Heights
+) -> Iterator[str]:
+    """Of D, the standard errors of D and ln G, the second estimate, and lost heights."""
+    if not 2 < D < 3:
+        yield f"D = {D:.4g} is not between 2 and 3: no surface of this model"
+    elif min(D - 2, 3 - D) < errors[0]:
+        yield f"D = {D:.4g} is within its standard error of 2 or 3"
+    if errors[1] > _VAGUE:
+        yield f"G is poorly known: ln G has a standard error of {errors[1]:.2g}"
+    both = math.hypot(errors[0], other.D_standard_error)
+    if abs(D - other.D) > max(_SIGMAS * both, _DISAGREES):
+        yield (
+            f"spectrum and structure function disagree: D = {D:.4g} and {other.D:.4g}, "
+            f"{abs(D - other.D) / both:.2g} standard errors apart"
+        )
+    lost = (heights.missing + heights.outliers) / heights.known.size
+    if lost > _MANY:
+        yield f"{lost:.1%} of the heights are missing or outliers"

@@ -1,0 +1,48 @@
+"""Damping matrices of a structure from what is known of its damping."""
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import ArrayLike, Float
+
+from .._base.parts import concrete, number, scalar
+from .matrices import MatrixLike, fitting, mass_matrix, mass_normalised, square
+
+
+def rayleigh_damping(
+    M: MatrixLike, K: MatrixLike, alpha: ArrayLike, beta: ArrayLike
+) -> Float[Array, "n n"]:
+    """C = alpha M + beta K (n, n) [N s/m], alpha in 1/s and beta in s.
+
+    **Raises:** `ValueError` unless alpha >= 0 and beta >= 0 are scalars and M and K are square
+    matrices of one size; `TypeError` for anything but real numbers.
+    """
+    M = square("M", M)
+    K = fitting("K", K, M.shape)
+    return scalar("alpha", alpha, at_least=0) * M + scalar("beta", beta, at_least=0) * K
+
+
+def modal_damping(M: MatrixLike, K: MatrixLike, ratio: ArrayLike) -> Float[Array, "n n"]:
+    """C (n, n) [N s/m] that gives every mode of M and K the damping ratio `ratio`.
+
+    `ratio` is a scalar, or (n,) in the order of rising frequency. C = L X diag(2 ratio omega)
+    X^T L^T with M = L L^T and X the eigenvectors of L^-1 K L^-T: differentiable where the
+    frequencies are distinct.
+
+    **Raises:** `ValueError` unless ratio >= 0, M is symmetric and positive definite, and K
+    symmetric and of the size of M; `TypeError` for anything but real numbers.
+    """
+    M = mass_matrix(square("M", M))
+    K, ratio = fitting("K", K, M.shape), number("damping_ratio", ratio, at_least=0)
+    if ratio.shape not in ((), K.shape[:1]):
+        raise ValueError(
+            f"damping_ratio must be a scalar or have shape {K.shape[:1]}, got shape {ratio.shape}"
+        )
+    values = concrete(K)
+    if values is not None and np.abs(values - values.T).max() > 1e-6 * np.abs(values).max():
+        raise ValueError("damping_ratio needs a symmetric K: others have no real modes")
+    L = jnp.linalg.cholesky(M)
+    squares, X = jnp.linalg.eigh(mass_normalised(L, K))
+    omega = jnp.sqrt(jnp.where(squares > 0, squares, 0))
+    LX = L @ X
+    return (LX * (2 * ratio * omega)[None]) @ LX.T

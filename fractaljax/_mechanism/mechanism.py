@@ -1,0 +1,55 @@
+"""What a `Scene` and a `Structure` have in common: named quantities, and a TOML file."""
+
+import abc
+import os
+from pathlib import Path
+from typing import Any, Self
+
+from .._base.files import read_bounded
+from .._base.parts import Part
+from .._base.toml import naming, read_toml
+
+
+class Mechanism(Part):
+    """Bodies with friction in their joints; a `Scene` is the smallest."""
+
+    @abc.abstractmethod
+    def _rebuilt(self, changes: dict[str, Any]) -> Self:
+        """A checked copy with those of the changes that apply."""
+
+    @abc.abstractmethod
+    def _known(self) -> list[str]:
+        """The names that `replace` takes."""
+
+    def replace(self, **changes: Any) -> Self:
+        """A copy with named quantities changed wherever they live: `replace(D=2.5, mu_s=0.3)`.
+
+        Whole parts have names as well: `replace(friction=Coulomb(0.4))`. A quantity given beside
+        the part that holds it is changed in the new part. Of a structure, M, C, K and F can be
+        replaced; `replace(D=2.5)` changes every joint that has a D, and
+        `replace(**{"left.D": 2.5})` the joint named left, also beside a D for all.
+
+        **Raises:** `ValueError` for a name unknown after the change, listing the known ones, and
+        for values outside their domain.
+        """
+        new = self._rebuilt(changes)
+        for name in changes:
+            if name not in new._known():
+                kind, known = type(self).__name__.lower(), ", ".join(new._known())
+                raise ValueError(f"{kind} has no quantity {name!r}; it has {known}")
+        return new
+
+    @classmethod
+    @abc.abstractmethod
+    def _from_document(cls, document: dict[str, Any], folder: Path) -> Self:
+        """Built from the tables of a TOML file that lies in `folder`."""
+
+    @classmethod
+    def load(cls, path: str | os.PathLike) -> Self:
+        """Read a TOML file, as `save` writes it; docs/model.md has the keys of a structure.
+
+        **Raises:** `OSError` if a file cannot be read; `ValueError` naming the file and the key
+        for anything unknown, missing, ill-fitting or outside its domain.
+        """
+        with naming(path):
+            return cls._from_document(read_toml(read_bounded(path)), Path(path).parent)

@@ -1,0 +1,286 @@
+"""The numbers of a scene or a structure by name: those it stores, and derived ones of a scene.
+
+| name | meaning | what it sets |
+|---|---|---|
+| `K_t/K_n` | stiffness ratio | K_t at the scene's K_n; the given ratio of a fractal contact |
+| `omega_1/omega_2` | ratio of natural frequencies | omega_1 at the scene's omega_2 |
+| `mu` | friction coefficient mu(V) at the belt velocity | the friction law, scaled as a whole |
+
+The mu that a `Coulomb` law stores is mu(V) as well. Where several quantities are set at once,
+derived ones come last: K_t/K_n = 0.5 beside K_n = 1e8 N/m sets K_t = 5e7 N/m. A structure has
+those of its joints, "left.D", and "D" for that of all joints that have one.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from .._base.parts import Part, leaf, number, quantities, substitute
+from .mechanism import Mechanism
+from .scene import Scene, stiffness
+from .structure import Structure
+
+_CHECKED_AT_ONCE = 1 << 16  # points of a grid
+STIFFNESS_RATIO, FREQUENCY_RATIO, FRICTION = "K_t/K_n", "omega_1/omega_2", "mu"
+
+
+class Quantity(NamedTuple):
+    """A number of a scene."""
+
+    value: Array | None  # None where it is optional, and not given
+    unit: str
+    meaning: str
+    log: bool  # a scale, whose ratios count
+
+
+def own_quantities(x: Part | Structure) -> dict[str, Quantity]:
+    """The numbers stored in a scene, a structure or a part, by name; no parts among them."""
+    found = {}
+    if isinstance(x, Structure):
+        for name, joint in zip(x.joint_names, x.joints, strict=True):
+            own = own_quantities(joint)
+            found = own | found | {f"{name}.{plain}": own[plain] for plain in own}
+        return found
+    for field in dataclasses.fields(x):
+        value, meant = getattr(x, field.name), field.metadata
+        if isinstance(value, Part):
+            found |= own_quantities(value)
+        elif "unit" in meant:
+            found[field.name] = Quantity(
+                value, meant["unit"], meant["meaning"], meant.get("log", False)
+            )
+    return found
+
+
+def known_quantities(x: Mechanism) -> list[str]:
+    """The names that `replaced` takes: own ones, then the derived ones of a scene."""
+    return list(dict.fromkeys([*own_quantities(x), *_derived(x)]))
+
+
+def require_known(x: Mechanism, name: str) -> None:
+    """Refuse a name that is neither an own nor a derived quantity, listing those there are."""
+    known = known_quantities(x)
+    if name not in known:
+        kind = "structure" if isinstance(x, Structure) else "scene"
+        raise ValueError(f"{kind} has no quantity {name!r}; it has {', '.join(known)}")
+
+
+def require_independent(x: Mechanism, names: Sequence[str]) -> None:
+    """Refuse names two of which set one quantity, such as K_t and K_t/K_n, or D and left.D."""
+    for i, name in enumerate(names):
+        for other in names[:i]:
+            if not moved_by(x, other).isdisjoint(moved_by(x, name)):
+                raise ValueError(f"quantities must be independent, got {other} and {name}")
+
+
+def moved_by(x: Mechanism, name: str) -> set[str]:
+    """The own quantities that a name sets; of a structure with the names of their joints."""
+    own = own_quantities(x)
+    if name not in own:
+        return set(_DERIVED[name].set(x, 1.0))
+    if isinstance(x, Structure) and "." not in name:
+        return {f"{joint}.{name}" for joint in x.joint_names if f"{joint}.{name}" in own}
+    return {name}
+
+
+def value_of(x: Mechanism, name: str) -> Float[Array, ""]:
+    """The number that a scene or a structure has under a name.
+
+    **Raises:** `ValueError` for an optional one that is not given, and for a plain name whose
+    quantity differs between the joints of a structure.
+    """
+    own = own_quantities(x)
+    if name not in own:
+        return _DERIVED[name].get(x)
+    values = {each: own[each].value for each in sorted(moved_by(x, name))}
+    found, *others = values.values()
+    if found is None or any(value is None for value in others):
+        raise ValueError(f"{name} is not given")
+    if any(value != found for value in others):
+        raise ValueError(
+            f"{name} differs between the joints: name {' and '.join(values)} by themselves, or "
+            f"replace({name}=...) first"
+        )
+    return found
+
+
+def replaced(x: Mechanism, values: Mapping[str, ArrayLike]) -> Any:
+    """The scene or structure with these quantities changed, of any shape, as by its `replace`.
+
+    **Raises:** `ValueError` for values outside their domain; under `jit` when it runs.
+    """
+    derived = _derived(x)
+    own = own_quantities(x)
+    checked = {
+        name: value if name in own else number(name, value, **derived[name].domain)
+        for name, value in values.items()
+    }
+    return x.replace(**_settings(x, checked))
+
+
+def require_inside(x: Mechanism, axes: Mapping[str, np.ndarray]) -> None:
+    """Refuse a grid of independent quantities, each with its values (n,), unless all is inside.
+
+    In batches: the grid is never made.
+
+    **Raises:** `ValueError` as `replaced`.
+    """
+    ends = {name: np.array([values.min(), values.max()]) for name, values in axes.items()}
+    # Domains are intervals, also of one quantity beside another, and all that moves a limit is
+    # monotonic, so that the corners decide; but for mu(V), by which `mu` scales the friction law.
+    _require_all_inside(x, ends)
+    if FRICTION in axes and isinstance(x, Scene):
+        law = {"V", *own_quantities(x.friction)}
+        among = {name: values for name, values in axes.items() if name in law}
+        if among:
+            _require_all_inside(x, {FRICTION: ends[FRICTION], **among})
+
+
+def _require_all_inside(x, axes):
+    shape = tuple(values.size for values in axes.values())
+    points = math.prod(shape)
+    batch = min(points, _CHECKED_AT_ONCE)
+    for begin in range(0, points, batch):
+        # The last batch goes back to the one before: one shape compiles once.
+        begin = min(begin, points - batch)
+        places = np.unravel_index(np.arange(begin, begin + batch), shape)
+        replaced(x, {name: axes[name][i] for name, i in zip(axes, places, strict=True)})
+
+
+def substituted(x: Mechanism, values: Mapping[str, ArrayLike]) -> Any:
+    """Like `replaced`, without checks, for what has all of them (`with_optional`)."""
+    return _substitute(x, _settings(x, values))
+
+
+def _substitute(x, values):
+    if not isinstance(x, Structure):
+        return substitute(x, values)
+    joints = []
+    for name, joint in zip(x.joint_names, x.joints, strict=True):
+        own = {f"{name}.{plain}": plain for plain in quantities(joint)}
+        plain = {key: value for key, value in values.items() if key in own.values()}
+        named = {own[key]: value for key, value in values.items() if key in own}
+        joints.append(substitute(joint, plain | named))
+    return eqx.tree_at(lambda s: s.joints, x, tuple(joints))
+
+
+def with_optional(x: Mechanism, names: Sequence[str]) -> Any:
+    """`x` with 1 for what these names set and it was not given: a stiffness ratio.
+
+    What is None cannot be substituted, and decides what a program computes.
+    """
+    own = own_quantities(x)
+    moved = {name for chosen in names for name in moved_by(x, chosen)}
+    missing = {name: 1.0 for name in moved if own[name].value is None}
+    return x.replace(**missing) if missing else x
+
+
+def _settings(x, values):
+    """What `replace` and `substitute` take to give quantities these values."""
+    own = own_quantities(x)
+    found = {name: value for name, value in values.items() if name in own}
+    if len(found) == len(values):
+        return found
+    moved = substitute(x, {n: value for n, value in found.items() if own[n].value is not None})
+    for name, value in values.items():
+        if name not in own:
+            found |= _DERIVED[name].set(moved, value)
+    return found
+
+
+def axis_values(x: Mechanism, name: str, values: ArrayLike | Sequence[float]) -> Array:
+    """The values (n,) of an axis over a quantity, a list or an array, traced or not.
+
+    **Raises:** `ValueError` for an unknown name and values that are not one-dimensional.
+    """
+    require_known(x, name)
+    # A list as NumPy reads it; what is an array already may be traced.
+    values = number(name, values if isinstance(values, (Array, np.ndarray)) else np.array(values))
+    if values.ndim != 1 or not values.size:
+        raise ValueError(f"the values of {name} must be a list, got shape {values.shape}")
+    return values
+
+
+def unit(x: Mechanism, name: str) -> str:
+    """The unit of a quantity, "-" for a ratio."""
+    own = own_quantities(x)
+    return own[name].unit if name in own else "-"
+
+
+def label(x: Mechanism, name: str) -> str:
+    """Meaning, symbol and unit of a quantity, as axes show them."""
+    own = own_quantities(x)
+    if name not in own:
+        return f"{_DERIVED[name].meaning} [-]"
+    meaning = own[name].meaning.split(";")[0].split(",")[0]
+    return f"{meaning} {name} [{own[name].unit}]"
+
+
+# --- friction at the velocity of the belt -------------------------------------------------
+
+
+def sliding_friction(scene: Scene) -> Array:
+    """mu(V), the friction coefficient at the velocity of the belt."""
+    friction = scene.friction
+    if not friction.velocity_dependent:
+        return friction.mu_s
+    return friction.coefficient(scene.oscillator.V)
+
+
+def with_friction_times(scene: Scene, factor: ArrayLike) -> Scene:
+    """The friction law as a whole times `factor`; not checked."""
+    return substitute(scene, _friction_times(scene, factor))
+
+
+def _friction_times(scene, factor):
+    names = [name for name in quantities(scene.friction) if name in ("mu", "mu_s", "mu_m")]
+    return {name: factor * leaf(scene.friction, (name,)) for name in names}
+
+
+# --- derived quantities -------------------------------------------------------------------
+
+
+class _Derived(NamedTuple):
+    meaning: str  # and symbol
+    domain: dict[str, float]  # as `number` takes it
+    get: Callable[[Any], Array]
+    set: Callable[[Any, Any], dict[str, Any]]
+
+
+def _stiffness_ratio(scene):
+    K_n, K_t = stiffness(scene)
+    return K_t / K_n
+
+
+def _set_stiffness_ratio(scene, ratio):
+    if scene.contact.fractal:
+        return {"stiffness_ratio": ratio}
+    return {"K_t": ratio * scene.contact.K_n}
+
+
+_DERIVED = {
+    STIFFNESS_RATIO: _Derived(
+        "stiffness ratio K_t/K_n", {"at_least": 0}, _stiffness_ratio, _set_stiffness_ratio
+    ),
+    FREQUENCY_RATIO: _Derived(
+        "ratio of natural frequencies ω₁/ω₂",
+        {"above": 0},
+        lambda scene: scene.oscillator.omega_1 / scene.oscillator.omega_2,
+        lambda scene, ratio: {"omega_1": ratio * scene.oscillator.omega_2},
+    ),
+    FRICTION: _Derived(
+        "friction coefficient at the belt velocity µ",
+        {"above": 0},
+        sliding_friction,
+        lambda scene, mu: _friction_times(scene, mu / sliding_friction(scene)),
+    ),
+}
+
+
+def _derived(x: Mechanism) -> Mapping[str, _Derived]:
+    return {} if isinstance(x, Structure) else _DERIVED

@@ -1,0 +1,248 @@
+"""A mechanism of many degrees of freedom, given by its matrices, with joints attached to it."""
+
+import os
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from .._base.files import read_bounded, write_together
+from .._base.parts import number, quantities, rebuild, require_scalar
+from .._base.toml import naming, read_toml
+from .joint import Dof, Joint
+from .matrices import MatrixLike, fitting, mass_matrix, square
+from .mechanism import Mechanism
+from .scene import Scene
+from .structure_file import npz_bytes, read_structure, structure_text
+
+
+class Structure(Mechanism):
+    """M x'' + C x' + K x = F with joints: a reduced finite-element model of n degrees of freedom.
+
+    `M` (n, n) [kg] is symmetric and positive definite. `K` (n, n) [N/m] and `C` (n, n) [N s/m],
+    zero where None, are of any kind. SciPy's sparse matrices are welcome; rotations have their own
+    units. `joints` is one `Joint`, a sequence of them (named joint_1, joint_2, ...) or a mapping
+    from names. `F` (n,) [N], or a mapping from degrees of freedom to forces, presses the joints
+    together: the slope of a friction law acts through the static equilibrium under it. `names` of
+    the degrees of freedom are optional.
+
+    **Raises:** `ValueError` or `TypeError` saying which matrix does not fit, is not finite or not
+    positive definite, which degree of freedom is unknown, or which joint is wrong.
+    """
+
+    M: Float[Array, "n n"]
+    C: Float[Array, "n n"]
+    K: Float[Array, "n n"]
+    F: Float[Array, " n"] | None
+    joints: tuple[Joint, ...]
+    joint_names: tuple[str, ...] = eqx.field(static=True)
+    names: tuple[str, ...] | None = eqx.field(static=True)
+
+    def __init__(
+        self,
+        M: MatrixLike,
+        C: MatrixLike | None,
+        K: MatrixLike,
+        joints: Joint | Sequence[Joint] | Mapping[str, Joint],
+        F: ArrayLike | Sequence[float] | Mapping[Any, ArrayLike] | None = None,
+        names: Iterable[str] | None = None,
+    ):
+        self.M = mass_matrix(square("M", M))
+        n = len(self.M)
+        self.K = fitting("K", K, (n, n))
+        self.C = jnp.zeros_like(self.K) if C is None else fitting("C", C, (n, n))
+        self.names = _names(names, n)
+        self.joints, self.joint_names = _joints(joints)
+        self._check_joints()
+        F = self._forces(F) if isinstance(F, Mapping) else F
+        self.F = None if F is None else fitting("F", F, (n,))
+
+    @classmethod
+    def from_scene(cls, scene: Scene) -> "Structure":
+        """The mass on a belt (Eq. 39) as a structure of two degrees of freedom, x1 and x2."""
+        oscillator = scene.oscillator
+        m, f = oscillator.m, oscillator.F / jnp.sqrt(2.0)
+        omega = jnp.stack([oscillator.omega_1, oscillator.omega_2])
+        xi = jnp.stack([oscillator.xi_1, oscillator.xi_2])
+        return cls(
+            M=m * jnp.eye(2, dtype=m.dtype),
+            C=jnp.diag(2 * xi * omega * m),
+            K=jnp.diag(m * omega**2),
+            joints=Joint(scene.contact, scene.friction, "x1", "x2", oscillator.V),
+            F=jnp.stack([f, -f]),
+            names=("x1", "x2"),
+        )
+
+    @property
+    def n(self) -> int:
+        """The number of degrees of freedom."""
+        return self.M.shape[-1]
+
+    def index(self, dof: Dof | np.integer) -> int:
+        """The index of a degree of freedom given by index or name.
+
+        **Raises:** `ValueError` if there is none; `TypeError` for anything else.
+        """
+        if isinstance(dof, bool) or not isinstance(dof, (int, str, np.integer)):
+            raise TypeError(f"a degree of freedom must be an index or a name, got {dof!r}")
+        known: list[Any] = list((self.names or ()) if isinstance(dof, str) else range(self.n))
+        if dof not in known:
+            has = _some(known) or "no names"
+            raise ValueError(f"unknown degree of freedom {dof!r}; the structure has {has}")
+        return known.index(dof)
+
+    def direction(self, dofs: tuple[Dof, ...]) -> np.ndarray:
+        """The vector d (n,) of 1, -1 and 0 for which d.x is the displacement that `dofs` names."""
+        d = np.zeros(self.n, self.M.dtype)
+        for dof, sign in zip(dofs, (1, -1), strict=False):
+            d[self.index(dof)] += sign
+        if not d.any():
+            raise ValueError(f"{dofs!r} is one degree of freedom twice")
+        return d
+
+    def _check_joints(self) -> None:
+        for name, joint in zip(self.joint_names, self.joints, strict=True):
+            try:
+                tangential, normal = map(self.direction, (joint.tangential, joint.normal))
+            except ValueError as error:
+                raise ValueError(f"joint {name}: {error}") from None
+            if (abs(tangential) == abs(normal)).all():
+                raise ValueError(
+                    f"joint {name}: tangential {joint.tangential!r} and normal {joint.normal!r} "
+                    "are one direction"
+                )
+
+    def _forces(self, given: Mapping[Any, ArrayLike]) -> Float[Array, " n"]:
+        places = [self.index(dof) for dof in given]
+        twice = [dof for dof, place in zip(given, places, strict=True) if places.count(place) > 1]
+        if twice:
+            raise ValueError(f"F gives one degree of freedom twice: {_some(map(repr, twice))}")
+        forces = [number(f"F at {dof}", force) for dof, force in given.items()]
+        return jnp.zeros(self.n).at[np.array(places, int)].set(jnp.array(forces, float))
+
+    def _rebuilt(self, changes):
+        joints = {}
+        for name, joint in zip(self.joint_names, self.joints, strict=True):
+            here = f"{name}."
+            mine = {key.removeprefix(here): changes[key] for key in changes if key.startswith(here)}
+            joints[name] = rebuild(joint, changes | mine)
+        own = {name: getattr(self, name) for name in ("M", "C", "K", "F")}
+        if changes.keys() & own.keys():
+            own |= {name: changes[name] for name in own if name in changes}
+            return Structure(**own, joints=joints, names=self.names)
+        # The matrices are as they were: there is nothing to check or factorise again.
+        new = eqx.tree_at(lambda structure: structure.joints, self, tuple(joints.values()))
+        new._check_joints()
+        return new
+
+    def _known(self):
+        known = ["M", "C", "K", "F"]
+        for name, joint in zip(self.joint_names, self.joints, strict=True):
+            known += [*quantities(joint), *(f"{name}.{plain}" for plain in quantities(joint))]
+        return list(dict.fromkeys(known))
+
+    def _shown(self):
+        yield f"n={self.n}"
+        yield from (f"{name}={j!r}" for name, j in zip(self.joint_names, self.joints, strict=True))
+
+    @classmethod
+    def _from_document(cls, document, folder):
+        return cls(**read_structure(document, folder))
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write a TOML file, and beside it the matrices as a .npz file of the same name.
+
+        Both or neither: an error leaves the files of an earlier structure as they were.
+
+        **Raises:** `OSError` if a file cannot be written; `ValueError` if the structure holds a
+        batch, if `path` itself ends in .npz, and if there is a .npz file of that name which the
+        TOML file at `path` does not name.
+        """
+        path = Path(path)
+        matrices = path.with_suffix(".npz")
+        if matrices == path:
+            raise ValueError(f"path must be that of the TOML file, got {str(path)!r}")
+        require_single(self)
+        if matrices.exists() and not _names_matrices(path, matrices.name):
+            raise ValueError(
+                f"{matrices} is not of a structure saved as {path.name}: save under another name,"
+                " or remove it"
+            )
+        text = structure_text(self, matrices.name).encode()
+        # The TOML file comes last, so that it never names matrices of another structure.
+        write_together({matrices: npz_bytes(self), path: text})
+
+
+def _names_matrices(path: Path, matrices: str) -> bool:
+    """Whether `path` is a structure's TOML file that has its matrices in the file `matrices`."""
+    try:
+        table = read_toml(path.read_bytes()).get("structure")
+    except (OSError, ValueError):
+        return False
+    return isinstance(table, dict) and table.get("matrices") == matrices
+
+
+def load(path: str | os.PathLike) -> Scene | Structure:
+    """What a TOML file holds: a structure if it has a table of that name, else a scene.
+
+    **Raises:** as `Scene.load` and `Structure.load`.
+    """
+    with naming(path):
+        document = read_toml(read_bounded(path))
+        kind = Structure if "structure" in document else Scene
+        return kind._from_document(document, Path(path).parent)
+
+
+def require_single(structure: Structure) -> None:
+    """Refuse a structure that holds a batch: `jax.vmap` takes many."""
+    if structure.M.ndim != 2 or (structure.F is not None and structure.F.ndim != 1):
+        raise ValueError(
+            f"M must have two dimensions, got shape {structure.M.shape}; "
+            "use jax.vmap for many structures"
+        )
+    for joint in structure.joints:
+        require_scalar(joint)
+
+
+def _names(names: Iterable[str] | None, n: int) -> tuple[str, ...] | None:
+    if names is None:
+        return None
+    if isinstance(names, (set, frozenset, Mapping)):
+        raise TypeError(f"names must be in an order, got {names!r}")
+    names = (names,) if isinstance(names, str) else tuple(names)
+    printable = all(isinstance(name, str) and name and name.isprintable() for name in names)
+    if not printable or len(names) != n:
+        wanted = f"{n} printable strings, one a degree of freedom"
+        raise ValueError(f"names must be {wanted}, got {len(names)}: {_some(map(repr, names))}")
+    name, times = Counter(names).most_common(1)[0]
+    if times > 1:
+        raise ValueError(f"names must differ, got {name!r} more than once")
+    return names
+
+
+def _joints(
+    joints: Joint | Sequence[Joint] | Mapping[str, Joint],
+) -> tuple[tuple[Joint, ...], tuple[str, ...]]:
+    if isinstance(joints, Joint):
+        joints = [joints]
+    if isinstance(joints, Sequence) and not isinstance(joints, str):
+        joints = {f"joint_{i}": joint for i, joint in enumerate(joints, start=1)}
+    if not isinstance(joints, Mapping):
+        raise TypeError(f"joints must be a Joint, several or a mapping of them, got {joints!r}")
+    for name, joint in joints.items():
+        if not (isinstance(name, str) and re.fullmatch(r"[A-Za-z0-9_-]+", name)):
+            raise ValueError(f"a joint's name must be of letters, digits, _ and -, got {name!r}")
+        if not isinstance(joint, Joint):
+            raise TypeError(f"joint {name} must be a Joint, got {joint!r}")
+    return tuple(joints.values()), tuple(joints)
+
+
+def _some(items: Iterable[Any]) -> str:
+    texts = list(map(str, items))
+    return ", ".join(texts[:10]) + (f", ... ({len(texts)} in all)" if len(texts) > 10 else "")

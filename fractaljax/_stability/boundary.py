@@ -1,0 +1,301 @@
+"""The stability boundary as a curve in two quantities of a scene.
+
+Both axes are scaled to [0, 1]. The boundary is where the Hopf test function is 0, which is smooth
+on the scale of the stiffness however light the damping. `_continuation.py` follows it.
+"""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._base.batches import in_batches
+from .._base.parts import Record, flag, require_scalar, scalar, whole
+from .._base.ranges import is_logarithmic
+from .._contact.contact import Regime
+from .._continuation import Continuation, Curve, CurveEnd, trace
+from .._mechanism.oscillator import linearise
+from .._mechanism.quantities import (
+    own_quantities,
+    require_independent,
+    require_inside,
+    require_known,
+    substituted,
+    with_optional,
+)
+from .._mechanism.scene import Scene, require_kind
+from .critical_friction import critical_frequency, hopf_test_function
+from .stability import growth_rate_of_linearised
+
+_BATCH = 512  # points evaluated at once
+_LINES_MAX = 2000  # of the lattice, whose points grow with the square
+_UNDAMPED = 1e-12  # negative damping over sqrt(a + b) that may be rounding
+_MU_M_STEP = 0.3  # where Eq. 19 is discontinuous
+
+Window = tuple[str, float, float]
+
+
+class BranchEnd(eqx.Enumeration):
+    """Why a branch of a stability boundary ends."""
+
+    window = "at the edge of the window"
+    closed = "where it began"
+    regime = "where the regime of the joint changes"
+    undamped = "where both directions have lost their damping"
+    friction_correction = "at mu_m = 0.3, where Eq. 19 has a step"
+    lost = "where it could not be followed"
+
+
+class Branch(Record):
+    """One connected piece of a stability boundary, with squeal on its right."""
+
+    x: Float[np.ndarray, " k"]
+    y: Float[np.ndarray, " k"]
+    frequency: Float[np.ndarray, " k"]  # of the imaginary pair of eigenvalues [Hz]
+    growth_rate: Float[np.ndarray, " k"]  # [1/s], 0 up to rounding
+    start: BranchEnd
+    end: BranchEnd
+
+    @property
+    def closed(self) -> bool:
+        """Whether it is a loop; its last point is then its first."""
+        return bool(self.end == BranchEnd.closed)
+
+
+class Boundary(Record):
+    """Where the growth rate is 0 in a window of two quantities, as `hopf_boundary` returns it."""
+
+    scene: Scene
+    x: Window  # name and range
+    y: Window
+    branches: tuple[Branch, ...]
+    friction_slope: bool
+    squeals: bool  # at the corner (low, low) of the window
+    untraced: int  # crossings of the lattice that could not be followed
+
+    def __repr__(self) -> str:
+        x, y = (f"{name} from {low:g} to {high:g}" for name, low, high in (self.x, self.y))
+        plural = "" if len(self.branches) == 1 else "es"
+        rows = [f"stability boundary, {x}, {y}: {len(self.branches)} branch{plural}"]
+        for branch in self.branches:
+            ends = f"begins {BranchEnd[branch.start]}, ends {BranchEnd[branch.end]}"
+            rows.append(f"  {len(branch.x)} points, {'a loop' if branch.closed else ends}")
+        if not self.branches and not self.untraced:
+            side = "it squeals" if self.squeals else "stable against small disturbances"
+            rows.append(f"  none found: {side}")
+        if self.untraced:
+            rows.append(f"  {self.untraced} crossings of the lattice could not be followed")
+        return "\n".join(rows)
+
+
+def hopf_boundary(
+    scene: Scene,
+    x: Window,
+    y: Window,
+    *,
+    friction_slope: bool = True,
+    lines: int = 49,
+) -> Boundary:
+    """Trace where the growth rate is 0 in the window of two quantities of a scene.
+
+    `x` and `y` are (name, low, high): any quantity of the scene, or "K_t/K_n" at the scene's K_n
+    (the given stiffness ratio of a fractal contact), "omega_1/omega_2" at the scene's omega_2, and
+    "mu", the friction at the belt velocity, which scales the friction law as a whole. A range over
+    a decade or more is logarithmic. Every point lies on the boundary within 1e-12 of the window, or
+    what the rounding of the scene allows. Branches are found where they cross one of `lines` lines
+    each way, or dip between two of them; a loop within a cell can be missed. Where both directions
+    lose all their damping at once, along a whole line, the Hopf test function does not change sign
+    smoothly: such crossings are counted as `untraced`.
+
+    Not differentiable, and not for use under `jit`; see `critical_friction` for that.
+
+    **Raises:** `ValueError` for a name that is no quantity of the scene, two names that set the
+    same one, a range that is empty, inverted or outside the domain, or a scene that holds arrays.
+    """
+    require_kind("scene", scene, Scene)
+    require_scalar(scene)
+    friction_slope = flag("friction_slope", friction_slope)
+    lines = whole("lines", lines, 2, _LINES_MAX)
+    windows = [_window(scene, which, window) for which, window in (("x", x), ("y", y))]
+    names = (windows[0][0], windows[1][0])
+    require_independent(scene, names)
+    require_inside(scene, {window[0]: _decisive(scene, *window) for window in windows})
+    logarithmic = tuple(is_logarithmic(*window[1:]) for window in windows)
+    ends = np.array([window[1:] for window in windows])
+    ends[list(logarithmic)] = np.log(ends[list(logarithmic)])
+    low, high = jnp.asarray(ends.T, scene.oscillator.m.dtype)
+    scene = with_optional(scene, names)
+    field = _Field(_Plane(scene, low, high, names, logarithmic, friction_slope))
+    curves = Continuation(
+        field.equations,
+        low=np.zeros(2),
+        high=np.ones(2),
+        valid=field.damped,
+        tolerance=max(1e-12, field.rounding),
+    )
+    found, squeals, untraced = trace(curves, field.values, lines)
+    return Boundary(
+        scene=scene,
+        x=windows[0],
+        y=windows[1],
+        branches=tuple(_branch(field, windows, curve) for curve in found),
+        friction_slope=friction_slope,
+        squeals=squeals,
+        untraced=untraced,
+    )
+
+
+def _window(scene, which, window) -> Window:
+    """A range, checked; not yet against the domain of the scene."""
+    if not (isinstance(window, (tuple, list)) and len(window) == 3 and isinstance(window[0], str)):
+        raise ValueError(f"{which} must be (name, low, high), got {window!r}")
+    name, *ends = window
+    require_known(scene, name)
+    low, high = (float(scalar(f"{which} limit", end)) for end in ends)
+    if not low < high:
+        raise ValueError(f"{which} must go from a lower to a higher value, got {window!r}")
+    return name, low, high
+
+
+def _decisive(scene, name, low, high) -> np.ndarray:
+    """The values of a range that decide whether all of it is inside the domain of the scene."""
+    own = own_quantities(scene)
+    # mu(V), by which "mu" scales the friction law, is least at V = v_m: perhaps between the ends.
+    other = {"V": "v_m", "v_m": "V"}.get(name)
+    value = own[other].value if other in own else None
+    least = low if value is None else min(max(float(value), low), high)
+    return np.array([low, least, high])
+
+
+# --- the function that vanishes on the boundary -------------------------------------------
+
+
+class _Point(eqx.Module):
+    """The Hopf test function at a point, and what the result shows of it."""
+
+    test: jax.Array
+    frequency: jax.Array
+    growth_rate: jax.Array
+    damping: Float[Array, "2"]  # over sqrt(a + b)
+    regime: Regime | None  # of a fractal joint
+    mu_m: jax.Array | None  # of a fractal joint, for which Eq. 19 corrects
+
+
+class _Plane(eqx.Module):
+    """A scene over the unit square: two of its quantities, each scaled to its range."""
+
+    scene: Scene
+    low: Float[Array, "2"]  # of each quantity, or of its logarithm
+    high: Float[Array, "2"]
+    names: tuple[str, str] = eqx.field(static=True)
+    logarithmic: tuple[bool, ...] = eqx.field(static=True)
+    friction_slope: bool = eqx.field(static=True)
+
+    def quantities(self, u) -> list[jax.Array]:
+        found = self.low + u * (self.high - self.low)
+        return [jnp.exp(found[i]) if log else found[i] for i, log in enumerate(self.logarithmic)]
+
+    def at(self, u) -> _Point:
+        scene = substituted(self.scene, dict(zip(self.names, self.quantities(u), strict=True)))
+        contact, friction = scene.contact, scene.friction
+        if contact.fractal:
+            state = contact.state(friction.mu_s, friction.mu_m)
+            K_n, K_t, law = state.K_n, state.K_t, (state.regime, friction.mu_m)
+        else:
+            (K_n, K_t), law = contact.stiffness(friction.mu_s, friction.mu_m), (None, None)
+        lin = linearise(scene.oscillator, friction, K_n, K_t, self.friction_slope)
+        damping = jnp.stack([lin.c_1, lin.c_2]) / jnp.sqrt(lin.a + lin.b)
+        growth = growth_rate_of_linearised(lin)
+        return _Point(hopf_test_function(lin), critical_frequency(lin), growth, damping, *law)
+
+
+@jax.jit
+def _at(plane: _Plane, u):
+    """Gradient (2,) of the test function, and the point."""
+
+    def both(u):
+        point = plane.at(u)
+        return point.test, point
+
+    return jax.jacfwd(both, has_aux=True)(u)
+
+
+@jax.jit
+def _tests(plane: _Plane, us):
+    """Test function (k,) and gradient (k, 2) at points (k, 2)."""
+    gradients, points = jax.vmap(_at, (None, 0))(plane, us)
+    return points.test, gradients
+
+
+class _Field:
+    """The test function for NumPy: at many points, or at one with all that is known there."""
+
+    def __init__(self, plane: _Plane):
+        self.plane, self.dtype = plane, plane.low.dtype
+        self.rounding = 10 * float(jnp.finfo(self.dtype).eps)
+        # A point is asked for its zero, for its damping and for what the result shows.
+        self._at = functools.lru_cache(8)(lambda u: _at(plane, jnp.asarray(u, self.dtype)))
+
+    def at(self, u) -> _Point:
+        return self._at(tuple(u))[1]
+
+    def equations(self, u):
+        gradient, point = self._at(tuple(u))
+        return np.asarray(point.test, float)[None], np.asarray(gradient, float)[None]
+
+    def values(self, us):
+        """Test function (k,) and gradient (k, 2) at any number of points."""
+
+        def program(us):
+            return _tests(self.plane, jnp.asarray(us, self.dtype))
+
+        tests, gradients = (np.asarray(x, float) for x in in_batches(program, _BATCH, us))
+        if np.isnan(tests).any():
+            place = zip(self.plane.names, self.quantities(us[np.isnan(tests)][0]), strict=True)
+            where = ", ".join(f"{name} = {value:.6g}" for name, value in place)
+            raise ValueError(f"stability cannot be computed at {where}")
+        return tests, gradients
+
+    def damped(self, u) -> bool:
+        """Whether both directions are; else the test function can be 0 without a Hopf point."""
+        return bool(np.asarray(self.at(u).damping).min() >= -max(_UNDAMPED, self.rounding**2))
+
+    def quantities(self, u) -> list[float]:
+        return [float(x) for x in self.plane.quantities(jnp.asarray(u, self.dtype))]
+
+    def why(self, end: CurveEnd, u, before) -> BranchEnd:
+        """Why a branch ends at u, coming from the point `before`."""
+        if end in (CurveEnd.edge, CurveEnd.closed):
+            return BranchEnd.window if end is CurveEnd.edge else BranchEnd.closed
+        here = self.at(u)
+        if np.abs(here.damping).max() < 1e-5:
+            return BranchEnd.undamped
+        if here.mu_m is not None and abs(float(here.mu_m) - _MU_M_STEP) < 1e-6:
+            return BranchEnd.friction_correction
+        ahead = (u - before) / np.linalg.norm(u - before)
+        for reach in 10.0 ** np.arange(-7, -2):
+            for direction in (ahead, ahead[::-1], -ahead[::-1]):
+                beside = self.at(np.clip(u + reach * direction, 0, 1))
+                if here.regime is not None and not bool(beside.regime == here.regime):
+                    return BranchEnd.regime
+        return BranchEnd.lost
+
+
+def _branch(field: _Field, windows, curve: Curve) -> Branch:
+    points = [field.at(u) for u in curve.points]
+    places = np.array([field.quantities(u) for u in curve.points])
+    # A point on the edge has the limit itself, not the exponential of its logarithm.
+    for i, (_, low, high) in enumerate(windows):
+        scaled = curve.points[:, i]
+        places[:, i] = np.where(scaled == 0, low, np.where(scaled == 1, high, places[:, i]))
+    return Branch(
+        x=places[:, 0],
+        y=places[:, 1],
+        frequency=np.array([float(point.frequency) for point in points]),
+        growth_rate=np.array([float(point.growth_rate) for point in points]),
+        start=field.why(curve.start, *curve.points[:2]),
+        end=field.why(curve.end, *curve.points[:-3:-1]),
+    )

@@ -1,0 +1,219 @@
+"""Linear stability of steady sliding: eigenvalues of a scene or a structure, and its modes.
+
+A scene takes the closed form of `quartic.py`, a structure LAPACK's route of `quadratic.py`.
+"""
+
+import functools
+import math
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from .._base.parts import Record
+from .._mechanism.oscillator import Linearised, linearise
+from .._mechanism.quantities import sliding_friction
+from .._mechanism.scene import Scene, stiffness
+from .._mechanism.structure import Structure
+from . import quartic
+from .linearise import assembled, linearised
+from .margin import damping_ratios, least_damping_ratio, margin_of
+from .quadratic import solve
+
+
+class Mode(NamedTuple):
+    """One mode, as `Stability.unstable` and `least_damped` list them."""
+
+    growth_rate: float  # [1/s]; > 0: it squeals
+    frequency: float  # [Hz]
+    damping_ratio: float  # -Re/|s|
+    shape: np.ndarray  # (n,) complex displacements, the largest of them 1
+    largest: int | str  # the degree of freedom of that one, by name where it has one
+    resolution: float  # rounding error of the growth rate, at most [1/s]
+
+
+class Stability(Record):
+    """Linear stability of steady sliding, as `stability` returns it, for n degrees of freedom.
+
+    `resolutions` bound the rounding error of the real part of each eigenvalue: a smaller real part
+    has no sign. A rigid-body mode of a structure, with K x = 0 within rounding,
+    has an eigenvalue and a damping ratio of exactly 0, and does not count in the margin.
+    """
+
+    eigenvalues: Complex[Array, " 2*n"]  # [1/s], largest real part first
+    growth_rate: Float[Array, ""]  # largest real part [1/s]; > 0: it squeals
+    frequency: Float[Array, ""]  # of the same eigenvalue [Hz]
+    damping_ratio: Float[Array, ""]  # of the same eigenvalue, -Re/|s|
+    margin: Float[Array, ""]  # > 0 exactly where all modes decay, see `margin`
+    resolutions: Float[Array, " 2*n"]  # [1/s]
+    shapes: Complex[Array, "2*n n"]  # displacements, the largest of each 1
+    names: tuple[str, ...] | None = eqx.field(static=True)  # of the degrees of freedom
+
+    @property
+    def resolution(self) -> Float[Array, ""]:
+        """Rounding error of the growth rate, at most [1/s]."""
+        return self.resolutions[..., 0]
+
+    @property
+    def frequencies(self) -> Float[Array, " 2*n"]:
+        """Of each eigenvalue [Hz]."""
+        return jnp.abs(self.eigenvalues.imag) / (2 * jnp.pi)
+
+    @property
+    def damping_ratios(self) -> Float[Array, " 2*n"]:
+        """-Re/|s| of each eigenvalue s, and 0 where s is 0."""
+        return damping_ratios(self.eigenvalues)
+
+    def unstable(self) -> list[Mode]:
+        """The modes that grow, the fastest first, one of each conjugate pair.
+
+        A real part within its resolution of 0 does not count: see `unresolved`.
+
+        **Raises:** `ValueError` for a batch.
+        """
+        return [mode for mode in self._modes() if mode.growth_rate > mode.resolution]
+
+    def unresolved(self) -> list[Mode]:
+        """The modes that may grow or decay within rounding, without rigid-body modes.
+
+        All modes without damping are among them.
+
+        **Raises:** `ValueError` for a batch.
+        """
+        # "not >" also holds for NaN, where the range of numbers ends.
+        modes = [mode for mode in self._modes() if not abs(mode.growth_rate) > mode.resolution]
+        return [mode for mode in modes if mode.growth_rate or mode.frequency]
+
+    def least_damped(self, count: int = 10) -> list[Mode]:
+        """The `count` oscillating modes with the least damping ratios, the least first.
+
+        **Raises:** `ValueError` for a batch.
+        """
+        modes = [mode for mode in self._modes() if mode.frequency > 0]
+        return sorted(modes, key=lambda mode: mode.damping_ratio)[:count]
+
+    def _modes(self) -> list[Mode]:
+        if self.eigenvalues.ndim != 1:
+            raise ValueError(f"modes are listed of one result, got {self.eigenvalues.shape}")
+        modes, columns = [], map(np.asarray, (self.eigenvalues, self.resolutions, self.shapes))
+        for s, resolution, shape in zip(*columns, strict=True):
+            if s.imag >= 0:
+                largest = int(np.abs(shape).argmax())
+                mode = Mode(
+                    growth_rate=float(s.real),
+                    frequency=float(s.imag) / (2 * np.pi),
+                    damping_ratio=float(-s.real / abs(s)) if s else 0.0,
+                    shape=shape,
+                    largest=largest if self.names is None else self.names[largest],
+                    resolution=float(resolution),
+                )
+                modes.append(mode)
+        return modes
+
+    def _shown(self):
+        for name in ("growth_rate", "frequency", "damping_ratio", "margin"):
+            yield f"{name}={getattr(self, name)}"
+        yield f"eigenvalues: {self.eigenvalues.shape}"
+
+
+@functools.partial(jax.jit, static_argnames="friction_slope")
+def growth_rate(scene: Scene | Structure, friction_slope: bool = True) -> Float[Array, ""]:
+    """Largest real part of the eigenvalues [1/s], a scalar; above 0 the scene squeals.
+
+    `friction_slope=False` leaves out the slope of the friction law, as the source's Eq. 43 does.
+    Towards coalescing eigenvalues the derivative grows without bound. Exactly there it is infinite,
+    and some finite number is returned. NaN where the numbers leave the range in which a sign can
+    be told (`dimensionless`).
+
+    **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`; or if a structure without F
+    has friction with a slope.
+    """
+    if isinstance(scene, Structure):
+        s = solve(*assembled(scene, friction_slope)).s
+        # An argmax: sorting would double the time to compile.
+        return s.real[jnp.argmax(s.real)]
+    return growth_rate_of_linearised(linearised(scene, friction_slope))
+
+
+def growth_rate_of_linearised(lin: Linearised) -> Float[Array, ""]:
+    """Largest real part of the roots of a characteristic polynomial [1/s], a scalar."""
+    return quartic.rightmost_root(lin).real
+
+
+@functools.partial(jax.jit, static_argnames="friction_slope")
+def stability(scene: Scene | Structure, friction_slope: bool = True) -> Stability:
+    """Eigenvalues of Eq. 43 and what follows from them; arguments and errors as `growth_rate`."""
+    if isinstance(scene, Structure):
+        s, x, error = solve(*assembled(scene, friction_slope))
+        order = jnp.lexsort((-s.imag, -s.real))
+        s, x, error = s[order], x[order], error[order]
+        margin, names = least_damping_ratio(s), scene.names
+    else:
+        K_n, K_t = stiffness(scene)
+        lin = linearise(scene.oscillator, scene.friction, K_n, K_t, friction_slope)
+        s = quartic.roots(lin)
+        x = _displacements(lin, s, sliding_friction(scene) / scene.oscillator.m, K_n, K_t)
+        error, margin, names = quartic.resolutions(lin, s), margin_of(lin), ("x1", "x2")
+    largest = jnp.abs(jax.lax.stop_gradient(x)).argmax(axis=1)
+    return Stability(
+        eigenvalues=s,
+        growth_rate=s[0].real,
+        frequency=jnp.abs(s[0].imag) / (2 * jnp.pi),
+        damping_ratio=damping_ratios(s[0]),
+        margin=margin,
+        resolutions=error,
+        shapes=x / jnp.take_along_axis(x, largest[:, None], axis=1),
+        names=names,
+    )
+
+
+def _displacements(lin: Linearised, s, mobility, K_n, K_t) -> Complex[Array, "4 2"]:
+    """(x1, x2) of each eigenvalue s of a scene, of any length; `mobility` is mu/m.
+
+    (s^2 + c_1 s + a) x1 = mu K_n/m x2 and (s^2 + c_2 s + b) x2 = -mu K_t/m x1.
+    """
+    unit = lin.a + lin.b
+    first, second = ((s * (s + c) + k) / unit for c, k in ((lin.c_1, lin.a), (lin.c_2, lin.b)))
+    to_1, to_2 = (jnp.full_like(s, mobility * K / unit) for K in (K_n, K_t))
+    # Either equation will do; the other may be 0 = 0.
+    size_1, size_2 = (jnp.abs(y.real) + jnp.abs(y.imag) for y in (first, second))
+    by_first = size_1 + to_1.real >= size_2 + to_2.real
+    x = jnp.stack([jnp.where(by_first, to_1, second), jnp.where(by_first, first, -to_2)], axis=-1)
+    # Two equal modes without coupling: any shape is one.
+    none = (x == 0).all(axis=-1, keepdims=True)
+    return jnp.where(none, jnp.array([1, 0], x.dtype)[None], x)
+
+
+def require_computable(
+    scene: Scene, friction_slope: bool = True, modes: Stability | None = None
+) -> None:
+    """Refuse a scene whose growth rate or margin is NaN, naming the quantity that causes it.
+
+    `modes` is its `stability`, where that is known already.
+
+    **Raises:** `ValueError` as said.
+    """
+    modes = stability(scene, friction_slope) if modes is None else modes
+    if math.isfinite(modes.growth_rate) and math.isfinite(modes.margin):
+        return
+    K_n, K_t = stiffness(scene)
+    lin = linearise(scene.oscillator, scene.friction, K_n, K_t, friction_slope)
+    found = {
+        "K_n [N/m]": K_n,
+        "K_t [N/m]": K_t,
+        "the friction at V": sliding_friction(scene),
+        "(K_t/m + omega_1^2) [1/s^2]": lin.a,
+        "(K_n/m + omega_2^2) [1/s^2]": lin.b,
+        "the damping of x1 [1/s]": lin.c_1,
+        "the damping of x2 [1/s]": lin.c_2,
+        "the coupling mu^2 K_n K_t/m^2 [1/s^4]": lin.g,
+    }
+    names = [name for name, value in found.items() if not math.isfinite(value)]
+    if not names:  # the largest of damping and coupling as rates
+        rates = dict(zip(list(found)[-3:], (abs(lin.c_1), abs(lin.c_2), lin.g**0.25), strict=True))
+        names = [max(rates, key=lambda name: float(rates[name]))]
+    value = found[names[0]]
+    raise ValueError(f"stability cannot be computed in {lin.a.dtype}: {names[0]} is {value:.6g}")

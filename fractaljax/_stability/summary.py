@@ -1,0 +1,191 @@
+"""The stability of scenes and structures as tables that people read."""
+
+import functools
+import math
+
+import jax
+import numpy as np
+
+from .._base.table import table
+from .._contact.contact import Regime
+from .._mechanism.quantities import sliding_friction
+from .._mechanism.scene import Scene, stiffness
+from .._mechanism.structure import Joint, Structure
+from .._surface.roughness import roughness
+from .critical_friction import critical_friction
+from .linearise import NO_EQUILIBRIUM, assemble
+from .stability import Stability, require_computable, stability
+
+ABSENT = "-"
+_STABLE = "stable against small disturbances"  # all that a growth rate can say
+_ROUNDING = 1e-14  # relative: growth rates and excesses of friction below it say nothing
+_LEAST_DAMPED = 10  # stable modes of a structure that its table lists
+
+
+@functools.partial(jax.jit, static_argnames="friction_slope")
+def _numbers(scene: Scene, friction_slope: bool):
+    """Stability, stiffness and state of the contact, in one program: eager operations are slow."""
+    friction, state = scene.friction, None
+    if scene.contact.fractal:
+        state = scene.contact.state(friction.mu_s, friction.mu_m)
+    return stability(scene, friction_slope), stiffness(scene), state, sliding_friction(scene)
+
+
+def scene_rows(
+    scene: Scene, friction_slope: bool = True, wavelengths: tuple[float, float] | None = None
+) -> dict[str, str]:
+    """The joint of a scene and its critical mode: row titles with units, and values.
+
+    With the longest and the shortest of the `wavelengths` [m] to count, the roughness as well.
+    """
+    modes, K, state, _ = _numbers(scene, friction_slope)
+    contact, surface, after = scene.contact, {}, {}
+    if contact.fractal:
+        surface = {"D": f"{contact.surface.D:.6g}", "G [m]": f"{contact.surface.G:.6g}"}
+        if wavelengths is not None:
+            rough = roughness(contact.surface, *wavelengths)
+            surface |= {"Sq [m]": f"{rough.Sq:.6g}", "Sdq": f"{rough.Sdq:.6g}"}
+        slip = state.slip_ratio
+        after = {
+            "regime": Regime[state.regime].split(":")[0],
+            "a_l/a_e": f"{np.exp(np.asarray(state.log_area_ratio)):.6g}",
+            "Q_e/(mu_s P)": "not evaluated" if slip is None else f"{slip:.6g}",
+        }
+    critical = {
+        "growth rate [1/s]": f"{modes.growth_rate:+.6g}",
+        "frequency [Hz]": f"{modes.frequency:.6g}",
+        "damping ratio": f"{modes.damping_ratio:+.6g}",
+    }
+    return surface | _stiffness_rows(K) | after | critical
+
+
+def _stiffness_rows(K) -> dict[str, str]:
+    K_n, K_t = map(float, K)
+    ratio = f"{K_t / K_n:.6g}" if K_n > 0 else ABSENT
+    return {"K_n [N/m]": f"{K_n:.6g}", "K_t [N/m]": f"{K_t:.6g}", "K_t/K_n": ratio}
+
+
+def stability_table(scene: Scene, friction_slope: bool = True) -> str:
+    """The rows of one scene, its verdict, every eigenvalue, and a remark on its friction.
+
+    **Raises:** `ValueError` if the growth rate cannot be computed.
+    """
+    modes, _, _, friction = _numbers(scene, friction_slope)
+    require_computable(scene, friction_slope, modes)
+    critical = float(critical_friction(scene, friction_slope))
+    rows = scene_rows(scene, friction_slope) | verdict(modes)
+    rows |= {
+        "margin": f"{modes.margin:+.6g}",
+        "friction at V": f"{friction:.6g}",
+        "critical friction": "none" if math.isinf(critical) else f"{critical:.6g}",
+    }
+    rows |= {
+        f"eigenvalue {i} [1/s]": f"{s.real:+.6g} {s.imag:+.6g}i"
+        for i, s in enumerate(modes.eigenvalues.tolist(), start=1)
+    }
+    return "\n".join([table([""], [rows]), *friction_remark(scene, scene.oscillator.V)])
+
+
+def verdict(modes: Stability) -> dict[str, str]:
+    """The growth rate of a scene as a row, and what it means."""
+    growth, margin = float(modes.growth_rate) + 0.0, float(modes.margin)
+    rounding = _ROUNDING * np.abs(np.asarray(modes.eigenvalues)).max()
+    verdict = "it squeals" if growth > 0 else _STABLE
+    if abs(growth) <= rounding or growth * margin > 0:
+        # With heavy damping, or without any, rounding can decide the sign of the growth rate. The
+        # sign of the margin, if it is not 0, is right.
+        verdict = "0 to rounding: it neither grows nor dies out"
+        if margin != 0:
+            verdict = f"0 to rounding; by its margin {'it squeals' if margin < 0 else _STABLE}"
+    return {"growth rate [1/s]": f"{growth:+.6g}  ({verdict})"}
+
+
+@jax.jit
+def _friction(law, speed):
+    return law.coefficient(speed), law.mu_s
+
+
+def friction_remark(scene: Scene, speed) -> list[str]:
+    """A line if friction exceeds mu_s at a sliding speed [m/s], else none.
+
+    Speeds and quantities of the scene may be arrays of one shape: the largest excess is shown.
+    """
+    mu, mu_s = _friction(scene.friction, speed)
+    shown = np.broadcast_arrays(*map(np.asarray, (speed, mu, mu_s)))
+    speeds, mu, static = (values.ravel() for values in shown)
+    worst = int((mu / static).argmax())
+    if not mu[worst] > static[worst] * (1 + _ROUNDING):
+        return []
+    return [
+        f"remark: at a sliding speed of {speeds[worst]:.6g} m/s the friction law gives "
+        f"{mu[worst]:.6g}, above mu_s = {static[worst]:.6g}: it is not meant for such speeds"
+    ]
+
+
+def structure_table(structure: Structure, friction_slope: bool = True) -> str:
+    """The joints of a structure, its verdict, and its unstable and its least damped modes.
+
+    **Raises:** `ValueError` as `assemble`, if the structure has no equilibrium under F, and if its
+    numbers leave the range of floating-point numbers.
+    """
+    try:
+        matrices = assemble(structure, friction_slope)
+    except RuntimeError:  # a message of many lines from inside a compiled program
+        raise ValueError(NO_EQUILIBRIUM) from None
+    for name, X in zip("MCK", matrices, strict=True):
+        if not np.isfinite(np.asarray(X)).all():
+            raise ValueError(f"{name} with the joints attached must be finite")
+    modes = stability(structure, friction_slope)
+    if not np.isfinite(np.asarray(modes.eigenvalues)).all():
+        raise ValueError(f"M, C and K have no eigenvalues in the range of {modes.margin.dtype}")
+    unstable, unresolved = modes.unstable(), modes.unresolved()
+    whole = {
+        "degrees of freedom": f"{structure.n}",
+        "unstable modes": f"{len(unstable)}  ({_structure_verdict(modes, unstable, unresolved)})",
+        "growth rate [1/s]": f"{modes.growth_rate:+.6g}  (to +-{modes.resolution:.1g})",
+        "least damping ratio": f"{modes.margin:+.6g}",
+    }
+    tables = [table([""], [whole])]
+    if structure.joints:
+        joints = [_joint_rows(joint) for joint in structure.joints]
+        shown = [name for name in joints[0] if any(rows[name] != ABSENT for rows in joints)]
+        joints = [{name: rows[name] for name in shown} for rows in joints]
+        tables.append(table(list(structure.joint_names), joints))
+    least = modes.least_damped(_LEAST_DAMPED + len(unstable) + len(unresolved))
+    listed = [(mode, "unstable") for mode in unstable]
+    listed += [
+        (mode, f"unresolved to +-{mode.resolution:.1g}") for mode in unresolved[:_LEAST_DAMPED]
+    ]
+    listed += [(mode, "") for mode in least if mode.growth_rate < -mode.resolution]
+    if listed:
+        columns = ["frequency [Hz]", "growth rate [1/s]", "damping ratio", "moves most", ""]
+        titles = [f"mode {i}" for i in range(1, len(listed) + 1)]
+        cells = zip(*(_mode_cells(*item) for item in listed), strict=True)
+        tables.append(table(columns, [dict(zip(titles, c, strict=True)) for c in cells]))
+    return "\n\n".join(tables)
+
+
+def _mode_cells(mode, remark) -> list[str]:
+    numbers = (f"{mode.growth_rate:+.6g}", f"{mode.damping_ratio:+.6g}")
+    return [f"{mode.frequency:.6g}", *numbers, f"{mode.largest}", remark]
+
+
+def _structure_verdict(modes, unstable, unresolved) -> str:
+    rigid = np.asarray(modes.resolutions)[np.asarray(modes.eigenvalues) == 0]
+    also = [f"{len(unresolved)} unresolved"] if unresolved else []
+    if rigid.size:
+        also.append(f"{rigid.size} eigenvalues 0 to +-{rigid.max():.1g} 1/s: rigid bodies")
+    if unstable:
+        return "; ".join(["it squeals", *also])
+    return "; ".join([*also, f"else {_STABLE}" if also else _STABLE])
+
+
+def _joint_rows(joint: Joint) -> dict[str, str]:
+    rows = dict.fromkeys(("D", "G [m]"), ABSENT) | _stiffness_rows(joint.stiffness())
+    rows |= {"friction coefficient": f"{joint.coefficient():.6g}", "regime": ABSENT}
+    if joint.contact.fractal:
+        surface = joint.contact.surface
+        state = joint.contact.state(joint.friction.mu_s, joint.friction.mu_m)
+        rows |= {"D": f"{surface.D:.6g}", "G [m]": f"{surface.G:.6g}"}
+        rows["regime"] = Regime[state.regime].split(":")[0]
+    return rows

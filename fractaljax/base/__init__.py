@@ -1,1 +1,0 @@
-"""What every other folder builds on: checked numbers, safe functions, batches, TOML files."""
