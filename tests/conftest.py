@@ -18,7 +18,7 @@ def pytest_configure(config):
     config.addinivalue_line("filterwarnings", f"ignore:{cache}")
     warnings.simplefilter("error")
     # Most of a run is compilation: workers, subprocesses and later runs share what is compiled.
-    from fractaljax.command.compiled import FIRST_QUIET_JAX
+    from fractaljax._cli.compiled import FIRST_QUIET_JAX
 
     if jax.__version_info__ < FIRST_QUIET_JAX:
         return

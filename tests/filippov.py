@@ -1,11 +1,11 @@
-"""Second opinion on the stick-slip motion: event by event on the exact friction law, with DOP853.
+"""An independent solver for the stick-slip motion: event by event, with SciPy's DOP853.
 
-Written apart from the package and without it. A trajectory is cut into phases in each of which
-both directions slip forward (1), slip backward (-1) or stick (0), so that the motion is smooth.
-What ends a phase is linear in the state: over one step of the integrator it is a polynomial of
-degree 7 of time, and its zeros are looked for between its turning points, so that no reversal is
-too short to be seen. Inside, time is in 1/omega, length in V/omega, and the state is
-y = [x1, x2, w1, w2] with w = 1 - x' the sliding velocity over V, exactly 0 in stick.
+It uses nothing of the package. A trajectory is cut into phases, in each of which both directions
+slip forward (1), slip backward (-1) or stick (0), so that the motion is smooth. What ends a phase
+is linear in the state: over one step of the integrator it is a polynomial of degree 7 in time. Its
+zeros are searched between its extrema, so that no reversal is too short. Inside, time is in
+1/omega, length in V/omega, and the state is y = [x1, x2, w1, w2] with w = 1 - x' the sliding
+velocity over V, exactly 0 in stick.
 """
 
 from collections.abc import Callable, Iterator
@@ -20,7 +20,7 @@ from numpy.polynomial import polynomial as poly
 from scipy.integrate import DOP853, OdeSolution, solve_ivp
 from scipy.optimize import brentq
 
-MOST_TURNS = 4  # maxima of x1 in one period
+MOST_RETURNS = 4  # maxima of x1 in one period
 FAR = 1e3  # in V/omega and V: a motion beyond it has diverged
 UNIT = np.eye(5)  # rows over [1, x1, x2, w1, w2]
 # Column j: term j of 1, x, x (1-x), x^2 (1-x), ..., which a DOP853 step is made of, in powers of x.
@@ -142,7 +142,7 @@ PLAIN = Mechanism(
 
 @dataclass(frozen=True)
 class Phase:
-    """A stretch of motion with constant signs; in SI units where `run` returns it."""
+    """The motion between two switches, with constant signs; in SI units where `run` returns it."""
 
     signs: tuple[int, ...]
     t0: float
@@ -151,15 +151,15 @@ class Phase:
     end: np.ndarray
     dense: Callable
     steps: list = field(repr=False, default_factory=list)  # (share used, length, polynomials)
-    turned: bool = False  # ends at a maximum of x1
+    maximum: bool = False  # whether it ends at a maximum of x1
 
 
 @dataclass(frozen=True)
 class Cycle:
-    """A periodic motion in SI units, or else only the `kind` of motion that there is."""
+    """A periodic motion in SI units, or only the `kind` of another motion."""
 
     kind: str  # "cycle", "equilibrium", "diverged", "not periodic"
-    turns: int = 0  # maxima of x1 in one period
+    returns: int = 0  # maxima of x1 in one period
     period: Any = None
     amplitude: Any = None  # peak to peak of x1, x2
     velocity_min: Any = None  # of x1', x2'
@@ -173,8 +173,8 @@ class Cycle:
     multipliers: Any = None  # its eigenvalues; the trivial 1 is not among them
 
 
-def turning(c) -> list[float]:
-    """Turning points inside 0..1 of a polynomial (rising powers); others may be among them."""
+def extrema(c) -> list[float]:
+    """Extrema inside 0..1 of a polynomial (rising powers); other points may be among them."""
     slope = poly.polyder(c)
     found = poly.polyroots(poly.polytrim(slope, 1e-18 * abs(slope).max())).real
     return sorted(x for x in found if 0 < x < 1)
@@ -186,7 +186,7 @@ def zeros(c, falling=False) -> list[float]:
     if corners.min() > 0 or corners.max() < 0:
         return []
     found = []
-    for low, high in pairwise([0.0, *turning(c), 1.0]):
+    for low, high in pairwise([0.0, *extrema(c), 1.0]):
         p, q = poly.polyval(low, c), poly.polyval(high, c)
         if p >= 0 > q or (p < 0 <= q and not falling):
             found.append(brentq(poly.polyval, low, high, (c,), xtol=1e-16))
@@ -205,8 +205,8 @@ def land(slope, y, h, row, rtol):
     return h, end
 
 
-def phases(mechanism, y, rtol, t1=np.inf, turns=False) -> Iterator[Phase]:
-    """The phases from the state y on, up to t1; with `turns`, cut at the maxima of x1 too."""
+def phases(mechanism, y, rtol, t1=np.inf, maxima=False) -> Iterator[Phase]:
+    """The phases from the state y on, up to t1; with `maxima`, cut at the maxima of x1 too."""
     y, t, longest = np.array(y, float), 0.0, 3.2 * rtol**0.125
     signs, known = [0, 0], [0, 0]  # known: the order of the zero of w at the start of a phase
     for i in (0, 1):
@@ -221,7 +221,7 @@ def phases(mechanism, y, rtol, t1=np.inf, turns=False) -> Iterator[Phase]:
                 watch.append((i, 0, s * UNIT[3 + i], known[i]))
             else:
                 watch += [(i, s, row, 0) for s, row in zip((1, -1), mechanism.hold(i), strict=True)]
-        if turns and signs[0] == 1:
+        if maxima and signs[0] == 1:
             watch.append((2, 0, UNIT[0] - UNIT[3], int(y[2] == 1)))
         solver = DOP853(slope, t, y, t1, max_step=longest, rtol=rtol, atol=rtol)
         start, t0, steps, pieces, events = y, t, [], [], []
@@ -272,34 +272,36 @@ def run(mechanism, start, t1, rtol=1e-12) -> list[Phase]:
     return found
 
 
-def round_trip(mechanism, z, turns, rtol) -> list[Phase]:
-    """From the maximum z = (x1, x2, w2) of x1 to the one `turns` later."""
+def round_trip(mechanism, z, returns, rtol) -> list[Phase]:
+    """From the maximum z = (x1, x2, w2) of x1 to the one `returns` later."""
     found, y = [], np.array([z[0], z[1], 1, z[2]])
     if mechanism.slope((1, 0))(0, y)[2] <= 0:
         raise ArithmeticError("not a maximum of x1")
-    for p in phases(mechanism, y, rtol, FAR, turns=True):
+    for p in phases(mechanism, y, rtol, FAR, maxima=True):
         found.append(p)
-        if sum(p.turned for p in found) == turns:
+        if sum(p.maximum for p in found) == returns:
             return found
     raise Diverged
 
 
-def returned(mechanism, z, turns, rtol) -> np.ndarray:
+def returned(mechanism, z, returns, rtol) -> np.ndarray:
     """The return map of (x1, x2, w2)."""
-    return round_trip(mechanism, z, turns, rtol)[-1].end[[0, 1, 3]]
+    return round_trip(mechanism, z, returns, rtol)[-1].end[[0, 1, 3]]
 
 
-def return_slopes(mechanism, z, turns, rtol, h=1e-5) -> np.ndarray:
+def return_slopes(mechanism, z, returns, rtol, h=1e-5) -> np.ndarray:
     """Jacobian of the return map, by central differences."""
-    ends = [returned(mechanism, z + d, turns, rtol) for d in h * np.vstack([np.eye(3), -np.eye(3)])]
+    ends = [
+        returned(mechanism, z + d, returns, rtol) for d in h * np.vstack([np.eye(3), -np.eye(3)])
+    ]
     return (np.array(ends[:3]) - ends[3:]).T / (2 * h)
 
 
-def close(mechanism, z, turns, rtol, slopes=None) -> np.ndarray:
+def close(mechanism, z, returns, rtol, slopes=None) -> np.ndarray:
     """The fixed point of the return map near z, by Broyden's method."""
-    matrix = return_slopes(mechanism, z, turns, rtol) if slopes is None else slopes
+    matrix = return_slopes(mechanism, z, returns, rtol) if slopes is None else slopes
     z, best, matrix = np.array(z), np.inf, matrix - np.eye(3)
-    residual = returned(mechanism, z, turns, rtol) - z
+    residual = returned(mechanism, z, returns, rtol) - z
     for _ in range(40):
         size = abs(residual).max()
         if size < 1e-14 or (best < 1e-11 and size > best / 2):
@@ -307,26 +309,26 @@ def close(mechanism, z, turns, rtol, slopes=None) -> np.ndarray:
         best = min(best, size)
         step = -np.linalg.solve(matrix, residual)
         z = z + step
-        residual = returned(mechanism, z, turns, rtol) - z
+        residual = returned(mechanism, z, returns, rtol) - z
         matrix = matrix + np.outer(residual, step) / (step @ step)
     raise ArithmeticError("no fixed point")
 
 
-def measure(mechanism, z, turns, rtol=1e-12) -> Cycle:
-    """What there is to tell of the periodic motion through the maximum z of x1.
+def measure(mechanism, z, returns, rtol=1e-12) -> Cycle:
+    """Everything about the periodic motion through the maximum z of x1.
 
-    margins: "graze", the smallest turning value of w in slip and of the reserve of friction in
-    stick; "decision", the smallest reserve or excess where a slip ended; "shortest", the share of
-    the shortest phase in the period.
+    margins: "graze", the smallest extremum of w in slip and of the distance from the friction
+    limits in stick; "decision", the smallest such distance, of either sign, where a slip ended;
+    "shortest", the share of the shortest phase in the period.
     """
-    trip = round_trip(mechanism, z, turns, rtol)
+    trip = round_trip(mechanism, z, returns, rtol)
     period, stuck, pulled = trip[-1].t1, np.zeros(2), 0.0
     values, graze, decision, visits = [trip[0].start], [], [], []
     for p, after in zip(trip, trip[1:] + trip[:1], strict=True):
         stuck += (p.t1 - p.t0) * (np.array(p.signs) == 0)
         rows = [r for i in (0, 1) for r in (UNIT[[3 + i]] if p.signs[i] else mechanism.hold(i))]
         for n, (used, h, c) in enumerate(p.steps):
-            at = np.array([used, *(x for q in c.T for x in turning(q) if x < used)])
+            at = np.array([used, *(x for q in c.T for x in extrema(q) if x < used)])
             values += list(poly.polyval(at, c).T)
             for row in rows:
                 g = c @ row[1:] + row[0] * np.eye(8)[0]
@@ -340,14 +342,14 @@ def measure(mechanism, z, turns, rtol=1e-12) -> Cycle:
                 decision.append(abs(mechanism.hold(i)[int(p.signs[i] == 1)] @ [1, *p.end]))
         joined = visits.pop()[1] if visits and visits[-1][0] == p.signs else 0.0
         visits.append((p.signs, joined + p.t1 - p.t0))
-    if len(visits) > 1:  # the last goes on in the first
+    if len(visits) > 1:  # the last continues in the first
         visits = [*visits[1:-1], (visits[-1][0], visits[-1][1] + visits[0][1])]
     ends = [n for i in (0, 1) for n, v in enumerate(visits) if v[0][i] and not visits[n - 1][0][i]]
     visits = visits[ends[0] :] + visits[: ends[0]] if ends else visits
     low, high = np.min(values, axis=0), np.max(values, axis=0)
     return Cycle(
         "cycle",
-        turns,
+        returns,
         period / mechanism.omega,
         (high - low)[:2] * mechanism.units[:2],
         (1 - high[2:]) * mechanism.V,
@@ -364,38 +366,41 @@ def measure(mechanism, z, turns, rtol=1e-12) -> Cycle:
     )
 
 
-def cycle(mechanism, start=None, rtol=1e-12, max_turns=5000, coarse=1e-8) -> Cycle:
+def cycle(mechanism, start=None, rtol=1e-12, max_returns=5000, coarse=1e-8) -> Cycle:
     """The stable periodic motion that the SI start leads to, or what it leads to instead.
 
-    The transient is run at the tolerance `coarse`; x1 must not come to rest on the way.
+    The transient is run at the tolerance `coarse`.
     """
     y = mechanism.equilibrium + np.eye(4)[0] if start is None else mechanism.scaled(start)
-    rest, maxima, far, near = mechanism.equilibrium[[0, 1, 3]], [], [], 1e-5
+    equilibrium, maxima, far, near = mechanism.equilibrium[[0, 1, 3]], [], [], 1e-5
     try:
-        for p in phases(mechanism, y, coarse, 20.0 * max_turns, turns=True):
-            if not p.turned:
+        for p in phases(mechanism, y, coarse, 20.0 * max_returns, maxima=True):
+            if not p.maximum:
                 continue
             maxima.append(p.end[[0, 1, 3]])
-            far.append(abs(maxima[-1] - rest).max())
+            far.append(abs(maxima[-1] - equilibrium).max())
             if mechanism.growth < 0 and max(far[-50:]) < min(0.1, max(far[-100:-50], default=0)):
                 return Cycle("equilibrium")
-            gaps = [abs(maxima[-1] - z).max() for z in maxima[-2 : -MOST_TURNS - 2 : -1]]
-            turns = 1 + next((k for k, gap in enumerate(gaps) if gap < near), -1)
-            if turns:
-                last = max(maxima[-turns:], key=lambda z: z[0])
+            gaps = [abs(maxima[-1] - z).max() for z in maxima[-2 : -MOST_RETURNS - 2 : -1]]
+            returns = 1 + next((k for k, gap in enumerate(gaps) if gap < near), -1)
+            if returns:
+                last = max(maxima[-returns:], key=lambda z: z[0])
                 try:
-                    z = close(mechanism, last, turns, rtol)
-                    gaps = [abs(returned(mechanism, z, k, rtol) - z).max() for k in range(1, turns)]
-                    turns = 1 + next((k for k, gap in enumerate(gaps) if gap < 1e-9), turns - 1)
-                    slopes = return_slopes(mechanism, z, turns, rtol)
+                    z = close(mechanism, last, returns, rtol)
+                    gaps = [
+                        abs(returned(mechanism, z, k, rtol) - z).max() for k in range(1, returns)
+                    ]
+                    shorter = (k for k, gap in enumerate(gaps) if gap < 1e-9)
+                    returns = 1 + next(shorter, returns - 1)
+                    slopes = return_slopes(mechanism, z, returns, rtol)
                 except (ArithmeticError, np.linalg.LinAlgError):
                     z, slopes = np.full(3, np.inf), np.eye(3)
                 found = np.array(sorted(np.linalg.eigvals(slopes), key=abs, reverse=True))
                 if abs(z - last).max() < 0.05 and abs(found[0]) < 1:
-                    known = measure(mechanism, z, turns, rtol)
+                    known = measure(mechanism, z, returns, rtol)
                     return replace(known, slopes=slopes, multipliers=found)
                 near /= 10  # a slow passage
-            if len(maxima) == max_turns:
+            if len(maxima) == max_returns:
                 break
     except Diverged:
         return Cycle("diverged")

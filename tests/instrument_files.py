@@ -1,4 +1,4 @@
-"""Files as instruments write them, made byte by byte from their formats' definitions."""
+"""Instrument files, byte by byte from the definitions of their formats."""
 
 import io
 import struct
@@ -7,38 +7,13 @@ import zipfile
 import numpy as np
 
 
-def sdf_text(z, dx, dy) -> bytes:
-    """ISO 25178-71 in ASCII: metres, lines along x, BAD where nothing was measured."""
-    n, m = z.shape
-    header = {"ManufacID": "Test", "CreateDate": "010120260000", "ModDate": "010120260000"}
-    header |= {"NumPoints": n, "NumProfiles": m, "Xscale": repr(dx), "Yscale": repr(dy)}
-    header |= {"Zscale": 1e-9, "Zresolution": -1, "Compression": 0, "DataType": 7, "CheckType": 0}
-    lines = ["aISO-1.0", *(f"{key} = {value}" for key, value in header.items()), "*"]
-    cells = [["BAD" if np.isnan(x) else repr(float(x) * 1e9) for x in line] for line in z.T]
-    return "\n".join([*lines, *(" ".join(line) for line in cells), "*", ""]).encode()
-
-
-def sdf_binary(z, dx, dy, step) -> bytes:
-    """ISO 25178-71 in bytes: 16-bit heights in units of `step`, the least integer for a gap."""
-    n, m = z.shape
-    header = b"bISO-1.0" + b"Test".ljust(10) + b"010120260000" * 2
-    header += struct.pack("<HHddddBBB", n, m, dx, dy, step, -1.0, 0, 5, 0)
-    whole = np.where(np.isnan(z), -(2**15), np.round(np.nan_to_num(z) / step))
-    return header + whole.T.astype("<i2").tobytes()
-
-
 def bcr(z, dx, dy, step) -> bytes:
     """BCR-STM: a header of 2048 characters in nanometres, 16-bit heights, 32767 for a gap."""
     n, m = z.shape
     header = ["fileformat = bcrstm", "headersize = 2048", f"xpixels = {n}", f"ypixels = {m}"]
     header += [f"xlength = {n * dx * 1e9!r}", f"ylength = {m * dy * 1e9!r}"]
-    header += [
-        "xunit = nm",
-        "yunit = nm",
-        "zunit = nm",
-        f"bit2nm = {step * 1e9!r}",
-        "intelmode = 1",
-    ]
+    header += [f"{axis}unit = nm" for axis in "xyz"]
+    header += [f"bit2nm = {step * 1e9!r}", "intelmode = 1"]
     whole = np.where(np.isnan(z), 32767, np.round(np.nan_to_num(z) / step))
     return "\n".join(header).ljust(2048).encode() + whole.T.astype("<i2").tobytes()
 

@@ -1,4 +1,4 @@
-"""Structures to test with, and an independent analysis of them in many digits.
+"""Scenes and structures to test with, and an independent analysis of the latter in many digits.
 
 The oracle knows nothing of Eq. 43: it writes down the forces of each joint as functions of
 displacement and velocity, differentiates them by differences in 50 digits, and finds eigenvalues
@@ -13,6 +13,15 @@ import numpy as np
 import fractaljax as fj
 
 DIGITS = 50
+_BRAKE = fj.brake_scene()
+SCENES = {  # one of every kind
+    "fractal, stribeck": _BRAKE,
+    "given ratio": _BRAKE.replace(stiffness_ratio=0.5),
+    "fixed, stribeck": _BRAKE.replace(contact=fj.FixedContact(4e8, 0.0)),
+    "fractal, coulomb": _BRAKE.replace(friction=fj.Coulomb(0.3)),
+    "fixed, coulomb": _BRAKE.replace(contact=fj.FixedContact(4e8, 2e8), friction=fj.Coulomb(1.2)),
+    "odd numbers": _BRAKE.replace(G=5e-324, P=1 / 3, F=-1.7976931348623157e308, V=0.1 + 0.2),
+}
 
 
 def matrices(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -26,19 +35,20 @@ def matrices(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 def two_joints(n: int, seed: int = 0) -> fj.Structure:
     """A structure with a joint between two bodies and another to the ground; it has friction."""
-    M, C, K = matrices(n, seed)
-    return fj.Structure(
-        M,
-        C,
-        K,
-        joints={
-            "left": fj.Joint(
-                fj.FixedContact(3e6, 1.4e6), fj.Stribeck(0.5, 0.3, 0.6), (0, 2), (1, 3), V=0.2
-            ),
-            "right": fj.Joint(fj.FixedContact(5e6, 2e6), fj.Stribeck(0.4, 0.2, 0.8), 2, 0, V=0.3),
-        },
-        F=np.linspace(200.0, -150.0, n),
-    )
+    left = fj.Joint(fj.FixedContact(3e6, 1.4e6), fj.Stribeck(0.5, 0.3, 0.6), (0, 2), (1, 3), V=0.2)
+    right = fj.Joint(fj.FixedContact(5e6, 2e6), fj.Stribeck(0.4, 0.2, 0.8), 2, 0, V=0.3)
+    F = np.linspace(200.0, -150.0, n)
+    return fj.Structure(*matrices(n, seed), joints={"left": left, "right": right}, F=F)
+
+
+def fractal_joints() -> fj.Structure:
+    """The same with four degrees of freedom, its joints with the surface of the brake."""
+    plain, contact = two_joints(4), fj.brake_scene().replace(P=1500.0).contact
+    joints = {
+        name: fj.Joint(contact, joint.friction, joint.tangential, joint.normal, joint.V)
+        for name, joint in zip(plain.joint_names, plain.joints, strict=True)
+    }
+    return fj.Structure(plain.M, plain.C, plain.K, joints, F=plain.F)
 
 
 def beam(elements: int, free: bool = False, height: float = 0.01):
@@ -49,16 +59,24 @@ def beam(elements: int, free: bool = False, height: float = 0.01):
     """
     E, rho, width, h = 2.1e11, 7800.0, 0.02, 1 / elements
     EI, mass = E * width * height**3 / 12, rho * width * height * h / 420
-    stiffness = np.array([[12, 6 * h, -12, 6 * h], [0, 4 * h**2, -6 * h, 2 * h**2]])
-    k = np.zeros((4, 4))
-    k[:2], k[2, 2:], k[3, 3] = stiffness, (12, -6 * h), 4 * h**2
-    m = np.zeros((4, 4))
-    m[0], m[1, 1:], m[2, 2:], m[3, 3] = (
-        (156, 22 * h, 54, -13 * h),
-        (4 * h**2, 13 * h, -3 * h**2),
-        (156, -22 * h),
+    k, m = np.zeros((2, 4, 4))
+    k[np.triu_indices(4)] = [
+        12,
+        6 * h,
+        -12,
+        6 * h,
         4 * h**2,
-    )
+        -6 * h,
+        2 * h**2,
+        12,
+        -6 * h,
+        4 * h**2,
+    ]
+    m[np.triu_indices(4)] = [
+        *(156, 22 * h, 54, -13 * h),
+        *(4 * h**2, 13 * h, -3 * h**2),
+        *(156, -22 * h, 4 * h**2),
+    ]
     k, m = (np.triu(x) + np.triu(x, 1).T for x in (EI / h**3 * k, mass * m))
     M, K = np.zeros((2, 2 * elements + 2, 2 * elements + 2))
     for i in range(elements):
@@ -73,36 +91,30 @@ def numbers_of(structure: fj.Structure) -> dict[str, Any]:
     joints = []
     for joint in structure.joints:
         K_n, K_t = joint.stiffness()
-        law = joint.friction
-        assert isinstance(law, fj.Stribeck)
-        assert joint.V is not None
-        quantities = {"K_n": K_n, "K_t": K_t, "V": joint.V}
+        law: Any = joint.friction
+        quantities: dict[str, Any] = {"K_n": K_n, "K_t": K_t, "V": joint.V}
         quantities |= {"mu_s": law.mu_s, "mu_m": law.mu_m, "v_m": law.v_m}
-        joints.append(
-            {name: mp.mpf(float(x)) for name, x in quantities.items()}
-            | {"t": joint.tangential, "n": joint.normal}
-        )
+        exact = {name: mp.mpf(float(x)) for name, x in quantities.items()}
+        joints.append(exact | {"t": joint.tangential, "n": joint.normal})
     arrays = {name: mp.matrix(np.asarray(getattr(structure, name)).tolist()) for name in "MCKF"}
     return arrays | {"joints": joints}
 
 
 def _mu(joint, v):
-    drop = joint["mu_s"] - joint["mu_m"]
-    u = v / joint["v_m"]
+    drop, u = joint["mu_s"] - joint["mu_m"], v / joint["v_m"]
     return joint["mu_s"] + drop * (u**3 - 3 * u) / 2
 
 
 def _forces(numbers, x, v):
-    """What the joints push with, (n,), at displacements x and velocities v."""
+    """The forces (n,) of the joints at displacements x and velocities v."""
     force = mp.matrix(len(x), 1)
 
     def along(dofs, z):
         return z[dofs[0]] - (z[dofs[1]] if len(dofs) == 2 else 0)
 
     def push(dofs, f):
-        force[dofs[0]] += f
-        if len(dofs) == 2:
-            force[dofs[1]] -= f
+        for dof, sign in zip(dofs, (1, -1), strict=False):
+            force[dof] += sign * f
 
     for joint in numbers["joints"]:
         t, n = joint["t"], joint["n"]
@@ -124,13 +136,11 @@ def _jacobian(function, at):
 
 def linearised(numbers, friction_slope: bool):
     """(M, C, K) about the equilibrium."""
-    n = numbers["M"].rows
-    rest = mp.matrix(n, 1)
-    K = numbers["K"] - _jacobian(lambda x: _forces(numbers, x, rest), rest)
-    C = numbers["C"]
+    zero, C = mp.matrix(numbers["M"].rows, 1), numbers["C"]
+    K = numbers["K"] - _jacobian(lambda x: _forces(numbers, x, zero), zero)
     if friction_slope:
         x_0 = mp.lu_solve(K, numbers["F"])
-        C = C - _jacobian(lambda v: _forces(numbers, x_0, v), rest)
+        C = C - _jacobian(lambda v: _forces(numbers, x_0, v), zero)
     return numbers["M"], C, K
 
 

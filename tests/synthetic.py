@@ -13,8 +13,10 @@ def mean_cosine_power(p):
 
 
 def gaussian_profile(rng, D=D, n=1024, G=G, dx=DX, finer=1, longer=8):
-    """A stretch (n,) of a Gaussian profile of a period `longer` times as long; with `finer`, every
-    so manieth point of one with finer waves."""
+    """A part (n,) of a Gaussian profile with a period `longer` times as long.
+
+    With `finer` it is sampled at every so many points of one with finer waves.
+    """
     p, points, step = 7 - 2 * D, n * longer * finer, dx / finer
     f = np.fft.rfftfreq(points, step)
     S = np.zeros(f.size)
@@ -45,18 +47,18 @@ def _waves(L, L_s, gamma, M, D, G):
     return f, a, scale * (f * L) ** (D - 3)
 
 
-def cut(rng, D=D, n=1024, G=G, dx=DX, angle=None, L=None, L_s=None, gamma=1.5, M=10):
+def cut(rng, D=D, n=1024, G=G, dx=DX, gamma=1.5, M=10):
     """A cut (n,) through the surface of Eq. 13 in any direction."""
-    f, a, amplitude = _waves(L or n * dx, L_s or 2 * dx, gamma, M, D, G)
-    angle = rng.uniform(0, np.pi) if angle is None else angle
+    f, a, amplitude = _waves(n * dx, 2 * dx, gamma, M, D, G)
+    angle = rng.uniform(0, np.pi)
     phases = 2 * np.pi * dx * np.outer(np.arange(n), f * np.cos(a - angle))
     phases = phases + rng.uniform(0, 2 * np.pi, f.size)
     return -(np.cos(phases) @ amplitude)
 
 
-def surface(rng, D=D, shape=(192, 192), G=G, dx=DX, dy=DX, L=None, gamma=1.5, M=10):
+def surface(rng, D=D, shape=(192, 192), G=G, dx=DX, dy=DX, gamma=1.5, M=10):
     """The surface of Eq. 13 on a grid (n, m), waves down to two points."""
-    f, a, amplitude = _waves(L or shape[0] * dx, 2 * max(dx, dy), gamma, M, D, G)
+    f, a, amplitude = _waves(shape[0] * dx, 2 * max(dx, dy), gamma, M, D, G)
     x, y = dx * np.arange(shape[0]), dy * np.arange(shape[1])
     along_x = np.exp(2j * np.pi * np.outer(x, f * np.cos(a)) + 2j * np.pi * rng.random(f.size))
     along_y = np.exp(2j * np.pi * np.outer(f * np.sin(a), y))

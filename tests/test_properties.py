@@ -1,4 +1,4 @@
-"""What holds of roughness, damping, files, sweeps and identification, whatever the input."""
+"""What holds for any input: roughness, files, sweeps and identification."""
 
 import hypothesis.extra.numpy as hnp
 import hypothesis.strategies as st
@@ -8,102 +8,57 @@ import pytest
 from hypothesis import given, settings
 
 import fractaljax as fj
-from benchmarks.extreme import programs
-from benchmarks.extreme.points import (
-    JOINT_COLUMNS,
-    MECHANISM_COLUMNS,
-    ROUGHNESS_COLUMNS,
-    areas,
-    joints,
-    mechanisms,
-)
-from properties import QUICK, places
+from properties import QUICK
 from tools import reference_scene
 
-ROUGHNESS = jax.jit(jax.vmap(programs.roughness))
-FEW = settings(QUICK, max_examples=15)  # calls that are not compiled, or print
+FEW = settings(QUICK, max_examples=10)  # calls that are not compiled, or print
+UNIT = st.floats(0, 1)
 
 
-@QUICK
-@given(u=places(ROUGHNESS_COLUMNS))
-def test_roughness_is_positive_and_grows_with_G(u):
-    x = areas(u)
-    rougher = x.copy()
-    rougher[:, 1] *= 16.0
-    less, more = ROUGHNESS(x), ROUGHNESS(rougher)
-    for name in ("Sq", "Sa", "Sdq"):
-        a, b = np.asarray(less[name]), np.asarray(more[name])
-        assert (a > 0).all() and np.isfinite(b).all()
-        # G stands there as G^(D-2) alone.
-        np.testing.assert_allclose(b / a, 16.0 ** (x[:, 0] - 2), rtol=1e-12)
+@jax.jit
+def roughness(D, G, gamma, L, L_s):
+    return fj.roughness(fj.Surface(D, G, gamma), L, L_s)
 
 
-@QUICK
-@given(u=places(ROUGHNESS_COLUMNS))
-def test_a_larger_copy_of_a_surface_is_as_steep_and_higher(u):
-    x = areas(u)
-    copy = x.copy()
-    copy[:, [1, 3, 4]] *= 8.0
-    small, large = ROUGHNESS(x), ROUGHNESS(copy)
-    np.testing.assert_allclose(large["Sdq"], small["Sdq"], rtol=1e-12)
-    np.testing.assert_allclose(large["Sq"], 8 * np.asarray(small["Sq"]), rtol=1e-12)
-
-
-DOF = 3
+def test_roughness_scales():
+    """With G as G^(D-2) alone; a larger copy of a surface is as steep and higher."""
+    u = np.random.default_rng(3).uniform(size=(5, 500))
+    D, G, gamma = 2 + 1e-6 + (1 - 2e-6) * u[0], 10 ** (-18 + 14 * u[1]), 1 + 10 ** (4 * u[2] - 3)
+    L = 10 ** (9 * u[3] - 8)
+    L_s = L / 10 ** (8 * u[4])
+    base = roughness(D, G, gamma, L, L_s)
+    rougher = roughness(D, 16.0 * G, gamma, L, L_s)
+    larger = roughness(D, 8.0 * G, gamma, 8.0 * L, 8.0 * L_s)
+    for name, length in (("Sq", 8.0), ("Sa", 8.0), ("Sdq", 1.0)):
+        value = np.asarray(getattr(base, name))
+        assert (value > 0).all() and np.isfinite(value).all()
+        np.testing.assert_allclose(getattr(rougher, name) / value, 16.0 ** (D - 2), rtol=1e-12)
+        np.testing.assert_allclose(getattr(larger, name), length * value, rtol=1e-12)
 
 
 @FEW
-@given(
-    u=hnp.arrays(np.float64, (2, DOF, DOF), elements=st.floats(-1, 1)),
-    ratio=st.floats(1e-6, 1e3),
-)
-def test_modal_damping_gives_back_its_ratio(u, ratio):
-    M, K = (x @ x.T + 0.1 * np.eye(DOF) for x in u)
-    C = np.asarray(fj.modal_damping(M, 1e8 * K, ratio))
-    # From coordinates in which M is the identity and K diagonal.
-    L = np.linalg.cholesky(M)
-    inverse = np.linalg.inv(L)
-    squares, X = np.linalg.eigh(inverse @ (1e8 * K) @ inverse.T)
-    own = X.T @ inverse @ C @ inverse.T @ X
-    wanted = np.diag(2 * ratio * np.sqrt(squares))
-    np.testing.assert_allclose(own, wanted, atol=1e-10 * wanted.max())
-    # The square of it is proportional to K, where damping is the same for all.
-    np.testing.assert_allclose(C, C.T, atol=1e-12 * np.abs(C).max())
-
-
-@FEW
-@given(alpha=st.floats(0, 1e6), beta=st.floats(0, 1))
-def test_rayleigh_damping_is_that_sum(alpha, beta):
-    M, K = np.diag([1.0, 2.0]), np.array([[3e6, -1e6], [-1e6, 1e6]])
-    found, wanted = fj.rayleigh_damping(M, K, alpha, beta), alpha * M + beta * K
-    # What is smaller than any normal number, compiled programs make 0.
-    np.testing.assert_allclose(found, wanted, rtol=1e-15, atol=1e-300)
-
-
-@FEW
-@given(u=places(JOINT_COLUMNS + MECHANISM_COLUMNS))
+@given(u=hnp.arrays(np.float64, 14, elements=UNIT))
 def test_a_scene_comes_back_from_its_file(u):
-    joint, mass = joints(u[:, :JOINT_COLUMNS])[0], mechanisms(u[:, JOINT_COLUMNS:])[0]
-    surface, material, P, frictions = programs.joint(joint)
-    scene = fj.Scene(
-        fj.FractalContact(surface, material, P),
-        fj.Stribeck(**frictions, v_m=mass[11]),
-        fj.Oscillator(*mass[:7]),
-    )
-    for given_scene in (scene, programs.scene(mass)):
-        back = fj.Scene.from_toml(given_scene.to_toml())
-        assert jax.tree.structure(back) == jax.tree.structure(given_scene)
-        assert jax.tree.all(jax.tree.map(lambda a, b: a == b, back, given_scene))
+    surface = fj.Surface(2.1 + 0.8 * u[0], 10 ** (-14 + 8 * u[1]), 1.001 + u[2])
+    material = fj.Material(1e9 + 1e12 * u[3], u[4] / 2, 1e6 + 1e8 * u[5], 2e8 + 1e9 * u[6])
+    for contact in (fj.FractalContact(surface, material, 1 + u[7]), fj.FixedContact(*1e9 * u[:2])):
+        scene = fj.Scene(
+            contact,
+            fj.Stribeck(0.3 + u[8], 0.3 * u[9], 1e-3 + u[10]),
+            fj.Oscillator(1 + u[11], 1e3 + u[12], 1e4, u[13], u[0], -u[1], 1 + u[2]),
+        )
+        back = fj.Scene.from_toml(scene.to_toml())
+        assert jax.tree.structure(back) == jax.tree.structure(scene)
+        assert jax.tree.all(jax.tree.map(lambda a, b: a == b, back, scene))
 
 
 @FEW
-@given(u=hnp.arrays(np.float64, (4,), elements=st.floats(0, 1)))
+@given(u=hnp.arrays(np.float64, 4, elements=UNIT))
 def test_a_sweep_gives_what_single_calls_give(u):
     scene, K_n = reference_scene(), 1e3 * 1e12**u
     swept = fj.sweep(fj.growth_rate, scene, progress=False, K_n=K_n)
     alone = [float(fj.growth_rate(scene.replace(K_n=K))) for K in K_n.tolist()]
-    omega = np.sqrt(K_n) + 1e4
-    assert (np.abs(np.asarray(swept) - alone) <= 1e-15 * omega).all()
+    assert (np.abs(np.asarray(swept) - alone) <= 1e-15 * (np.sqrt(K_n) + 1e4)).all()
 
 
 @pytest.fixture(scope="module")
@@ -119,10 +74,7 @@ def test_identification_in_other_units(measured, power, height):
     """Lengths times 2^power move G alone; heights times 2^height move it as G^(D-2) says."""
     z, dx, base = measured
     unit, higher = 2.0**power, 2.0**height
-    same = fj.identify(z * unit, dx * unit)
-    assert abs(same.D - base.D) < 1e-8
+    same, tall = fj.identify(z * unit, dx * unit), fj.identify(z * higher, dx)
+    assert abs(same.D - base.D) < 1e-8 and abs(tall.D - base.D) < 1e-8
     assert abs(np.log(same.G / base.G / unit)) < 1e-6
-    tall = fj.identify(z * higher, dx)
-    assert abs(tall.D - base.D) < 1e-8
-    moved = (base.D - 2) * np.log(tall.G / base.G)
-    assert abs(moved - np.log(higher)) < 1e-6
+    assert abs((base.D - 2) * np.log(tall.G / base.G) - np.log(higher)) < 1e-6

@@ -1,47 +1,55 @@
-"""README tells the truth: its commands, its example and output, its scene file, its picture."""
+"""README and guide tell the truth: commands, examples and output, scene file, pictures, links."""
 
 import re
+
+import pytest
 
 import fractaljax as fj
 from fractaljax.__main__ import main
 from tools import ROOT, assert_same_picture
 
-README = (ROOT / "README.md").read_text()
+README, GUIDE = "README.md", "docs/guide.md"
 
 
-def blocks(language):
+def blocks(page, language):
     """The texts of the fenced blocks of a language."""
-    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
+    return re.findall(rf"```{language}\n(.*?)```", (ROOT / page).read_text(), flags=re.DOTALL)
 
 
-def test_examples_print_what_is_printed(capsys, tmp_path, monkeypatch):
-    """They run one after the other, and output and picture are those shown, digit for digit."""
+@pytest.mark.parametrize("page", [README, GUIDE])
+def test_examples_print_what_is_printed(page, capsys, tmp_path, monkeypatch):
+    """The output shown is printed digit for digit, and the picture of the guide is drawn."""
     monkeypatch.chdir(tmp_path)
-    names = {}
-    for code, text in zip(blocks("python"), blocks("text"), strict=True):
-        assert len([line for line in code.splitlines() if line.strip()]) <= 15
-        exec(compile(code, "README.md", "exec"), names)
+    for code, text in zip(blocks(page, "python"), blocks(page, "text"), strict=True):
+        exec(compile(code, page, "exec"), {})
         assert capsys.readouterr().out == text
-    assert_same_picture(tmp_path / "cycle.png", "cycle.png")
+    if page == GUIDE:
+        assert_same_picture(tmp_path / "cycle.png", "cycle.png")
+
+
+def test_example_of_readme_is_short():
+    (code,) = blocks(README, "python")
+    assert len([line for line in code.splitlines() if line.strip()]) <= 15
 
 
 def test_scene_file_is_the_one_the_command_writes():
-    """The scene file shown is that of `fractaljax scene`."""
-    assert blocks("toml") == [fj.brake_scene().to_toml()]
+    assert blocks(GUIDE, "toml") == [fj.brake_scene().to_toml()]
 
 
 def test_commands_are_those_that_ci_runs():
-    """The two commands for a fresh machine; CI runs the second as printed."""
-    first, second = re.findall(r"^    (python -m pip .*)$", README, flags=re.MULTILINE)
-    ci = (ROOT / ".ci" / "run").read_text().splitlines()
-    assert second in ci
-    assert any(line.startswith(first) for line in ci)
+    """README shows two commands for a fresh machine. CI runs both."""
+    text = (ROOT / README).read_text()
+    first, second = re.findall(r"^    (python -m pip .*)$", text, flags=re.MULTILINE)
+    ci = (ROOT / ".ci" / "run").read_text()
+    assert first in ci and second in ci
 
 
-def test_links_lead_somewhere():
-    """Every relative link of README has a file."""
-    for target in re.findall(r"\]\(([^)]+)\)", README):
-        assert (ROOT / target).is_file(), target
+@pytest.mark.parametrize("page", [README, GUIDE, "docs/model.md", "docs/measurements.md"])
+def test_links_lead_somewhere(page):
+    """Every relative link has a file."""
+    links = re.findall(r"\]\(([^)#]+)\)", (ROOT / page).read_text())
+    for target in links:
+        assert "://" in target or ((ROOT / page).parent / target).is_file(), target
 
 
 def test_pictures_are_those_the_command_writes(tmp_path, capsys):

@@ -1,4 +1,4 @@
-"""What several test files share: the contact table, its derivatives, a limit cycle."""
+"""What several test files share: scenes, a limit cycle, runs of the command."""
 
 import functools
 import importlib.util
@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import matplotlib.image
 import numpy as np
 
@@ -19,12 +18,6 @@ from fractaljax.__main__ import main
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-INPUTS = ("D", "G", "gamma", "E", "nu", "sigma_y", "H", "P", "mu_s", "mu_m")
-MEMBERS = {
-    "fully_plastic": fj.Regime.fully_plastic,
-    "elastic_plastic": fj.Regime.elastic_plastic,
-    "gross_slip": fj.Regime.gross_slip,
-}
 
 
 def reference_scene() -> fj.Scene:
@@ -54,68 +47,6 @@ def motionless_scene() -> fj.Scene:
 def reference_cycle() -> fj.LimitCycle:
     """The limit cycle of the reference scene, computed once."""
     return fj.limit_cycle(reference_scene())
-
-
-@functools.cache
-def contact_rows() -> list[dict[str, Any]]:
-    """The rows of tests/reference/contact.json."""
-    path = Path(__file__).parent / "reference" / "contact.json"
-    return json.loads(path.read_text(encoding="utf-8"))["rows"]
-
-
-def contact_columns() -> dict[str, np.ndarray]:
-    """The numeric columns of the table; derivatives have shape (rows, 3), NaN where undefined."""
-    rows, columns = contact_rows(), {}
-    for name in rows[0]:
-        if name.startswith("dln"):
-            cells = [row[name] or [np.nan] * 3 for row in rows]
-        else:
-            cells = [row[name] for row in rows]
-        columns[name] = np.array(cells if name == "regime" else np.array(cells, dtype=float))
-    return columns
-
-
-def state_at(x: dict[str, Any], D, log_G, log_P) -> fj.ContactState:
-    """The state of joint x, moved to D and, by logarithmic steps, from its own G and P."""
-    surface = fj.Surface(D, x["G"] * jnp.exp(log_G), x["gamma"])
-    material = fj.Material(x["E"], x["nu"], x["sigma_y"], x["H"])
-    P = x["P"] * jnp.exp(log_P)
-    # Not by `contact_state`, which refuses the rows of the table in which mu_m exceeds mu_s.
-    return fj.FractalContact(surface, material, P).state(x["mu_s"], x["mu_m"])
-
-
-@jax.jit
-@jax.vmap
-def _everything(x):
-    def numbers(*moved):
-        state = state_at(x, *moved)
-        return {name: value for name, value in vars(state).items() if name != "regime"}
-
-    at = x["D"], jnp.zeros_like(x["D"]), jnp.zeros_like(x["D"])
-    slopes = [mode(numbers, argnums=(0, 1, 2))(*at) for mode in (jax.jacfwd, jax.jacrev)]
-    stacked = [{name: jnp.stack(slope) for name, slope in s.items()} for s in slopes]
-    return state_at(x, *at), *stacked
-
-
-def every_joint(dtype, columns: dict[str, np.ndarray] | None = None):
-    """State, forward and reverse derivatives by [D, ln G, ln P] of all rows, in `dtype`."""
-    columns = contact_columns() if columns is None else columns
-    return _everything({name: jnp.asarray(columns[name], dtype) for name in INPUTS})
-
-
-def joints(**changes):
-    """`every_joint` of the reference joint with some inputs changed to 1-d arrays of one length.
-
-    Padded to the length of the table, so that all tests share what is compiled for it.
-    """
-    changed = np.broadcast_arrays(*(np.asarray(change, float) for change in changes.values()))
-    rest = len(contact_rows()) - changed[0].size
-    columns = {name: np.full(len(contact_rows()), contact_rows()[0][name]) for name in INPUTS}
-    columns |= {
-        name: np.pad(values, (0, rest), mode="edge")
-        for name, values in zip(changes, changed, strict=True)
-    }
-    return jax.tree.map(lambda x: x[: changed[0].size], every_joint(jnp.float64, columns))
 
 
 def labels(ax) -> list[str]:

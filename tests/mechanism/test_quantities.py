@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
-from fractaljax.mechanism import quantities
-from fractaljax.mechanism.quantities import (
+from fractaljax._mechanism import quantities
+from fractaljax._mechanism.quantities import (
     axis_values,
     known_quantities,
     label,
@@ -19,9 +19,11 @@ from fractaljax.mechanism.quantities import (
     sliding_friction,
     substituted,
     unit,
+    value_of,
     with_friction_times,
     with_optional,
 )
+from structures import two_joints
 from tools import reference_scene
 
 BRAKE = fj.brake_scene()
@@ -96,6 +98,39 @@ def test_two_names_of_one_quantity_are_refused(scene, names):
 )
 def test_independent_names_are_not(scene, names):
     require_independent(scene, names)
+
+
+def test_a_structure_has_the_numbers_of_its_joints():
+    structure = two_joints(4)
+    own = own_quantities(structure)
+    assert own["right.K_n"].value == 5e6 and own["K_n"].value == 3e6 and own["K_n"].log
+    assert known_quantities(structure)[0] == "K_n" and not {"M", "F", "mu"} & own.keys()
+    assert unit(structure, "left.V") == "m/s"
+    assert label(structure, "left.V") == "sliding velocity left.V [m/s]"
+    moved = substituted(structure, {"V": 0.25, "right.K_n": 7e6})
+    checked = replaced(structure, {"V": 0.25, "right.K_n": 7e6})
+    assert [float(joint.V) for joint in moved.joints] == [0.25, 0.25]
+    for name in ("left.V", "right.V", "left.K_n", "right.K_n", "V"):
+        assert value_of(moved, name) == value_of(checked, name)
+    assert value_of(moved, "right.K_n") == 7e6 and value_of(moved, "left.K_n") == 3e6
+    with pytest.raises(ValueError, match=r"^K_n differs between the joints: name left.K_n and"):
+        value_of(structure, "K_n")
+    with pytest.raises(ValueError, match="structure has no quantity 'P'; it has K_n, K_t, "):
+        require_known(structure, "P")
+    with pytest.raises(ValueError, match=r"must be independent, got V and left\.V"):
+        require_independent(structure, ("V", "left.V"))
+    require_independent(structure, ("left.V", "right.V"))
+    with pytest.raises(ValueError, match="V must be above 0"):
+        require_inside(structure, {"left.V": np.array([-0.1, 0.2])})
+
+
+@pytest.mark.parametrize("name", ["K_t/K_n", "omega_1/omega_2", "mu", "D"])
+def test_what_is_set_is_what_is_read(name):
+    """Also of derived quantities, and of an optional one that is not given, by the law."""
+    scene = replaced(BRAKE, {name: 1.01 * value_of(BRAKE, name)})
+    assert value_of(scene, name) == pytest.approx(1.01 * float(value_of(BRAKE, name)), rel=1e-14)
+    with pytest.raises(ValueError, match="stiffness_ratio is not given"):
+        value_of(BRAKE, "stiffness_ratio")
 
 
 # --- values -------------------------------------------------------------------------------

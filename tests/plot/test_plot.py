@@ -1,98 +1,191 @@
-"""Pictures: what is on them, and that they leave no global state."""
+"""Pictures: their labels, the data on them, what they refuse, and no trace in pyplot."""
 
+import dataclasses
+import functools
+import io
 import itertools
+import pickle
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import matplotlib.image
 import matplotlib.pyplot
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
+from IPython.core.formatters import DisplayFormatter
 
 import fractaljax as fj
-from tools import assert_whole, labels, motionless_scene, reference_cycle, reference_scene
+from fractaljax.plot.maps import vibration_modes
+from synthetic import DX, gaussian_map, gaussian_profile
+from tools import (
+    assert_whole,
+    labels,
+    motionless_scene,
+    reference_cycle,
+    reference_scene,
+    state_matrix,
+)
+
+plot: Any = fj.plot
+BRAKE = fj.brake_scene()
+START, TIME = [1e-5, 0.0, 0.0, 0.0], 1.5e-3  # s, some five returns
+Z = 1e-6 * np.add.outer(np.arange(6.0), 10 * np.arange(4.0))
+SAMPLES = {"wide": np.array([3.0, -1.0, 0.5, 2.0]), "narrow": [0.1, 0.2]}
+MU, KAPPA = np.linspace(0.02, 1, 41), np.linspace(0.0, 1.4, 30)
 
 
-@pytest.fixture(scope="module")
+@functools.cache
 def best():
-    return fj.design(fj.brake_scene(), progress=False)
+    return fj.design(BRAKE, progress=False)
 
 
-def test_design_picture(best):
-    """Units on the axes, boundary, three regimes, path and both surfaces, nothing cut off."""
-    ax = fj.plot.design(best)
-    assert ax.get_xlabel() == "fractal dimension D [-]"
-    assert ax.get_ylabel() == "fractal roughness G [m]" and ax.get_yscale() == "log"
-    assert labels(ax) == [
-        "fully plastic",
-        "gross slip",
-        "elastic-plastic, stable",
-        "stability boundary",
-        "growth rate -3.14 1/s",
-        "K_n = 4.03e+08 N/m",
-        "path of the best start",
-        "given surface",
-        "designed surface",
-    ]
-    walk = next(line for line in ax.lines if line.get_label() == "path of the best start")
-    np.testing.assert_array_equal(walk.get_xdata(), best.history["D"])
-    bar = ax.figure.axes[1]
-    assert bar.get_ylabel() == "growth rate where it squeals [1/s]"
-    assert_whole(ax.figure, [ax, bar, ax.get_legend()])
+@functools.cache
+def nothing():
+    return fj.limit_cycle(motionless_scene(), throw=False)
 
 
-def test_boundary_is_where_growth_changes_sign(best):
-    """The contour drawn as the boundary is the zero of the growth rate."""
-    scene = best.initial
-    ax = fj.plot.stability_map(scene)
-    contour = next(
-        c for c in ax.collections if getattr(c, "levels", None) is not None and 0.0 in c.levels
-    )
-    points = np.concatenate([path.vertices for path in contour.get_paths()])[::10]
-    growth = jax.vmap(lambda p: fj.growth_rate(scene.replace(D=p[0], G=p[1])))
-    aside = np.array([[0.004, 0.0]])
-    # The first crosses towards high D; near the plastic joint there is a second one.
-    signs = np.sign(growth(points + aside)) * np.sign(growth(points - aside))
-    assert (signs < 0).mean() > 0.95
-
-
-def test_given_axes_and_bounds(best):
-    """It draws where it is told, over the bounds it is told."""
-    ax = Figure().add_subplot()
-    assert fj.plot.stability_map(best.initial, {"D": (2.3, 2.5)}, ax) is ax
-    assert ax.get_xlim() == (2.3, 2.5) and ax.get_ylim() == pytest.approx((1e-12, 1e-8))
-
-
-def test_infeasible_design_says_so():
-    """The end of the path is not called designed if it is no solution."""
-    best = fj.design(fj.brake_scene(), K_n_min=1e14, progress=False)
-    assert labels(fj.plot.design(best))[-1] == "best found, not a solution"
-
-
-def test_scene_that_never_squeals(best):
-    """No unstable region: no colour bar, no boundary, and no warning."""
-    ax = fj.plot.stability_map(best.initial.replace(mu_s=0.01, mu_m=0.01))
-    assert len(ax.figure.axes) == 1 and "stability boundary" not in labels(ax)
-
-
-def test_given_stiffness_ratio_has_no_gross_slip(best):
-    """Without a tangential law there are two regimes."""
-    ax = fj.plot.stability_map(best.initial.replace(stiffness_ratio=0.5))
-    assert "gross slip" not in labels(ax) and "fully plastic" in labels(ax)
-
-
-def test_fixed_contact_is_refused():
-    """A joint without a surface has no map over D and G."""
-    scene = fj.brake_scene().replace(contact=fj.FixedContact(4e8, 2e8))
-    with pytest.raises(ValueError, match="needs a FractalContact"):
-        fj.plot.stability_map(scene)
-
-
-@pytest.fixture(scope="module")
+@functools.cache
 def both_stick():
     """A limit cycle in which both directions stick."""
     return fj.limit_cycle(reference_scene().replace(mu_s=0.9))
+
+
+@functools.cache
+def batch():
+    """Three cycles, the middle one without a result."""
+    return jax.tree.map(lambda *x: jnp.stack(x), reference_cycle(), nothing(), both_stick())
+
+
+@functools.cache
+def motion():
+    return fj.simulate(reference_scene(), START, TIME)
+
+
+@functools.cache
+def spectrum_of_profile():
+    z = gaussian_profile(np.random.default_rng(0), 2.5, 2048)
+    return fj.identify(z, DX, resolution=4e-6)
+
+
+@functools.cache
+def modes(xi_1=0.001, xi_2=0.007):
+    scene = fj.Scene(fj.FixedContact(4e8, 2e8), fj.Coulomb(0.4), BRAKE.oscillator)
+    axes: dict[str, Any] = {"mu": MU, "K_t/K_n": KAPPA}
+    return fj.sweep(fj.stability, scene.replace(xi_1=xi_1, xi_2=xi_2), progress=False, **axes)
+
+
+def state(scene):
+    return scene.contact.state(scene.friction.mu_s, scene.friction.mu_m)
+
+
+@functools.cache
+def states(low=2.35):
+    """From fully plastic through elastic-plastic to gross slip, and one that does not slip."""
+    D = np.linspace(low, low + 0.35, 60)
+    return fj.sweep(state, BRAKE, progress=False, D=D, G=[1e-10, 1e-8])
+
+
+@functools.cache
+def rates():
+    """Growth rates over a surface, geometric in G."""
+    D, G = np.linspace(2.2, 2.8, 30), np.geomspace(1e-12, 1e-8, 31)
+    return fj.sweep(fj.growth_rate, BRAKE, progress=False, D=D, G=G)
+
+
+def cube():
+    return fj.sweep(fj.growth_rate, BRAKE, progress=False, D=[2.4], G=[1e-10], P=[1e3])
+
+
+MAP = "friction coefficient mu [-]", "stiffness ratio K_t/K_n [-]"
+SURFACE = "fractal dimension D [-]", "fractal roughness G [m]"
+BELT, NORMAL = "along the belt [µm]", "normal to the belt [µm]"
+FREQUENCY, DENSITY = "frequency f [1/m]", "power spectral density"
+# Result, options, and the labels of x and y.
+PICTURES: dict[str, tuple[Any, Any, dict[str, Any], str, str]] = {
+    "design": (plot.design, best, {}, *SURFACE),
+    "growth map": (plot.growth_map, modes, {}, *MAP),
+    "growth map of a surface": (plot.growth_map, rates, {}, *SURFACE),
+    "frequency map": (plot.frequency_map, modes, {"mode": 2}, *MAP),
+    "mode lines": (plot.mode_lines, modes, {}, MAP[1], "real part [1/s] of all modes"),
+    "mode frequencies": (
+        plot.mode_lines,
+        modes,
+        {"quantity": "frequency"},
+        MAP[1],
+        "frequency [kHz] of all modes",
+    ),
+    "curves": (
+        lambda rates, ax=None, **options: plot.curves(
+            fj.sweep(fj.growth_rate, BRAKE, progress=False, P=[1e3, 2e3]), ax, **options
+        ),
+        rates,
+        {"label": "growth rate [1/s]"},
+        "normal load P [N]",
+        "growth rate [1/s]",
+    ),
+    "K_n": (plot.stiffness_curves, states, {}, SURFACE[0], "normal stiffness K_n [N/m]"),
+    "K_t": (
+        plot.stiffness_curves,
+        states,
+        {"stiffness": "K_t"},
+        SURFACE[0],
+        "tangential stiffness K_t [N/m]",
+    ),
+    "portrait": (plot.phase_portrait, reference_cycle, {}, f"x1, {BELT}", "dx1/dt [m/s]"),
+    "normal portrait": (
+        plot.phase_portrait,
+        reference_cycle,
+        {"direction": 2},
+        f"x2, {NORMAL}",
+        "dx2/dt [m/s]",
+    ),
+    "spectrum": (
+        plot.spectrum,
+        reference_cycle,
+        {"direction": 2},
+        "frequency [kHz]",
+        "peak amplitude of x2 [µm]",
+    ),
+    "amplitudes": (
+        lambda batch, ax=None, **options: plot.amplitudes(batch, [1, 2, 5], ax, **options),
+        batch,
+        {"label": "stiffness [N/m]"},
+        "stiffness [N/m]",
+        "peak-to-peak amplitude [µm]",
+    ),
+    "trajectory": (plot.trajectory, motion, {}, "time [ms]", f"x1, {BELT}"),
+    "distribution": (
+        plot.distribution,
+        lambda: SAMPLES,
+        {"label": "growth rate [1/s]", "limit": 0.0},
+        "growth rate [1/s]",
+        "share below [-]",
+    ),
+    "identification": (
+        plot.identification,
+        spectrum_of_profile,
+        {},
+        FREQUENCY,
+        f"{DENSITY} of the profile [m³]",
+    ),
+    "topography": (
+        lambda z, ax=None, **options: plot.topography(z, 2e-6, ax, **options),
+        lambda: Z,
+        {"dy": 3e-6},
+        "x [µm]",
+        "y [µm]",
+    ),
+}
+FIGURES = {
+    "modes": lambda: plot.modes(modes()),
+    "stiffness": lambda: plot.stiffness(states()),
+    "cycle": lambda: plot.cycle(reference_cycle()),
+    "cycles": lambda: plot.cycles({"one": reference_cycle(), "two": both_stick()}),
+    "topographies": lambda: plot.topographies(best(), n=32),
+    "surfaces": lambda: plot.mode_surfaces(modes()).figure,
+}
 
 
 def drawn(ax, label):
@@ -100,32 +193,226 @@ def drawn(ax, label):
     return [np.array(line.get_data()) for line in ax.lines if line.get_label().startswith(label)]
 
 
+@pytest.mark.parametrize("name", PICTURES)
+def test_labels_with_units_on_given_axes(name):
+    """Nothing is cut off."""
+    draw, result, options, x, y = PICTURES[name]
+    ax = plot.new_figure().add_subplot()
+    assert draw(result(), ax, **options) is ax
+    assert (ax.get_xlabel(), ax.get_ylabel()) == (x, y)
+    assert_whole(ax.figure)
+    assert matplotlib.pyplot.get_fignums() == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FIGURES)
+def test_whole_figures(name):
+    """Nothing is cut off, and no panel overlaps another."""
+    figure = FIGURES[name]()
+    assert_whole(figure)
+    boxes = [ax.get_tightbbox() for ax in figure.axes]
+    assert not any(one.overlaps(other) for one, other in itertools.combinations(boxes, 2))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: plot.phase_portrait(reference_cycle(), direction=3), "direction must be 1 or 2"),
+        (lambda: plot.spectrum(batch()), "index the batch first"),
+        (lambda: plot.spectrum(nothing()), "no limit cycle to draw: the motion dies out"),
+        (lambda: plot.cycles({}), "at least one limit cycle"),
+        (lambda: plot.trajectory(motion(), direction=0), "direction must be 1 or 2"),
+        (lambda: plot.trajectory(jax.tree.map(lambda x: x[None], motion())), "index the batch"),
+        (lambda: plot.amplitudes(batch(), [1, 2], label="x"), r"got \(2,\) and \(3,\)"),
+        (lambda: plot.amplitudes(reference_cycle(), [1], label="x"), r"got \(1,\) and \(\)"),
+        (
+            lambda: plot.amplitudes(batch(), [1, 2, 3], label="x", slopes=[1, 2]),
+            r"slopes must have shape \(3,\), got \(2,\)",
+        ),
+        (lambda: plot.distribution({}, label="x"), "at least one set of samples"),
+        (lambda: plot.distribution({"bad": []}, label="x"), "samples 'bad' must be finite"),
+        (lambda: plot.distribution({"bad": [[1.0]]}, label="x"), "samples 'bad' must be finite"),
+        (lambda: plot.distribution({"bad": [np.nan]}, label="x"), "samples 'bad' must be finite"),
+        (lambda: plot.topography(np.zeros(5), 1e-6), r"z must be a map \(n, m\) of heights"),
+        (lambda: plot.topography(np.full((3, 3), np.nan), 1e-6), "z must be a map"),
+        (lambda: plot.topography(np.zeros((0, 3)), 1e-6), "z must be a map"),
+        (lambda: plot.topography(Z, 0.0), "dx and dy must be above 0, got 0.0 and 0.0"),
+        (lambda: plot.topography(Z, np.nan), "dx and dy must be above 0"),
+        (lambda: plot.frequency_map(modes(), mode=3), "mode must be from 1 to 2, got 3"),
+        (lambda: plot.mode_lines(modes(), quantity="imag"), "quantity must be 'real' or"),
+        (lambda: plot.stiffness_curves(states(), stiffness="K"), "stiffness must be 'K_n' or"),
+        (lambda: plot.curves(cube(), label="x"), "curves need scalars over one or two axes"),
+        (
+            lambda: plot.growth_map(fj.sweep(fj.growth_rate, BRAKE, progress=False, P=[1e3])),
+            "a map needs two axes of two values or more",
+        ),
+        (
+            lambda: plot.stability_map(reference_scene()),
+            "scene has no quantity 'D'",
+        ),
+    ],
+)
+def test_refusals(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+# --- maps ---------------------------------------------------------------------------------
+
+
+def test_design_shows_its_path_and_whether_it_is_one():
+    ax = plot.design(best())
+    legend = ["fully plastic", "gross slip", "stable", "stability boundary"]
+    assert labels(ax)[:4] == legend and labels(ax)[-2:] == ["given surface", "designed surface"]
+    np.testing.assert_array_equal(
+        drawn(ax, "path of the best start")[0], [best().history["D"], best().history["G"]]
+    )
+    assert ax.figure.axes[1].get_ylabel() == "growth rate where it squeals [1/s]"
+    missed = dataclasses.replace(best(), violated=("K_n >= K_n_min",))
+    assert labels(plot.design(missed))[-1] == "best found, not a solution"
+    title = plot.topographies(missed, n=8).axes[1].get_title()
+    assert title.startswith("best found: D = ")
+
+
+@pytest.mark.slow
+def test_boundary_is_where_the_growth_rate_changes_sign():
+    for ax, moved, aside in (
+        (plot.stability_map(BRAKE), lambda p: BRAKE.replace(D=p[0], G=p[1]), [0.004, 0]),
+        (
+            plot.growth_map(modes()),
+            lambda p: modes().scene.replace(mu=p[0], K_t=p[1] * 4e8),
+            [0.02, 0],
+        ),
+    ):
+        (zero,) = (c for c in ax.collections if list(getattr(c, "levels", ())) == [0.0])
+        points = np.concatenate([path.vertices for path in zero.get_paths()])
+        points = points[points[:, 1] < 0.9][5:-5:7]
+        growth = jax.vmap(lambda p, moved=moved: fj.growth_rate(moved(p)))
+        sides = growth(points - np.array([aside])), growth(points + np.array([aside]))
+        assert (sides[0] * sides[1] < 0).mean() > 0.95
+
+
+@pytest.mark.slow
+def test_maps_of_other_quantities_and_bounds():
+    ax = plot.stability_map(BRAKE, {"D": (2.3, 2.5)})
+    assert ax.get_xlim() == (2.3, 2.5) and ax.get_ylim() == pytest.approx((1e-12, 1e-8))
+    calm = plot.stability_map(BRAKE.replace(mu_s=0.01, mu_m=0.01))
+    assert len(calm.figure.axes) == 1 and "stability boundary" not in labels(calm)
+    given = plot.stability_map(BRAKE.replace(stiffness_ratio=0.5))
+    assert "gross slip" not in labels(given) and "fully plastic" in labels(given)
+    fixed = plot.stability_map(reference_scene(), {"K_n": (1e8, 1e9), "mu": (0.1, 0.6)})
+    assert fixed.get_xlabel() == "normal contact stiffness K_n [N/m]"
+    assert labels(fixed) == ["stable", "stability boundary"]
+
+
+@pytest.mark.parametrize("damping", [(0.001, 0.007), (0.0, 0.0), (6.0, 0.007), (5.0, 9.0)], ids=str)
+def test_modes_are_those_of_the_state_matrix(damping):
+    """Real part and frequency of both, also where a direction does not oscillate."""
+    result = modes(*damping)
+    real, frequency = vibration_modes(result)
+    assert real.shape == (41, 30, 2) and (np.diff(frequency, axis=-1) >= 0).all()
+    np.testing.assert_array_equal(real.max(axis=-1), result.values.growth_rate)
+    omega = np.sqrt(4e8)
+    for i, j in itertools.product(range(0, 41, 4), range(0, 30, 4)):
+        A = state_matrix(result.scene.oscillator, MU[i], 4e8, KAPPA[j] * 4e8)
+        s = sorted(np.linalg.eigvals(A), key=lambda s: -s.real)
+        s = [*(z for z in s if z.imag > 0), *(z for z in s if z.imag == 0)][:2]
+        # Undamped frequencies are equal where coupled: the order is rounding's there.
+        exact = np.array(sorted((z.imag / (2 * np.pi), z.real) for z in s))
+        if np.ptp(exact[:, 0]) < 1e-6 * omega:
+            exact = np.sort(exact, axis=0)
+            real[i, j] = np.sort(real[i, j])
+        np.testing.assert_allclose(frequency[i, j], exact[:, 0], rtol=0, atol=1e-9 * omega)
+        np.testing.assert_allclose(real[i, j], exact[:, 1], rtol=0, atol=1e-9 * omega)
+
+
+def test_maps_and_lines_show_the_modes():
+    real, frequency = vibration_modes(modes())
+    for mode in (1, 2):
+        levels = plot.frequency_map(modes(), mode=mode).collections[0].levels
+        low, high = frequency[..., mode - 1].min() / 1e3, frequency[..., mode - 1].max() / 1e3
+        assert levels[1] > low >= levels[0] and levels[-2] < high <= levels[-1]
+    ax = plot.mode_lines(modes(), at=[0.3, 0.8])
+    assert labels(ax) == ["mu = 0.29", "mu = 0.804"]  # the nearest there are
+    lines = [line.get_ydata() for line in ax.lines if len(line.get_xdata()) == 30]
+    np.testing.assert_array_equal(lines[0], real[11].min(axis=-1))
+    np.testing.assert_array_equal(lines[3], real[32].max(axis=-1))
+    surfaces = plot.mode_surfaces(modes(), quantity="frequency")
+    assert surfaces.get_zlabel() == "frequency [kHz]" and labels(surfaces) == ["mode 1", "mode 2"]
+
+
+def test_map_of_a_surface_hatches_the_other_regimes():
+    ax = plot.growth_map(rates())
+    assert labels(ax) == ["stability boundary", "fully plastic", "gross slip"]
+    assert (ax.get_xscale(), ax.get_yscale()) == ("linear", "log")
+    assert ax.get_ylim() == pytest.approx((1e-12, 1e-8))
+
+
+def test_map_without_a_boundary():
+    """All stable and all alike: no boundary, no legend, no warning."""
+    same = eqx.tree_at(lambda s: s.values, modes(), jax.tree.map(np.ones_like, modes().values))
+    calm = eqx.tree_at(lambda s: s.values.growth_rate, same, -np.ones(same.growth_rate.shape))
+    for draw in (plot.growth_map, plot.frequency_map):
+        ax = draw(calm)
+        assert ax.get_legend() is None
+        ax.figure.draw_without_rendering()
+
+
+def test_curves_of_stiffness_and_their_marks():
+    """Marks at the last elastic point and the last before gross slip."""
+    ax, x = plot.stiffness_curves(states()), states().points[0]
+    assert labels(ax)[:2] == ["G = 1e-10 m", "G = 1e-08 m"]
+    assert labels(ax)[2:] == ["fully plastic beyond", "gross slip begins or ends"]
+    assert (ax.get_xscale(), ax.get_yscale()) == ("linear", "log")
+    K_n = states().values.K_n.T
+    curves = np.stack([line.get_ydata() for line in ax.lines if len(line.get_xdata()) == 60])
+    np.testing.assert_array_equal(curves, np.where(K_n > 0, K_n, np.nan))
+
+    def marks(marker):
+        return [np.ravel(line.get_xydata()) for line in ax.lines if line.get_marker() == marker]
+
+    first = [np.flatnonzero(row > 0)[0] for row in K_n]
+    np.testing.assert_array_equal(
+        marks("o"), [(x[k], row[k]) for k, row in zip(first, K_n, strict=True)]
+    )
+    slips = np.asarray(states().values.regime == fj.Regime.gross_slip).T
+    last = np.flatnonzero(slips[0])[0] - 1
+    assert not slips[1].any()
+    np.testing.assert_array_equal(marks("X"), [(x[last], K_n[0, last])])
+    pair = fj.sweep(fj.stiffness, BRAKE, progress=False, P=np.geomspace(1e3, 1e4, 5))
+    alone = plot.stiffness_curves(pair, stiffness="K_t")
+    assert alone.get_xscale() == "log" and alone.get_legend() is None
+    np.testing.assert_array_equal(alone.lines[0].get_ydata(), pair[1])
+    words = [ax.texts[0].get_text() for ax in plot.stiffness(states(2.01)).axes]
+    assert words == ["K_n = 0 everywhere", "K_t = 0 everywhere"]
+
+
+# --- motions ------------------------------------------------------------------------------
+
+
 @pytest.mark.parametrize("direction", [1, 2])
 def test_phase_portrait_has_the_extent_of_the_cycle(direction):
     """A closed curve, as wide as the amplitude and as high as the velocity range; V dashed."""
     cycle, i = reference_cycle(), direction - 1
-    ax = fj.plot.phase_portrait(cycle, direction=direction)
+    ax = plot.phase_portrait(cycle, direction=direction)
     ((x, v),) = drawn(ax, "limit cycle")
     assert np.ptp(x) == pytest.approx(1e6 * float(cycle.amplitude[i]), rel=1e-4)
     ends = [cycle.velocity_min[i], cycle.velocity_max[i]]
     np.testing.assert_allclose([v.min(), v.max()], ends, rtol=1e-4)
     assert (x[0], v[0]) == (x[-1], v[-1])
-    (belt,) = (line for line in ax.lines if line.get_linestyle() == "--")
-    assert list(belt.get_ydata()) == [0.15, 0.15]
-    where = ["along the belt", "normal to the belt"][i]
-    assert ax.get_xlabel() == f"x{direction}, {where} [µm]"
-    assert ax.get_ylabel() == f"dx{direction}/dt [m/s]"
-    stuck = ["sticks, 9.7% of the period"] if direction == 1 else []
-    assert labels(ax) == ["limit cycle", "belt velocity 0.15 m/s", *stuck]
+    assert list(drawn(ax, "belt velocity 0.15 m/s")[0][1]) == [0.15, 0.15]
+    assert len(drawn(ax, "sticks, 9.7% of the period")) == 2 - direction
+    creeps = eqx.tree_at(lambda cycle: cycle.regularisation_error, cycle, 0.0123)
+    assert labels(plot.phase_portrait(creeps)) == ["limit cycle", "belt velocity 0.15 m/s"]
 
 
 @pytest.mark.parametrize("direction", [1, 2])
-def test_sticking_is_drawn_where_it_is(both_stick, direction):
-    """At the belt's velocity, over the way that the belt goes meanwhile, along the orbit."""
-    ax = fj.plot.phase_portrait(both_stick, direction=direction)
+def test_sticking_is_drawn_where_it_is(direction):
+    """At the velocity of the belt, as far as the belt moves meanwhile, along the orbit."""
+    ax = plot.phase_portrait(both_stick(), direction=direction)
     ((x, v),) = drawn(ax, "sticks")
     np.testing.assert_array_equal(v, 0.15)
-    time = both_stick.stick_fraction[direction - 1] * both_stick.period
+    time = both_stick().stick_fraction[direction - 1] * both_stick().period
     assert x[1] - x[0] == pytest.approx(1e6 * 0.15 * float(time), rel=1e-3)
     ((orbit_x, orbit_v),) = drawn(ax, "limit cycle")
     inside = (orbit_x > x[0]) & (orbit_x < x[1]) & (orbit_v > 0)
@@ -133,61 +420,146 @@ def test_sticking_is_drawn_where_it_is(both_stick, direction):
     np.testing.assert_allclose(orbit_v[inside], 0.15, rtol=1e-9)
 
 
-def test_regularised_cycle_has_no_sticking_part():
-    """The regularised law creeps where the exact one sticks; its orbit is drawn all the same."""
-    creeps = eqx.tree_at(lambda cycle: cycle.regularisation_error, reference_cycle(), 0.0123)
-    ax = fj.plot.phase_portrait(creeps)
-    assert labels(ax) == ["limit cycle", "belt velocity 0.15 m/s"]
+def test_spectrum_shows_the_harmonics():
+    """Stems at the multiples of 1/period, as high as `LimitCycle.spectrum` says."""
+    cycle = reference_cycle()
+    ax = plot.spectrum(cycle, direction=2)
+    f, a = np.hstack([*drawn(ax, "fundamental 3.092 kHz"), *drawn(ax, "harmonics")])
+    np.testing.assert_allclose(f, np.arange(1, 21) / float(cycle.period) / 1e3, rtol=1e-12)
+    np.testing.assert_allclose(a, 1e6 * cycle.spectrum()[1][:20, 1], rtol=1e-12)
+    stems = np.array(ax.collections[0].get_segments())
+    np.testing.assert_array_equal(stems[:, 1].T, [f, a])
+    assert ax.get_ylim()[0] == stems[0, 0, 1] < a.min() and a.max() < ax.get_ylim()[1]
+    # A period of two returns has twice as many lines.
+    twice = eqx.tree_at(lambda cycle: cycle.returns, cycle, jnp.array(2))
+    assert drawn(plot.spectrum(twice), "harmonics")[0].shape == (2, 39)
+
+
+def test_cycles_have_common_axes():
+    """Orbits and lines as they are alone, a named row each, stems on the common axis."""
+    given = {"soft": reference_cycle(), "hard": both_stick()}
+    figure = plot.cycles(given, direction=2)
+    assert [part.get_suptitle() for part in figure.subfigs] == ["soft", "hard"]
+    rows = [part.axes for part in figure.subfigs]
+    for (portrait, spectrum), cycle in zip(rows, given.values(), strict=True):
+        alone = plot.phase_portrait(cycle, direction=2)
+        np.testing.assert_array_equal(drawn(portrait, "limit cycle"), drawn(alone, "limit cycle"))
+        stems = np.array(spectrum.collections[0].get_segments())
+        assert (stems[:, 0, 1] == spectrum.get_ylim()[0]).all()
+        np.testing.assert_allclose(stems[1:, 1], drawn(spectrum, "harmonics")[0].T)
+    for column in zip(*rows, strict=True):
+        assert len({(ax.get_xlim(), ax.get_ylim()) for ax in column}) == 1
+
+
+def test_amplitudes_with_gaps_and_tangents():
+    over, slopes = np.array([1.0, 2.0, 5.0]), np.array([-2e-6, np.nan, 1e-6])
+    ax = plot.amplitudes(batch(), over, label="x", slopes=slopes)
+    for i in (0, 1):
+        ((x, y),) = drawn(ax, f"direction {i + 1}")
+        np.testing.assert_array_equal(x, over)
+        np.testing.assert_allclose(y, 1e6 * batch().amplitude[:, i])
+    tangents = [np.array(line.get_data()) for line in ax.lines[2:]]
+    for (x, y), k in zip(tangents, range(3), strict=True):
+        assert x.mean() == pytest.approx(over[k])
+        if k != 1:
+            assert np.diff(y) / np.diff(x) == pytest.approx(1e6 * slopes[k])
+            assert y.mean() == pytest.approx(1e6 * float(batch().amplitude[k, 0]))
+    assert labels(ax) == ["direction 1", "direction 2", "derivative of direction 1"]
 
 
 @pytest.mark.parametrize("direction", [1, 2])
-def test_spectrum_shows_the_harmonics(direction):
-    """Stems at the multiples of 1/period, as high as `LimitCycle.spectrum` says."""
-    cycle = reference_cycle()
-    ax = fj.plot.spectrum(cycle, direction=direction)
-    (first,), (rest,) = drawn(ax, "fundamental 3.092 kHz"), drawn(ax, "harmonics")
-    f, a = np.hstack([first, rest])
-    np.testing.assert_allclose(f, np.arange(1, 21) / float(cycle.period) / 1e3, rtol=1e-12)
-    np.testing.assert_allclose(a, 1e6 * cycle.spectrum()[1][:20, direction - 1], rtol=1e-12)
-    stems = np.array(ax.collections[0].get_segments())
-    np.testing.assert_array_equal(stems[:, :, 0], np.stack([f, f], axis=1))
-    np.testing.assert_array_equal(stems[:, 1, 1], a)
-    assert ax.get_yscale() == "log" and ax.get_ylim()[0] == stems[0, 0, 1] < a.min()
-    assert ax.get_xlim()[1] > f[-1] and ax.get_ylim()[1] > a.max()
-    assert ax.get_xlabel() == "frequency [kHz]"
-    assert ax.get_ylabel() == f"peak amplitude of x{direction} [µm]"
+def test_motion_is_drawn_as_it_is(direction):
+    """From the start to the end, every step among them."""
+    ax, i = plot.trajectory(motion(), direction=direction), direction - 1
+    ((t, x),) = drawn(ax, "motion")
+    assert t[0] == 0 and t[-1] == pytest.approx(1e3 * TIME) and (np.diff(t) >= 0).all()
+    ends = 1e6 * START[i], 1e6 * float(motion().end[i])
+    assert (x[0], x[-1]) == pytest.approx(ends)
+    at_steps = np.interp(1e3 * motion().times, t, x)
+    np.testing.assert_allclose(at_steps, 1e6 * motion().states[:, i], atol=1e-6)
 
 
-def test_spectrum_reaches_as_far_for_a_longer_period():
-    """A period of two turns has two lines for each one of a period of one turn."""
-    twice = eqx.tree_at(lambda cycle: cycle.turns, reference_cycle(), jnp.array(2))
-    (rest,) = drawn(fj.plot.spectrum(twice), "harmonics")
-    assert rest.shape == (2, 39)
+def test_sticking_is_marked_in_the_motion():
+    """For the time that the contact states say, at the velocity of the belt."""
+    ((t, x),) = drawn(plot.trajectory(motion()), "sticks")
+    inside = np.isfinite(x[1:]) & np.isfinite(x[:-1])
+    sticks = np.diff(motion().times)[np.asarray(motion().contact_states)[:-1, 0] == 0].sum()
+    # The last sample before its end is not drawn: one of some 180.
+    assert sticks > 0 and np.diff(t)[inside].sum() == pytest.approx(1e3 * sticks, rel=0.03)
+    moved = np.diff(x)[inside].sum() / np.diff(t)[inside].sum()
+    assert moved == pytest.approx(1e3 * 0.15, rel=1e-6)  # um/ms
+    slides = fj.simulate(motionless_scene(), [1e-8, 0, 0, 0], TIME)
+    assert labels(plot.trajectory(slides)) == ["motion"]
 
 
-def test_cycle_picture():
-    """A row for each direction, nothing cut off or overlapping, nothing left in pyplot."""
-    figure = fj.plot.cycle(reference_cycle())
-    words = ["x1, along", "frequency", "x2, normal", "frequency"]
-    assert len(figure.axes) == 4
-    for ax, word in zip(figure.axes, words, strict=True):
-        assert ax.get_xlabel().startswith(word)
-    assert_whole(figure, figure.axes)
-    boxes = [ax.get_tightbbox() for ax in figure.axes]  # with labels and legend
-    assert not any(one.overlaps(other) for one, other in itertools.combinations(boxes, 2))
-    assert matplotlib.pyplot.get_fignums() == []
+# --- surfaces and samples -----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("draw", [fj.plot.phase_portrait, fj.plot.spectrum])
-def test_cycle_pictures_take_axes_and_refuse_the_rest(draw):
-    """They draw where they are told; no direction 3, no picture of a batch or of no cycle."""
-    ax = Figure().add_subplot()
-    assert draw(reference_cycle(), ax) is ax
-    with pytest.raises(ValueError, match="direction must be 1 or 2, got 3"):
-        draw(reference_cycle(), direction=3)
-    batch = jax.tree.map(lambda leaf: leaf[None], reference_cycle())
-    with pytest.raises(ValueError, match="index the batch first"):
-        draw(batch)
-    nothing = fj.limit_cycle(motionless_scene(), throw=False)
-    with pytest.raises(ValueError, match="no limit cycle to draw: the motion dies out"):
-        draw(nothing)
+def test_share_below_every_value():
+    """A step of 1/n at each of the sorted samples, and the limit."""
+    ax = plot.distribution(SAMPLES, label="growth rate [1/s]", limit=0.0)
+    assert labels(ax) == ["wide", "narrow", "limit 0"]
+    for name, values in SAMPLES.items():
+        ((x, y),) = drawn(ax, name)
+        np.testing.assert_allclose(y[1:], [(np.asarray(values) <= at).mean() for at in x[1:]])
+        np.testing.assert_array_equal(np.sort(values), x[1:])
+    assert (drawn(ax, "limit 0")[0][0] == 0).all()
+
+
+def test_identification_shows_spectrum_fit_and_limit():
+    found = spectrum_of_profile()
+    ax = plot.identification(found)
+    words = labels(ax)
+    assert words[:2] == ["measured", "means over bins"] and words[3].startswith("structure")
+    assert words[4] == "limit of the instrument 6.25e+04 1/m"
+    np.testing.assert_array_equal(ax.lines[0].get_ydata(), found.spectrum.power)
+    ((f, power),) = drawn(ax, f"D = {found.D:.3f} ± ")
+    np.testing.assert_allclose(f[[0, -1]], found.band)
+    np.testing.assert_allclose(power, found.law(f))
+    of_map = fj.identify(gaussian_map(np.random.default_rng(0), shape=(64, 64)), DX)
+    assert "of the map" in plot.power_spectrum(of_map).get_ylabel()
+
+
+def test_topography_shows_heights_about_their_mean():
+    z = Z.copy()
+    z[5, 3] = np.nan  # left out, also of the mean and the scale
+    image = plot.topography(z, 2e-6, dy=3e-6).images[0]
+    np.testing.assert_allclose(image.get_array(), (z - np.nanmean(z)).T * 1e6)
+    assert image.get_extent() == pytest.approx([0, 12, 0, 12]) and image.origin == "lower"
+    assert image.get_clim() == pytest.approx(((0 - np.nanmean(z)) * 1e6, 34 - np.nanmean(z) * 1e6))
+    assert plot.topography(Z, 1e-6).images[0].get_extent() == pytest.approx([0, 6, 0, 4])
+
+
+def test_topographies_have_one_colour_scale():
+    left, right, bar = plot.topographies(best(), n=32).axes
+    surfaces = best().topographies(32)
+    for ax, z in ((left, surfaces.before), (right, surfaces.after)):
+        np.testing.assert_allclose(ax.images[0].get_array(), (z - z.mean()).T * 1e6)
+        assert ax.images[0].get_extent() == pytest.approx([0, 1000, 0, 1000])
+    heights = [ax.images[0].get_array() for ax in (left, right)]
+    limits = min(z.min() for z in heights), max(z.max() for z in heights)
+    assert left.images[0].get_clim() == right.images[0].get_clim() == limits
+    assert bar.get_ylabel() == "height about the mean [µm]"
+    assert left.get_title() == "given surface: D = 2.4, G = 1.342e-10 m"
+    assert right.get_title().startswith("designed surface: D = ")
+
+
+# --- figures ------------------------------------------------------------------------------
+
+
+def picture(figure):
+    """The pixels that Jupyter is given, (height, width, 4)."""
+    data, _ = DisplayFormatter().format(figure)
+    return matplotlib.image.imread(io.BytesIO(data["image/png"]))
+
+
+def test_a_notebook_is_given_the_picture():
+    """Of the size asked for, with what was drawn, again after more is drawn, also unpickled."""
+    ax = plot.new_figure().add_subplot()
+    ax.set_axis_off()
+    blank = picture(ax.figure)
+    assert blank.shape[:2] == (640, 840) and np.all(blank == 1)
+    ax.plot([0, 1], [0, 1], "k")
+    assert picture(ax.figure).min() == 0
+    again = pickle.loads(pickle.dumps(ax.figure))
+    assert picture(again).shape == (640, 840, 4)

@@ -1,0 +1,197 @@
+"""`fractaljax design`: its table, its files, and how it refuses."""
+
+import csv
+import warnings
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import fractaljax as fj
+from fractaljax._cli.design import _LIMITS, _OPTIONS, _remarks
+from tools import run_command as run
+
+_WRITTEN = ["design.png", "design.toml", "history.csv", "run.toml"]
+_WRITTEN += ["topographies.png", "topography.npy"]
+_ROWS = ["D ", "G [m]", "Sq [m]", "Sdq", "K_n [N/m]", "K_t [N/m]", "K_t/K_n", "regime", "a_l/a_e"]
+_ROWS += ["Q_e/(mu_s P)", "growth rate [1/s]", "frequency [Hz]", "damping ratio"]
+_ROWS += ["active constraints", "Sq and Sdq: wavelengths from 0.001 to 1e-06 m", "found: "]
+_ROWS += ["written to fractaljax-design: ", "topography.npy: 1024 x 1024 heights in m, dx = "]
+_ROWS += ["stable against small disturbances; a larger kick may still end in squeal"]
+
+
+def failing(error):
+    def fail(*_, **__):
+        raise error
+
+    return fail
+
+
+def test_design_without_arguments(capsys, tmp_path):
+    """The main job: a progress bar, a table, and files that hold what was found."""
+    status, out, err = run(capsys, "design")
+    assert status == 0 and "12/12" in err
+    titles, *lines = out.splitlines()
+    assert titles.split() == ["before", "after"]
+    wrong = [line for line, row in zip(lines, _ROWS, strict=True) if not line.startswith(row)]
+    assert wrong == []
+    assert "+22.0801" in out and "growth_rate <= target" in out
+
+    folder = tmp_path / "fractaljax-design"
+    assert sorted(p.name for p in folder.iterdir()) == _WRITTEN
+    scene = fj.Scene.load(folder / "design.toml")
+    assert fj.growth_rate(scene) <= -np.pi
+    with open(folder / "history.csv", newline="") as file:
+        history = list(csv.DictReader(file))
+    assert float(history[0]["D"]) == pytest.approx(2.4)
+    assert float(history[-1]["G [m]"]) == pytest.approx(float(scene.contact.surface.G), rel=1e-12)
+    assert float(history[0]["growth_rate [1/s]"]) == pytest.approx(22.0801103, rel=1e-8)
+    assert [int(row["step"]) for row in history] == list(range(len(history)))
+    for picture in ("design.png", "topographies.png"):
+        assert (folder / picture).read_bytes().startswith(b"\x89PNG")
+    z = fj.topography(scene.contact.surface, 1e-3, 1024, key=jax.random.key(0))
+    np.testing.assert_allclose(np.load(folder / "topography.npy"), z, rtol=0, atol=1e-18)
+
+
+def test_infeasible_design_is_no_success(capsys):
+    """Exit status 1; table and file say that it is not a solution. Other files stay."""
+    Path("old").mkdir()
+    Path("old/notes.txt").write_text("mine")
+    status, out, _ = run(capsys, "design", "--K-n-min", 1e14, "--quiet", "--out", "old")
+    assert status == 1
+    assert "not met: K_n >= K_n_min" in out and "infeasible" in out
+    text = Path("old/design.toml").read_text()
+    assert text.startswith("# infeasible") and "# not met: K_n >= K_n_min" in text
+    assert sorted(p.name for p in Path("old").iterdir()) == sorted([*_WRITTEN, "notes.txt"])
+
+
+@pytest.mark.slow
+def test_design_of_a_users_scene(capsys, tmp_path):
+    """A scene file, bounds, options and an output folder of the user's own, made if missing."""
+    fj.brake_scene().replace(P=3000.0).save(tmp_path / "mine.toml")
+    arguments = ["--out", "a/b", "--D", 2.3, 2.8, "--G", 1e-11, 1e-9, "--target", -1, "--quiet"]
+    status, _, err = run(capsys, "design", "mine.toml", *arguments)
+    assert (status, err) == (0, "")
+    scene = fj.Scene.load("a/b/design.toml")
+    assert fj.growth_rate(scene) == pytest.approx(-1, abs=1e-4)
+    assert scene.contact.P == 3000
+
+
+@pytest.mark.slow
+def test_robust_design_and_its_repetition(capsys):
+    """Envelope, tolerance and limits as given; the file of the run gives the same files again."""
+    options = ["--envelope", "P=1800:2000", "mu_s=0.39,0.4,0.41", "--tolerance", "D=0.002"]
+    options += ["--sq", ":2e-6", "--sq-lengths", 1e-3, 1e-5, "--elastic-share", 0.2, "--seed", 5]
+    options += ["--quantile", 0.9, "--starts", 4, "--lattice", 8, "--quiet"]
+    status, out, err = run(capsys, "design", "--out", "first", *options)
+    assert (status, err) == (0, "")
+    assert "over P 1800 to 2000, 3 samples of mu_s; where D scatters by 0.002" in out
+    assert "probability of squeal" in out and "worst at P = " in out
+    text = Path("first/run.toml").read_text()
+    assert "seed = 5" in text and "at_most = 2e-06, L = 0.001, L_s = 1e-05" in text
+    repeated = run(capsys, "design", "--repeat", "first/run.toml", "--out", "again", "--quiet")
+    assert repeated == (0, out.replace("to first", "to again"), "")
+    for name in _WRITTEN:
+        assert Path("first", name).read_bytes() == Path("again", name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--out", "file/below", "--quiet"], "not a folder: file/below"),
+        (["--out", "file", "--quiet"], "File exists"),
+        (["--D", 2.5, 2.3], "bounds on D must be (lower, upper), got (2.5, 2.3)"),
+        (["--D", 2.5, 2.9], "D must lie inside its bounds [2.5, 2.9], got 2.4"),
+        (["--starts", 0], "starts must be a whole number of at least 1, got 0"),
+        (["--target", "low"], "invalid float value: 'low'"),
+        (["--envelope", "P"], "--envelope must be NAME=LOW:HIGH, got 'P'"),
+        (["--envelope", "P=1:x"], "--envelope P must be numbers, got 'x'"),
+        (["--envelope", "P=1"], "--envelope P must be LOW:HIGH or at least two samples"),
+        (["--envelope", "P=1:1"], "envelope of P must be (lower, upper), got (1, 1)"),
+        (["--envelope", "P=nan:2"], "envelope of P must be finite, got nan"),
+        (["--envelope", "P=1:2", "--envelope", "P=3:4"], "--envelope has P more than once"),
+        (["--envelope", "Q=1:2"], "envelope names 'Q'; there are D, G"),
+        (["--tolerance", "D=1", "lnG=1", "D=2"], "--tolerance has D more than once"),
+        (["--tolerance", "D"], "--tolerance must be NAME=SIGMA, got 'D'"),
+        (["--tolerance", "D=-1"], "tolerance of D must be at least 0, got -1.0"),
+        (["--seed", 1, "--seed", 2], "argument --seed: given more than once"),
+        (["--seed", "1e20"], "argument --seed: invalid int value: '1e20'"),
+        (["--seed", 10**20], f"seed must be a whole number of at most {2**63 - 1}, got {10**20}"),
+        (["--lattice", 200000], "lattice must be a whole number of at most 1000, got"),
+        (["--lattice", 2, "--starts", 5], "starts must be at most the 4 of the lattice"),
+        (["--quantile", "nan"], "quantile must be at least 0.5 and at most 0.999, got "),
+        (["--risk", "cvar:x"], "--risk must be numbers, got 'x'"),
+        (["--sq", "2:1"], "Sq at_least must be below at_most, got 2.0, 1.0"),
+        (["--sq-lengths", 1, 2], "--sq-lengths needs --sq"),
+        (["--damping-ratio", "0:1"], "--damping-ratio has a lower limit only: LOW:"),
+        (["--repeat", "nowhere.toml"], "no such file: nowhere.toml"),
+        (["--repeat", "file"], "file: "),
+        (["--repeat", "file", "--seed", 1], "takes everything from its file, got seed"),
+    ],
+)
+def test_bad_arguments(capsys, tmp_path, arguments, message):
+    """One line, exit status 2, and no folder left behind."""
+    (tmp_path / "file").write_text("in the way")
+    status, out, err = run(capsys, "design", *arguments)
+    assert (status, out) == (2, "")
+    assert err.startswith("fractaljax: ") and message in err and err.count("\n") == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_random_arguments(capsys, tmp_path, monkeypatch):
+    """Never a traceback, always one line, and refused before the search."""
+    monkeypatch.setattr("fractaljax._design.design.design", failing(ValueError("accepted")))
+    random, accepted = np.random.default_rng(12), 0
+    values = "nan inf -inf 0 -1 1e20 1e400 x : 1: 1:1 2:1 2.5 P=1 P=nan:2 P=1:2 D=-1 =1 cvar:1 "
+    values = (values + "smooth:0 1_ é 10 1e-9").split()
+    options = {"--D": 2, "--G": 2, "--sq-lengths": 2, "--envelope": 1, "--tolerance": 1}
+    options |= {f"--{name.replace('_', '-')}": 1 for name in (*_OPTIONS, *_LIMITS, "risk")}
+    for _ in range(150):
+        arguments = ["design", "--quiet"]
+        for name in random.choice(list(options), random.integers(1, 3), replace=False):
+            arguments += [name, *random.choice(values, options[name])]
+        status, out, err = run(capsys, *arguments)
+        assert (status, out) == (2, ""), arguments
+        assert err.startswith("fractaljax: ") and err.count("\n") == 1, arguments
+        accepted += err == "fractaljax: accepted\n"
+    assert 0 < accepted < 75
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("where", "error", "status", "message"),
+    [
+        ("_design.design.design", KeyboardInterrupt(), 130, "interrupted, nothing written"),
+        ("_cli.design.picture", OSError("disk full"), 2, "disk full"),
+    ],
+)
+def test_failure_writes_nothing(capsys, tmp_path, monkeypatch, where, error, status, message):
+    """Ctrl-C, or a picture that fails: all files are ready before the first is written."""
+    monkeypatch.setattr(f"fractaljax.{where}", failing(error))
+    found, out, err = run(capsys, "design", "--quiet", "--out", "a/b")
+    assert (found, out) == (status, "") and message in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_repetition_of_a_run_of_other_versions(capsys, tmp_path, monkeypatch):
+    """A warning is one line on standard error, and the command continues."""
+
+    def noted(path):
+        warnings.warn(f"{path} was written by another", stacklevel=1)
+        raise ValueError("that is enough")
+
+    monkeypatch.setattr("fractaljax._design.design_file.read_design", noted)
+    status, out, err = run(capsys, "design", "--repeat", "run.toml")
+    assert (status, out) == (2, "")
+    assert err == "fractaljax: run.toml was written by another\nfractaljax: that is enough\n"
+
+
+def test_remarks_on_friction_beyond_its_law():
+    """At the worst of the envelope, and of the scene itself; nothing where the law holds."""
+    scene = fj.brake_scene()
+    assert _remarks(scene, {}) == _remarks(scene, {"envelope": {"P": (1800.0, 2000.0)}}) == []
+    (line,) = _remarks(scene, {"envelope": {"V": (0.1, 2.0), "P": (1800.0, 2000.0)}})
+    assert line.startswith("remark: at a sliding speed of 2 m/s the friction law gives 4.3, above")
+    (line,) = _remarks(scene.replace(V=5.0), {"envelope": None})
+    assert "gives 73.15, above mu_s = 0.4" in line

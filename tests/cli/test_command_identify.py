@@ -1,0 +1,182 @@
+"""`fractaljax identify`: from a file of heights to a scene that can be designed."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fractaljax as fj
+import instrument_files as files
+from fractaljax._cli.identify import _bounds
+from fractaljax._identify.warnings import DISQUALIFYING
+from synthetic import gaussian_map, gaussian_profile
+from tools import run_command as run
+
+D, G, DX = 2.4, 1.342e-10, 1e-6
+SCENE = Path("fractaljax-identification/scene.toml")
+
+
+def profile(n, D=D):
+    """Heights [m] of a Gaussian profile."""
+    return gaussian_profile(np.random.default_rng(0), D=D, n=n, G=G, dx=DX)
+
+
+def write_profile(name, z):
+    """A CSV file of positions in um and heights in nm."""
+    rows = [f"{i * DX * 1e6!r},{h * 1e9!r}" for i, h in enumerate(z.tolist())]
+    Path(name).write_text("\n".join(["x [um],z [nm]", *rows]))
+
+
+def test_identify_a_profile(capsys):
+    """What is printed and written; D and G within three standard errors of the truth."""
+    z = profile(4096)
+    z[100:140] = np.nan
+    write_profile("mine.csv", z)
+    status, out, err = run(capsys, "identify", "mine.csv")
+    assert (status, err) == (0, "")
+    lines = out.splitlines()
+    assert lines[:2] == [
+        "mine.csv: text of 4096 lines and 2 columns",
+        "profile of 4096 heights, 40 missing, dx = 1e-06 m",
+    ]
+    assert "written to fractaljax-identification: identification.png, scene.toml" in lines
+    assert lines[-1] == f"next: fractaljax design {SCENE}"
+    assert sorted(path.name for path in SCENE.parent.iterdir()) == [
+        "identification.png",
+        "scene.toml",
+    ]
+    assert (SCENE.parent / "identification.png").read_bytes().startswith(b"\x89PNG")
+    found, scene = fj.identify(z, DX), fj.Scene.load(SCENE)
+    assert f"{found}" in out
+    surface = scene.contact.surface
+    np.testing.assert_allclose([surface.D, surface.G], [found.D, found.G], rtol=1e-9)
+    assert abs(found.D - D) < 3 * found.D_standard_error
+    assert abs(math.log(found.G / G)) < 3 * found.ln_G_standard_error
+    assert scene.to_toml() == fj.brake_scene().replace(surface=surface).to_toml()
+    comments = SCENE.read_text().split("# A fractaljax scene")[0]
+    assert "# surface identified from mine.csv" in comments and "standard error" in comments
+
+
+def test_identify_a_map_for_a_scene(capsys):
+    """An instrument's file, a band, limits and a scene of the user's own."""
+    z = gaussian_map(np.random.default_rng(0), D, (64, 48))
+    Path("map.x3p").write_bytes(files.x3p(z, DX, DX))
+    fj.brake_scene().replace(P=3000.0, gamma=1.4).save("mine.toml")
+    options = ["--band", 8e4, 4e5, "--resolution", 1e-7, "--scene", "mine.toml", "--out", "a/b"]
+    status, out, err = run(capsys, "identify", "map.x3p", *options)
+    assert (status, err) == (0, "")
+    assert "map of 64 x 48 heights, 0 missing, dx = 1e-06 m, dy = 1e-06 m" in out
+    scene = fj.Scene.load("a/b/scene.toml")
+    found = fj.identify(z, DX, band=(8e4, 4e5), resolution=1e-7, gamma=1.4)
+    np.testing.assert_allclose(scene.contact.surface.D, found.D, rtol=1e-9)
+    assert scene.contact.P == 3000 and scene.contact.surface.gamma == 1.4
+
+
+def test_options_reach_reading_and_identification(capsys, monkeypatch):
+    """The instrument's limits are the file's unless given."""
+    asked = {}
+
+    def read(path, **options):
+        asked.update(options, path=path)
+        return fj.Measurement(np.ones(3), 1e-6, None, "mine", 3e-6, 4e-6)
+
+    def identify(z, dx, dy, **options):
+        asked.update(options, steps=(dx, dy))
+        raise ValueError("enough")
+
+    monkeypatch.setattr("fractaljax._identify.files.read_measurement", read)
+    monkeypatch.setattr("fractaljax._identify.identify.identify", identify)
+    reading = {"dx": 1.0, "dy": 2.0, "unit": "um", "position_unit": "mm", "channel": "Z"}
+    limits = {"stylus_radius": 5e-6}
+    options = [
+        word
+        for name, value in (reading | limits).items()
+        for word in (f"--{name.replace('_', '-')}", value)
+    ]
+    options += ["--band", 1, "2e3", "--aliased", "no"]
+    assert run(capsys, "identify", "f", *options) == (2, "", "fractaljax: enough\n")
+    fitting = {"band": [1.0, 2000.0], "aliased": False, "gamma": 1.5, "resolution": 3e-6}
+    expected = {"path": Path("f"), "steps": (1e-6, None)}
+    assert asked == reading | limits | fitting | expected
+
+
+WAVY = 1e-6 * np.sin(2 * np.pi * DX * np.arange(4096) / 3e-4) + 1e-9 * np.random.default_rng(
+    1
+).normal(size=4096)
+
+
+@pytest.mark.parametrize(
+    ("z", "message"),
+    [
+        (profile(1024, 3.25), "D must be above 2 and below 3"),
+        (profile(1024, 1.25), "D must be above 2 and below 3"),
+        (WAVY, DISQUALIFYING[0]),
+        (1e-8 * np.round(4 * profile(1024) / np.ptp(profile(1024))), DISQUALIFYING[1]),
+    ],
+)
+def test_no_scene(capsys, z, message):
+    """Exit status 1, the reason, the picture that shows it, and no scene."""
+    np.save("z.npy", z)
+    SCENE.parent.mkdir()
+    SCENE.write_text("")
+    status, out, err = run(capsys, "identify", "z.npy", "--dx", DX, "--unit", "m")
+    lines = out.splitlines()
+    assert (status, err) == (1, "") and "next" not in out
+    assert lines[-1].startswith("no scene: ") and message in lines[-1]
+    assert lines[-2] == f"{SCENE} is from an earlier run"
+    assert lines[-3] == "written to fractaljax-identification: identification.png"
+    assert SCENE.read_text() == ""
+
+
+@pytest.mark.parametrize(
+    ("D", "G", "options"),
+    [
+        (2.4, 1e-10, ""),
+        (2.06, 1e-10, " --D 2.03 2.16"),
+        (2.95, 1e-7, " --D 2.85 2.975 --G 1e-08 1e-06"),
+    ],
+)
+def test_bounds_for_the_design(D, G, options):
+    """Only where the default ones leave the surface out."""
+    assert _bounds(fj.Surface(D, G)) == options
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "required: file"),
+        (["nowhere.csv"], "no such file"),
+        (["words.csv"], "words.csv: there is no line of numbers in it"),
+        (["flat.npy", "--dx", 1], "in which unit heights are: give it (--unit um)"),
+        (["flat.npy", "--unit", "um"], "give dx in metres (--dx 1e-6)"),
+        (["flat.npy", "--unit", "um", "--dx", "1um"], "invalid float value: '1um'"),
+        (["flat.npy", "--unit", "um", "--dx", 1], "z has no roughness: it is constant"),
+        (["flat.npy", "--scene", "fixed.toml"], "takes no surface"),
+        (["flat.npy", "--scene", "nowhere.toml"], "no such file"),
+        (["good.csv", "--band", 1e9, 2e9], "band must rise and lie between"),
+        (["good.csv", "--out", "words.csv"], "File exists"),
+    ],
+)
+def test_bad_input(capsys, tmp_path, arguments, message):
+    """One line, exit status 2, and no folder left behind."""
+    Path("words.csv").write_text("nothing\n")
+    np.save("flat.npy", np.ones(500))
+    write_profile("good.csv", profile(512))
+    fj.brake_scene().replace(contact=fj.FixedContact(1.0, 1.0)).save("fixed.toml")
+    before = sorted(path.name for path in tmp_path.iterdir())
+    status, out, err = run(capsys, "identify", *arguments)
+    assert (status, out) == (2, "")
+    assert err.startswith("fractaljax: ") and message in err and err.count("\n") == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+@pytest.mark.slow
+def test_from_a_measurement_to_a_design(capsys):
+    """`fractaljax design` makes the scene stable."""
+    write_profile("mine.csv", profile(4096))
+    assert run(capsys, "identify", "mine.csv")[0] == 0
+    status, out, err = run(capsys, "design", SCENE, "--starts", 8, "--lattice", 8, "--quiet")
+    assert err == "" and (status, "found: " in out) in [(0, True), (1, False)]
+    start, end = fj.Scene.load(SCENE), fj.Scene.load("fractaljax-design/design.toml")
+    assert fj.growth_rate(start) > 0 > fj.growth_rate(end)

@@ -1,0 +1,285 @@
+"""The command: what it prints and writes, and how it refuses."""
+
+import csv
+import errno
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+
+import fractaljax as fj
+from fractaljax.__main__ import main
+from fractaljax._dynamics.summary import cycle_table
+from tools import motionless_scene, reference_cycle, reference_scene, run_command as run
+
+_CYCLE = ["cycle.csv", "cycle.png"]
+_SEARCH = "fractaljax._dynamics.limit_cycle.limit_cycle"
+_TABLE = "fractaljax._stability.summary.stability_table"
+
+
+def names(folder) -> list[str]:
+    return sorted(path.name for path in Path(folder).iterdir())
+
+
+# --- what it prints and writes ------------------------------------------------------------
+
+
+def test_stability(capsys, tmp_path):
+    """The table of the reference brake, and of a file; the slope of the friction law left out."""
+    status, out, err = run(capsys, "stability")
+    assert (status, err) == (0, "")
+    assert "+22.0801  (it squeals)" in out and out.count("eigenvalue") == 4
+    fixed = fj.brake_scene().replace(contact=fj.FixedContact(0.0, 0.0), friction=fj.Coulomb(0.3))
+    fixed.save(tmp_path / "fixed.toml")
+    status, out, _ = run(capsys, "stability", "fixed.toml")
+    assert status == 0 and "(stable against small disturbances)" in out and "regime" not in out
+    status, out, _ = run(capsys, "stability", "--constant-friction")
+    assert status == 0 and "+23.311" in out
+
+
+def test_scene_and_version(capsys):
+    """What `fractaljax scene` prints is the reference brake, to the last bit."""
+    status, out, _ = run(capsys, "scene")
+    Path("scene.toml").write_text(out)
+    assert status == 0
+    assert fj.Scene.load("scene.toml").to_toml() == fj.brake_scene().to_toml() == out
+    assert run(capsys, "--version") == (0, f"fractaljax {fj.__version__}\n", "")
+
+
+def test_cycle(capsys):
+    """The table, the picture, and one period as numbers that are those of the orbit."""
+    reference_scene().save("mine.toml")
+    status, out, err = run(capsys, "cycle", "mine.toml")
+    table = cycle_table(reference_scene(), reference_cycle())
+    assert (status, err) == (0, "")
+    assert out == f"{table}\nwritten to fractaljax-cycle: cycle.png, cycle.csv\n"
+    assert names("fractaljax-cycle") == _CYCLE
+    with open("fractaljax-cycle/cycle.csv", newline="") as file:
+        titles, *rows = csv.reader(file)
+    assert titles == ["time [s]", "x1 [m]", "x2 [m]", "v1 [m/s]", "v2 [m/s]"]
+    t, states = reference_cycle().orbit(512)
+    np.testing.assert_array_equal(np.array(rows, float), np.column_stack([t, states]))
+    assert Path("fractaljax-cycle/cycle.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_cycle_options(capsys, monkeypatch):
+    """Options as given, none otherwise; an inaccurate cycle is one; other files stay."""
+    asked = []
+
+    def search(scene, **options):
+        asked.append(options)
+        return eqx.tree_at(lambda c: c.result, reference_cycle(), fj.CycleResult.inaccurate)
+
+    Path("out").mkdir()
+    Path("out/notes.txt").write_text("mine")
+    monkeypatch.setattr(_SEARCH, search)
+    # Negative numbers with an exponent are numbers, no options.
+    options = ["--start", 1, "-2E-3", "-.5e1", 4, "--rtol", 1e-6, "--max-returns", 7]
+    status, out, _ = run(capsys, "cycle", *options, "--out", "out")
+    assert status == 0 and "but not to rtol" in out
+    assert names("out") == [*_CYCLE, "notes.txt"]
+    assert run(capsys, "cycle")[0] == 0
+    start = [1.0, -0.002, -5.0, 4.0]
+    options = {"start": start, "rtol": 1e-6, "max_returns": 7, "throw": False}
+    assert asked == [options, {"throw": False}]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scene", "start", "message"),
+    [
+        (motionless_scene, [], "the motion dies out"),
+        (reference_scene, ["--start", "6e-4", 0, 0, 0], "the motion grows beyond all bounds"),
+    ],
+)
+def test_no_cycle_is_no_success(capsys, tmp_path, scene, start, message):
+    """Exit status 1, the reason, and nothing written: a new folder is gone, an old one as was."""
+    scene().save("mine.toml")
+    (tmp_path / "old").mkdir()
+    for folder in ["a/b", "old"]:
+        status, out, err = run(capsys, "cycle", "mine.toml", *start, "--out", folder)
+        assert (status, err) == (1, "")
+        assert out.startswith("result  ") and message in out and "written" not in out
+    assert sorted(p.name for p in tmp_path.rglob("*")) == ["mine.toml", "old"]
+
+
+# --- how it refuses -----------------------------------------------------------------------
+
+EDITS = [
+    ("D = 2.4", "D = 2.0", "bad.toml: [contact.surface] D must be above 2 and below 3, got 2.0"),
+    ("mu_s = 0.4 ", "mu_s = '0.4' ", "bad.toml: [friction] mu_s must be a number, got '0.4'"),
+    ("v_m = 0.5", "v_n = 0.5", "bad.toml: [friction] has the unknown key 'v_n'"),
+    ("v_m = 0.5", "", "bad.toml: [friction] lacks the key 'v_m'"),
+    ("[friction]", "[friction", "bad.toml: "),
+    ("v_m = 0.5", "v_m = 1e-150", "stability cannot be computed in float64: the friction at V is"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "message"), EDITS)
+@pytest.mark.parametrize("command", ["design", "stability", "cycle"])
+def test_bad_scene_files(capsys, tmp_path, command, old, new, message):
+    """One line with file, table, bound and value; exit status 2; nothing written."""
+    text = fj.brake_scene().to_toml()
+    assert old in text
+    (tmp_path / "bad.toml").write_text(text.replace(old, new, 1))
+    status, out, err = run(capsys, command, "bad.toml")
+    assert (status, out) == (2, "")
+    assert err.startswith(f"fractaljax: {message}") and err.count("\n") == 1
+    assert names(tmp_path) == ["bad.toml"]
+
+
+def test_friction_beyond_its_law(capsys, tmp_path):
+    """mu_m above 0.9 is beyond Eq. 19."""
+    text = fj.brake_scene().to_toml().replace("mu_s = 0.4", "mu_s = 1.0")
+    (tmp_path / "bad.toml").write_text(text.replace("mu_m = 0.25", "mu_m = 0.95"))
+    status, _, err = run(capsys, "stability", "bad.toml")
+    assert status == 2 and "mu_m must be at most 0.9, got 0.95" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["stability", "."], "a folder, not a file: ."),
+        (["cycle", "nowhere.toml"], "no such file: nowhere.toml"),
+        (["cycle", "--out", "file/below"], "not a folder: file/below"),
+        (["cycle", "--rtol", "nan"], "rtol must be above 0 and at most 0.1, got nan"),
+        (["cycle", "--max-returns", 0], "max_returns must be a whole number of at least 1, got 0"),
+        (["cycle", "--max-returns", 1.5], "invalid int value: '1.5'"),
+        (["cycle", "--start", 1, 2, 3], "--start: expected 4 arguments"),
+        (["cycle", "--start", 0, 0, "nan", 0], "start must be finite, got nan"),
+        (["cycle", "--rtol", 1, "--rtol", 2], "argument --rtol: given more than once"),
+        (["cycle", "--constant-friction"], "unrecognized arguments: --constant-friction"),
+        (["polish"], "invalid choice: 'polish'"),
+        ([], "required: command"),
+    ],
+)
+def test_bad_arguments(capsys, tmp_path, arguments, message):
+    """One line, exit status 2, and no folder left behind."""
+    (tmp_path / "file").write_text("in the way")
+    status, out, err = run(capsys, *arguments)
+    assert (status, out) == (2, "")
+    assert err.startswith("fractaljax: ") and message in err and err.count("\n") == 1
+    assert names(tmp_path) == ["file"]
+
+
+def raising(error):
+    def fail(*_):
+        raise error
+
+    return fail
+
+
+def checked(compile):
+    """A function whose compiled program fails a check."""
+    program = compile(lambda x: eqx.error_if(x, x > 0, "F must be below 0"))
+    return lambda *_: jax.block_until_ready(program(np.ones(())))
+
+
+@pytest.mark.parametrize(
+    ("fail", "line"),
+    [
+        (raising(MemoryError("1 TiB")), "not enough memory: 1 TiB"),
+        (raising(RecursionError("maximum recursion depth")), "a file is too deeply nested"),
+        (raising(OverflowError("int too large")), "a number is out of range: int too large"),
+        (raising(ZeroDivisionError("by zero")), "a number is out of range: by zero"),
+        (raising(PermissionError(13, "Permission denied", "x")), "no permission for: x"),
+        (raising(OSError(28, "No space left on device", "x")), "No space left on device: x"),
+        (raising(OSError("disk full")), "disk full"),
+        (raising(jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: of")), "not enough memory: RESO"),
+        (checked(jax.jit), "F must be below 0\n"),
+        (checked(eqx.filter_jit), "F must be below 0\n"),
+    ],
+)
+def test_expected_failures_are_one_line(capsys, monkeypatch, fail, line):
+    monkeypatch.setattr(_TABLE, fail)
+    status, out, err = run(capsys, "stability")
+    assert (status, out) == (2, "")
+    assert err.startswith(f"fractaljax: {line}") and err.count("\n") == 1
+
+
+def test_defect_keeps_its_traceback(monkeypatch):
+    monkeypatch.setattr(_TABLE, raising(AttributeError("no x")))
+    with pytest.raises(AttributeError, match="no x"):
+        main(["stability"])
+
+
+def test_full_disk(capsys, monkeypatch):
+    """The reason is that of the second file, and neither file is left."""
+    fsync, synced = os.fsync, []
+
+    def fail(handle):
+        synced.append(handle)
+        if len(synced) == 2:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        fsync(handle)
+
+    monkeypatch.setattr(_SEARCH, lambda *_, **__: reference_cycle())
+    monkeypatch.setattr(os, "fsync", fail)
+    said = "fractaljax: No space left on device: fractaljax-cycle/cycle.csv\n"
+    assert run(capsys, "cycle") == (2, "", said)
+    assert names(".") == []
+
+
+# --- processes: signals, pipes, precision -------------------------------------------------
+
+_PROGRAM = """
+import os, sys, time
+import fractaljax._dynamics.limit_cycle as search
+from fractaljax.__main__ import main
+
+def limit_cycle(*_, **__):
+    print(sorted(os.listdir()), flush=True)
+    time.sleep(60)
+
+search.limit_cycle = limit_cycle
+sys.exit(main(["cycle", "--out", "a/b"]))
+"""
+
+
+def test_termination_leaves_nothing(tmp_path):
+    """SIGTERM as Ctrl-C: one line, exit status 143, and no folder before there are files."""
+    with tempfile.TemporaryFile("w+") as errors:  # a pipe that nobody reads may fill up
+        process = subprocess.Popen(
+            [sys.executable, "-c", _PROGRAM], stdout=subprocess.PIPE, stderr=errors, text=True
+        )
+        assert process.stdout is not None
+        assert process.stdout.readline() == "[]\n"
+        process.terminate()
+        process.communicate(timeout=60)
+        errors.seek(0)
+        err = errors.read()
+    assert (process.returncode, err) == (143, "fractaljax: terminated, nothing written\n")
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "message"),
+    [
+        ("scene | true", 141, "standard output was closed"),
+        ("scene > /dev/full", 2, "No space left on device"),
+        ("stability nowhere.toml >&-", 2, "nowhere.toml"),
+    ],
+)
+def test_output_that_cannot_be_written(arguments, status, message):
+    """One line, however much is printed and whenever it fails."""
+    done = subprocess.run(
+        ["bash", "-c", f"{sys.executable} -m fractaljax {arguments}; exit ${{PIPESTATUS[0]}}"],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == status
+    assert message in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_module_in_double_precision():
+    """`python -m fractaljax` is the same command, and chooses float64 itself."""
+    done = subprocess.run(
+        [sys.executable, "-m", "fractaljax", "stability"], capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, "") and "+22.0801" in done.stdout

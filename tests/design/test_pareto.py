@@ -1,0 +1,99 @@
+"""The front of two objectives against a fine grid, and its refusals."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fractaljax as fj
+from fractaljax._design import constraints
+from fractaljax._design.pareto import pareto
+from fractaljax.plot.pareto import pareto as draw
+
+BOUNDS = {"D": (2.3, 2.8), "G": (1e-11, 1e-9)}
+
+
+def fineness(scene):
+    """-ln Sq over the lengths of a profile: a rough surface is cheap."""
+    return -jnp.log(constraints.root_mean_square_height(scene.contact.surface, 1e-3, 1e-6))
+
+
+@pytest.fixture(scope="module")
+def front():
+    names = "growth rate [1/s]", "fineness -ln(Sq/m) [-]"
+    return pareto(
+        fj.brake_scene(),
+        fj.growth_rate,
+        fineness,
+        points=9,
+        bounds=BOUNDS,
+        names=names,
+        progress=False,
+    )
+
+
+@jax.jit
+def on_grid(Ds, Gs):
+    def one(D, G):
+        moved = fj.brake_scene().replace(D=D, G=G)
+        state = moved.contact.state(moved.friction.mu_s, moved.friction.mu_m)
+        meets = (fj.growth_rate(moved) <= -math.pi) & (state.log_area_ratio >= math.log(2))
+        meets &= (state.K_n >= fj.stiffness(fj.brake_scene())[0]) & (state.slip_ratio <= 0.9)
+        return meets, fj.growth_rate(moved), fineness(moved)
+
+    return jax.vmap(lambda D: jax.vmap(lambda G: one(D, G))(Gs))(Ds)
+
+
+@pytest.mark.slow
+def test_front_is_that_of_a_grid(front):
+    """No grid point that meets the requirements beats a member in both objectives."""
+    Ds, Gs = jnp.linspace(*BOUNDS["D"], 300), jnp.geomspace(*BOUNDS["G"], 300)
+    meets, first, second = (np.asarray(x) for x in on_grid(Ds, Gs))
+    first, second = first[meets], second[meets]
+    for f, s in zip(front.first, front.second, strict=True):
+        assert not ((first < f - 1e-3 * abs(f)) & (second < s - 1e-3)).any()
+    assert front.first.min() <= first.min() + 1e-6 and front.second.min() <= second.min() + 1e-6
+
+
+@pytest.mark.slow
+def test_members_meet_every_requirement_and_trade(front):
+    """In order, none dominated, and each worth what it says."""
+    assert len(front.first) == 9 and front.failed == 0  # as many points as were asked for
+    assert (np.diff(front.first) > 0).all() and (np.diff(front.second) < 0).all()
+    for i in range(len(front.first)):
+        scene = front.scene(i)
+        assert fj.growth_rate(scene) <= -math.pi
+        assert scene.contact.state(0.4, 0.25).slip_ratio <= 0.9
+        assert float(fj.growth_rate(scene)) == pytest.approx(front.first[i], rel=1e-9)
+        assert float(fineness(scene)) == pytest.approx(front.second[i], rel=1e-9)
+
+
+def test_picture(front):
+    """Every member, with the names of the objectives at the axes."""
+    ax = draw(front)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == front.names
+    assert len(np.asarray(ax.collections[0].get_offsets())) == np.size(front.first)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"points": 2}, "points must be a whole number of at least 3, got 2"),
+        ({"envelope": {"P": (1.0, 2.0)}}, "pareto does not take envelope"),
+        ({"bounds": {"D": (2.5, 2.3)}}, "bounds on D must be (lower, upper)"),
+        ({"K_n_min": 1e14}, "no design meets every requirement"),
+    ],
+)
+def test_refusals(options, message):
+    """One clear line."""
+    with pytest.raises(ValueError) as caught:
+        pareto(
+            fj.brake_scene(),
+            fj.growth_rate,
+            fineness,
+            progress=False,
+            **{"bounds": BOUNDS} | options,
+        )
+    assert message in str(caught.value) and "\n" not in str(caught.value)

@@ -1,0 +1,187 @@
+"""The solver on known problems, starts, averages, and the exchange of conditions."""
+
+import threading
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fractaljax as fj
+from fractaljax._design.search import (
+    _Functions,
+    averaged,
+    choose_starts,
+    expected_shortfall,
+    in_lockstep,
+    screened_designs,
+    slsqp,
+)
+from tools import reference_scene
+
+
+def functions_of(f, c, slack=0.0):
+    """Values and Jacobians of functions of one point, by complex step, as a solver asks them."""
+
+    def rows_at(u):
+        at = [np.append(f(z), c(z)) for z in (u, *(u + 1e-30j * np.eye(len(u))))]
+        return np.real(at[:1]), np.imag(at[1:]).T[None] / 1e-30
+
+    k = 1 + len(c(np.zeros(2)))
+    return _Functions(rows_at, np.arange(k) == 0, np.arange(k) > 0, slack, 1.0, extra=False)
+
+
+@pytest.mark.parametrize(
+    ("f", "c", "solution"),
+    [
+        # Outside a circle, nearest to a point inside it: along the radius.
+        (
+            lambda u: (u[0] - 0.6) ** 2 + (u[1] - 0.5) ** 2,
+            lambda u: np.array([0.09 - (u[0] - 0.5) ** 2 - (u[1] - 0.5) ** 2]),
+            (0.8, 0.5),
+        ),
+        # Two curves meet in a corner, where residuals are far from order one.
+        (
+            lambda u: u[0] + 2 * u[1],
+            lambda u: 1e3 * np.array([0.25 - u[0] * u[1], u[0] ** 2 - 0.36]),
+            (0.6, 0.25 / 0.6),
+        ),
+        # The bounds alone decide.
+        (lambda u: u[0] - u[1], lambda u: np.array([-1 + 0 * u[0]]), (0.0, 1.0)),
+        # Nothing decides: a smooth minimum inside.
+        (
+            lambda u: (u[0] - 0.3) ** 2 + 5 * (u[1] - 0.7 - u[0] ** 2 / 2) ** 2,
+            lambda u: np.array([-1 + 0 * u[0]]),
+            (0.3, 0.745),
+        ),
+    ],
+)
+def test_known_solutions(f, c, solution):
+    """Curved, cornered, bounded and free minima, with as few evaluations as a solver asks for."""
+    bounds, ends = np.tile([0.0, 1.0], (2, 1)), []
+    for start in np.random.default_rng(0).uniform(size=(6, 2)):
+        functions = functions_of(f, c)
+        u = slsqp(functions.objective, functions.constraints, start, bounds)
+        if (c(u) <= 1e-6).all():
+            ends.append((f(u), *u))
+            assert len(functions.seen) == len(np.unique(functions.seen, axis=0)) < 200
+    np.testing.assert_allclose(min(ends)[1:], solution, atol=1e-6)
+
+
+def test_residuals_without_a_number_are_finite_and_unmet():
+    functions = functions_of(lambda u: u[0], lambda u: np.array([np.nan, -np.inf, 0.5 + 0 * u[0]]))
+    c, slopes = functions.constraints(np.array([0.5, 0.5]))
+    assert np.isfinite(c).all() and np.isfinite(slopes).all()
+    assert c[0] > 1 and c[1] < -1 and c[2] == 0.5
+
+
+def test_tasks_in_lockstep_are_answered_together_and_in_this_thread():
+    asked, here = [], threading.get_ident()
+
+    def task(count):
+        return lambda ask: sum(ask(count) for _ in range(count))
+
+    def answer(questions):
+        assert threading.get_ident() == here
+        asked.append(questions)
+        return [10 * question for question in questions]
+
+    assert in_lockstep([task(count) for count in (3, 1, 2)], answer) == [90, 10, 40]
+    assert asked == [[3, 1, 2], [3, 2], [3]]
+
+    def interrupt(questions):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        in_lockstep([task(2), task(3)], interrupt)
+    with pytest.raises(ZeroDivisionError):
+        in_lockstep([task(2), lambda ask: 1 / 0], answer)
+
+
+@pytest.mark.parametrize("variables", [1, 2, 3, 5])
+def test_screened_designs_fill_the_bounds(variables):
+    """Every half of every variable holds half of them, every quadrant a quarter."""
+    designs = screened_designs(16, variables)
+    assert designs.shape == (16 if variables == 1 else 256, variables)
+    upper = designs > 0.5
+    np.testing.assert_allclose(upper.mean(axis=0), 0.5, atol=0.01)
+    if variables > 1:
+        quadrants = (upper.T @ upper.astype(float)) / len(designs)
+        np.testing.assert_allclose(quadrants[~np.eye(variables, dtype=bool)], 0.25, atol=0.05)
+
+
+def test_starts_are_those_given_and_one_in_every_basin():
+    designs = screened_designs(24, 2)
+    deep, shallow = np.array([0.2, 0.3]), np.array([0.8, 0.7])
+    values = np.minimum(
+        *(((designs - at) ** 2).sum(axis=1) + level for at, level in ((deep, 0), (shallow, 0.01)))
+    )
+    rows = np.column_stack([values, np.full(len(values), -1.0)])
+    own = np.array([0.51, 0.52])
+    us, scale = choose_starts(own, designs, rows, 6)
+    np.testing.assert_array_equal(us[0], own)
+    for basin in (deep, shallow):
+        assert np.abs(us[1:3] - basin).max(axis=1).min() < 1 / 24
+    assert len(us) == 6 and scale == pytest.approx(np.ptp(np.quantile(values, [0.1, 0.9])))
+
+
+@pytest.mark.parametrize(("count", "alpha"), [(10, 0.9), (10, 0.85), (7, 0.0), (4, 0.99)])
+def test_expected_shortfall_is_the_mean_of_the_worst(count, alpha):
+    """Against the integral of the quantile function over the tail."""
+    values = np.sort(np.random.default_rng(count).normal(size=count))
+    levels = np.linspace(alpha, 1, 200001)[:-1] + (1 - alpha) / 400000
+    tail = values[np.minimum((levels * count).astype(int), count - 1)]
+    assert expected_shortfall(count, alpha) @ values == pytest.approx(tail.mean(), abs=1e-4)
+    assert expected_shortfall(count, alpha).sum() == pytest.approx(1, rel=1e-14)
+
+
+@pytest.mark.parametrize("risk", [0.02, expected_shortfall(10, 0.8)])
+def test_averages_and_their_derivatives(risk):
+    rows = np.random.default_rng(0).normal(size=(10, 3))
+    found, weights = averaged(rows, risk)
+    if np.ndim(risk):
+        np.testing.assert_allclose(found, np.sort(rows, axis=0)[-2:].mean(axis=0))
+    else:
+        assert (found >= rows.max(axis=0)).all()
+        assert (found <= rows.max(axis=0) + risk * np.log(10)).all()
+    moved = rows + 1e-7 * (direction := np.random.default_rng(1).normal(size=rows.shape))
+    change = (averaged(moved, risk)[0] - found) / 1e-7
+    np.testing.assert_allclose(change, (weights * direction).sum(axis=0), atol=1e-5)
+
+
+# --- a problem whose worst case is known ------------------------------------------------------
+
+
+def outside_disc(scene):
+    """Stay outside a disc that travels along a curve with the condition F in [0, 1]."""
+    o = scene.oscillator
+    return 0.2 - jnp.hypot(o.xi_1 - o.F, o.xi_2 - 0.5 - 0.15 * jnp.sin(jnp.pi * o.F))
+
+
+def from_centre(scene):
+    return (scene.oscillator.xi_1 - 0.5) ** 2 + (scene.oscillator.xi_2 - 0.55) ** 2
+
+
+@pytest.mark.slow
+def test_exchange_finds_the_worst_between_all_points():
+    """The nearest point of the envelope's edge, which no condition of the first guess touches."""
+    best = fj.design(
+        reference_scene().replace(xi_1=0.3, xi_2=0.4, F=0.5),
+        {"xi_1": (0.0, 1.0), "xi_2": (0.0, 1.0)},
+        from_centre,
+        target=1e6,
+        constraints=[outside_disc],
+        envelope={"F": (0.0, 1.0)},
+        progress=False,
+    )
+    assert best.violated == () and best.active == ("outside_disc",)
+    side, s = np.linspace(0, 1, 401), np.linspace(0, 1, 801)
+    x, y = (axis.ravel() for axis in np.meshgrid(side, side))
+
+    def clear(x, y):
+        curve = 0.5 + 0.15 * np.sin(np.pi * s)
+        return np.min([np.hypot(x - a, y - b) for a, b in zip(s, curve, strict=True)], axis=0)
+
+    xi = best.scene.oscillator
+    assert clear(float(xi.xi_1), float(xi.xi_2)) >= 0.2 - 1e-9
+    nearest = ((x - 0.5) ** 2 + (y - 0.55) ** 2)[clear(x, y) >= 0.2].min()
+    assert 0.97 * nearest < best.value < 1.0001 * nearest

@@ -1,0 +1,173 @@
+"""Quadrature, quantiles and draws of scatter against the normal distribution."""
+
+import math
+from statistics import NormalDist
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fractaljax as fj
+from fractaljax._design.problem import DEFAULT_BOUNDS
+from fractaljax._design.tolerance import Tolerance, low_discrepancy, nodes, proportion, quantile
+
+NORMAL = NormalDist()
+
+
+@pytest.mark.parametrize("dimensions", [1, 2, 3])
+def test_nodes_are_standard_normal(dimensions):
+    """Weights sum to one; mean, covariance and fourth moment are those of the normal."""
+    z, weights = nodes(dimensions)
+    assert z.shape == (55 * 2 ** max(dimensions - 2, 0), dimensions) and (weights > 0).all()
+    assert weights.sum() == pytest.approx(1, rel=1e-14)
+    np.testing.assert_allclose(weights @ z, 0, atol=0.02)
+    accuracy = 0.03 if dimensions < 3 else 0.06
+    np.testing.assert_allclose((z * weights[:, None]).T @ z, np.eye(dimensions), atol=accuracy)
+    np.testing.assert_allclose(weights @ z**4, 3, rtol=0.1)
+
+
+@pytest.mark.parametrize("level", [0.9, 0.95, 0.99])
+def test_quantile_of_linear_functions(level):
+    """In every direction of the plane: the level that is reached is the one asked for."""
+    z, weights = nodes(2)
+    angles = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+    values = jnp.asarray(z @ np.stack([np.cos(angles), np.sin(angles)]))
+    found = np.asarray(quantile(values, jnp.asarray(weights), level))
+    reached = np.array([NORMAL.cdf(x) for x in found])
+    assert np.abs(reached - level).max() < (1 - level) / 2
+
+
+def test_quantile_of_a_radius_and_in_one_dimension():
+    """A curved function, and one deviate alone."""
+    z, weights = nodes(2)
+    squared = quantile(jnp.asarray((z**2).sum(axis=1)), jnp.asarray(weights), 0.95)
+    assert 1 - math.exp(-float(squared) / 2) == pytest.approx(0.95, abs=0.012)
+    z, weights = nodes(1)
+    assert quantile(jnp.asarray(z[:, 0]), jnp.asarray(weights), 0.95) == pytest.approx(
+        NORMAL.inv_cdf(0.95), abs=0.03
+    )
+
+
+def test_quantile_of_samples_is_between_its_neighbours():
+    """Equal weights: the mean of the order statistics around the level, whatever the order."""
+    values = np.random.default_rng(3).permutation(np.arange(100.0))
+    found = quantile(jnp.asarray(values), jnp.full(100, 0.01), 0.9)
+    assert found == pytest.approx(np.arange(85, 95).mean(), rel=1e-12)
+
+
+def test_quantile_is_continuous_with_the_derivative_of_its_nodes():
+    """Forward and reverse mode against differences, also where two nodes change places."""
+    z, weights = (jnp.asarray(x) for x in nodes(2))
+
+    def at(x):
+        return quantile(z[:, 0] * x + jnp.sin(3 * z[:, 1]) * (1 - x), weights, 0.95)
+
+    xs = jnp.linspace(0.2, 0.9, 401)
+    values, forward = (np.asarray(jax.vmap(f)(xs)) for f in (at, jax.jacfwd(at)))
+    reverse = np.asarray(jax.vmap(jax.jacrev(at))(xs))
+    np.testing.assert_allclose(forward, reverse, rtol=1e-12)
+    assert np.abs(np.diff(values)).max() < 0.01
+    difference = np.asarray((jax.vmap(at)(xs + 1e-7) - jax.vmap(at)(xs - 1e-7)) / 2e-7)
+    assert (np.abs(difference - forward) < 1e-5).mean() > 0.99
+
+
+def test_the_lattice_in_the_plane_is_fibonaccis():
+    i = np.arange(55)
+    expected = np.stack([(i + 0.5) / 55, (34 * i % 55 + 0.5) / 55], axis=1)
+    np.testing.assert_array_equal(low_discrepancy(55, 2), expected)
+
+
+CORRELATED = np.array([[1.0, 0.985 * 15], [0.985 * 15, 15**2]]) * 6e-3**2
+
+
+@pytest.mark.parametrize(
+    "covariance",
+    [np.diag([0.005**2, 0.05**2]), CORRELATED, np.outer([0.002, 0.03], [0.002, 0.03])],
+    ids=["independent", "correlated", "singular"],
+)
+def test_draws_have_the_covariance(covariance):
+    """Also where the correlation is 1, and of a mapping the standard deviations."""
+    tolerance = Tolerance(("D", "ln G"), covariance)
+    drawn = tolerance.shifts(np.random.default_rng(4).standard_normal((20000, 2)))
+    np.testing.assert_allclose(np.cov(drawn.T), covariance, atol=0.02 * np.abs(covariance).max())
+    sigma = dict(zip(("D", "ln G"), np.sqrt(np.diagonal(covariance)), strict=True))
+    assert tolerance.standard_deviations == pytest.approx(sigma)
+    mapped = Tolerance.of(sigma)
+    np.testing.assert_allclose(mapped.covariance, np.diag(np.diagonal(covariance)))
+    values = tolerance.scattered({"D": 2.4, "G": 1e-10, "P": 1.0}, drawn.T)
+    assert set(values) == {"D", "G"}
+    np.testing.assert_allclose(np.log(values["G"] / 1e-10), drawn[:, 1], rtol=1e-9, atol=1e-12)
+
+
+class Identified:
+    """As an `Identification` has it: D and ln G correlated 0.985."""
+
+    D_standard_error, ln_G_standard_error, covariance = 0.006, 0.09, CORRELATED
+
+
+def test_a_correlation_counts_in_the_probability_of_squeal():
+    """Of a surface on the quiet side; as independent they gave many times too much."""
+    scene = fj.brake_scene().replace(D=2.43, G=1.234e-10)
+    found = fj.squeal_probability(scene, Identified())
+    alone = fj.squeal_probability(scene, Tolerance.of(Identified()).standard_deviations)
+    random = np.random.default_rng(9).multivariate_normal([0, 0], CORRELATED, 20000)
+    growth = jax.jit(jax.vmap(lambda D, G: fj.growth_rate(scene.replace(D=D, G=G))))(
+        2.43 + random[:, 0], 1.234e-10 * np.exp(random[:, 1])
+    )
+    share = float((growth > 0).mean())
+    spread = 4 * math.hypot(found.standard_error, math.sqrt(share * (1 - share) / 20000))
+    assert found.value == pytest.approx(share, abs=spread)
+    assert alone.value > 20 * found.value
+
+
+@pytest.mark.slow
+def test_squeal_probability_under_an_envelope_and_by_seed():
+    scene, sigma = fj.brake_scene().replace(D=2.436), {"ln P": 0.1, "D": 0.001}
+    asked: dict[str, Any] = dict(envelope={"mu_s": (0.3, 0.5)}, samples=2000)
+    first, again = (fj.squeal_probability(scene, sigma, seed=1, **asked) for _ in range(2))
+    assert first == again != fj.squeal_probability(scene, sigma, seed=2, **asked)
+    assert 0.05 < first.value < 0.95
+    structure = fj.Structure.from_scene(scene)
+    same = fj.squeal_probability(structure, sigma, seed=1, **asked)
+    assert same.value == pytest.approx(first.value, abs=1e-3)
+
+
+def test_proportion_has_a_standard_error_at_its_ends():
+    """The usual one in the middle, one over n at nothing and at all."""
+    assert proportion(3000, 10000) == (0.3, pytest.approx(math.sqrt(0.21 / 10000), rel=1e-3))
+    assert proportion(0, 10000) == (0.0, pytest.approx(1e-4, rel=1e-3))
+    assert proportion(10000, 10000) == (1.0, pytest.approx(1e-4, rel=1e-3))
+
+
+def test_what_does_not_scatter_is_left_out():
+    assert Tolerance.of({"ln G": 0.05, "D": 0.0}).names == ("ln G",)
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "message"),
+    [
+        ({"D": -0.1}, "tolerance of D must be at least 0, got -0.1"),
+        ({"D": math.nan}, "tolerance of D must be at least 0, got nan"),
+        ({"K": 0.1}, "tolerance names 'K'; there are D, G"),
+        ({}, "tolerance must name a quantity, got none"),
+        ({"D": 0.0}, "tolerance must be above 0 for some quantity, got 0 for all"),
+        ({"D": 0.02}, "leaves its domain within 6 deviations: D must be above 2 and below 3, got"),
+        (0.1, "tolerance must be a mapping, a Tolerance or an Identification, got 0.1"),
+        ({"D": "small"}, "tolerance of D must be a number, got 'small'"),
+    ],
+)
+def test_refusals(tolerance, message):
+    """One clear line."""
+    with pytest.raises((ValueError, TypeError)) as caught:
+        Tolerance.of(tolerance).check(fj.brake_scene(), DEFAULT_BOUNDS)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "covariance", [[[1.0, 2.0], [2.0, 1.0]], [[1.0, 0.5], [0.0, 1.0]], [[1.0]]]
+)
+def test_what_is_no_covariance(covariance):
+    with pytest.raises(ValueError, match=r"^tolerance must (have a symmetric|name the rows)"):
+        Tolerance(("D", "ln G"), covariance)

@@ -1,0 +1,347 @@
+"""The scaled Filippov system against Eq. 39 as printed, in SI units and with a sign at a time."""
+
+import functools
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fractaljax as fj
+from fractaljax._dynamics.stick_slip import (
+    SECTION,
+    StickSlip,
+    check_rtol,
+    sliding_equilibrium,
+    start_state,
+    stick_slip,
+    units,
+)
+from tools import reference_scene
+
+STATES = list(itertools.product((1, 0, -1), repeat=2))
+SEEDS = range(8)
+NAMES = ("m", "omega_1", "omega_2", "xi_1", "xi_2", "F", "V", "K_n", "K_t", "mu_s", "mu_m", "v_m")
+
+field = jax.jit(StickSlip.field)
+guards = jax.jit(StickSlip.guards)
+switch = jax.jit(StickSlip.switch)
+first_state = jax.jit(StickSlip.contact_state)
+scaled = jax.jit(stick_slip)
+equal = np.testing.assert_array_equal
+
+
+def close(found, truth, atol):
+    np.testing.assert_allclose(found, truth, rtol=0, atol=atol)
+
+
+# --- the model, in SI units ---------------------------------------------------------------
+
+
+@functools.cache
+def numbers(seed):
+    """A random mechanism: the reference's, every number times up to two; the first has K_t = 0."""
+    rng = np.random.default_rng(seed)
+    usual = (1.0, 6283.2, 5026.5, 0.02, 0.05, 3000.0, 0.15, 4e8, 2e8, 0.4, 0.25, 0.5)
+    x = dict(zip(NAMES, np.array(usual) * rng.uniform(0.5, 2, len(usual)), strict=True))
+    x["mu_m"] = x["mu_s"] * rng.uniform(0.3, 0.95)
+    x["F"] *= rng.choice([-1, 1])
+    x["K_t"] *= seed > 0
+    return {name: float(value) for name, value in x.items()}
+
+
+def scene_of(x) -> fj.Scene:
+    return fj.Scene(
+        fj.FixedContact(x["K_n"], x["K_t"]),
+        fj.Stribeck(x["mu_s"], x["mu_m"], x["v_m"]),
+        fj.Oscillator(**{name: x[name] for name in NAMES[:7]}),
+    )
+
+
+def acceleration(x, state, signs):
+    """Eq. 39 solved for x1'', x2'', with sgn v_i = signs[i]; state [x1, x2, x1', x2'] (4, ...)."""
+    x_1, x_2, v_1, v_2 = state
+    drop, f = x["mu_s"] - x["mu_m"], x["F"] / np.sqrt(2)
+
+    def mu(v, sign):
+        return x["mu_s"] * sign - 3 * drop / (2 * x["v_m"]) * v + drop / (2 * x["v_m"] ** 3) * v**3
+
+    K_1, K_2 = x["m"] * x["omega_1"] ** 2, x["m"] * x["omega_2"] ** 2
+    C_1, C_2 = 2 * x["xi_1"] * x["omega_1"] * x["m"], 2 * x["xi_2"] * x["omega_2"] * x["m"]
+    force_1 = f + mu(x["V"] - v_1, signs[0]) * x["K_n"] * x_2 - C_1 * v_1 - (K_1 + x["K_t"]) * x_1
+    force_2 = -f - mu(x["V"] - v_2, signs[1]) * x["K_t"] * x_1 - C_2 * v_2 - (K_2 + x["K_n"]) * x_2
+    return np.array([force_1, force_2]) / x["m"]
+
+
+def scale(x):
+    """(omega, factors from a scaled state to SI)."""
+    omega = np.sqrt(x["omega_1"] ** 2 + x["omega_2"] ** 2 + (x["K_n"] + x["K_t"]) / x["m"])
+    return omega, x["V"] * np.array([1 / omega, 1 / omega, 1, 1])[:, None]
+
+
+def sides(x, y):
+    """Scaled du_i/dt on the forward and on the backward side of u_i = 1, (2, n) each."""
+    omega, factors = scale(x)
+    return [acceleration(x, y * factors, (s, s)) / (omega * x["V"]) for s in (1, -1)]
+
+
+def states(s, seed=0):
+    """200 random scaled states (4, n) and the contact state s (2, n), which they obey."""
+    y = np.random.default_rng(seed + 100).normal(size=(4, 200))
+    s = np.repeat(np.array(s, float)[:, None], 200, axis=1)
+    y[2:] = np.where(s == 0, 1, 1 - s * abs(y[2:]))
+    return y, s
+
+
+# --- field --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "x", [*map(numbers, SEEDS), numbers(1) | {"K_n": 0.0, "K_t": 0.0}], ids=lambda _: "x"
+)
+def test_field(x):
+    """Eq. 39 in all nine contact states; what sticks moves with the belt, unaccelerated."""
+    system, (omega, factors) = scaled(scene_of(x)), scale(x)
+    np.testing.assert_allclose(system.omega, omega, rtol=1e-14)
+    np.testing.assert_allclose(units(system), factors[:, 0], rtol=1e-14)
+    for s in STATES:
+        y, contact = states(s)
+        slips = np.array(s)[:, None] != 0
+        rate = np.vstack([y[2:] * x["V"], np.where(slips, acceleration(x, y * factors, s), 0)])
+        truth = rate / factors / omega
+        found = field(system, y, contact)
+        close(found, truth, 1e-13 * abs(truth).max())
+        equal(found[:2], y[2:])
+        equal(found[2:][np.array(s) == 0], 0)
+
+
+def test_equilibrium():
+    """Steady sliding at V > 0 is where the field vanishes, and Eq. 40's."""
+    for seed, V in itertools.product(SEEDS, (0.05, 0.15, 1.3)):
+        x = numbers(seed) | {"V": V}
+        scene, (_, factors) = scene_of(x), scale(x)
+        y = np.asarray(sliding_equilibrium(scene, scaled(scene)))[:, None]
+        equal(y[2:], 0)
+        here = field(scaled(scene), np.tile(y, 200), np.ones((2, 200)))
+        close(here, 0, 1e-15 * float(abs(y).max() + 1))
+        force = acceleration(x, y * factors, (1, 1))[:, 0] * x["m"]
+        close(force, 0, 1e-11 * abs(x["F"]))
+
+
+def test_coulomb():
+    """Constant friction: no cubic is traced, the field is affine, and friction has no slope."""
+    stribeck = reference_scene()
+    coulomb = stribeck.replace(friction=fj.Coulomb(0.4))
+    y, s = states((1, 1))
+
+    def program(scene):
+        system = stick_slip(scene)
+        return jax.make_jaxpr(lambda y: system.field(y, s))(y)
+
+    assert len(program(coulomb).eqns) < len(program(stribeck).eqns)
+    assert "pow" not in str(program(coulomb)) and "pow" in str(program(stribeck))
+    system, flat = stick_slip(coulomb), stick_slip(stribeck.replace(mu_m=0.4))
+    ends, middle = system.field(y, s), (y + y[:, ::-1]) / 2
+    close(system.field(middle, s), (ends + ends[:, ::-1]) / 2, 1e-14)
+    close(ends, flat.field(y, s), 1e-15)
+    equal(system.stiffness(y), np.zeros(200))
+
+
+def test_stiffness():
+    """The larger slope of what friction does to u_i by u_i, in units of omega."""
+    for seed in SEEDS:
+        x, (omega, factors) = numbers(seed), scale(numbers(seed))
+        y, _ = states((1, -1), seed)
+        y[2:] *= 3  # also beyond v_m, where friction rises
+        slopes = []
+        for i in (0, 1):
+            step = 1e-6 * np.eye(4)[2 + i][:, None]
+            ends = [
+                acceleration(x | {"xi_1": 0.0, "xi_2": 0.0}, moved * factors, (1, -1))[i]
+                for moved in (y + step, y - step)
+            ]
+            slopes.append((ends[0] - ends[1]) / 2e-6 / (omega * x["V"]))
+        found = np.asarray(scaled(scene_of(x)).stiffness(y))
+        np.testing.assert_allclose(found, abs(np.array(slopes)).max(axis=0), rtol=1e-6, atol=1e-8)
+
+
+def test_derivatives():
+    """By every quantity of the scene, forward and reverse: those of Eq. 39, scaled by hand."""
+    y, contact = (x[:, :1] for x in states((1, -1)))
+
+    def truth(values):
+        x = dict(zip(NAMES, values, strict=True))
+        omega, factors = scale(x)
+        return acceleration(x, y * factors, (1, -1))[:, 0] / (omega * x["V"])
+
+    def found(values):
+        scene = scene_of(dict(zip(NAMES, values, strict=True)))
+        return stick_slip(scene).field(y, contact)[2:, 0]
+
+    values = np.array([numbers(7)[name] for name in NAMES])
+    steps = [(truth(values + d) - truth(values - d)) / 2e-5 for d in np.diag(1e-5 * values)]
+    for mode in (jax.jacfwd, jax.jacrev):
+        close(np.asarray(jax.jit(mode(found))(values)) * values, np.array(steps).T, 1e-9)
+
+
+# --- guards -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("s", STATES)
+def test_guards(s):
+    """In slip the velocity's own sign; in stick both sides push back; the section is u1.
+
+    They are affine: `one` = 0 leaves the linear part, which at the field is their rate.
+    """
+    x = numbers(4)
+    system, (y, contact) = scaled(scene_of(x)), states(s)
+    found, others = (np.asarray(guards(system, z, contact)) for z in (y, np.roll(y, 1, axis=1)))
+    close(guards(system, y - np.roll(y, 1, axis=1), contact, 0.0), found - others, 1e-13)
+    rate = field(system, y, contact)
+    tangent = jax.jvp(lambda y: guards(system, y, contact), (y,), (rate,))[1]
+    close(guards(system, rate, contact, 0.0), tangent, 1e-13)
+    forward, backward = sides(x, np.vstack([y[:2], np.ones((2, 200))]))
+    for i in (0, 1):
+        if s[i]:
+            close(found[2 * i], s[i] * (1 - y[2 + i]), 1e-15)
+            equal(found[2 * i + 1], 1)
+        else:
+            close(found[2 * i], forward[i], 1e-12)
+            close(found[2 * i + 1], -backward[i], 1e-12)
+            held = (forward[i] > 0) & (backward[i] < 0)
+            equal((found[2 * i : 2 * i + 2] > 0).all(axis=0), held)
+    equal(found[SECTION], y[2])
+
+
+# --- switches -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("i", [0, 1])
+@pytest.mark.parametrize("arriving", [1, -1])
+def test_slip_that_ends(i, arriving):
+    """It reverses where the far side leads on and sticks where both lead back.
+
+    Decided from Eq. 39 on both sides of v = 0. Where the load is negative it never sticks.
+    """
+    seen = {"reversal": 0, "stick": 0, "reversal under tension": 0}
+    for seed in SEEDS:
+        x, other = numbers(seed), (1, -1, 0)[seed % 3]
+        y, contact = states((arriving, other) if i == 0 else (other, arriving), seed)
+        y[2 + i] = 1
+        own, far = sides(x, y)[:: int(arriving)]
+        arrives, reverses = arriving * own[i] > 0, arriving * far[i] > 0
+        after, s = map(np.asarray, switch(scaled(scene_of(x)), y, contact, 2 * i))
+        equal(s[i][arrives], np.where(reverses, -arriving, 0)[arrives])
+        equal(after, y)
+        equal(s[1 - i], contact[1 - i])
+        load = y[1] * x["K_n"] if i == 0 else -y[0] * x["K_t"]
+        assert (s[i][arrives & (load < 0)] == -arriving).all()
+        assert (load[(s[i] == 0) & arrives] > 0).all() or (i == 1 and x["K_t"] == 0)
+        seen["reversal"] += (arrives & reverses).sum()
+        seen["stick"] += (arrives & ~reverses).sum()
+        seen["reversal under tension"] += (arrives & (load < 0)).sum()
+    assert min(seen.values()) > 50, seen
+
+
+@pytest.mark.parametrize("i", [0, 1])
+@pytest.mark.parametrize("to", [1, -1])
+def test_stick_that_ends(i, to):
+    """The guard that reaches zero names the side, and that side's own field leaves the belt."""
+    for seed in SEEDS:
+        x, other = numbers(seed), (1, -1, 0)[seed % 3]
+        y, contact = states((0, other) if i == 0 else (other, 0), seed)
+        guard, system = 2 * i if to == 1 else 2 * i + 1, scaled(scene_of(x))
+        # Moved along x_i until the guard is just below zero, under a positive load.
+        y[1 - i] = abs(y[1 - i]) if i == 0 else -abs(y[1 - i])
+        value = np.asarray(guards(system, y, contact))[guard]
+        along = np.tile(np.eye(4)[i][:, None], 200)
+        y[i] -= (value + 1e-9) / np.asarray(guards(system, along, contact, 0.0))[guard]
+        after, s = map(np.asarray, switch(system, y, contact, guard))
+        equal(s[i], to)
+        equal(s[1 - i], contact[1 - i])
+        equal(after, y)
+        own = sides(x, y)[0 if to == 1 else 1][i]
+        assert (to * own < 0).all() and (abs(own) < 1e-8).all()
+
+
+def test_each_guard():
+    """The section puts u1 to zero, an end puts u_i to one; no guard touches anything else.
+
+    A guard a column: each acts on its own column only.
+    """
+    system = scaled(scene_of(numbers(5)))
+    for s in STATES:
+        y, contact = states(s)
+        columns = np.arange(200) % (SECTION + 2)
+        together = switch(system, y, contact, columns)
+        for guard in range(SECTION + 2):
+            after, new = map(np.asarray, switch(system, y, contact, guard))
+            expected, untouched = y.copy(), [0, 1]
+            if guard == SECTION:
+                expected[2] = 0
+            elif guard < SECTION:
+                expected[2 + guard // 2] = 1
+                untouched.remove(guard // 2)
+            equal(after, expected)
+            equal(new[untouched], contact[untouched])
+            for found, alone in zip(together, (after, new), strict=True):
+                equal(np.asarray(found)[:, columns == guard], alone[:, columns == guard])
+
+
+def test_first_contact_state():
+    """Off the belt's velocity its sign; on it, the side that leaves (or forward), else stick."""
+    seen = np.zeros(4, int)
+    for seed in SEEDS:
+        x, rng = numbers(seed), np.random.default_rng(seed)
+        y = rng.normal(size=(4, 300))
+        y[2:] = np.where(rng.uniform(size=(2, 300)) < 0.7, 1, y[2:] + 1)
+        found = np.asarray(first_state(scaled(scene_of(x)), y))
+        forward, backward = sides(x, y)
+        for i, (u, s) in enumerate(zip(y[2:], found, strict=True)):
+            leaves = forward[i] < 0, backward[i] > 0
+            expected = np.where(u == 1, np.select(leaves, [1, -1], 0), np.sign(1 - u))
+            equal(s, expected)
+            seen += np.bincount((2 * leaves[0] + leaves[1])[u == 1], minlength=4)
+    assert (seen > 50).all(), seen
+
+
+# --- arguments ----------------------------------------------------------------------------
+
+
+def test_start():
+    """Lists, whole numbers and arrays become one array of floats."""
+    for start in ([1, 2, 3, 4], np.arange(1, 5), jnp.arange(1.0, 5)):
+        found = start_state(start)
+        assert found.dtype == np.float64
+        equal(found, [1, 2, 3, 4])
+
+
+@pytest.mark.parametrize(
+    ("rtol", "dtype", "outcome"),
+    [
+        (None, "float64", 1e-9),
+        (None, "float32", 4096 * 2**-23),
+        (0.1, "float64", 0.1),
+        (9.1e-13, "float64", 9.1e-13),
+        (0.00049, "float32", 0.00049),
+        (np.float64(1e-6), "float64", 1e-6),
+        (jnp.float32(0.5) ** 8, "float64", 2**-8),
+        (0, "float64", "rtol must be above 0 and at most 0.1, got 0"),
+        (0.2, "float64", "rtol must be above 0 and at most 0.1, got 0.2"),
+        (np.nan, "float64", "rtol must be above 0 and at most 0.1, got nan"),
+        (1e-14, "float64", "rtol must be at least 9.1e-13 in float64, got 1e-14"),
+        (1e-9, "float32", "rtol must be at least 0.00049 in float32, got 1e-09"),
+        (True, "float64", "rtol must be a number, got True"),
+        ("1e-9", "float64", "rtol must be a number, got '1e-9'"),
+        ((1e-9, 1e-6), "float64", "rtol must be a number, got (1e-09, 1e-06)"),
+    ],
+)
+def test_rtol(rtol, dtype, outcome):
+    """It follows the precision; what that cannot hold, and what is no number, is refused."""
+    if not isinstance(outcome, str):
+        assert check_rtol(rtol, dtype) == outcome
+        return
+    with pytest.raises((ValueError, TypeError)) as caught:
+        check_rtol(rtol, dtype)
+    assert str(caught.value) == outcome

@@ -1,0 +1,95 @@
+"""Power laws through spectra that are known: exact, aliased, with a floor, and with chance."""
+
+import math
+
+import numpy as np
+import pytest
+
+from fractaljax._identify.fit import bin_edges, curvature, fit, shape
+from fractaljax._identify.spectrum import Spectrum
+
+NYQUIST, BAND, RATIO = 5e5, (5e3, 2.5e5), 1.5
+F = np.arange(1e3, NYQUIST, 1e3)
+
+
+def spectrum(power, kind="profile", spread=0.0):
+    """Ordinates a thousand 1/m apart."""
+    one = np.ones_like(F)
+    return Spectrum(F, power, one, 1 / F, spread * one, kind, NYQUIST)
+
+
+def law(p, aliased=False):
+    return 1e-20 * shape(F / NYQUIST, p, aliased)
+
+
+SPREAD = 4e6  # 1/m^2: a window smears a law by half its second derivative times its width
+EXACT = [  # (power, p, flat, kind, spread, options)
+    (law(1.1), 1.1, 0, "profile", 0, {}),
+    (law(2.9), 2.9, 0, "profile", 0, {}),
+    (law(1.1), 1.1, 0, "map", 0, {}),
+    (law(2.9), 2.9, 0, "map", 0, {}),
+    (law(1.8, aliased=True), 1.8, 0, "profile", 0, {"aliased": True}),
+    (law(2.5) * (1 + 2.5 * 3.5 / 2 * SPREAD / F**2), 2.5, 0, "profile", SPREAD, {}),
+    (law(2.5) * (1 + 3.5**2 / 2 * SPREAD / F**2), 2.5, 0, "map", SPREAD, {}),
+    (law(2.4) + 3e-20, 2.4, 3.0, "profile", 0, {"flat_deviation": 1e6}),
+    (law(2.4) + 3e-20 * F / NYQUIST, 2.4, 3.0, "map", 0, {"flat_deviation": 1e6}),
+    (law(2.0) - 3e-21, 2.0, -0.3, "profile", 0, {"flat_mean": -0.3}),
+    (law(2.0) / (1 + F / 1e5), 2.0, 0, "profile", 0, {"factor": lambda f, p: 1 / (1 + f / 1e5)}),
+]
+
+
+@pytest.mark.parametrize(("power", "p", "flat", "kind", "spread", "options"), EXACT)
+def test_an_exact_law_is_found_exactly(power, p, flat, kind, spread, options):
+    """With its floor, its aliased waves and the smearing by a window."""
+    found = fit(spectrum(power, kind, spread), BAND, RATIO, **options)
+    assert found.p == pytest.approx(p, abs=1e-5)
+    assert found.log_A == pytest.approx(math.log(1e-20), abs=1e-4)
+    assert found.flat == pytest.approx(flat, abs=1e-4) and found.scatter == 0
+    if not spread and "factor" not in options:
+        np.testing.assert_allclose(found(F), power, rtol=1e-3)
+    np.testing.assert_allclose(found.power, found(found.f), rtol=1e-4)
+
+
+def test_aliasing_is_the_sum_over_all_bands():
+    """In closed form at p = 2: the sum of (u + 2j)^-2 over all j is (pi/2)^2/sin^2(pi u/2)."""
+    u = np.array([0.01, 0.3, 0.5, 0.99])
+    closed = (np.pi / 2) ** 2 / np.sin(np.pi * u / 2) ** 2
+    np.testing.assert_allclose(shape(u, 2.0, True), closed, rtol=1e-12)
+    j = np.arange(1, 200_001)[:, None]
+    direct = u**-2.6 + ((u + 2 * j) ** -2.6 + (2 * j - u) ** -2.6).sum(axis=0)
+    np.testing.assert_allclose(shape(u, 2.6, True), direct, rtol=1e-8)
+
+
+def test_errors_are_those_of_many_draws():
+    """Exponential ordinates, as of a Gaussian profile: the covariance is that of the estimates."""
+    rng = np.random.default_rng(0)
+    drawn = [
+        fit(spectrum(law(2.0) * rng.exponential(size=F.size)), BAND, RATIO) for _ in range(300)
+    ]
+    found = np.array([(one.log_A, one.p) for one in drawn])
+    said = np.median([np.sqrt(np.diag(one.covariance)[:2]) for one in drawn], axis=0)
+    # The unknown flat share widens the errors by what no draw here has: at most a half.
+    for values, truth, error in zip(found.T, (math.log(1e-20), 2.0), said, strict=True):
+        assert values.mean() == pytest.approx(truth, abs=4 * values.std() / math.sqrt(300))
+        assert values.std() < 1.1 * error < 1.7 * values.std()
+
+
+def test_a_bend_is_measured():
+    bent = law(2.0) * np.exp(-0.05 * np.log(F / 5e4) ** 2)
+    c, _ = curvature(fit(spectrum(bent), BAND, RATIO, flat_deviation=1e-3))
+    assert c == pytest.approx(-0.05, abs=0.005)
+    straight, error = curvature(fit(spectrum(law(2.0)), BAND, RATIO, flat_deviation=1e-3))
+    assert abs(straight) < 1e-3 < error
+
+
+@pytest.mark.parametrize(
+    ("band", "edges"),
+    [
+        ((1.0, 1.5**4), 1.5 ** np.arange(5.0)),
+        ((0.9, 1.5**4), [0.9, *1.5 ** np.arange(1.0, 5.0)]),  # a wider one
+        ((0.75, 1.5**4), [0.75, *1.5 ** np.arange(5.0)]),  # one more
+        ((1.0, 1.2), [1.0, 1.2]),
+    ],
+)
+def test_bins_tile_the_band_from_above(band, edges):
+    np.testing.assert_allclose(bin_edges(band, 1.5), edges)

@@ -1,0 +1,285 @@
+"""The peers and truths that pages measure with, each against another one; how runs are compared."""
+
+import jax
+import numpy as np
+import pytest
+
+import fractaljax as fj
+from benchmarks import (
+    eigenvalues,
+    limit_cycle,
+    loops,
+    many_cycles,
+    scale,
+    scene_cost,
+    transients,
+    whole_design as designs,
+)
+from benchmarks.extreme.families import FAMILIES, family_rows
+from benchmarks.extremes import corner_rows
+from benchmarks.growth_rate import surfaces
+from benchmarks.timing import versions
+from fractaljax._sweep.shards import Shards
+
+REGIMES = {"elastic-plastic", "fully plastic", "gross slip"}
+
+
+def test_loops_and_arrays_agree_in_every_regime():
+    D, G = surfaces(100)
+    loop, plain = (body(loops.brake()) for body in (loops.tuned_loop, loops.plain_loop))
+    states = [loop(d, g) for d, g in zip(D, G, strict=True)]
+    others = [plain(d, g) for d, g in zip(D, G, strict=True)]
+    assert {state[2] for state in states} == REGIMES
+    assert [state[2] for state in states] == [state[2] for state in others]
+    rate, omega = np.array([state[:2] for state in states]).T
+    for found in (loops.arrays(loops.brake())(D, G), [state[0] for state in others]):
+        assert np.max(np.abs(found - rate) / omega) < 1e-14
+
+
+@pytest.mark.parametrize("order", [2, 4])
+def test_differences_have_their_order(order):
+    def power(D, G):
+        return D**order + np.log(G) ** order
+
+    D, G = np.array([2.4]), np.array([1e-10])
+    slopes = order * D ** (order - 1), order * np.log(G) ** (order - 1)
+    found = loops.differences(power, D, G, 0.1, order)
+    np.testing.assert_allclose(found, [power(D, G), *slopes], rtol=1e-10)
+
+
+@pytest.mark.parametrize("family", eigenvalues.FAMILIES)
+def test_truth_and_lapacks_matrices_are_of_the_same_systems(family):
+    columns = eigenvalues.FAMILIES[family](np.random.default_rng(2), 3)
+    matrices, omega = eigenvalues.state_matrices(columns)
+    assert np.all(np.frexp(omega)[0] == 0.5)  # powers of two
+    for A, unit, row in zip(matrices, omega, zip(*columns, strict=True), strict=True):
+        a, b, c_1, c_2, g = row
+        monic = [1, c_1 + c_2, a + b + c_1 * c_2, c_1 * b + c_2 * a, a * b + g]
+        scaled = np.array(monic) / unit ** np.arange(5)
+        np.testing.assert_allclose(np.poly(A), scaled, rtol=1e-10, atol=1e-12)
+        exact, size = eigenvalues.exact_growth(*row)
+        assert abs(float(exact) - np.roots(scaled).real.max() * unit) < 1e-10 * size
+
+
+# Limit cycles ------------------------------------------------------------------------------------
+
+
+def test_extremes_of_a_sine_are_read_between_its_points():
+    t = np.linspace(0, 20, 401)
+    found, values = transients.extremes_of(t, np.sin(t), np.cos(t), -np.sin(t))
+    np.testing.assert_allclose(found, np.pi * (0.5 + np.arange(len(found))), atol=1e-7)
+    np.testing.assert_allclose(np.abs(values), 1, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_transient_is_over_where_it_is_read():
+    """Half as many periods again move the error by less than a fifth of the floor."""
+    law, periods = transients.law(), transients.PERIODS[1e-2]
+    runs = (transients.scipy_run("LSODA", law, 1e-2, 1e-8, n) for n in (periods, 3 * periods // 2))
+    short, long = (
+        np.array(limit_cycle.relative(*transients.last_period(law, run()))) for run in runs
+    )
+    assert np.all(np.abs(short - long) < 0.2 * long)
+
+
+@pytest.mark.slow  # compiles with diffrax and numba
+def test_every_integrator_solves_the_same_law():
+    """Shorter than a cycle needs: what they read agrees to what their tolerance lets pass."""
+    law, read = transients.law(), []
+    for library, solver, rtol, bound in (
+        ("SciPy", "LSODA", 1e-10, 0),
+        ("diffrax", "Tsit5", 1e-10, 1e-6),
+        ("diffrax", "KenCarp4", 1e-6, 1e-5),
+        ("numbalsoda", "LSODA", 1e-10, 1e-6),
+        ("heyoka", "", 1e-10, 1e-6),
+    ):
+        if library in versions("scipy", "diffrax", "numbalsoda", "heyoka") or library == "SciPy":
+            run = transients.RUNS[library](solver, law, 1e-2, rtol, 6)
+            read.append(transients.last_period(law, run()))
+            np.testing.assert_allclose(read[-1], read[0], rtol=bound)
+
+
+def test_slopes_are_compared_in_the_order_in_which_they_are_given():
+    truth = np.array(list(limit_cycle.SLOPES.values())).T
+    found = limit_cycle.differences(lambda place: truth @ place, 1e-3)
+    np.testing.assert_allclose(found, truth, rtol=1e-9)
+    assert not limit_cycle.slope_errors(truth).any()
+
+
+def test_ratio_of_one_cycle_is_to_the_quickest_peer_that_is_as_accurate():
+    own, events = limit_cycle.OWN, limit_cycle.EVENTS
+    rows, times = [], {}
+    for group, setting, error, own_times in (
+        (own, "coarse", 1e-8, [1.0]),
+        (own, "fine", 1e-10, [2.0, 4.0]),
+        (events, "short", 1e-8, [5.0]),
+        (events, "long", 1e-10, [8.0, 12.0]),
+        (events, "longer", 1e-11, [9.0, 14.0]),
+    ):
+        errors = {"period": error, "amplitude": error}
+        rows.append(limit_cycle.row(group, setting, seconds=np.median(own_times)) | errors)
+        times[rows[-1]["name"]] = own_times
+    (head,) = limit_cycle.headline(rows, times)
+    assert head["ratio"] == 3.5 and "fine" in head["what"] and head["what"].endswith("long")
+
+
+def test_ratio_of_many_cycles_is_to_all_cores_at_no_larger_an_error():
+    names = ("fj.limit_cycle, default", "fj.limit_cycle, 24 segments", "heyoka by events")
+    times = [[0.1, 0.1], [1.0, 2.0], [9.0, 12.0]]
+    rows = [
+        {"name": name, "devices": 2, "error": {"worst": error}, "seconds_a_cycle": own[0]}
+        for name, error, own in zip(names, (1e-8, 1e-10, 1e-10), times, strict=True)
+    ]
+    (head,) = many_cycles.headline(rows, times)
+    assert head["ratio"] == 7.5 and "24 segments" in head["what"]
+    assert many_cycles.headline(rows[:2], times[:2]) == []
+    lengths = np.array([1.0, 1.0, 2.0, 4.0])
+    assert [many_cycles.busy(lengths, n) for n in (1, 2, 4)] == [1, 0.875, 0.5]
+
+
+# Designs -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "task",
+    [designs.TASKS[0], *(pytest.param(t, marks=pytest.mark.slow) for t in designs.TASKS[1:])],
+    ids=lambda task: task.name,
+)
+def test_package_and_loop_evaluate_a_design_alike(task):
+    us = np.random.default_rng(3).uniform(size=(12, len(task.bounds)))
+    found, loop = np.asarray(jax.jit(jax.vmap(designs.by_package(task)))(us)), designs.by_loop(task)
+    np.testing.assert_allclose(found, [loop(u) for u in us], rtol=1e-9, atol=1e-9)
+    assert (found[:, 1:].max(axis=1) > 0).any()
+    u = np.linspace(0, 1, len(task.bounds))
+    np.testing.assert_allclose(task.scaled(task.quantities(u)), u, atol=1e-12)
+    ends = [list(task.quantities(u * 0 + end).values()) for end in (0, 1)]
+    np.testing.assert_allclose(np.transpose(ends), list(task.bounds.values()))
+
+
+def test_searches_on_the_loop_end_in_the_optimum_from_nearby():
+    """Where the slip limit meets the bound on G, by hand; no method misses it by more."""
+    task, start = designs.TASKS[0], np.array([0.45, 0.9])
+    loop = designs.by_loop(task)
+    found, simplex = designs.slsqp(task, loop, None, start), designs.nelder_mead(task, loop, start)
+    assert found.answer is not None and simplex.answer is not None
+    row = loop(found.answer)
+    assert found.answer[1] == pytest.approx(1, abs=1e-12)  # G at its bound, up to rounding
+    assert abs(row[2]) < 1e-9 and row[1:].max() < designs.MEETS  # Q_e at its limit
+    assert row[0] < loop(simplex.answer)[0] < row[0] + 1
+
+
+def test_grids_keep_the_best_that_meets_every_requirement():
+    def rows(us):
+        away = np.sum((us - 0.3) ** 2, axis=1)
+        return np.column_stack([away, 0.25 - us[:, 0]])  # the first variable is at least 0.25
+
+    start = np.array([0.5, 0.5])
+    plain, zoomed = (designs.grid(designs.TASKS[0], rows, 10, start, levels=n) for n in (1, 12))
+    assert plain.answer is not None and zoomed.answer is not None
+    assert plain.evaluations == 100 and plain.answer[0] > 0.25 - 1e-9
+    np.testing.assert_allclose(np.abs(plain.answer - 0.3), 0.05)
+    np.testing.assert_allclose(zoomed.answer, 0.3, atol=1e-6)
+
+
+def test_runs_are_compared_as_wholes_by_the_median_start():
+    late, never = np.array([[1.0, 2.0, 3.0], [0.5, 0.1, 0.1]]), np.array([[1.0], [np.inf]])
+    assert designs.thinned(late) == [[1, 0.5], [2, 0.1], [3, 0.1]] and designs.thinned(never) == []
+    assert designs.reached([late, late, never], 0.2) == {"starts": 2, "seconds": 2.0}
+    assert designs.reached([late, never, never], 0.2) == {"starts": 1, "seconds": None}
+    t, gap = designs.median_curve([designs.thinned(late), designs.thinned(late), []])
+    assert list(t) == [1, 2, 3] and list(gap) == [0.5, 0.1, 0.1]
+    runs = [
+        {"name": "a", "compile_s": 9.0, "seconds": 3.0, "starts": 3, "near": {"starts": 3}},
+        {"name": "b", "compile_s": 0.0, "seconds": 4.0, "starts": 3, "near": {"starts": 3}},
+        {"name": "c", "compile_s": 0.0, "seconds": 0.1, "starts": 3, "near": {"starts": 2}},
+    ]
+    assert [designs.quickest(runs, "near", cold) for cold in (True, False)] == ["b: 4 s", "a: 3 s"]
+
+
+# Sweeps and costs --------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_job_gives_the_values_at_its_points(tmp_path):
+    lengths, picked = (2, 3, 2, 2), (0, 5, 23)
+    found = scale.in_this_process(scale.Job(lengths, 2, 10, shards=str(tmp_path), picked=picked))
+    scenes = [fj.brake_scene().replace(**scale.at(lengths, point)) for point in picked]
+    np.testing.assert_allclose(found["values"], list(map(fj.growth_rate, scenes)), rtol=1e-9)
+    assert len(found["seconds"]) == 2 and found["result_bytes"] == 8 * 24
+    assert len(scale.files(str(tmp_path))) == 3
+    once = scale.in_this_process(scale.Job(lengths, at_once=True, picked=picked))
+    np.testing.assert_allclose(once["values"], found["values"], rtol=1e-9)
+
+
+def test_batches_that_are_begun_are_written_down(tmp_path, monkeypatch):
+    monkeypatch.setattr(Shards, "has", Shards.has)  # put back afterwards
+    scale.log_begun(str(tmp_path / "begun.txt"))
+    shards = Shards(tmp_path / "sweep", {"key": "", "axes": {}, "batch": 1, "arrays": []})
+    shards.write(1, [np.arange(3)])
+    assert [shards.has(k) for k in range(3)] == [False, True, False]
+    assert (tmp_path / "begun.txt").read_text().split() == ["0", "2"]
+    rows = [{"points": n, "seconds": 2e-6 * n} for n in (10, 1000, 100_000)]
+    assert scale.slope(rows, "seconds") == pytest.approx(1)
+    assert (scale.short(100_000_000), scale.short(4e6)) == ("1e8", "4e6")
+
+
+def test_the_row_without_a_part_traces_fewer_operations():
+    def twice(x):
+        return jax.lax.fori_loop(0, 3, lambda i, x: jax.jit(lambda x: x * x + 1)(x), x)
+
+    found = scene_cost.operations(jax.make_jaxpr(twice)(1.0).jaxpr)
+    assert (found["mul"], found["add"]) == (1, 2)  # the second add is the loop's counter
+    counts = {}
+    for row in scene_cost.ROWS:
+        if row.quick:
+            jaxpr = scene_cost.traced(row)[0].jaxpr.jaxpr
+            counts[row.name] = scene_cost.operations(jaxpr).total()
+            assert counts.get(row.without, 0) < counts[row.name]
+
+
+@pytest.mark.slow  # compiles limit cycles and their gradients, minutes
+def test_the_row_without_a_part_is_the_cheaper_one_when_compiled():
+    found = {row.name: scene_cost.cost(row, repeats=1) for row in scene_cost.ROWS}
+    for row in found.values():
+        for count in scene_cost.COUNTS if row["without"] else ():
+            # Fusion moves the bytes by a little.
+            slack = 1.01 if count == "bytes_accessed" else 1
+            assert found[row["without"]][count] < slack * row[count], (row["name"], count)
+
+
+# Extremes ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow  # compiles every family
+@pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.name)
+def test_every_family_is_exact_to_what_its_inputs_allow(family):
+    tight = {"plastic_share": 1e-14, "margin": 1e-12, "growth_rate": 1e-12, "real": 1e-12}
+    for row in family_rows(family, 2000, 60, 5):
+        found, name = row["float64"], row["quantity"]
+        # Roundings of ln a_e, of the order 1/(D - 2), cancel in the exact a_l and Q_e alone.
+        assert found["worst_beside_rounding"] < 100 or name in ("a_l", "Q_e")
+        assert found["worst"] < tight.get(name, 1e-6)
+        assert found["not_finite_gradient"] == 0
+        assert found["not_finite"] == 0 or name == "mu_c"  # K_t = 0 never squeals
+
+
+@pytest.mark.slow
+def test_corners():
+    """Stiffness to a hundred roundings of its inputs, growth rates to a few of their own."""
+    for row, truth, numbers in corner_rows():
+        # Exactly coalescing eigenvalues keep half the digits, where a rounding separates them.
+        wide, narrow = (1e-7, 1e-3) if row["corner"] == "exact coalescence" else (1e-15, 1e-6)
+        if row["quantity"] == "K_n":
+            condition = condition_number(truth, numbers)
+            wide, narrow = (100 * np.finfo(x).eps * (1 + condition) for x in ("f8", "f4"))
+        assert row["float64"] < wide and row["float32"] < narrow, row["corner"]
+
+
+def condition_number(truth, numbers):
+    """By how much more than themselves all relative changes of the inputs change K_n."""
+    exact, total = truth(*numbers)["K_n"], 0.0
+    for i, number in enumerate(numbers):
+        step = 1e-9 * number  # far less than D is from 2
+        high, low = (truth(*numbers[:i], at, *numbers[i + 1 :]) for at in (number + step, number))
+        total += float(abs(high["K_n"] - low["K_n"])) / 1e-9
+    return total / float(exact) if exact else 0.0

@@ -1,0 +1,37 @@
+"""Surfaces: the domain and refusals."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fractaljax as fj
+
+WRONG: Any = "2.4"
+
+
+def test_the_whole_open_interval():
+    """2 < D < 3 up to the doubles next to its ends; gamma is 1.5 unless given."""
+    for D in (np.nextafter(2, 3), 2.5, np.nextafter(3, 2)):
+        surface = fj.Surface(D, 1e-10)
+        assert (surface.D, surface.G, surface.gamma) == (D, 1e-10, 1.5)
+        assert surface.D.dtype == np.float64
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        *((lambda D=D: fj.Surface(D, 1e-10), "^D must be above 2 and below 3") for D in (2, 3)),
+        (lambda: fj.Surface(jnp.array([2.5, 3.5]), 1e-10), r"^D .* below 3, got 3\.5$"),
+        (lambda: fj.Surface(2.4, np.nan), "^G must be above 0, got nan$"),
+        (lambda: fj.Surface(2.4, 1e-10, 1), r"^gamma must be above 1, got 1\.0$"),
+        (lambda: fj.Surface(WRONG, 1e-10), "^D must be a number, got '2.4'$"),
+        (lambda: jax.jit(fj.Surface)(2.4, -1.0), "G must be above 0"),
+        (lambda: jax.grad(lambda D: fj.Surface(D, 1e-10).D)(3.25), r"^D .* below 3, got 3\.25"),
+    ],
+)
+def test_refusals(call, message):
+    with pytest.raises((ValueError, TypeError, RuntimeError), match=message):
+        jax.block_until_ready(call())
