@@ -1,8 +1,10 @@
 """What every benchmark times with, and the machine it ran on."""
 
+import importlib.metadata
 import math
 import os
 import platform
+import statistics
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -10,20 +12,20 @@ from typing import Any
 
 import jax
 
-LEAST = 0.2  # s: what is timed lasts this long at least, so that the first calls count little
+SHORTEST = 0.2  # s: quicker calls are repeated for so long, so that the first ones count little
 
 
 def seconds(function: Callable, *arguments) -> tuple[float, Any]:
-    """Wall-clock seconds of one call, and what it gave."""
+    """Wall-clock seconds of one call, and its result."""
     start = time.perf_counter()
     result = jax.block_until_ready(function(*arguments))
     return time.perf_counter() - start, result
 
 
 def taking_turns(calls: dict[str, Callable], repeats: int) -> dict[str, list[float]]:
-    """Seconds of each call, `repeats` times, by turns: what disturbs the machine disturbs all.
+    """Seconds of each call, `repeats` times in turn: what disturbs the machine disturbs all.
 
-    Short calls are repeated: the first of a turn finds the caches full of another's data.
+    Quick calls are repeated within a turn: the first one finds the caches full of other data.
     """
 
     def each(call: Callable, often: int) -> float:
@@ -32,9 +34,7 @@ def taking_turns(calls: dict[str, Callable], repeats: int) -> dict[str, list[flo
             jax.block_until_ready(call())
         return (time.perf_counter() - start) / often
 
-    often = {
-        name: math.ceil(LEAST / min(each(call, 1), each(call, 1))) for name, call in calls.items()
-    }
+    often = {n: math.ceil(SHORTEST / min(each(c, 1), each(c, 1))) for n, c in calls.items()}
     times: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(repeats):
         for name, call in calls.items():
@@ -42,12 +42,17 @@ def taking_turns(calls: dict[str, Callable], repeats: int) -> dict[str, list[flo
     return times
 
 
-def too_long(elapsed: float, times_the_work: float, limit: float) -> bool:
-    """Whether a call would take above `limit` [s], by what it took for a part of the work.
+def ratio(peer: list[float], own: list[float]) -> float:
+    """How many times as fast as a peer: the median of the ratios within a turn."""
+    return statistics.median(a / b for a, b in zip(peer, own, strict=True))
 
-    What a short call takes is mostly the calling, and says nothing.
+
+def too_long(elapsed: float, growth: float, limit: float) -> bool:
+    """Whether a call on `growth` times the work would take above `limit` [s].
+
+    A short call is mostly overhead and predicts nothing.
     """
-    return elapsed > 0.1 and elapsed * times_the_work > limit
+    return elapsed > 0.1 and elapsed * growth > limit
 
 
 def compiled(function: Callable, *arguments) -> tuple[Callable, float]:
@@ -58,33 +63,40 @@ def compiled(function: Callable, *arguments) -> tuple[Callable, float]:
     return program, time.perf_counter() - start
 
 
+def versions(*packages: str) -> dict[str, str]:
+    """The versions of Python and of those packages that are installed."""
+    found = {"python": platform.python_version()}
+    for name in packages:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
+
+
 def this_machine(busy: float) -> dict[str, Any]:
-    """The processor, how `busy` it was before the benchmark, and the device; ready for JSON."""
-    return {
-        "cpu": cpu_model(),
-        "cores": os.cpu_count(),
-        "device": jax.devices()[0].device_kind,
-        "others_running": busy,
-    }
+    """The processor, how `busy` it was before the benchmark, and the device."""
+    device = jax.devices()[0].device_kind
+    return {"cpu": cpu(), "cores": os.cpu_count(), "device": device, "others_running": busy}
 
 
-def ran_on(result: dict[str, Any]) -> str:
-    """The line of a page that names the machine, how busy it was, and the versions."""
-    versions = ", ".join(f"{name} {version}" for name, version in result["versions"].items())
-    machine = result["machine"]
-    return (
-        f"{named(machine)}, {machine['others_running']:.1f} programs running on them before;"
-        f" {versions}."
-    )
-
-
-def named(machine: dict[str, Any]) -> str:
+def machine_name(machine: dict[str, Any]) -> str:
     """Processor and cores, and the device where that is another."""
     device = "" if machine["device"] == "cpu" else f"{machine['device']} beside "
     return f"{device}{machine['cpu']}, {machine['cores']} cores"
 
 
-def cpu_model() -> str:
+def ran_on(result: dict[str, Any]) -> str:
+    """The line of a page that names the machine, how busy it was, and the versions."""
+    machine = result["machine"]
+    versions = ", ".join(f"{name} {version}" for name, version in result["versions"].items())
+    return (
+        f"{machine_name(machine)}, {machine['others_running']:.1f} other programs running before;"
+        f" {versions}."
+    )
+
+
+def cpu() -> str:
     """The processor's name, where the system tells it."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
@@ -95,5 +107,5 @@ def cpu_model() -> str:
 
 
 def others_running() -> float:
-    """Load of the last minute before the benchmark: what other programs took of the machine."""
+    """Load of the last minute: what other programs take of the machine."""
     return os.getloadavg()[0] if hasattr(os, "getloadavg") else math.nan

@@ -113,3 +113,11 @@ def slopes(truth: Truth, name: str, row, columns) -> list[Any]:
             ends = [truth(*row[:j], row[j] + sign * h, *row[j + 1 :])[name] for sign in (1, -1)]
             found.append((ends[0] - ends[1]) / (2 * h))
     return found
+
+
+def growth_of_surface(b: dict[str, float], D, log_G):
+    """Growth rate [1/s] of the brake's numbers (`loops.brake`) with another surface."""
+    contact, mass = ("gamma E nu sigma_y H P mu_s mu_m", "m omega_1 omega_2 xi_1 xi_2 F V")
+    found = exact_joint(D, mp.exp(log_G), *(b[name] for name in contact.split()))
+    row = [*(b[name] for name in mass.split()), found["K_n"], found["K_t"]]
+    return mechanism(*row, b["mu_s"], b["mu_m"], b["v_m"])["growth_rate"]

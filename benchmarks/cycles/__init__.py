@@ -1,1 +1,0 @@
-"""The stick-slip limit cycle beside transients, one and many."""

@@ -1,1 +1,0 @@
-"""Whole designs beside derivative-free and gradient-based searches."""

@@ -1,0 +1,324 @@
+"""Quantities that come one call at a time: structures, damping, boundaries, heights, motion."""
+
+import dataclasses
+import itertools
+import math
+import statistics
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+from scipy.optimize import brentq
+from tqdm import tqdm
+
+import fractaljax as fj
+from fractaljax._surface.topography import random_phases
+
+from ..timing import seconds
+from ..transients import SCALE, V, outcomes, reference
+
+mp: Any = mpmath.mp  # it makes its functions at run time
+WAVES = 3  # of each length in a topography
+Row = dict[str, Any]
+Cases = Iterator[tuple[str, Callable[[], Any], Callable[[Any], float]]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Quantity:
+    """A public quantity with its ranges, and its cases: name, call, error of the call's result."""
+
+    name: str
+    ranges: str
+    cases: Callable[[], Cases]
+
+
+def chain(rng, n: int, spread: float) -> tuple[np.ndarray, np.ndarray]:
+    """Mass and stiffness (n, n) of a chain, both over `spread` decades."""
+    M = np.diag(10 ** rng.uniform(-spread / 2, spread / 2, n))
+    k = 1e6 * 10 ** rng.uniform(-spread / 2, spread / 2, n + 1)
+    return M, np.diag(k[:-1] + k[1:]) - np.diag(k[1:-1], 1) - np.diag(k[1:-1], -1)
+
+
+def damping_cases() -> Cases:
+    """The damping ratios that come back from the matrix, by mpmath."""
+    rng = np.random.default_rng(5)
+    for spread in (0.0, 1.0, 3.0, 6.0):
+        for ratio in (1e-8, 0.01, 1e3):
+            M, K = chain(rng, 4, spread)
+
+            def error(C, M=M, K=K, ratio=ratio):
+                with mp.workdps(40):
+                    root = mp.diag([mp.sqrt(mp.mpf(m)) for m in np.diag(M)]) ** -1
+                    squares, X = mp.eigsy(root * mp.matrix(K.tolist()) * root)
+                    own = X.T * root * mp.matrix(np.asarray(C).tolist()) * root * X
+                    w = [mp.sqrt(square) for square in squares]
+                    off = (abs(own[i, i] / (2 * w[i]) / ratio - 1) * w[i] for i in range(4))
+                    return float(max(off) / max(w))
+
+            name = f"masses and springs over {spread:g} decades, ratio {ratio:g}"
+            yield name, lambda M=M, K=K, ratio=ratio: fj.modal_damping(M, K, ratio), error
+
+
+def structure_cases() -> Cases:
+    """Largest real part of a chain with one joint, by mpmath; beside the largest modulus."""
+    rng = np.random.default_rng(6)
+    for spread in (0.0, 1.0, 3.0, 6.0):
+        for K_n in (1e3, 1e6, 1e9, 1e12, 1e15):
+            M, K = chain(rng, 6, spread)
+            joint = fj.Joint(fj.FixedContact(K_n, K_n / 2), fj.Coulomb(0.4), 2, 3)
+            structure = fj.Structure(M, 1e-6 * K, K, joint)
+
+            def error(found, structure=structure):
+                M, C, K = (mp.matrix(np.asarray(x).tolist()) for x in fj.assemble(structure))
+                with mp.workdps(60):
+                    A, n = mp.zeros(12), 6
+                    for i in range(n):
+                        A[i, n + i] = 1
+                    A[n:, :n], A[n:, n:] = -(M**-1) * K, -(M**-1) * C
+                    s = mp.eig(A, left=False, right=False)
+                    exact, size = max(mp.re(z) for z in s), max(abs(z) for z in s)
+                    return float(abs(mp.mpf(float(found)) - exact) / size)
+
+            name = f"K_n = {K_n:g} N/m, {spread:g} decades"
+            yield name, lambda structure=structure: fj.growth_rate(structure), error
+
+
+def boundary_cases() -> Cases:
+    """Growth rate on the boundary, beside the frequency of the imaginary pair."""
+    scene = fj.brake_scene()
+    stiff = scene.replace(contact=fj.FixedContact(4e8, 2e8))
+    for own, x, y in (
+        (scene, ("D", 2.05, 2.95), ("G", 1e-14, 1e-6)),
+        (scene, ("P", 1e-2, 1e8), ("D", 2.05, 2.95)),
+        (stiff, ("K_n", 1e3, 1e15), ("mu_s", 0.26, 2.0)),
+        (stiff, ("xi_1", 1e-6, 1e3), ("xi_2", 1e-6, 1e3)),
+    ):
+
+        def error(found):
+            rates = [np.abs(b.growth_rate) / (2 * np.pi * b.frequency) for b in found.branches]
+            return float(max((rate.max() for rate in rates), default=0.0))
+
+        name = f"{x[0]} and {y[0]}"
+        yield name, lambda own=own, x=x, y=y: fj.hopf_boundary(own, x, y), error
+
+
+def topography_cases() -> Cases:
+    """The double sum of Eq. 13 on a grid of 16 x 16, wave by wave; beside the largest height."""
+    key, n, L = jax.random.key(1), 16, 1e-3
+    for D in (2 + 1e-6, 2.5, 3 - 1e-6):
+        for G in (1e-18, 1e-10, 1e-4):
+            for gamma in (1.05, 1.5, 10.0):
+                surface = fj.Surface(D, G, gamma)
+
+                def error(z, surface=surface):
+                    exact = double_sum(surface, L, n, key)
+                    return float(np.abs(np.asarray(z) - exact).max() / np.abs(exact).max())
+
+                def call(surface=surface):
+                    return fj.topography(surface, L, n, key=key, M=WAVES)
+
+                yield f"D = {D:.7g}, G = {G:g} m, gamma = {gamma:g}", call, error
+
+
+def double_sum(surface: fj.Surface, length: float, n: int, key) -> np.ndarray:
+    """Eq. 13 by extended doubles, its phases being those that the package draws."""
+    D, G, gamma = (np.longdouble(float(x)) for x in (surface.D, surface.G, surface.gamma))
+    L = np.longdouble(length)
+    count = 1 + int(np.floor(np.log(n / 2) / np.log(float(gamma)) + 1e-9))
+    phases = np.asarray(random_phases(key, count, WAVES)).astype(np.longdouble)
+    x = (np.arange(n) * L / n)[:, None]
+    y, pi = x.T, np.longdouble("3.14159265358979323846264338327950288")
+    z = np.zeros((n, n), np.longdouble)
+    for i in range(count):
+        for m in range(WAVES):
+            angle, phase = pi * (m + 1) / WAVES, 2 * pi * phases[i, m]
+            wave = 2 * pi * gamma**i / L * (x * np.cos(angle) + y * np.sin(angle))
+            z += gamma ** (i * (D - 3)) * (np.cos(phase) - np.cos(wave + phase))
+    return L * (G / L) ** (D - 2) * np.sqrt(np.log(gamma) / WAVES) * z
+
+
+def identify_cases() -> Cases:
+    """One profile in other units: D must stay, and G go with the unit of length."""
+    surface, n, L = fj.Surface(2.4, 1e-10), 1024, 1e-3
+    z = np.asarray(fj.topography(surface, L, n, key=jax.random.key(2))[:, 0])
+    given = fj.identify(z, L / n)
+    for unit in (1e-9, 1e-3, 1e3, 1e6):
+
+        def error(found, unit=unit):
+            return max(abs(found.D - given.D), abs(np.log(found.G / given.G / unit)))
+
+        yield f"lengths times {unit:g}", lambda u=unit: fj.identify(z * u, L / n * u), error
+
+
+QUANTITIES = [
+    Quantity("modal_damping", "ratio 1e-8 to 1e3, chains over 0 to 6 decades", damping_cases),
+    Quantity(
+        "growth_rate of a Structure",
+        "K_n 1e3 to 1e15 N/m on chains over 0 to 6 decades, dampers 1e-6 s times the springs",
+        structure_cases,
+    ),
+    Quantity(
+        "hopf_boundary",
+        "D 2.05 to 2.95, G 1e-14 to 1e-6 m, P 1e-2 to 1e8 N, K_n 1e3 to 1e15 N/m, xi 1e-6 to 1e3",
+        boundary_cases,
+    ),
+    Quantity(
+        "topography", "D to 2 + 1e-6 and 3 - 1e-6, G 1e-18 to 1e-4 m, gamma to 10", topography_cases
+    ),
+    Quantity("identify", "lengths 1e-9 to 1e6 times those of a profile", identify_cases),
+]
+
+
+def quantity_row(quantity: Quantity) -> Row:
+    """Its worst error and its slowest case, in float64."""
+    off, taken = [], {}
+    for name, call, error in tqdm(list(quantity.cases()), desc=quantity.name):
+        call()
+        taken[name], found = seconds(call)
+        off.append(error(found))
+    slowest, middle = max(taken, key=lambda name: taken[name]), statistics.median(taken.values())
+    return {
+        "quantity": quantity.name,
+        "ranges": quantity.ranges,
+        "points": len(off),
+        "worst": max(off),
+        "not_finite": int((~np.isfinite(off)).sum()),
+        "seconds": middle,
+        "slowest": slowest,
+        "slowest_ratio": taken[slowest] / middle,
+    }
+
+
+# Motion -------------------------------------------------------------------------------------------
+
+
+def bisect(inside: Callable[[float], bool], low: float, high: float) -> tuple[float, float]:
+    """The two ends, 1e-9 apart in the logarithm, between which a property changes."""
+    first = inside(low)
+    while math.log(high / low) > 1e-9:
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if inside(middle) == first else (low, middle)
+    return low, high
+
+
+def barely(sign: int) -> fj.Scene:
+    """The reference scene with so little friction that its growth rate is +-1e-6 omega."""
+
+    def weaker(share):
+        return reference().replace(friction=fj.Stribeck(0.4 * share, 0.25 * share, 0.5))
+
+    def gap(share):
+        return float(fj.growth_rate(weaker(share))) / SCALE - sign * 1e-6
+
+    return weaker(brentq(gap, 0.01, 1.0, xtol=1e-15))
+
+
+def scenes() -> dict[str, fj.Scene]:
+    """Where the search for a cycle may fail."""
+    base, brake = reference(), fj.brake_scene()
+
+    def stiff(G):
+        return float(fj.stiffness(brake.replace(G=G))[1]) > 0
+
+    slip, stuck = bisect(stiff, 1e-11, 1e-10)
+    last, soft = bisect(stiff, 2e-10, 4e-10)
+    undamped = base.replace(xi_1=0.0, xi_2=0.0)
+    return (
+        {f"K_n = {K:.0e} N/m": reference(K) for K in 10.0 ** np.arange(6, 14)}
+        | {f"V = {v:g} m/s": base.replace(V=v) for v in (1e-4, 1e-3, 1e-2, 0.5, 1.0)}
+        | {
+            "xi_1 = xi_2 = 0": undamped,
+            "F = 0": base.replace(F=0.0),
+            "xi_1 = xi_2 = 0, F = 0": undamped.replace(F=0.0),
+            "growth 1e-6 omega": barely(1),
+            "growth -1e-6 omega": barely(-1),
+            "brake": brake,
+            "brake, G at gross slip, outside": brake.replace(G=slip),
+            "brake, G at gross slip, inside": brake.replace(G=stuck),
+            "brake, G at fully plastic, inside": brake.replace(G=last),
+            "brake, G at fully plastic, outside": brake.replace(G=soft),
+            "brake, D = 2.45": brake.replace(D=2.45),
+            "brake, D = 2.9": brake.replace(D=2.9),
+        }
+    )
+
+
+def cycles() -> list[Row]:
+    """One row a scene, by the exact law."""
+
+    @eqx.filter_jit
+    def describe(scene):
+        cycle = fj.limit_cycle(scene, throw=False)
+        one = cycle.multipliers[jnp.argmin(jnp.abs(cycle.multipliers - 1))]
+        omega = jnp.sqrt(fj.stiffness(scene)[0] / scene.oscillator.m)
+        numbers = {
+            "period": cycle.period,
+            "error": cycle.error,
+            "trivial_multiplier_off": jnp.abs(one - 1),
+            "amplitude": cycle.amplitude[0],
+        }
+        return cycle.result, cycle.returns, fj.growth_rate(scene) / omega, numbers
+
+    rows = []
+    for name, scene in tqdm(scenes().items(), desc="extreme"):
+        describe(scene)
+        elapsed, (result, returns, growth, numbers) = seconds(describe, scene)
+        numbers = {key: float(value) for key, value in numbers.items()}
+        why, (outcome,) = None, outcomes(result)
+        if not all(map(math.isfinite, numbers.values())):
+            why, numbers = str(fj.CycleResult[result]), dict.fromkeys(numbers)
+        row = {"name": name, "result": outcome, "turns": int(returns), "seconds": elapsed}
+        growth = float(growth) if math.isfinite(growth) else None
+        rows.append(row | {"growth_by_omega": growth, "non_finite": why} | numbers)
+    return rows
+
+
+def layers() -> list[Row]:
+    """Three periods of the tanh law from a point of the exact cycle: how far it comes back."""
+    cycle = fj.limit_cycle(reference(), segments=64)
+    units = np.array([V / SCALE, V / SCALE, V, V])
+    rows = []
+    for eps in 10.0 ** np.arange(-3, -9, -1):
+
+        def run(eps=eps):
+            options = {"solver": diffrax.Kvaerno5(), "max_steps": 200_000, "throw": False}
+            t1 = 3 * cycle.period
+            return fj.simulate(reference(), cycle.state, t1, regularisation=eps, **options)
+
+        run()
+        elapsed, found = seconds(run)
+        off = float(np.max(np.abs(np.asarray(found.end - cycle.state)) / units))
+        rows.append(
+            {
+                "eps": float(eps),
+                "result": str(fj.SimulationResult[found.result]),
+                "steps": int(np.sum(np.diff(found.times) > 0)),
+                "seconds": elapsed,
+                "off_the_exact_cycle": off if math.isfinite(off) else None,
+            }
+        )
+    return rows
+
+
+def grazing() -> list[Row]:
+    """Cycles on both sides of the K_n at which direction 1 just touches the belt's velocity."""
+
+    @jax.jit
+    def cycle(K_n):
+        found = fj.limit_cycle(reference(K_n), throw=False)
+        return {"stick": found.stick_fraction[0], "period": found.period, "error": found.error}
+
+    def sticks(K_n):
+        return float(cycle(K_n)["stick"]) > 0
+
+    K = np.geomspace(1e8, 1e9, 31).tolist()
+    for low, high in itertools.pairwise(K):
+        if sticks(low) != sticks(high):
+            found = {k: cycle(k) for k in bisect(sticks, low, high)}
+            return [{"K_n": k} | {n: float(x) for n, x in r.items()} for k, r in found.items()]
+    return []

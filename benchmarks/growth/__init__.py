@@ -1,1 +1,0 @@
-"""The growth rate beside LAPACK and beside loops, value and gradient."""

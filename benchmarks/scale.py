@@ -1,0 +1,501 @@
+"""Scale: `sweep` over more and more points, in memory and in shards, interrupted, and shared.
+
+Every sweep is one of the growth rate over D, G, mu_s and V in a Python process of its own
+(`python -m benchmarks.scale JSON`, the fields of a `Job`), so that its peak of memory is its own.
+Beside it all points in one call of the vmapped program, which is what a user has without `sweep`.
+"""
+
+import contextlib
+import hashlib
+import json
+import math
+import os
+import resource
+import signal
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+from unittest import mock
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import fractaljax as fj
+from fractaljax._sweep.shards import Shards
+
+from .page import cell, draw, in_words, png, subplots, table
+
+TITLE = "Scale: a sweep over more and more points"
+PACKAGES = ("jaxlib", "numpy")
+LINEAR, OWN_MEMORY = 0.1, 100e6  # how far from 1 a slope may be; bytes beyond the result
+KILLS = (0.25, 0.5, 0.75)  # shares of the batches that are there when a sweep is killed
+IN_MEMORY, SHARDS, AT_ONCE = "sweep, in memory", "sweep, in shards", "one call of jax.vmap"
+RANGES = {"D": (2.3, 2.6), "G": (1e-11, 1e-9), "mu_s": (0.3, 0.5), "V": (0.05, 0.3)}
+Result = dict[str, Any]
+
+
+class Size(NamedTuple):
+    """How much is measured."""
+
+    sides: tuple[tuple[int, ...], ...]  # lengths of the axes, from few points to many
+    at_once: int  # most points in one call
+    repeats: int  # of a sweep up to 1e7 points; beyond, one
+    checked: int  # points of every result beside a single call and 40 digits
+    shared: tuple[int, ...]  # lengths of the axes of what is interrupted or shared
+    batch: int  # of what is interrupted
+    turns: int  # of what is shared
+
+
+SIDES = ((10,) * 4, (100, 10, 10, 10), (100, 100, 10, 10), (100, 100, 100, 10), (100,) * 4)
+FULL = Size(SIDES, 10_000_000, 3, 16, (100, 100, 20, 20), 8192, 3)
+QUICK = Size(SIDES[:2], 10_000, 1, 4, (100, 100, 10, 5), 1024, 1)
+
+
+# One sweep, in its process ------------------------------------------------------------------------
+
+
+class Job(NamedTuple):
+    """A sweep of the growth rate over the axes of `RANGES`, and how it is run."""
+
+    lengths: tuple[int, ...]  # of the axes
+    repeats: int = 1
+    batch: int | None = None  # points at a time, by default those of `sweep`
+    at_once: bool = False  # all points in one call of a vmapped program instead
+    shards: str | None = None  # folder in which every repeat keeps its batches
+    begun: str | None = None  # file to which the number of every batch that is begun is added
+    warm: bool = True  # whether the program is compiled before the clock starts
+    picked: tuple[int, ...] = ()  # points whose values are returned
+    port: int | None = None  # of the first of two processes
+    rank: int = 0
+
+
+def axes(lengths) -> dict[str, Any]:
+    """The values on every axis."""
+    return {
+        name: (np.geomspace if name == "G" else np.linspace)(*ends, length)
+        for (name, ends), length in zip(RANGES.items(), lengths, strict=True)
+    }
+
+
+def at(lengths, point: int) -> dict[str, float]:
+    """The quantities at a point of the grid."""
+    places = zip(axes(lengths).items(), np.unravel_index(point, lengths), strict=True)
+    return {name: float(axis[place]) for (name, axis), place in places}
+
+
+def swept(job: Job, folder: str | None) -> np.ndarray:
+    """Growth rates over the grid."""
+    scene, given = fj.brake_scene(), axes(job.lengths)
+    return np.asarray(fj.sweep(fj.growth_rate, scene, job.batch, False, out=folder, **given))
+
+
+class _Enough(Exception):
+    """The first batch is there."""
+
+
+def first_batch(job: Job) -> None:
+    """Trace, compile and run one batch of the sweep, with axes of the same lengths."""
+    stop = mock.patch.object(Shards, "write", side_effect=_Enough)
+    with tempfile.TemporaryDirectory() as folder, stop, contextlib.suppress(_Enough):
+        swept(job, folder)
+
+
+def whole_grid(job: Job) -> Callable[[], np.ndarray]:
+    """A call that makes the grid and gives it to a program compiled for all points at once."""
+    scene = fj.brake_scene()
+
+    def growth(*values):
+        return fj.growth_rate(scene.replace(**dict(zip(RANGES, values, strict=True))))
+
+    flat = [jax.ShapeDtypeStruct((math.prod(job.lengths),), float)] * len(RANGES)
+    program = jax.jit(jax.vmap(growth)).lower(*flat).compile()
+
+    def run():
+        grid = np.meshgrid(*axes(job.lengths).values(), indexing="ij")
+        return np.asarray(program(*(jnp.asarray(values.ravel()) for values in grid)))
+
+    return run
+
+
+def peak_memory() -> int:
+    """The largest number of bytes that were resident so far, or since `forget_peak`."""
+    try:
+        status = Path("/proc/self/status").read_text().splitlines()
+        return next(1024 * int(line.split()[1]) for line in status if line.startswith("VmHWM"))
+    except (OSError, StopIteration):  # not Linux
+        unit = 1 if sys.platform == "darwin" else 1024
+        return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def forget_peak() -> None:
+    """Let `peak_memory` start again from what is resident now, where the system can."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+
+
+def log_begun(file: str) -> None:
+    """Add the number of every batch that a sweep finds missing to a file, before it is computed."""
+    log, has = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_APPEND), Shards.has
+
+    def logged(self, k):
+        found = has(self, k)
+        if not found:
+            os.write(log, f"{k}\n".encode())
+        return found
+
+    Shards.has = logged
+
+
+def in_this_process(job: Job) -> Result:
+    """Run it: seconds of every repeat, bytes beyond those held before, and picked values."""
+    if job.port is not None:
+        jax.distributed.initialize(f"127.0.0.1:{job.port}", 2, job.rank)
+    if job.begun is not None:
+        log_begun(job.begun)
+    start = time.perf_counter()
+    at_once = whole_grid(job) if job.at_once else None
+    if job.warm and not job.at_once:
+        first_batch(job)
+    prepared = time.perf_counter() - start
+    forget_peak()
+    base = peak_memory()
+    times, result = [], np.empty(0)
+    for repeat in range(job.repeats):
+        del result
+        folder = None if job.shards is None else str(Path(job.shards) / str(repeat))
+        if job.port is not None:
+            from jax.experimental.multihost_utils import sync_global_devices
+
+            sync_global_devices(f"repeat {repeat} begins")
+        start = time.perf_counter()
+        result = swept(job, folder) if at_once is None else at_once()
+        times.append(time.perf_counter() - start)
+    peak = peak_memory()
+    return {
+        "device": jax.devices()[0].device_kind,
+        "devices": jax.local_device_count(),
+        "prepared_s": prepared,
+        "seconds": times,
+        "base_bytes": base,
+        "peak_bytes": peak,
+        "result_bytes": result.nbytes,
+        "values": result.ravel()[list(job.picked)].tolist(),
+        "sha256": hashlib.sha256(result.tobytes()).hexdigest(),
+    }
+
+
+# Sweeps in processes of their own -----------------------------------------------------------------
+
+
+def started(job: Job, devices: int | None = None) -> subprocess.Popen:
+    """The process of a job; on so many virtual devices of the processor where they are given."""
+    flags = {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}"}
+    return subprocess.Popen(
+        [sys.executable, "-m", "benchmarks.scale", json.dumps(job._asdict())],
+        cwd=Path(__file__).parents[1],
+        env=os.environ | ({"JAX_PLATFORMS": "cpu"} | flags if devices else {}),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def ended(process: subprocess.Popen) -> Result:
+    """The numbers of a job."""
+    said, complaint = process.communicate()
+    if process.returncode:
+        raise RuntimeError(f"a sweep failed: {complaint}")
+    return json.loads(said.splitlines()[-1])
+
+
+def files(folder: str) -> list[Path]:
+    """The batches that the first repeat of a job has kept in its folder."""
+    return list((Path(folder) / "0").glob("[0-9]*.npz"))
+
+
+def ladder(size: Size) -> list[Result]:
+    """Time, memory, files and errors of every way to every number of points."""
+    from tqdm import tqdm
+
+    rows = []
+    steps = [
+        (way, lengths)
+        for way in (IN_MEMORY, SHARDS, AT_ONCE)
+        for lengths in size.sides
+        if way != AT_ONCE or math.prod(lengths) <= size.at_once
+    ]
+    for way, lengths in tqdm(steps, desc="more points"):
+        points = math.prod(lengths)
+        repeats = size.repeats if points <= 10_000_000 else 1
+        picked = np.random.default_rng(0).integers(points, size=size.checked).tolist()
+        with tempfile.TemporaryDirectory() as place:
+            shards = place if way == SHARDS else None
+            job = Job(lengths, repeats, None, way == AT_ONCE, shards, picked=tuple(picked))
+            found = ended(started(job))
+            kept = files(place)
+            on_disk = sum(file.stat().st_size for file in kept) if kept else None
+        rows.append(
+            {
+                "way": way,
+                "points": points,
+                "repeats": repeats,
+                "device": found["device"],
+                "compile_s": found["prepared_s"],
+                "seconds": statistics.median(found["seconds"]),
+                "base_bytes": found["base_bytes"],
+                "peak_beyond_base": found["peak_bytes"] - found["base_bytes"],
+                "result_bytes": found["result_bytes"],
+                "disk_bytes": on_disk,
+                "files": len(kept),
+                **errors(lengths, picked, found["values"]),
+            }
+        )
+    return rows
+
+
+def errors(lengths, picked, values) -> dict[str, float]:
+    """Worst errors of values of a sweep, in omega_1: beside single calls, and 40 digits."""
+    from mpmath import mpf
+
+    from .loops import brake
+    from .truths import growth_of_surface, mp
+
+    single, exact, b = [], [], brake()
+    for point, value in zip(picked, values, strict=True):
+        there = at(lengths, point)
+        single.append(abs(value - float(fj.growth_rate(fj.brake_scene().replace(**there)))))
+        with mp.workdps(40):
+            truth = growth_of_surface(b | there, mpf(there["D"]), mp.log(mpf(there["G"])))
+        exact.append(abs(value - float(truth)))
+    return {"off_single": max(single) / b["omega_1"], "off_exact": max(exact) / b["omega_1"]}
+
+
+def interrupted(size: Size) -> Result:
+    """A sweep killed in the middle, more than once, and finished; beside one left alone."""
+    whole = ended(started(Job(size.shared, batch=size.batch, warm=False)))
+    batches, kills = -(-math.prod(size.shared) // size.batch), []
+    with tempfile.TemporaryDirectory() as place:
+        log = Path(place) / "begun.txt"
+        job = Job(size.shared, batch=size.batch, shards=place, begun=str(log), warm=False)
+        for share in KILLS:
+            process = started(job)
+            while process.poll() is None and len(files(place)) < share * batches:
+                time.sleep(1e-3)
+            process.send_signal(signal.SIGKILL)
+            process.communicate()
+            if process.returncode == -signal.SIGKILL:
+                there = {int(file.stem) for file in files(place)}
+                lost = set(map(int, log.read_text().split())) - there
+                kills.append({"batches_there": len(there), "begun_but_not_there": len(lost)})
+        resumed = ended(started(job))
+        begun, complete = log.read_text().split(), len(files(place))
+    return {
+        "points": math.prod(size.shared),
+        "batches": batches,
+        "batches_at_the_end": complete,
+        "kills": kills,
+        "computed_again": len(begun) - len(set(begun)),
+        "equal_to_the_last_bit": resumed["sha256"] == whole["sha256"],
+    }
+
+
+def free_port() -> int:
+    """A port of this machine that nobody listens at."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return free.getsockname()[1]
+
+
+WAYS = (  # name, devices of a process, processes
+    ("one device, in memory", 1, 1),
+    ("two devices, in memory", 2, 1),
+    ("one process, in shards", 1, 1),
+    ("two processes, in shards", 1, 2),
+)
+
+
+def shared(size: Size) -> list[Result]:
+    """One device and two, one process and two, of this processor; each in its turn."""
+    times: dict[str, list[float]] = {name: [] for name, _, _ in WAYS}
+    counts, hashes = {}, set()
+    for _ in range(size.turns):
+        for name, devices, processes in WAYS:
+            with tempfile.TemporaryDirectory() as place:
+                port = free_port() if processes > 1 else None
+                job = Job(size.shared, shards=place if "shards" in name else None, port=port)
+                jobs = [started(job._replace(rank=rank), devices) for rank in range(processes)]
+                found = [ended(process) for process in jobs]
+            counts[name] = sum(one["devices"] for one in found)
+            hashes |= {one["sha256"] for one in found}
+            times[name].append(max(one["seconds"][0] for one in found))
+    peers = {True: times[WAYS[2][0]], False: times[WAYS[0][0]]}
+    return [
+        {
+            "name": name,
+            "device_count": counts[name],
+            "points_a_second": math.prod(size.shared) / statistics.median(own),
+            "beside_one": statistics.median(
+                peer / t for peer, t in zip(peers["shards" in name], own, strict=True)
+            ),
+            "equal_to_the_last_bit": len(hashes) == 1,
+        }
+        for name, own in times.items()
+    ]
+
+
+def slope(rows: list[Result], key: str) -> float:
+    """Of the logarithm of a number over that of the points, over the last decade."""
+    (x, y) = ([row[k] for row in rows[-2:]] for k in ("points", key))
+    return math.log(y[1] / y[0]) / math.log(x[1] / x[0])
+
+
+def measure(quick: bool) -> Result:
+    """The ladder, the sweep that is killed and the one that is shared."""
+    size = QUICK if quick else FULL
+    rows, killed = ladder(size), interrupted(size)
+    own = {way: [row for row in rows if row["way"] == way] for way in (IN_MEMORY, SHARDS)}
+    bounds = []
+    for way, found in own.items():
+        what, value = (
+            f"{way}: slope of log time over log points, last decade",
+            slope(found, "seconds"),
+        )
+        bounds.append((what, value, [1 - LINEAR, 1 + LINEAR]))
+    for way, found in own.items():
+        most = max(row["peak_beyond_base"] - row["result_bytes"] for row in found) / 1e6
+        bounds.append((f"{way}: most memory beyond the result [MB]", most, [0, OWN_MEMORY / 1e6]))
+    again = killed["computed_again"] / max(len(killed["kills"]), 1)
+    bounds.append(("batches computed again after a kill", again, [0, 1]))
+    return {
+        "headline": [dict(zip(("what", "value", "wanted"), b, strict=True)) for b in bounds],
+        "checked": size.checked,
+        "turns": size.turns,
+        "rows": rows,
+        "interrupted": killed,
+        "shared_points": math.prod(size.shared),
+        "shared": shared(size),
+    }
+
+
+# The page -----------------------------------------------------------------------------------------
+
+
+def short(count: float) -> str:
+    """A number of points as a page shows it, 1e8."""
+    mantissa, exponent = f"{count:.0e}".split("e")
+    return f"{mantissa}e{int(exponent)}"
+
+
+def choice(result: Result) -> str:
+    """One sentence: what to use."""
+    own, kept, at_once = (
+        [row for row in result["rows"] if row["way"] == way] for way in (IN_MEMORY, SHARDS, AT_ONCE)
+    )
+    peer, last = at_once[-1], own[-1]
+    same = next(row for row in own if row["points"] == peer["points"])
+    return f"""Use `sweep`: {short(last["points"])} growth rates in {last["seconds"]:.3g} s and
+        {last["peak_beyond_base"] / 1e6:.0f} MB, of which the result is
+        {last["result_bytes"] / 1e6:.0f} MB, while one call of a vmapped program takes
+        {peer["peak_beyond_base"] / same["peak_beyond_base"]:.1f} times the memory and
+        {peer["seconds"] / same["seconds"]:.2f} times the time for {short(same["points"])} points;
+        name a folder (`out=`) where a sweep may be interrupted, which takes
+        {kept[-1]["seconds"] / last["seconds"]:.2f} times the time."""
+
+
+def row_cells(row: Result) -> str:
+    """Time, memory, files and errors of one sweep."""
+
+    def megabytes(count):
+        return cell(None if count is None else count / 1e6, ".3g")
+
+    return (
+        f"{row['way']} | {short(row['points'])} | {row['seconds']:.3g}"
+        f" | {row['points'] / row['seconds']:.3g} | {megabytes(row['peak_beyond_base'])}"
+        f" | {megabytes(row['result_bytes'])} | {row['files'] or '-'}"
+        f" | {megabytes(row['disk_bytes'])} | {row['compile_s']:.1f} | {row['off_single']:.0e}"
+        f" | {row['off_exact']:.0e}"
+    )
+
+
+def page(result: Result) -> list[str]:
+    """What to use, what is promised, the tables, how they were measured."""
+    rows, killed = result["rows"], result["interrupted"]
+    there = ", ".join(str(kill["batches_there"]) for kill in killed["kills"])
+    lost = ", ".join(str(kill["begun_but_not_there"]) for kill in killed["kills"])
+    how = "the same to the last bit as" if killed["equal_to_the_last_bit"] else "NOT equal to"
+    equal = all(way["equal_to_the_last_bit"] for way in result["shared"])
+    return [
+        choice(result),
+        table("what | found | wanted | ", map(in_words, result["headline"])),
+        "## More points",
+        table(
+            "way | points | time [s] | points a second | peak memory [MB] | of it the result [MB]"
+            " | files | on disk [MB] | before the first batch is there [s]"
+            " | error beside single calls | error to 40 digits",
+            map(row_cells, rows),
+        ),
+        f"""Growth rates of the reference brake over D, G, mu_s and V in double precision, each row
+        in a Python process of its own on {", ".join(sorted({row["device"] for row in rows}))}. Time
+        is the median of {rows[0]["repeats"]} runs{
+            "" if result["quick"] else ", one run beyond 1e7 points"
+        }, without compiling, which is in the column of the first
+        batch. Peak memory is beyond what the process held before the clock started, which is
+        {max(row["base_bytes"] for row in rows) / 1e6:.0f} MB at most: Python, JAX and the program.
+        Errors are the worst of {result["checked"]} points drawn at random, in omega_1. One call of
+        jax.vmap holds the grid and all intermediate values at once; more points than shown were not
+        tried.""",
+        "## Interrupted",
+        f"""A sweep of {short(killed["points"])} points in {killed["batches"]} batches, killed by
+        SIGKILL when {there} of them were there and started again each time, computed
+        {killed["computed_again"]} batches twice ({lost} were begun and lost at each kill); its
+        result is {how} that of a sweep left alone.""",
+        "## Shared",
+        table(
+            "way | devices in all | points a second | beside one",
+            (
+                f"{way['name']} | {way['device_count']} | {way['points_a_second']:.3g}"
+                f" | {way['beside_one']:.2f}"
+                for way in result["shared"]
+            ),
+        ),
+        f"""{short(result["shared_points"])} points; devices are virtual ones of this processor, all
+        on the same cores, and processes talk over the loopback address: this shows the cost of
+        sharing, not the gain from more machines. Two processes each read back the whole. Ratios are
+        medians of those within each of {result["turns"]} turns. The results of all ways and
+        processes are {"the same to the last bit" if equal else "NOT the same"}.""",
+    ]
+
+
+STYLES = {IN_MEMORY: "C0o-", SHARDS: "C1s--", AT_ONCE: "C2^:"}
+
+
+def picture(result: Result) -> bytes:
+    """Time at the left, peak memory at the right, over the points."""
+    figure, (left, right) = subplots(1, 2, figsize=(11, 4.8))
+    times, memory = [], []
+    for way, style in STYLES.items():
+        rows = [row for row in result["rows"] if row["way"] == way]
+        points = [row["points"] for row in rows]
+        times.append((points, [row["seconds"] for row in rows], style, way))
+        memory.append((points, [row["peak_beyond_base"] / 1e6 for row in rows], style, way))
+    rows = [row for row in result["rows"] if row["way"] == IN_MEMORY]
+    points = [row["points"] for row in rows]
+    line = [rows[-1]["seconds"] * n / points[-1] for n in points]
+    times.append((points, line, "k-", "in proportion to the points"))
+    needed = [row["result_bytes"] / 1e6 for row in rows]
+    memory.append((points, needed, "k-", "the result itself"))
+    draw(left, times, "points [-]", "time [s]")
+    draw(right, memory, "points [-]", "peak memory beyond the base [MB]")
+    return png(figure)
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    print(json.dumps(in_this_process(Job(**json.loads(sys.argv[1])))))

@@ -1,1 +1,0 @@
-"""Sweeps over more and more points."""
