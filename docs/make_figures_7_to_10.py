@@ -3,70 +3,90 @@
 `python docs/make_figures_7_to_10.py` writes figures_7_to_10.md and its pictures.
 """
 
-import io
+import functools
+from collections import Counter
+from itertools import groupby
 from pathlib import Path
+from typing import Any
 
-import jax
 import numpy as np
+from writing import run, small_png, table
 
-from fractaljax.base.scene_file import write_whole
-from fractaljax.modes.maps import SOURCE_PANELS, Modes, source_modes, source_scene
-from fractaljax.plot import mode_surfaces, source_figure
+import fractaljax as fj
+from fractaljax.plot.maps import vibration_modes
 
 PAGE = Path(__file__).with_name("figures_7_to_10.md")
 POINTS = 400  # a side
 KAPPA = 0.15  # where the source has its Hopf point
+# Friction (None: an axis) and K_n/(4e8 N/m). The axes of the source are lost in its scan. These
+# show the whole unstable region, except for a friction above 1.
+PANELS = {
+    "7": (None, 1.0),
+    "8": (None, 8.0),
+    "9a": (0.1, 1.0),
+    "9b": (0.2, 1.0),
+    "9c": (0.2, 0.4),
+    "9d": (0.3, 1.0),
+}
 
 
-def coefficients(scene, kappa):
-    """a, b, c_1, c_2 of Eq. 43 with K_t = kappa K_n."""
-    o, K_n = scene.oscillator, float(scene.contact.K_n)
-    a = float(o.omega_1) ** 2 + kappa * K_n / float(o.m)
-    b = float(o.omega_2) ** 2 + K_n / float(o.m)
-    return a, b, *(2 * float(xi * w) for xi, w in ((o.xi_1, o.omega_1), (o.xi_2, o.omega_2)))
+def scene_of(panel: str) -> fj.Scene:
+    """The scene of a panel: the source's section 3.2 with constant friction."""
+    mu, factor = PANELS[panel]
+    contact = fj.FixedContact(4e8 * factor, 2e8 * factor)
+    return fj.Scene(contact, fj.Coulomb(mu or 0.4), fj.brake_scene().oscillator)
+
+
+@functools.cache
+def modes_of(panel: str, points: int = POINTS) -> fj.Sweep:
+    """Both modes over friction, or the ratio of frequencies, and the stiffness ratio kappa."""
+    x, y = np.linspace(0.0025, 1, points), np.linspace(0.0025, 1, points)
+    name = "mu"
+    if PANELS[panel][0] is not None:
+        x, y, name = np.linspace(0.02, 6, points), np.linspace(0, 1.6, points), "omega_1/omega_2"
+    axes: dict[str, Any] = {name: x, "K_t/K_n": y}
+    return fj.sweep(fj.stability, scene_of(panel), progress=False, **axes)
+
+
+def at_ratio(panel, kappa):
+    """The scene of a panel with K_t = kappa K_n."""
+    scene = scene_of(panel)
+    return scene.replace(K_t=kappa * scene.contact.K_n)
 
 
 def critical_friction(panel, kappa):
-    """mu_c^2 kappa K_n^2/m^2 = (a3 a2 a1 - a1^2)/a3^2 - a b: the friction where squeal begins."""
-    scene = source_scene(panel)
-    a, b, c_1, c_2 = coefficients(scene, kappa)
-    a_3, a_2, a_1 = c_1 + c_2, a + b + c_1 * c_2, c_1 * b + c_2 * a
-    coupling = (a_3 * a_2 * a_1 - a_1**2) / a_3**2 - a * b
-    K_n = float(scene.contact.K_n)
-    return np.sqrt(coupling / kappa) * float(scene.oscillator.m) / K_n
+    """The friction where squeal begins."""
+    return float(fj.critical_friction(at_ratio(panel, kappa)))
 
 
 def critical_ratio(panel, mu):
-    """The K_t/K_n below 0.95 where squeal begins at a friction, by bisection."""
-    low, high = 1e-4, 0.95  # mu_c falls between them
-    for _ in range(60):
+    """The kappa below 0.95 where squeal begins at a friction, by bisection."""
+    low, high = 1e-4, 0.95  # the critical friction falls between them
+    for _ in range(50):
         middle = (low + high) / 2
         low, high = (middle, high) if critical_friction(panel, middle) > mu else (low, middle)
     return high
 
 
-def critical_frequency(panel, kappa):
-    """Frequency [kHz] where squeal begins: s^2 = -a1/a3 on the boundary."""
-    a, b, c_1, c_2 = coefficients(source_scene(panel), kappa)
-    return np.sqrt((c_1 * b + c_2 * a) / (c_1 + c_2)) / (2 * np.pi) / 1e3
+def critical_frequency(panel, mu, kappa):
+    """Frequency [kHz] on the boundary."""
+    return float(fj.stability(at_ratio(panel, kappa).replace(mu=mu)).frequency) / 1e3
 
 
 class Map:
-    """One panel as NumPy arrays."""
+    """One panel as arrays (kappa, x)."""
 
     def __init__(self, panel):
-        modes: Modes = source_modes(panel, POINTS)
-        self.x, self.y = np.asarray(modes.x), np.asarray(modes.y)
-        self.growth = np.asarray(modes.growth_rate)
-        self.low, self.high = np.moveaxis(np.asarray(modes.frequency), -1, 0) / 1e3
+        result, scene = modes_of(panel), scene_of(panel)
+        self.x, self.y = result.points
+        self.growth = result.growth_rate.T
+        self.low, self.high = (vibration_modes(result)[1][..., i].T / 1e3 for i in (0, 1))
         self.unstable = self.growth > 0
-        scene = source_scene(panel)
         x, y = self.x[None, :], self.y[:, None]
-        K_n = float(scene.contact.K_n)
-        fixed_mu = panel.startswith("9")
-        mu = float(scene.friction.mu_s) if fixed_mu else x
-        omega_2 = float(scene.oscillator.omega_2)
-        omega_1 = x * omega_2 if fixed_mu else float(scene.oscillator.omega_1)
+        K_n, omega_2 = float(scene.contact.K_n), float(scene.oscillator.omega_2)
+        mu, omega_1 = x, float(scene.oscillator.omega_1)
+        if PANELS[panel][0] is not None:
+            mu, omega_1 = float(scene.friction.mu_s), x * omega_2
         apart = omega_1**2 + y * K_n - omega_2**2 - K_n  # m = 1 kg
         # Without damping the frequencies meet inside, and nowhere else.
         self.coupled = np.abs(apart) < 2 * mu * np.sqrt(y) * K_n
@@ -80,8 +100,7 @@ class Map:
     @property
     def coupling(self):
         """Mean frequency of the two modes where they are coupled and unstable [kHz]."""
-        both = self.coupled & self.unstable
-        return ((self.low + self.high) / 2)[both]
+        return ((self.low + self.high) / 2)[self.coupled & self.unstable]
 
 
 def percent(mask):
@@ -91,19 +110,15 @@ def percent(mask):
 
 def falls(gap, axis, where):
     """Share of neighbours along an axis, both in `where`, between which the gap falls."""
-    ahead, behind = ([slice(None)] * 2 for _ in range(2))
-    ahead[axis], behind[axis] = slice(1, None), slice(None, -1)
-    ahead, behind = tuple(ahead), tuple(behind)
-    return percent((gap[ahead] < gap[behind])[where[ahead] & where[behind]])
+    ahead, behind = np.moveaxis(gap, axis, 0)[1:], np.moveaxis(gap, axis, 0)[:-1]
+    both = np.moveaxis(where, axis, 0)
+    return percent((ahead < behind)[both[1:] & both[:-1]])
 
 
 def patterns(unstable):
-    """Columns by what they are as K_t/K_n grows: S stable, U unstable, changes only."""
-    found = {}
-    for column in unstable.T:
-        word = "".join("U" if u else "S" for u in column[[True, *(np.diff(column) != 0)]])
-        found[word] = found.get(word, 0) + 1
-    return {word: count / unstable.shape[1] for word, count in sorted(found.items())}
+    """Shares of the columns by their sequence as kappa grows: S stable, U unstable."""
+    words = ("".join("SU"[key] for key, _ in groupby(column)) for column in unstable.T.tolist())
+    return {word: n / unstable.shape[1] for word, n in sorted(Counter(words).items())}
 
 
 def friction_claims(maps):
@@ -121,8 +136,9 @@ def friction_claims(maps):
     rate = eight.growth[seven.unstable & eight.unstable]
     rate = rate / seven.growth[seven.unstable & eight.unstable]
     c = [critical_friction(panel, KAPPA) for panel in "78"]
-    a, b, *_ = coefficients(source_scene("7"), 0.0)
-    meeting = (b - a) / float(source_scene("7").contact.K_n)
+    scene = scene_of("7")
+    squares = float(scene.oscillator.omega_2**2 - scene.oscillator.omega_1**2)
+    meeting = 1 + squares / float(scene.contact.K_n)
     off = [(eight.growth > 0) != (seven.growth > 0)]
     return [
         (
@@ -145,8 +161,8 @@ def friction_claims(maps):
             "Small kappa and large mu: squeal of lower frequency; large kappa and small mu: of"
             " higher",
             "holds",
-            f"on the boundary {critical_frequency('7', ends[0]):.3f} kHz at (mu, kappa) ="
-            f" (0.9, {ends[0]:.3f}), {critical_frequency('7', ends[1]):.3f} kHz at"
+            f"on the boundary {critical_frequency('7', 0.9, ends[0]):.3f} kHz at (mu, kappa) ="
+            f" (0.9, {ends[0]:.3f}), {critical_frequency('7', 0.1, ends[1]):.3f} kHz at"
             f" (0.1, {ends[1]:.3f})",
         ),
         (
@@ -264,62 +280,66 @@ def frequency_claims(maps):
 INTRODUCTION = """\
 # The source's Figs. 7 to 10
 
-Real part and frequency of both modes by the source's Eq. 43 (constant friction), over friction mu
-and stiffness ratio kappa = K_t/K_n (Figs. 7 and 8: K_n = 4e8 N/m and 8 times that), and over
-omega = omega_1/omega_2, at its omega_2, and kappa (Figs. 9 and 10: mu = 0.1, 0.2, 0.2, 0.3 with
-K_n = 4e8, 4e8, 1.6e8, 4e8 N/m). The source's axes are lost in its scan; here mu and kappa go up to
-1, and omega to 6 with kappa to 1.6.
+Real part and frequency of both modes by the source's Eq. 43 with constant friction. Figs. 7 and 8
+show them over friction mu and stiffness ratio kappa = K_t/K_n, for K_n = 4e8 N/m and 8 times that.
+Figs. 9 and 10 show them over omega = omega_1/omega_2, at its omega_2, and kappa, for mu = 0.1, 0.2,
+0.2, 0.3 and K_n = 4e8, 4e8, 1.6e8, 4e8 N/m. The axes of the source are lost in its scan. Here mu
+and kappa go up to 1 in the first two, and omega to 6 and kappa to 1.6 in the others.
 
-    fj.plot.source_figure(7)                       # or 8, 9, 10
-    modes = fj.modes_over(scene, ("mu", mu), ("K_t/K_n", kappa), friction_slope=False)
-    fj.plot.growth_map(modes)                      # also frequency_map, mode_lines, mode_surfaces
+    result = fj.sweep(fj.stability, scene, **{"mu": mu, "K_t/K_n": kappa})
+    fj.plot.growth_map(result)           # also frequency_map, mode_lines, mode_surfaces, modes
 
-`fj.modes_over` takes any two quantities of any scene, and the slope of the friction law unless told
-not to. Shares of an area below are shares of a map with 400 x 400 points.
+`fj.sweep` takes any quantities of any scene. Shares of an area below are shares of a map with
+400 x 400 points.
 """
+
+
+def figure(number: int, points: int = POINTS):
+    """Fig. 7, 8, 9 or 10 as maps."""
+    if number < 9:
+        return fj.plot.modes(modes_of(str(number), points))
+    drawn = fj.plot.new_figure(11.2, 9.2 if number == 9 else 17)
+    rows = drawn.subplots(2, 2).reshape(4, 1) if number == 9 else drawn.subplots(4, 2)
+    for letter, row in zip("abcd", rows, strict=True):
+        result = modes_of(f"9{letter}", points)
+        for mode, ax in enumerate(row, start=1):
+            if number == 9:
+                fj.plot.growth_map(result, ax)
+            else:
+                fj.plot.frequency_map(result, ax, mode=mode)
+            ax.set_title(f"({letter}) {ax.get_title(loc='left')}", fontsize="medium", loc="left")
+    return drawn
+
+
 PICTURES = {
-    "figure_7.png": ("Fig. 7: K_n = 4e8 N/m", lambda: source_figure(7)),
+    "figure_7.png": ("Fig. 7: K_n = 4e8 N/m", lambda: figure(7)),
     "figure_7_surfaces.png": (
         "The real parts of Fig. 7 as surfaces, as the source draws them",
-        lambda: mode_surfaces(source_modes("7")).figure,
+        lambda: fj.plot.mode_surfaces(modes_of("7")).figure,
     ),
-    "figure_8.png": ("Fig. 8: K_n = 3.2e9 N/m", lambda: source_figure(8)),
-    "figure_9.png": ("Fig. 9: growth rate over omega and kappa", lambda: source_figure(9)),
-    "figure_10.png": ("Fig. 10: frequencies over omega and kappa", lambda: source_figure(10)),
+    "figure_8.png": ("Fig. 8: K_n = 3.2e9 N/m", lambda: figure(8)),
+    "figure_9.png": ("Fig. 9: growth rate over omega and kappa", lambda: figure(9)),
+    "figure_10.png": ("Fig. 10: frequencies over omega and kappa", lambda: figure(10)),
 }
 
 
 def page() -> str:
     """The text of figures_7_to_10.md."""
-    maps = {panel: Map(panel) for panel in SOURCE_PANELS}
-    lines = [INTRODUCTION]
+    maps, lines = {panel: Map(panel) for panel in PANELS}, [INTRODUCTION]
     for title, rows, names in [
         ("Figs. 7 and 8", friction_claims(maps), list(PICTURES)[:3]),
         ("Figs. 9 and 10", frequency_claims(maps), list(PICTURES)[3:]),
     ]:
-        lines += [f"## {title}", "", "| the source says | verdict | numbers |", "|---|---|---|"]
-        lines += [f"| {' | '.join(row)} |" for row in rows] + [""]
+        lines += [f"## {title}", "", *table(["the source says", "verdict", "numbers"], rows), ""]
         lines += [f"![{PICTURES[name][0]}]({name})\n" for name in names]
     return "\n".join([*lines, "Written by `python docs/make_figures_7_to_10.py`.", ""])
 
 
-def small_png(figure) -> bytes:
-    """A picture of few colours, a third of the size."""
-    from PIL import Image
-
-    content, reduced = io.BytesIO(), io.BytesIO()
-    figure.savefig(content, format="png", dpi=85)
-    Image.open(content).convert("RGB").quantize(64).save(reduced, format="png", optimize=True)
-    return reduced.getvalue()
-
-
-def main() -> None:
-    """Write the page and the pictures."""
-    jax.config.update("jax_enable_x64", True)
-    for name, (_, draw) in PICTURES.items():
-        write_whole(PAGE.with_name(name), small_png(draw()))
-    write_whole(PAGE, page().encode())
-
-
 if __name__ == "__main__":
-    main()
+    run(
+        {
+            PAGE.with_name(name): lambda draw=draw: small_png(draw())
+            for name, (_, draw) in PICTURES.items()
+        }
+        | {PAGE: lambda: page().encode()}
+    )

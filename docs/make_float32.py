@@ -10,9 +10,9 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from writing import run, table
 
 import fractaljax as fj
-from fractaljax.base.scene_file import write_whole
 
 PAGE = Path(__file__).with_name("float32.md")
 POINTS = 2000  # a place
@@ -65,9 +65,7 @@ def measured(scene: fj.Scene, points: dict[str, jax.Array]) -> dict[str, jax.Arr
     return jax.vmap(one)(points)
 
 
-# ---------------------------------------------------------------------------------------------
-# The places
-# ---------------------------------------------------------------------------------------------
+# --- The places
 
 
 def log_uniform(rng, low, high, n=POINTS):
@@ -124,11 +122,11 @@ def near_fully_plastic(rng) -> Points:
 
 def near_gross_slip(rng) -> Points:
     """Q_e just below mu_s P, found by bisection in ln(P / P at a_l = a_e)."""
-    D, rest = rng.uniform(2.3, 2.7, POINTS), log_uniform(rng, 1e-4, 1e-1)
+    D, reserve = rng.uniform(2.3, 2.7, POINTS), log_uniform(rng, 1e-4, 1e-1)
     low, high = np.full(POINTS, 1e-3), np.full(POINTS, 30.0)
     for _ in range(50):
         middle = (low + high) / 2
-        beyond = np.asarray(joints(loaded(D, middle)).slip_ratio) > 1 - rest
+        beyond = np.asarray(joints(loaded(D, middle)).slip_ratio) > 1 - reserve
         low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
     return loaded(D, low)
 
@@ -166,9 +164,7 @@ PLACES: dict[str, Callable[[np.random.Generator], Points]] = {
 }
 
 
-# ---------------------------------------------------------------------------------------------
-# The errors
-# ---------------------------------------------------------------------------------------------
+# --- The errors
 
 
 def errors_at(place: str) -> dict[str, str]:
@@ -246,23 +242,16 @@ def page() -> str:
     cells = {place: errors_at(place) for place in PLACES}
     nan = any("nan" in text for row in cells.values() for text in row.values())
     introduction = INTRODUCTION.format(broken=BROKEN if nan else "", overflow=overflow_of_a_e())
-    lines = [introduction, "## Values", "", *table(cells, [*VALUES, "ln(a_l/a_e)", "a_e"])]
-    lines += ["", "## Gradients to (D, ln G)", "", *table(cells, [f"d {v}" for v in VALUES])]
+    lines = [introduction, "## Values", "", *grid(cells, [*VALUES, "ln(a_l/a_e)", "a_e"])]
+    lines += ["", "## Gradients to (D, ln G)", "", *grid(cells, [f"d {v}" for v in VALUES])]
     return "\n".join([*lines, "", "Written by `python docs/make_float32.py`.", ""])
 
 
-def table(cells: dict[str, dict[str, str]], columns: list[str]) -> list[str]:
-    """The lines of a Markdown table, a place a row."""
-    head = [f"| where | {' | '.join(columns)} |", "|---" * (len(columns) + 1) + "|"]
+def grid(cells: dict[str, dict[str, str]], columns: list[str]) -> list[str]:
+    """A table with a row a place."""
     rows = [[place, *(row[column] for column in columns)] for place, row in cells.items()]
-    return head + [f"| {' | '.join(row)} |" for row in rows]
-
-
-def main() -> None:
-    """Write the page."""
-    jax.config.update("jax_enable_x64", True)
-    write_whole(PAGE, page().encode())
+    return table(["where", *columns], rows)
 
 
 if __name__ == "__main__":
-    main()
+    run({PAGE: lambda: page().encode()})

@@ -1,6 +1,7 @@
 """Draw identification.png: a known surface, identified, `python docs/make_identification.py`."""
 
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -18,7 +19,8 @@ def draw(path=PICTURE) -> fj.Identification:
     z = np.asarray(fj.topography(surface, L, POINTS, key=jax.random.key(4)))
     z = z + NOISE * np.random.default_rng(0).standard_normal(z.shape)
     found = fj.identify(z, L / POINTS, stylus_radius=TIP)
-    fj.plot.identification(found).figure.savefig(path, dpi=110)
+    figure: Any = fj.plot.identification(found).figure
+    figure.savefig(path, dpi=110)
     return found
 
 

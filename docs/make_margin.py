@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fractaljax.mechanism.oscillator import Linearised
-from fractaljax.modes.margin import margin_of
-from fractaljax.modes.stability import _eigenvalues
+from fractaljax._mechanism.oscillator import Linearised
+from fractaljax._stability.margin import margin_of
+from fractaljax._stability.quartic import roots
 
 PICTURE = Path(__file__).with_name("margin.png")
 POINTS = 401
@@ -42,7 +42,7 @@ def smoothed_abscissa(matrix, eps):
 @jax.vmap
 def measures(lin: Linearised):
     """Growth rate, least damping ratio and margin."""
-    s = _eigenvalues(lin)
+    s = roots(lin)
     return s[0].real, (-s.real / jnp.abs(s)).min(), margin_of(lin)
 
 
