@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._base.parts import Record, concrete
-from .shooting import UNUSED, Segments, flow
-from .stick_slip import StickSlip, units
+from .hybrid import OPEN, UNUSED, HybridSystem
+from .orbit import Segments, flow
 
 _SQUARINGS = 40  # of a monodromy matrix
 
@@ -47,7 +47,7 @@ def repels(
     """
     along = rate / jnp.linalg.norm(rate)
     missed = jnp.max(jnp.abs(jnp.sum(monodromy * along[None], axis=1) - along))
-    across = jnp.eye(4, dtype=along.dtype) - along[:, None] * along[None]
+    across = jnp.eye(len(along), dtype=along.dtype) - along[:, None] * along[None]
 
     def square(_, carry):
         # The matrix to the power of 2^k, scaled to 1, and the logarithm of its scale.
@@ -66,8 +66,8 @@ class Switch(Record):
     """One change of the contact state, as `LimitCycle.switches` lists them."""
 
     time: float  # after `state` [s]
-    direction: int  # which one switches, 1 or 2
-    before: str  # "+" (slip, dx/dt < V), "-" (slip, dx/dt > V) or "stick"
+    direction: int  # which one switches, from 1
+    before: str  # "+" (slip, t.v < V), "-" (slip, t.v > V), "stick" or "open"
     after: str
 
 
@@ -76,7 +76,7 @@ class Orbit(eqx.Module):
 
     segments: Segments
 
-    def at(self, system: StickSlip, times) -> Float[Array, "4 n"]:
+    def at(self, system: HybridSystem, times) -> Float[Array, "4 n"]:
         """Scaled states at scaled times (n,) within one period."""
         segments = self.segments
         ends = jnp.cumsum(segments.duration)
@@ -92,18 +92,20 @@ class LimitCycle(Record):
     """A limit cycle, as `limit_cycle` returns it. NaN throughout where there is none."""
 
     period: Float[Array, ""]  # [s]
-    amplitude: Float[Array, "2"]  # peak to peak, one value a direction [m]
-    velocity_min: Float[Array, "2"]  # of dx/dt [m/s]
-    velocity_max: Float[Array, "2"]  # [m/s]
-    stick_fraction: Float[Array, "2"]  # of the period in stick (regularised: abs(v) < eps)
-    tension_fraction: Float[Array, ""]  # of the period with K_n x2 < 0: the contact pulls
-    state: Float[Array, "4"]  # [x1, x2, v1, v2] on the cycle, where x1 is largest [m, m/s]
+    amplitude: Float[Array, " n"]  # peak to peak of each degree of freedom [m]
+    velocity_min: Float[Array, " n"]  # of dx/dt [m/s]
+    velocity_max: Float[Array, " n"]  # [m/s]
+    stick_fraction: Float[Array, " m"]  # of the period in stick (regularised: abs(v) < eps)
+    open_fraction: Float[Array, " m"]  # of the period open, one value a joint
+    tension_fraction: Float[Array, "..."]  # of the period with K_n n.x < 0: the contact pulls
+    normal_force: Float[Array, "m 2"]  # smallest and largest of each joint [N]
+    state: Float[Array, " 2n"]  # [x, v] on the cycle, at the section: a maximum of t.x [m, m/s]
     error: Float[Array, ""]  # estimated relative error of period and states
     returns: Int[Array, ""]  # of the Poincare map (maxima of x1) in one period
     regularisation_error: Float[Array, ""]  # largest relative difference from the exact law
     result: CycleResult
-    _monodromy: Float[Array, "4 4"] = eqx.field(repr=False)
-    _system: StickSlip = eqx.field(repr=False)
+    _monodromy: Float[Array, "2n 2n"] = eqx.field(repr=False)
+    _system: HybridSystem = eqx.field(repr=False)
     _orbit: Any = eqx.field(repr=False)  # Orbit, or regularised.SmoothOrbit
 
     @property
@@ -125,7 +127,7 @@ class LimitCycle(Record):
         share = jnp.arange(n) / n
         y = self._orbit.at(system, share * self.period * system.omega)
         y = jnp.where(jnp.isfinite(self.period), y, jnp.nan)
-        return share * self.period, (y * units(system)[:, None]).T
+        return share * self.period, (y * system.units[:, None]).T
 
     def spectrum(self, n: int = 512) -> tuple[Float[Array, " n/2"], Float[Array, "n/2 2"]]:
         """Harmonics: frequencies [Hz] and peak amplitudes [m] of x1 and x2.
@@ -147,7 +149,7 @@ class LimitCycle(Record):
             raise ValueError("switches() needs one cycle, outside of jit: index the batch first")
         if not isinstance(self._orbit, Orbit):
             raise ValueError("a regularised cycle has no switches")
-        segments, names = self._orbit.segments, {1: "+", -1: "-", 0: "stick"}
+        segments, names = self._orbit.segments, {1: "+", -1: "-", 0: "stick", OPEN: "open"}
         used = np.asarray(segments.guard) != UNUSED
         states = np.asarray(segments.s)[:, used].astype(int)
         times = np.cumsum(np.asarray(segments.duration)[used]) / float(self._system.omega)

@@ -1,12 +1,11 @@
 """A coarse Runge-Kutta step that stops where the first guard reaches zero."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
-from .stick_slip import SECTION, StickSlip
-
-NONE = SECTION + 1  # as a guard's number: no guard ended the step
+from .hybrid import NONE, SECTION, HybridSystem
 
 
 class Cubic(eqx.Module):
@@ -21,6 +20,17 @@ class Cubic(eqx.Module):
     def through(cls, g_0, g_1, d_0, d_1) -> "Cubic":
         """With values g and slopes d at 0 and at 1."""
         return cls(g_0, d_0, 3 * (g_1 - g_0) - 2 * d_0 - d_1, d_0 + d_1 - 2 * (g_1 - g_0))
+
+    @classmethod
+    def at_thirds(cls, g) -> "Cubic":
+        """With values g (4, ...) at 0, 1/3, 2/3 and 1."""
+        g_0, a, b, g_1 = g
+        return cls(
+            g_0,
+            (18 * a - 11 * g_0 - 9 * b + 2 * g_1) / 2,
+            (18 * g_0 - 45 * a + 36 * b - 9 * g_1) / 2,
+            (27 * a - 9 * g_0 - 27 * b + 9 * g_1) / 2,
+        )
 
     def __call__(self, x):
         return self.k_0 + x * (self.k_1 + x * (self.k_2 + x * self.k_3))
@@ -68,42 +78,36 @@ def without_start(cubic: Cubic, rising) -> Cubic:
     )
 
 
-def first_root(g_0, g_1, d_0, d_1) -> Array:
-    """Where in (0, 1] a cubic first falls through zero, or 2 if it does not; any shape.
+def first_root(whole: Cubic) -> Array:
+    """Where in (0, 1] cubics first fall through zero, or 2 where they do not; any shape.
 
-    Arguments are its values g and slopes d at 0 and 1. A root at 0 does not count: the motion has
-    just left it. A cubic below zero at 0 has its root there.
+    A root at 0 does not count: the motion has just left it. A cubic below zero at 0 has its root
+    there.
     """
-    entered = g_0 == 0
-    whole = Cubic.through(g_0, g_1, d_0, d_1)
+    entered = whole.k_0 == 0
     cubic = without_start(whole, entered)
     # A minimum below zero has a root before it, even if the cubic ends above zero.
     lowest, dips = cubic.minimum()
     dips &= cubic(lowest) < 0
     end = jnp.where(dips, lowest, 1)
     # A cubic that rises from just above zero has a root just before 0, which does not count.
-    rising = ~entered & (d_0 > 0)
+    rising = ~entered & (whole.k_1 > 0)
     back = without_start(whole, rising).root_before(end)
     x = cubic.root_before(end, jnp.where(rising, back, 0))
     # A step of zero length would be repeated forever.
     x = jnp.where(entered, jnp.maximum(x, 1e-6), x)
-    return jnp.where(g_0 < 0, 0, jnp.where(cubic(end) < 0, x, 2))
+    return jnp.where(whole.k_0 < 0, 0, jnp.where(cubic(end) < 0, x, 2))
 
 
-def guards_and_rates(system: StickSlip, y, s, h, f) -> tuple[Array, Array]:
-    """The guards at y (4, ...) and their changes over a step h (...), where dy/dt = f."""
-    return system.guards(y, s), jnp.asarray(h)[None] * system.guards(f, s, 0.0)
+def rounding(y) -> Array:
+    """Within how much of zero a guard at y (2n, ...) is zero."""
+    return 64 * jnp.finfo(y.dtype).eps * (1 + jnp.max(jnp.abs(y), axis=0))
 
 
-def _nearest(guards, of) -> Array:
-    """Of the two guards of each direction the one that is lower in `of`; and the section."""
-    lower = [jnp.where(of[k] <= of[k + 1], guards[k], guards[k + 1]) for k in (0, 2)]
-    return jnp.stack([*lower, guards[SECTION]])
-
-
-def step(system: StickSlip, y, s, h):
+def step(system: HybridSystem, y, s, last, h):
     """A step of length h, or less, in contact state s by the classical fourth-order method.
 
+    `last` is the guard that ended the step before: a section just crossed is not crossed again.
     Returns the state and contact state after it, its length, and the number of the guard that
     ended it or `NONE`. States inside the step are those of the cubic through its ends.
     """
@@ -116,23 +120,34 @@ def step(system: StickSlip, y, s, h):
     y_1 = y + step / 6 * (f_0 + 2 * f_b + 2 * f_c + f_d)
     f_1 = system.field(y_1, s)
 
-    at_0, at_1 = guards_and_rates(system, y, s, h, f_0), guards_and_rates(system, y_1, s, h, f_1)
-    of = at_1[0]
-    values, rates = zip(at_0, at_1, strict=True)
-    roots = first_root(*(_nearest(x, of) for x in (*values, *rates)))
+    def between(theta):
+        left, right = 1 - theta, theta
+        return (
+            left**2 * (1 + 2 * right) * y
+            + right**2 * (3 - 2 * right) * y_1
+            + step * left * right * (left * f_0 - right * f_1)
+        )
+
+    nodes = jnp.stack([y, between(1 / 3), between(2 / 3), y_1])
+    guards = jax.vmap(lambda y: system.guards(y, s))(nodes)
+    start, rate = guards[0], guards[1] - guards[0]
+    # A guard starts on its own side: at zero it is entered, unless it falls on.
+    near = rounding(y)[None]
+    entered = (jnp.abs(start) <= near) & (rate >= -near)
+    guards = guards.at[0].set(jnp.where(entered, 0, start))
     # Only a fall through the section counts.
-    roots = jnp.stack([roots[0], roots[1], jnp.where(y[2] > 0, roots[2], 2)])
+    falls = (guards[0, SECTION] > 0) & (last != SECTION)
+    roots = first_root(Cubic.at_thirds(guards))
+    roots = roots.at[SECTION].set(jnp.where(falls, roots[SECTION], 2))
     theta = jnp.min(roots, axis=0)
     hit = theta <= 1
-    first = jnp.argmin(roots, axis=0)
-    second = jnp.stack([of[k + 1] < of[k] for k in (0, 2)])
-    guard = jnp.where(first == 2, SECTION, 2 * first + jnp.where(first == 1, second[1], second[0]))
-    guard = jnp.where(hit, guard, NONE)
-    left, right = 1 - theta[None], theta[None]
-    between = (
-        left**2 * (1 + 2 * right) * y
-        + right**2 * (3 - 2 * right) * y_1
-        + step * left * right * (left * f_0 - right * f_1)
-    )
-    y_end, s_end = system.switch(jnp.where(hit[None], between, y_1), s, guard)
+    guard = jnp.where(hit, jnp.argmin(roots, axis=0), NONE)
+    end = jnp.where(hit[None], between(jnp.where(hit, theta, 1)[None]), y_1)
+    y_end, s_end = system.switch(end, s, guard)
     return y_end, s_end, jnp.where(hit, theta, 1) * h, guard
+
+
+def guards_and_rates(system: HybridSystem, y, s, h, f) -> tuple[Array, Array]:
+    """The guards at y (k, ...) and their changes over a step h (...), where dy/dt = f."""
+    guards, rates = jax.jvp(lambda y: system.guards(y, s), (y,), (f,))
+    return guards, jnp.asarray(h)[None] * rates

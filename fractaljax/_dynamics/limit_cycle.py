@@ -10,29 +10,31 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, ScalarLike
 
 from .._base.parts import concrete, number, raise_unless, require_scalar, whole
+from .._mechanism.mechanism import Mechanism
 from .._mechanism.scene import Scene
 from .._stability.stability import growth_rate
-from . import transient
+from . import search
 from .cycle import CycleResult, LimitCycle, Orbit, repels
 from .events import Cubic, first_root
-from .shooting import UNUSED, Maps, Segments, flow, maps, next_start, orbit
-from .stick_slip import (
-    StickSlip,
+from .hybrid import (
+    NONE,
+    OPEN,
+    HybridSystem,
     check_rtol,
+    degrees_of_freedom,
+    hybrid_system,
     scaled_start,
-    sliding_equilibrium,
     start_state,
-    stick_slip,
-    units,
 )
+from .orbit import Maps, Segments, flow, maps, next_start, orbit
 
 if TYPE_CHECKING:
     from diffrax import AbstractSolver
 
-_REFINEMENTS = 3
+_SEGMENTS = 64  # one return takes some 35 at rtol 1e-9
 _CROSSINGS = 16  # segments in which x2 may change sign
 
-# In the order of the numbers in `transient`.
+# In the order of the numbers in `search`.
 _RESULTS = (
     CycleResult.exhausted,
     CycleResult.converged,
@@ -43,73 +45,78 @@ _RESULTS = (
 )
 
 
-def _extremes(system: StickSlip, segments: Segments) -> Float[Array, "2 4"]:
-    """Smallest and largest value of each component along the orbit."""
+def _along(system: HybridSystem, y, s, t, row):
+    """row @ y and its first two derivatives by time, each lane at its own time t."""
+    y = flow(system, y, t, s)
+
+    def derivative(function):
+        return lambda y: jax.jvp(function, (y,), (system.field(y, s),))[1]
+
+    def value(y):
+        return jnp.sum(row * y, axis=0)
+
+    rate = derivative(value)
+    return value(y), rate(y), derivative(rate)(y)
+
+
+def _extremes(system: HybridSystem, segments: Segments, rows) -> Float[Array, "2 r"]:
+    """Smallest and largest value along the orbit of linear functions rows @ y, rows (r, 2n)."""
     y, h, s = segments.y, segments.duration, segments.s
-    ends = next_start(y)
-    sign = jnp.array([1.0, -1.0], y.dtype)[:, None, None]
-    d_0, d_1 = (sign * (h[None] * system.field(at, s))[None] for at in (y, ends))
-    # Where the cubic through the ends of each segment is lowest.
-    cubic = Cubic.through(sign * y[None], sign * ends[None], d_0, d_1)
-    theta, inside = cubic.minimum()
-    low = cubic(theta)
-    k = jnp.argmin(low, axis=-1)
-    y, s, h = y[:, k], s[:, k], h[k]
-    t = jnp.take_along_axis(theta, k[..., None], axis=-1)[..., 0] * h
-    inside = jnp.take_along_axis(inside, k[..., None], axis=-1)[..., 0]
-    own = jnp.eye(4, dtype=y.dtype)[:, None]
-
-    def refine(_, t):
-        along = flow(system, y, t, s)
-        rate, change = jax.jvp(lambda at: system.field(at, s), (along,), (system.field(along, s),))
-        rate, change = (jnp.sum(own * x, axis=0) for x in (rate, change))
-        step = rate / jnp.where(change == 0, 1, change)
-        return jnp.where(inside, jnp.clip(t - step, -0.1 * h, 1.1 * h), t)
-
-    # At an extremum the derivative by time is zero.
-    t = jax.lax.stop_gradient(jax.lax.fori_loop(0, _REFINEMENTS, refine, t))
-    return jnp.sum(own * flow(system, y, t, s), axis=0)
-
-
-def _time_below_zero(system: StickSlip, segments: Segments, component: int) -> Float[Array, ""]:
-    """How long one component is negative in one period."""
-    y, h, s = segments.y, segments.duration, segments.s
-    ends = next_start(y)
-    whole_segments = jnp.sum(jnp.where(y[component] < 0, h, 0))
-    # In a segment with crossings: from its start to the first zero, and from the last to its end.
-    sign = jnp.where(y[component] < 0, -1, 1)
-    g_0, g_1 = sign * y[component], sign * ends[component]
-    d_0, d_1 = (sign * h * system.field(at, s)[component] for at in (y, ends))
-    first = first_root(g_0, g_1, d_0, d_1)
-    reversed_sign = jnp.where(g_1 < 0, -1, 1)
-    last = 1 - first_root(
-        reversed_sign * g_1, reversed_sign * g_0, -reversed_sign * d_1, -reversed_sign * d_0
+    ends, rows = next_start(y), jnp.concatenate([rows, -rows])
+    g_0, g_1, d_0, d_1 = (
+        rows @ x for x in (y, ends, h[None] * system.field(y, s), h[None] * system.field(ends, s))
     )
-    (k,) = jnp.nonzero(first <= 1, size=_CROSSINGS, fill_value=-1)
-    y, s, h, sign = y[:, k], s[:, k], h[k], sign[k]
-    t = jnp.stack([first[k], last[k]]) * h[None]
-    y, s = y[:, None], s[:, None]
+    # Where the cubic through the ends of each segment is lowest.
+    cubic = Cubic.through(g_0, g_1, d_0, d_1)
+    theta, inside = cubic.minimum()
+    k = jnp.argmin(cubic(theta), axis=1)[:, None]
+    theta = jax.lax.stop_gradient(jnp.take_along_axis(theta, k, axis=1)[:, 0])
+    inside, k = jnp.take_along_axis(inside, k, axis=1)[:, 0], k[:, 0]
+    value, rate, change = _along(system, y[:, k], s[:, k], theta * h[k], rows.T)
+    # The cubic's minimum is near; the parabola there has the orbit's.
+    inside = inside & (change > 0)
+    value = value - jnp.where(inside, rate**2 / jnp.where(inside, 2 * change, 1), 0)
+    low, high = jnp.split(value, 2)
+    return jnp.stack([low, -high])
 
-    def refine(_, t):
-        at = flow(system, y, t, s)
-        rate = system.field(at, s)[component]
-        return t - at[component] / jnp.where(rate == 0, 1, rate)
 
-    t = jax.lax.fori_loop(0, _REFINEMENTS, refine, jax.lax.stop_gradient(t))
-    t = refine(0, jax.lax.stop_gradient(t))  # carries the derivative
+def _time_below_zero(system: HybridSystem, segments: Segments, row, offset) -> Float[Array, ""]:
+    """How long row @ y + offset is negative in one period."""
+    y, h, s = segments.y, segments.duration, segments.s
+    ends = next_start(y)
+    g_0, g_1 = row @ y + offset, row @ ends + offset
+    d_0, d_1 = (h * (row @ system.field(at, s)) for at in (y, ends))
+    whole_segments = jnp.sum(jnp.where(g_0 < 0, h, 0))
+    # In a segment with crossings: from its start to the first zero, and from the last to its end.
+    sign, reversed_sign = jnp.where(g_0 < 0, -1, 1), jnp.where(g_0 * g_1 < 0, -1, 1)
+    g_0, g_1, d_0, d_1 = (sign * x for x in (g_0, g_1, d_0, d_1))
+    back = [reversed_sign * x for x in (g_1, g_0, -d_1, -d_0)]
+    cubics = Cubic.through(*(jnp.stack(x) for x in zip((g_0, g_1, d_0, d_1), back, strict=True)))
+    first, last = first_root(cubics)
+    crosses, k = jax.lax.top_k((first <= 1).astype(int), _CROSSINGS)
+    t = jax.lax.stop_gradient(jnp.concatenate([first[k], 1 - last[k]]))
+    twice = jnp.concatenate([k, k])
+    t = t * h[twice]
+    lanes = jnp.broadcast_to(row[:, None], (len(row), len(t)))
+    value, rate, change = _along(system, y[:, twice], s[:, twice], t, lanes)
+    # One step of third order from the cubic's root, which carries the derivative as well.
+    rate = jnp.where(rate == 0, 1, rate)
+    newton = (value + offset) / rate
+    t = t - newton * (1 + newton * change / (2 * rate))
+    first, last = jnp.split(t, 2)
     # With one crossing the rest of the segment has the other sign, else the time between two.
-    crossed = jnp.where(jax.lax.stop_gradient(g_1[k]) < 0, h - t[0], t[1] - t[0])
-    return whole_segments + jnp.sum(jnp.where(k >= 0, sign * crossed, 0))
+    crossed = jnp.where(jax.lax.stop_gradient(g_1[k]) < 0, h[k] - first, last - first)
+    return whole_segments + jnp.sum(jnp.where(crosses > 0, sign[k] * crossed, 0))
 
 
-def _monodromy(system: StickSlip, segments: Segments, local: Maps) -> Float[Array, "4 4"]:
+def _monodromy(system: HybridSystem, segments: Segments, local: Maps) -> Float[Array, "2n 2n"]:
     """The product of all segments' maps, with the jump of the tangent at every switch."""
     ends, s = next_start(segments.y), segments.s
     before, after = system.field(ends, s), system.field(ends, jnp.roll(s, -1, axis=-1))
-    used = segments.guard != UNUSED
-    speed = jnp.where(used, jnp.sum(local.c * before, axis=0), 1)
-    jump = jnp.where(used[None], (after - before) / speed[None], 0)
-    eye = jnp.eye(4, dtype=ends.dtype)
+    switches = segments.used & (segments.guard != NONE)
+    speed = jnp.where(switches, jnp.sum(local.c * before, axis=0), 1)
+    jump = jnp.where(switches[None], (after - before) / speed[None], 0)
+    eye = jnp.eye(len(ends), dtype=ends.dtype)
     M = jnp.einsum("ijn,jkn->nik", eye[:, :, None] + jump[:, None] * local.c[None], local.A)
     while len(M) > 1:
         unpaired = M[len(M) & ~1 :]
@@ -118,13 +125,17 @@ def _monodromy(system: StickSlip, segments: Segments, local: Maps) -> Float[Arra
 
 
 @functools.partial(jax.jit, static_argnames=("segments", "rtol"))
-def _limit_cycle(scene: Scene, start, max_returns, *, segments: int, rtol: float) -> LimitCycle:
-    system = stick_slip(scene)
+def _limit_cycle(
+    mechanism: Mechanism, start, max_returns, *, segments: int, rtol: float
+) -> LimitCycle:
+    system = hybrid_system(mechanism)
     frozen, equilibrium, growth = jax.lax.stop_gradient(
-        (system, sliding_equilibrium(scene, system), growth_rate(scene) / system.omega)
+        (system, system.equilibrium(), growth_rate(mechanism) / system.omega)
     )
-    y = scaled_start(scene, system, start)
-    found = transient.find(frozen, y, equilibrium, growth, max_returns.astype(y.dtype), segments)
+    y = scaled_start(system, start)
+    h = jnp.asarray(0.25 * (rtol / 1e-9) ** 0.125, y.dtype)
+    max_returns = max_returns.astype(y.dtype)
+    found = search.find(frozen, y, equilibrium, growth, max_returns, h, jnp.asarray(rtol, y.dtype), segments)
     found = jax.lax.stop_gradient(found)
 
     y, duration = orbit(system, found.segments)
@@ -135,7 +146,7 @@ def _limit_cycle(scene: Scene, start, max_returns, *, segments: int, rtol: float
     status = CycleResult.exhausted
     for outcome, result in enumerate(_RESULTS):
         status = CycleResult.where(found.status == outcome, result, status)
-    exists = found.status == transient.CONVERGED
+    exists = found.status == search.CONVERGED
     monodromy = _monodromy(system, closed, local)
     frozen_map, rate = jax.lax.stop_gradient(
         (monodromy, system.field(y[:, 0], found.segments.s[:, 0]))
@@ -148,15 +159,37 @@ def _limit_cycle(scene: Scene, start, max_returns, *, segments: int, rtol: float
         return jnp.where(exists, value, jnp.nan)
 
     period = only(period)
-    scale = units(system)
-    low, high = _extremes(system, closed) * scale[None]
+    n, scale = system.n, system.units
+    # The loads of the tangential faces are the normal forces of the joints.
+    tangential = np.array([faces[0] for faces in system.faces])
+    rows = jnp.concatenate([system.L[tangential], jnp.zeros_like(system.L[tangential])], axis=1)
+    everything = jnp.concatenate([jnp.eye(2 * n, dtype=rows.dtype), rows])
+    low, high = _extremes(system, closed, everything)
+    offset = system.P[tangential][None]
+    forces = (jnp.stack([low, high])[:, 2 * n :] + offset) * system.force_unit
+    forces = jnp.where(np.array(system.opens)[None], jnp.maximum(forces, 0), forces)
+    low, high = low[: 2 * n] * scale, high[: 2 * n] * scale
+
+    def share(of):
+        return jnp.sum(jnp.where(of, duration[None], 0), axis=1) / period
+
+    # A scene says it of both directions, a structure of each joint.
+    shown = slice(None) if isinstance(mechanism, Scene) else tangential
+    pulls = [
+        jnp.zeros_like(period)
+        if opens or not faces[1:]
+        else _time_below_zero(system, closed, row, shift) / period
+        for row, shift, faces, opens in zip(rows, offset[0], system.faces, system.opens, strict=True)
+    ]
     return LimitCycle(
         period=period / system.omega,
-        amplitude=only((high - low)[:2]),
-        velocity_min=only(low[2:]),
-        velocity_max=only(high[2:]),
-        stick_fraction=jnp.sum(jnp.where(closed.s == 0, duration, 0), axis=1) / period,
-        tension_fraction=_time_below_zero(system, closed, 1) / period,
+        amplitude=only((high - low)[:n]),
+        velocity_min=only(low[n:]),
+        velocity_max=only(high[n:]),
+        stick_fraction=only(share(closed.s == 0))[shown],
+        open_fraction=only(share(closed.s == OPEN))[tangential],
+        tension_fraction=only(pulls[0] if isinstance(mechanism, Scene) else jnp.stack(pulls)),
+        normal_force=only(forces.T),
         state=only(y[:, 0] * scale),
         error=only(error),
         returns=found.period_returns,
@@ -168,11 +201,6 @@ def _limit_cycle(scene: Scene, start, max_returns, *, segments: int, rtol: float
     )
 
 
-def _segments_for(rtol: float) -> int:
-    # 40 resolve one return to some 1e-12 in 64 bits; the method is of order eight.
-    return int(np.clip(round(40 * (1e-9 / rtol) ** 0.125), 24, 256))
-
-
 def _may_need_more_segments(cycle: LimitCycle) -> bool:
     """Known only of one cycle outside of a compiled program."""
     if concrete(cycle.period) is None or cycle.period.ndim:
@@ -182,7 +210,7 @@ def _may_need_more_segments(cycle: LimitCycle) -> bool:
 
 
 def limit_cycle(
-    scene: Scene,
+    mechanism: Mechanism,
     start: ArrayLike | Sequence[float] | None = None,
     *,
     regularisation: ScalarLike | None = None,
@@ -223,21 +251,21 @@ def limit_cycle(
     **Raises:** `ValueError` for a start of another shape, an rtol above 0.1 or below what the
     precision can hold, less than 16 segments or max_returns below 1; `RuntimeError` if `throw`.
     """
-    require_scalar(scene)
-    start = None if start is None else start_state(start)
-    given = scene if start is None else (scene, start)
+    require_scalar(mechanism)
+    n = degrees_of_freedom(mechanism)
+    start = None if start is None else start_state(start, n)
+    given = mechanism if start is None else (mechanism, start)
     tolerance = check_rtol(rtol, jnp.result_type(*jax.tree.leaves(given)))
     returns = jnp.asarray(whole("max_returns", max_returns, 1), float)
-    usual = _segments_for(1e-9 if rtol is None else float(rtol))
-    count = usual if segments is None else whole("segments", segments, 16)
-    cycle = _limit_cycle(scene, start, returns, segments=count, rtol=tolerance)
+    count = _SEGMENTS if segments is None else whole("segments", segments, 16)
+    cycle = _limit_cycle(mechanism, start, returns, segments=count, rtol=tolerance)
     if segments is None and _may_need_more_segments(cycle):
         # A period of several returns needs as many times the segments.
-        cycle = _limit_cycle(scene, start, returns, segments=4 * usual, rtol=tolerance)
+        cycle = _limit_cycle(mechanism, start, returns, segments=8 * count, rtol=tolerance)
     if regularisation is not None:
         from .regularised import regularised_cycle
 
         eps = number("regularisation", regularisation, above=0)
         steps = whole("max_steps", max_steps, 1)
-        cycle = regularised_cycle(scene, start, eps, cycle, solver, tolerance, steps)
+        cycle = regularised_cycle(mechanism, start, eps, cycle, solver, tolerance, steps)
     return raise_unless(CycleResult.converged, cycle) if throw else cycle

@@ -14,10 +14,12 @@ import jax.numpy as jnp
 import optimistix
 from jaxtyping import Array, Float
 
+from .._mechanism.mechanism import Mechanism
 from .._mechanism.scene import Scene
+from .._mechanism.structure import Structure
 from .cycle import CycleResult, LimitCycle, repels
 from .events import Cubic
-from .stick_slip import StickSlip, scaled_start, stick_slip, units
+from .hybrid import HybridSystem, hybrid_system, scaled_start
 
 _SETTLING = 64  # slowest periods of the transient
 _LONGEST = 4  # most returns in one period
@@ -26,14 +28,14 @@ _TOLERANCE = 1e-3  # of the relative difference from the exact law's cycle
 DENSE = diffrax.SaveAt(t0=True, steps=True, dense=True)
 
 
-def field(t, y, args) -> Float[Array, "4"]:
+def field(t, y, args) -> Float[Array, " 2n"]:
     """dy/dt of the regularised system in scaled units; `args` is (system, eps) with eps in m/s."""
     system, eps = args
-    signs = jnp.tanh(system.V * (1 - y[2:]) / eps)
-    return jnp.stack([y[2], y[3], *system.accelerations(y, signs)])
+    signs = jnp.tanh(system.speed * system.sliding(y[system.n :]) / eps)
+    return system.regularised_field(y, signs)
 
 
-def solve(system: StickSlip, eps, y, until, *, solver, rtol, **options) -> Any:
+def solve(system: HybridSystem, eps, y, until, *, solver, rtol, **options) -> Any:
     """diffrax's solution from y over [0, until] in scaled time; differentiable in both modes."""
     solver = diffrax.Tsit5() if solver is None else solver
     options = {"adjoint": diffrax.DirectAdjoint(), "throw": False} | options
@@ -42,7 +44,7 @@ def solve(system: StickSlip, eps, y, until, *, solver, rtol, **options) -> Any:
     return diffrax.diffeqsolve(term, solver, 0.0, until, None, y, (system, eps), **options)
 
 
-def nodes(solution) -> tuple[Float[Array, " n"], Float[Array, "n 4"]]:
+def nodes(solution) -> tuple[Float[Array, " n"], Float[Array, "n 2n"]]:
     """Times and states of the steps taken; unused ones repeat the last."""
     used = jnp.isfinite(solution.ts)
     last = jnp.maximum(jnp.sum(used) - 1, 0)
@@ -57,23 +59,24 @@ class SmoothOrbit(eqx.Module):
 
     solution: Any
 
-    def at(self, system: StickSlip, times) -> Float[Array, "4 n"]:
+    def at(self, system: HybridSystem, times) -> Float[Array, "2n n"]:
         """Scaled states at scaled times (n,) within one period."""
         return jax.vmap(self.solution.evaluate, out_axes=1)(times)
 
 
-def _settle(system: StickSlip, eps, y, solver, rtol, max_steps):
+def _settle(system: HybridSystem, eps, y, solver, rtol, max_steps):
     """State and period where the motion from y nearly repeats, the number of returns in between.
 
     Also whether each was reached within `max_steps` steps.
     """
-    slowest = 2 * jnp.pi / jnp.sqrt(jnp.minimum(system.a, 1 - system.a))
+    K = jnp.diag(system.K) if system.K.ndim == 1 else system.K
+    slowest = 2 * jnp.pi * jnp.sqrt(jnp.linalg.norm(jnp.linalg.inv(K), 2))
     run = functools.partial(solve, system, eps, solver=solver, adjoint=diffrax.ForwardMode())
-    maximum = diffrax.Event(lambda t, y, args, **_: y[2], optimistix.Newton(rtol, rtol), False)
+    maximum = diffrax.Event(lambda t, y, args, **_: system.section(y), optimistix.Newton(rtol, rtol), False)
 
     def next_return(y, _):
         found = run(y, 8 * slowest, rtol=rtol, max_steps=max_steps, event=maximum)
-        y = found.ys[0].at[2].set(0)
+        y = found.ys[0]
         return y, (y, found.ts[0], found.result != diffrax.RESULTS.max_steps_reached)
 
     steps = _SETTLING * max_steps
@@ -89,7 +92,7 @@ def _cubics(h, x, rate) -> Cubic:
     return Cubic.through(x[:-1], x[1:], h * rate[:-1], h * rate[1:])
 
 
-def extremes(times, states, rates) -> Float[Array, "2 4"]:
+def extremes(times, states, rates) -> Float[Array, "2 2n"]:
     """Smallest and largest value of each component over the steps of a solution."""
     h = jnp.diff(times)[:, None]
     cubics = _cubics(h, states, rates), _cubics(h, -states, -rates)
@@ -113,20 +116,20 @@ def share_below_zero(times, values, rates) -> Float[Array, ""]:
 
 @eqx.filter_jit
 def regularised_cycle(
-    scene: Scene, start, eps, exact: LimitCycle, solver, rtol: float, max_steps: int
+    mechanism: Mechanism, start, eps, exact: LimitCycle, solver, rtol: float, max_steps: int
 ) -> LimitCycle:
-    """The limit cycle of the regularised law from a start (4,), beside the `exact` law's.
+    """The limit cycle of the regularised law from a start (2n,), beside the `exact` law's.
 
     The arguments are those of `limit_cycle`, with eps in m/s.
     """
-    system = stick_slip(scene)
+    system = hybrid_system(mechanism)
     options = {"solver": solver, "max_steps": max_steps}
-    frozen = jax.lax.stop_gradient((system, eps, scaled_start(scene, system, start)))
+    frozen = jax.lax.stop_gradient((system, eps, scaled_start(system, start)))
     guess, returns, followed = _settle(*frozen, solver, rtol, max_steps)
 
     def gap(unknown, args):
         (y, period), (system, eps) = unknown, args
-        return solve(system, eps, y, period, rtol=rtol, **options).ys[0] - y, y[2]
+        return solve(system, eps, y, period, rtol=rtol, **options).ys[0] - y, system.section(y)
 
     # Looser than the integration, whose adaptive steps make the gap rough.
     newton = optimistix.Newton(rtol=10 * rtol, atol=10 * rtol)
@@ -140,19 +143,27 @@ def regularised_cycle(
     solution = solve(system, eps, y, period, rtol=rtol, saveat=DENSE, **options)
     times, states = nodes(solution)
     rates = jax.vmap(lambda y: field(0.0, y, (system, eps)))(states)
-    low, high = extremes(times, states, rates) * units(system)[None]
-    width = eps / system.V
+    low, high = extremes(times, states, rates) * system.units[None]
+    n, shown = system.n, np.arange(system.n)
+    if isinstance(mechanism, Structure):
+        shown = np.array([faces[0] for faces in system.faces])
+    w = jax.vmap(lambda y: system.sliding(y[n:]))(states)
+    change = -jax.vmap(lambda rate: system.along(rate[n:]))(rates)
+    width = eps / system.speed
     stuck = [
-        share_below_zero(times, (1 - u) ** 2 - width**2, 2 * (u - 1) * rate)
-        for u, rate in zip(states.T[2:], rates.T[2:], strict=True)
+        share_below_zero(times, w[:, i] ** 2 - width**2, 2 * w[:, i] * change[:, i]) for i in shown
     ]
+    loads, changes = states[:, :n] @ system.L.T + system.P[None], rates[:, :n] @ system.L.T
+    below = [share_below_zero(times, loads[:, f[0]], changes[:, f[0]]) for f in system.faces]
+    below, opens = jnp.stack(below), np.array(system.opens)
+    forces = jnp.stack([(low, high) for low, high in extremes(times, loads, changes).T])
 
     def end(y):
         # Tangents are less accurate than states at the same tolerance.
         return solve(system, eps, y, period, rtol=rtol / 10, **options).ys[0]
 
     monodromy = jax.jacfwd(end)(y)
-    numbers = jnp.stack([period / system.omega, *(high - low)[:2]])
+    numbers = jnp.stack([period / system.omega, *(high - low)[:n]])
     difference = jnp.abs(numbers / jnp.stack([exact.period, *exact.amplitude]) - 1)
     difference = jax.lax.stop_gradient(jnp.max(difference))
     error = jnp.asarray(rtol, y.dtype)
@@ -168,11 +179,13 @@ def regularised_cycle(
     return LimitCycle(
         period=only(numbers[0]),
         amplitude=only(numbers[1:]),
-        velocity_min=only(low[2:]),
-        velocity_max=only(high[2:]),
+        velocity_min=only(low[n:]),
+        velocity_max=only(high[n:]),
         stick_fraction=only(jnp.stack(stuck)),
-        tension_fraction=only(share_below_zero(times, states[:, 1], rates[:, 1])),
-        state=only(y * units(system)),
+        open_fraction=only(jnp.where(opens, below, 0)),
+        tension_fraction=only(jnp.where(opens, 0, below)),
+        normal_force=only(forces),
+        state=only(y * system.units),
         error=only(error),
         returns=returns,
         regularisation_error=only(difference),

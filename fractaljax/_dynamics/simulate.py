@@ -16,10 +16,10 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, ScalarLike
 
 from .._base.parts import Record, concrete, number, raise_unless, require_scalar, scalar, whole
-from .._mechanism.scene import Scene
-from .events import NONE, Cubic, guards_and_rates, without_start
-from .shooting import flow
-from .stick_slip import SECTION, StickSlip, check_rtol, start_state, stick_slip, units
+from .._mechanism.mechanism import Mechanism
+from .events import Cubic, guards_and_rates, without_start
+from .hybrid import NONE, HybridSystem, check_rtol, hybrid_system, start_state
+from .orbit import chosen_guard, flow
 
 if TYPE_CHECKING:
     from diffrax import AbstractSolver
@@ -40,25 +40,25 @@ class Trajectory(Record):
     """The motion of a scene, as `simulate` returns it; unused steps repeat the last state."""
 
     times: Float[Array, " n"]  # at the ends of the steps [s]
-    states: Float[Array, "n 4"]  # [x1, x2, v1, v2] [m, m/s]
-    contact_states: Float[Array, "n 2"]  # from each time on: +1, -1 slip forward, backward, 0 stick
+    states: Float[Array, "n 2n"]  # [x, v] [m, m/s]
+    contact_states: Float[Array, "n f"]  # from each time on: +1, -1 slip forward, backward, 0 stick, 2 open
     result: SimulationResult
-    _system: StickSlip = eqx.field(repr=False)
+    _system: HybridSystem = eqx.field(repr=False)
     _solution: Any = eqx.field(repr=False)  # diffrax's, of the regularised law
 
     @property
-    def end(self) -> Float[Array, "4"]:
+    def end(self) -> Float[Array, " 2n"]:
         """The last state [m, m/s]."""
         return self.states[-1]
 
-    def at(self, times: ArrayLike | Sequence[float]) -> Float[Array, "k 4"]:
+    def at(self, times: ArrayLike | Sequence[float]) -> Float[Array, "k 2n"]:
         """States at `times` (k,) [s] from 0 to the end of the simulation.
 
         **Raises:** `ValueError` for times of another shape or outside; `RuntimeError` inside a
         compiled program.
         """
         times = self._inside(number("times", jnp.asarray(times)))
-        scale = units(self._system)
+        scale = self._system.units
         if self._solution is not None:
             states = jax.vmap(self._solution.evaluate)(times * self._system.omega)
             return states * scale[None]
@@ -91,32 +91,33 @@ class Trajectory(Record):
         ]
 
 
-def _event(system: StickSlip, y, s, h, g_0, g_1, d_0, d_1):
+def _event(system: HybridSystem, y, s, h, g_0, g_1, d_0, d_1):
     """When the first switch happens in a step: its time and guard.
 
     The cubics through the guards g and their rates d at both ends say where to look. The
     eighth-order flow decides, also whether a guard that dips towards zero and rises reaches it.
     """
     # One lane a guard: each has its own time t.
-    lanes = jnp.broadcast_to(y[:, None], (4, SECTION)), jnp.broadcast_to(s[:, None], (2, SECTION))
+    k = len(g_0)
+    lanes = jnp.broadcast_to(y[:, None], (len(y), k)), jnp.broadcast_to(s[:, None], (len(s), k))
 
     def pick(values):
-        return jnp.diagonal(values[:SECTION])
+        return jnp.diagonal(values[1:])
 
-    def at(t):
-        """Guards and their rates after t, and a function for their second derivatives."""
-        along = flow(system, lanes[0], t, lanes[1])
-        rate = system.field(along, lanes[1])
+    def value(y):
+        return jnp.diagonal(system.guards(y, lanes[1])[1:])
 
-        def curve():
-            change = jax.jvp(lambda y: system.field(y, lanes[1]), (along,), (rate,))[1]
-            return pick(system.guards(change, lanes[1], 0.0))
+    def derivative(function):
+        return lambda y: jax.jvp(function, (y,), (system.field(y, lanes[1]),))[1]
 
-        value, slope = system.guards(along, lanes[1]), system.guards(rate, lanes[1], 0.0)
-        return pick(value), pick(slope), curve
+    def along(t):
+        return flow(system, lanes[0], t, lanes[1])
+
+    rate = derivative(value)
+    bend = derivative(rate)
 
     # In its contact state every guard starts above zero, up to rounding.
-    rounding = 16 * jnp.finfo(y.dtype).eps * (1 + jnp.max(jnp.abs(y)) + jnp.abs(system.f))
+    rounding = 16 * jnp.finfo(y.dtype).eps * (1 + jnp.max(jnp.abs(y)) + jnp.max(jnp.abs(system.F)))
     late = g_0 < -rounding
     g_0 = jnp.maximum(g_0, 0)
     d_0 = jnp.where((g_0 <= rounding) & (d_0 >= -rounding), jnp.maximum(d_0, 0), d_0)
@@ -125,20 +126,20 @@ def _event(system: StickSlip, y, s, h, g_0, g_1, d_0, d_1):
     theta, inside = cubic.minimum()
 
     def lower(_, t):
-        _, rate, curve = at(t)
-        bend = curve()
-        return jnp.clip(t - rate / jnp.where(bend == 0, 1, bend), 0, h)
+        y = along(t)
+        second = bend(y)
+        return jnp.clip(t - rate(y) / jnp.where(second == 0, 1, second), 0, h)
 
     bottom = jnp.where(inside, jax.lax.fori_loop(0, 3, lower, theta * h), 0)
-    depth, _, curve = at(bottom)
-    bend = curve()
+    lowest = along(bottom)
+    depth, second = value(lowest), bend(lowest)
     dips = inside & (depth < -rounding)
     end = jnp.where(dips, bottom, h)
     falls = dips | (g_1 < 0)
     t = without_start(cubic, rising).root_before(end / h) * h
     # A shallow dip is a parabola. From afar Newton's method would confuse its two roots.
-    half = jnp.sqrt(2 * jnp.maximum(-depth, 0) / jnp.where(bend > 0, bend, 1))
-    shallow = dips & (bend > 0) & (depth > -1e-2)
+    half = jnp.sqrt(2 * jnp.maximum(-depth, 0) / jnp.where(second > 0, second, 1))
+    shallow = dips & (second > 0) & (depth > -1e-2)
     t = jnp.where(shallow, jnp.clip(bottom - half, 0, bottom), t)
     t = jnp.where(dips & (t >= bottom), bottom / 2, t)
 
@@ -148,15 +149,16 @@ def _event(system: StickSlip, y, s, h, g_0, g_1, d_0, d_1):
 
     def refine(carry):
         t, low, high, found, count = carry
-        value, rate, _ = at(t)
-        low, high = jnp.where(value > 0, t, low), jnp.where(value > 0, high, t)
+        y = along(t)
+        g, d = value(y), rate(y)
+        low, high = jnp.where(g > 0, t, low), jnp.where(g > 0, high, t)
         # A guard that rises first has a root at the start of the step, which does not count:
         # Newton's method is for its quotient by t.
-        slope = jnp.where(rising, rate - value / jnp.where(t == 0, 1, t), rate)
-        guess = t - value / jnp.where(slope == 0, 1, slope)
+        slope = jnp.where(rising, d - g / jnp.where(t == 0, 1, t), d)
+        guess = t - g / jnp.where(slope == 0, 1, slope)
         between = (guess >= low) & (guess <= high)
         guess = jnp.where(between, guess, (low + high) / 2)
-        near = (jnp.abs(guess - t) <= close) | (jnp.abs(value) <= close)
+        near = (jnp.abs(guess - t) <= close) | (jnp.abs(g) <= close)
         return jnp.where(found, t, guess), low, high, found | near, count + 1
 
     close = 2 * jnp.finfo(y.dtype).eps
@@ -167,10 +169,10 @@ def _event(system: StickSlip, y, s, h, g_0, g_1, d_0, d_1):
     t = jnp.where(late, 0, jnp.where(falls, t, jnp.inf))
     first = jnp.min(t)
     hit = first <= h
-    return jnp.where(hit, first, h), jnp.where(hit, jnp.argmin(t), NONE)
+    return jnp.where(hit, first, h), jnp.where(hit, 1 + jnp.argmin(t), NONE)
 
 
-def _smooth_step(system: StickSlip, y, s, longest, left, rtol):
+def _smooth_step(system: HybridSystem, y, s, longest, left, rtol):
     """A step in contact state s, as long as rtol allows: the state it ends in, and its length."""
     h = jnp.minimum(longest / jnp.maximum(1, 2 * system.stiffness(y)), left)
     allowed = rtol * (1 + jnp.max(jnp.abs(y)))
@@ -191,12 +193,12 @@ def _smooth_step(system: StickSlip, y, s, longest, left, rtol):
     return y_1, h
 
 
-def _step(system: StickSlip, y, s, longest, left, rtol):
+def _step(system: HybridSystem, y, s, longest, left, rtol):
     """A step up to the first switch: state, contact state, length, and the guard that ended it."""
     y_1, h = _smooth_step(system, y, s, longest, left, rtol)
     g_0, d_0 = guards_and_rates(system, y, s, h, system.field(y, s))
     g_1, d_1 = guards_and_rates(system, y_1, s, h, system.field(y_1, s))
-    ends = [x[:SECTION] for x in (g_0, g_1, d_0, d_1)]
+    ends = [x[1:] for x in (g_0, g_1, d_0, d_1)]
     cubic = Cubic.through(*ends)
     theta, dips = cubic.minimum()
     # A cubic well above zero has no event to look for.
@@ -214,14 +216,14 @@ class _Steps(eqx.Module):
     """What the first pass finds."""
 
     duration: Float[Array, " n"]
-    s: Float[Array, "2 n"]
+    s: Float[Array, "f n"]
     guard: Int[Array, " n"]
     count: Int[Array, ""]
     result: SimulationResult
 
 
 @functools.partial(jax.jit, static_argnames="max_steps")
-def _find_steps(system: StickSlip, y, end, h, rtol, *, max_steps: int) -> _Steps:
+def _find_steps(system: HybridSystem, y, end, h, rtol, *, max_steps: int) -> _Steps:
     limit = 1e3 * (1 + jnp.max(jnp.abs(y)))
 
     def running(carry):
@@ -237,8 +239,9 @@ def _find_steps(system: StickSlip, y, end, h, rtol, *, max_steps: int) -> _Steps
         return y, s_new, t, k + 1, *recorded
 
     n = max_steps
-    empty = jnp.zeros(n, y.dtype), jnp.ones((2, n), y.dtype), jnp.full(n, NONE)
-    start = y, system.contact_state(y), jnp.zeros((), y.dtype), 0, *empty
+    s = system.contact_state(y)
+    empty = jnp.zeros(n, y.dtype), jnp.ones((len(s), n), y.dtype), jnp.full(n, NONE)
+    start = y, s, jnp.zeros((), y.dtype), 0, *empty
     _, s, t, count, duration, states, guards = jax.lax.while_loop(running, body, start)
     result = SimulationResult.where(
         count >= n, SimulationResult.out_of_steps, SimulationResult.diverged
@@ -250,7 +253,7 @@ def _find_steps(system: StickSlip, y, end, h, rtol, *, max_steps: int) -> _Steps
 
 
 @jax.jit
-def _repeat(system: StickSlip, y, end, steps: _Steps) -> Trajectory:
+def _repeat(system: HybridSystem, y, end, steps: _Steps) -> Trajectory:
     """The steps once more, differentiably."""
     last = jnp.where(steps.result == SimulationResult.reached, steps.count - 1, -1)
 
@@ -261,9 +264,7 @@ def _repeat(system: StickSlip, y, end, steps: _Steps) -> Trajectory:
         dt = jnp.where(k == last, end - t, dt)
         y_1 = flow(system, y, dt, s)
         rate = system.field(y_1, s)
-        own = jnp.arange(SECTION + 1) == guard
-        value = jnp.sum(jnp.where(own, system.guards(y_1, s), 0))
-        slope = jnp.sum(jnp.where(own, system.guards(rate, s, 0.0), 0))
+        value, slope = jax.jvp(lambda y: chosen_guard(system, y, s, guard), (y_1,), (rate,))
         # Zero, with minus the derivative of the time at which the guard is zero.
         off = value - jax.lax.stop_gradient(value)
         late = off / jax.lax.stop_gradient(jnp.where(slope == 0, 1, slope))
@@ -275,7 +276,7 @@ def _repeat(system: StickSlip, y, end, steps: _Steps) -> Trajectory:
     _, (states, times, after) = jax.lax.scan(body, (y, jnp.zeros_like(end)), moves)
     return Trajectory(
         times=jnp.concatenate([jnp.zeros(1, y.dtype), times]) / system.omega,
-        states=jnp.concatenate([y[None], states]) * units(system)[None],
+        states=jnp.concatenate([y[None], states]) * system.units[None],
         contact_states=jnp.concatenate([steps.s[:, :1].T, after]),
         result=steps.result,
         _system=system,
@@ -284,7 +285,7 @@ def _repeat(system: StickSlip, y, end, steps: _Steps) -> Trajectory:
 
 
 @eqx.filter_jit
-def _regularised(system: StickSlip, y, end, eps, solver, rtol, max_steps: int) -> Trajectory:
+def _regularised(system: HybridSystem, y, end, eps, solver, rtol, max_steps: int) -> Trajectory:
     from diffrax import RESULTS
 
     from .regularised import DENSE, nodes, solve
@@ -292,7 +293,7 @@ def _regularised(system: StickSlip, y, end, eps, solver, rtol, max_steps: int) -
     options = {"solver": solver, "rtol": rtol, "max_steps": max_steps, "saveat": DENSE}
     solution = solve(system, eps, y, end, **options)
     times, states = nodes(solution)
-    sliding = system.V * (1 - states[:, 2:])
+    sliding = system.speed * jax.vmap(lambda y: system.sliding(y[system.n :]))(states)
     far = jnp.max(jnp.abs(states[-1])) > 1e3 * (1 + jnp.max(jnp.abs(y)))
     reached = solution.result == RESULTS.successful
     result = SimulationResult.where(
@@ -301,7 +302,7 @@ def _regularised(system: StickSlip, y, end, eps, solver, rtol, max_steps: int) -
     result = SimulationResult.where(far, SimulationResult.diverged, result)
     return Trajectory(
         times=times / system.omega,
-        states=states * units(system)[None],
+        states=states * system.units[None],
         contact_states=jnp.where(jnp.abs(sliding) < eps, 0, jnp.sign(sliding)),
         result=result,
         _system=system,
@@ -310,7 +311,7 @@ def _regularised(system: StickSlip, y, end, eps, solver, rtol, max_steps: int) -
 
 
 def simulate(
-    scene: Scene,
+    mechanism: Mechanism,
     start: ArrayLike | Sequence[float],
     t1: ScalarLike,
     *,
@@ -342,12 +343,12 @@ def simulate(
     **Raises:** `ValueError` for a start of another shape, an argument outside its domain or an
     rtol that the precision cannot hold; `RuntimeError` if `throw`.
     """
-    require_scalar(scene)
-    start = start_state(start)
+    require_scalar(mechanism)
+    system = hybrid_system(mechanism)
+    start = start_state(start, system.n)
     t1 = scalar("t1", t1, above=0)
     n = whole("max_steps", max_steps, 1)
-    system = stick_slip(scene)
-    y, end = start / units(system), t1 * system.omega
+    y, end = start / system.units, t1 * system.omega
     rtol = check_rtol(rtol, y.dtype)
     if regularisation is not None:
         eps = number("regularisation", regularisation, above=0)

@@ -1,0 +1,420 @@
+"""A mechanism with dry friction as a hybrid system: field, guards and transitions.
+
+Everything here is in scaled units: time 1/omega, velocity V of the first joint, length V/omega. A
+state y (2n, ...) is [x, u] with u = dx/dt. Friction acts on faces: along the tangential direction
+of a joint and, where the joint has a tangential spring, along its normal. The contact state s
+(f, ...) has for each face +1 (slip forward, w = V - t.u > 0), -1 (slip backward), 0 (stick, w = 0)
+or 2 (open, both faces of a joint together). Components are the first axis; lanes may follow.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, DTypeLike, Float
+
+from .._base.parts import concrete, number
+from .._friction import Friction
+from .._mechanism.mechanism import Mechanism
+from .._mechanism.scene import Scene, stiffness
+from .._mechanism.structure import Structure
+
+OPEN = 2
+# Guards, by number: the section of the Poincare map, two for each face, one for each joint that
+# can open. The section is where t.u of the first face falls through 0: a maximum of t.x.
+SECTION, NONE, UNUSED = 0, -1, -2
+_FEW = 4  # degrees of freedom up to which products are written out, which compile into one loop
+
+
+class HybridSystem(eqx.Module):
+    """M x'' + C x' + K x = F + joints (Eq. 39 and its generalisation), in scaled units."""
+
+    laws: tuple[Friction, ...]  # one a joint
+    speed: Float[Array, ""]  # unit of velocity [m/s]
+    omega: Float[Array, ""]  # unit of 1/time [1/s]
+    force_unit: Float[Array, ""]  # of the loads [N]
+    K: Float[Array, "n n"]  # M^-1 K with closed joints; its diagonal (n,) if it is diagonal
+    C: Float[Array, "n n"]  # M^-1 C; its diagonal (n,) if it is diagonal
+    F: Float[Array, " n"]  # M^-1 F
+    T: Float[Array, "f n"] | None  # directions of the faces; None: they are the dofs
+    B: Float[Array, "n f"] | None  # M^-1 T^T; None: absorbed by the loads
+    L: Float[Array, "f n"]  # the load on a face, which friction multiplies, is L x + P
+    P: Float[Array, " f"]
+    V: Float[Array, " f"]
+    faces: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # of each joint
+    opens: tuple[bool, ...] = eqx.field(static=True)  # whether a joint can open
+
+    @property
+    def n(self) -> int:
+        """The number of degrees of freedom."""
+        return self.F.shape[0]
+
+    def _leaf(self, leaf, lanes: int) -> Array:
+        """A leaf with an axis of length one for each lane that the system does not have."""
+        return leaf.reshape(leaf.shape + (1,) * (lanes - self.omega.ndim))
+
+    def _times(self, matrix, x) -> Array:
+        """matrix (i, j) times x (j, ...); a matrix (j,) is a diagonal."""
+        own = self.omega.ndim
+        if matrix.ndim - own == 1:
+            return self._leaf(matrix, x.ndim - 1) * x
+        if len(x) > _FEW and not own:
+            return jnp.tensordot(matrix, x, 1)
+        matrix = self._leaf(matrix, x.ndim - 1)
+        if len(x) > _FEW:
+            return jnp.sum(matrix * x[None], axis=1)
+        columns = (matrix[:, j] * x[j][None] for j in range(len(x)))
+        return sum(columns, start=jnp.zeros((), x.dtype))
+
+    def along(self, x) -> Array:
+        """t.x for each face (f, ...)."""
+        return x if self.T is None else self._times(self.T, x)
+
+    def _acceleration(self, forces) -> Array:
+        """What forces (f, ...) on the faces accelerate (n, ...)."""
+        return forces if self.B is None else self._times(self.B, forces)
+
+    def loads(self, x) -> Array:
+        """What the coefficient of friction multiplies (f, ...); sticking attracts where > 0."""
+        return self._times(self.L, x) + self._leaf(self.P, x.ndim - 1)
+
+    def sliding(self, u) -> Array:
+        """Sliding velocity w of each face (f, ...)."""
+        return self._leaf(self.V, u.ndim - 1) - self.along(u)
+
+    def _each(self, function, *arrays) -> Array:
+        """function(law, *rows) of each face, with the law of its joint."""
+        rows = [None] * sum(map(len, self.faces))
+        for law, faces in zip(self.laws, self.faces, strict=True):
+            own = slice(faces[0], faces[-1] + 1)
+            for i, row in zip(faces, function(law, *(x[own] for x in arrays)), strict=True):
+                rows[i] = row
+        return jnp.stack(rows)
+
+    def limits(self, loads) -> Array:
+        """The largest friction force of each face in stick (f, ...)."""
+        return self._each(lambda law, load: law.mu_s * load, loads)
+
+    def _driven(self, y, friction, s=None) -> Array:
+        """Acceleration (n, ...) with these friction forces, without those of sticking faces."""
+        x, u = y[: self.n], y[self.n :]
+        if s is not None and any(self.opens):
+            # An open joint has no springs: their forces, which K holds, are taken back.
+            loads, taken = self.loads(x), jnp.zeros_like(friction)
+            for faces, opens in zip(self.faces, self.opens, strict=True):
+                if opens:
+                    tangential, normal = faces
+                    taken = taken.at[normal].set(loads[tangential])
+                    taken = taken.at[tangential].set(-loads[normal])
+            friction = jnp.where(s == OPEN, taken, friction)
+        free = self._leaf(self.F, x.ndim - 1) - self._times(self.K, x) - self._times(self.C, u)
+        return free + self._acceleration(friction)
+
+    def _slipping(self, y, s) -> Array:
+        """The friction forces of slipping faces (f, ...), 0 elsewhere."""
+        w, loads = self.sliding(y[self.n :]), self.loads(y[: self.n])
+        force = self._each(
+            lambda law, w, load, s: law.branch(self.speed * w, s) * load, w, loads, s
+        )
+        return jnp.where(jnp.abs(s) == 1, force, 0)
+
+    def held(self, accelerations, held) -> Array:
+        """Forces (f, ...) on the faces `held` that cancel their accelerations t.x'' (f, ...)."""
+        wanted = jnp.where(held, -accelerations, 0)
+        if self.B is None:
+            return wanted
+        W = self._leaf(jnp.sum(self.T[:, :, None] * self.B[None], axis=1), held.ndim - 1)
+        own = jnp.eye(len(W), dtype=W.dtype).reshape(len(W), len(W), *(1,) * (held.ndim - 1))
+        W = jnp.where(held[:, None] & held[None], W, own)
+        return jnp.where(held, _solve(W, wanted), 0)
+
+    def field(self, y, s) -> Array:
+        """dy/dt in contact state s. A sticking face must have w = 0."""
+        acceleration = self._driven(y, self._slipping(y, s), s)
+        stick = s == 0
+        if self.B is None:
+            acceleration = jnp.where(stick, 0, acceleration)
+        else:
+            force = self.held(self.along(acceleration), stick)
+            acceleration = acceleration + self._acceleration(force)
+        return jnp.concatenate([y[self.n :], acceleration])
+
+    def regularised_field(self, y, signs) -> Array:
+        """dy/dt where friction has `signs` (f, ...) between -1 and 1, by a smoothed sign."""
+        w, loads = self.sliding(y[self.n :]), self.loads(y[: self.n])
+        force = self._each(
+            lambda law, w, load, sign: law.branch(self.speed * w, sign) * load, w, loads, signs
+        )
+        opens = np.repeat(self.opens, [len(faces) for faces in self.faces])
+        first = jnp.stack([loads[faces[0]] for faces in self.faces for _ in faces])
+        opens = opens.reshape(-1, *(1,) * (y.ndim - 1)) & (first < 0)
+        return jnp.concatenate([y[self.n :], self._driven(y, force, jnp.where(opens, OPEN, 1))])
+
+    def section(self, y) -> Array:
+        """t.u of the first face, which falls through 0 at a return to the Poincare section."""
+        return self.along(y[self.n :])[0]
+
+    def guards(self, y, s) -> Array:
+        """Functions (k, ...) that are positive while contact state s lasts, and the section.
+
+        Of a face in slip s w and a constant, in stick the distances of the friction force from
+        its two limits; of a joint that can open its normal force, or minus that while open.
+        """
+        x, u = y[: self.n], y[self.n :]
+        w, loads = self.sliding(u), self.loads(x)
+        one = jnp.ones_like(w)
+        if self.B is None:
+            force = -self._driven(y, jnp.zeros_like(w), s)
+        else:
+            force = self.held(self.along(self._driven(y, self._slipping(y, s), s)), s == 0)
+        limits, slip, stick = self.limits(loads), jnp.abs(s) == 1, s == 0
+        lower = jnp.where(slip, s * w, jnp.where(stick, limits - force, one))
+        upper = jnp.where(stick, limits + force, one)
+        pairs = jnp.stack([lower, upper], axis=1).reshape(2 * len(w), *w.shape[1:])
+        rows = [self.section(y)[None], pairs]
+        for faces, opens in zip(self.faces, self.opens, strict=True):
+            if opens:
+                load, state = loads[faces[0]], s[faces[0]]
+                rows.append(jnp.where(state == OPEN, -load, load)[None])
+        return jnp.concatenate(rows)
+
+    def stiffness(self, y) -> Array:
+        """The largest rate (...) at which friction alone changes sliding velocities.
+
+        Far from equilibrium it exceeds every other rate. Zero for laws without slope.
+        """
+        if not any(law.velocity_dependent for law in self.laws):
+            return jnp.zeros_like(y[0])
+        w, loads = self.sliding(y[self.n :]), self.loads(y[: self.n])
+        rates = self._each(
+            lambda law, w, load: self.speed * law.slope(self.speed * w) * load, w, loads
+        )
+        if self.B is not None:
+            own = jnp.sum(self.T * jnp.swapaxes(self.B, 0, 1), axis=1)
+            rates = rates * self._leaf(own, y.ndim - 1)
+        return jnp.max(jnp.abs(rates), axis=0)
+
+    def switch(self, y, s, guard) -> tuple[Array, Array]:
+        """State and contact state after the guard of that number has reached zero.
+
+        A slip that ends reverses if the force on the other side carries it on; otherwise it
+        sticks. Under a negative load it always reverses: the sliding mode there is repelling.
+        """
+        f = len(s)
+        number_of = jnp.arange(f).reshape(f, *(1,) * (s.ndim - 1))
+        guard = jnp.asarray(guard)
+        ended = (guard[None] - 1) // 2 == number_of
+        ended = ended & (guard[None] > 0)
+        lower = guard[None] == 1 + 2 * number_of
+        reversed_s = jnp.where(ended & (s != 0), -s, s)
+        rate = self.along(self.field(y, reversed_s)[self.n :])
+        after_slip = jnp.where(s * rate > 0, -s, 0)
+        after = jnp.where(s == 0, jnp.where(lower, 1, -1), after_slip)
+        new = jnp.where(ended, after.astype(s.dtype), s)
+        exact = ended | (new == 0)
+        k, x, u = 1 + 2 * f, y[: self.n], y[self.n :]
+        for faces, opens in zip(self.faces, self.opens, strict=True):
+            if opens:
+                tangential, normal = faces
+                closes = (guard == k) & (s[tangential] == OPEN)
+                changes = guard == k
+                w = self.sliding(u)
+                for i in faces:
+                    slips = jnp.where(w[i] < 0, -1, 1)
+                    new = new.at[i].set(
+                        jnp.where(changes, jnp.where(closes, slips, OPEN), new[i]).astype(s.dtype)
+                    )
+                x = self._without_load(x, tangential, normal, changes)
+                k += 1
+        # To rounding, the velocity of a face that sticks or starts to slip is the belt's.
+        u = u + self._acceleration(self.held(-self.sliding(u), exact))
+        return jnp.concatenate([x, u]), new
+
+    def _without_load(self, x, tangential, normal, where) -> Array:
+        """x moved along the normal of a joint to where its normal force is 0."""
+        load = self.loads(x)[tangential]
+        unit = jnp.zeros((len(self.P), *x.shape[1:]), x.dtype).at[normal].set(1)
+        away = self._acceleration(unit)
+        change = self._times(self.L, away)[tangential]
+        return x - jnp.where(where, load / jnp.where(change == 0, 1, change), 0)[None] * away
+
+    def contact_state(self, y) -> Array:
+        """The contact state in which the motion from y begins."""
+        x, u = y[: self.n], y[self.n :]
+        w, loads = self.sliding(u), self.loads(x)
+        s = jnp.sign(w)
+        for faces, opens in zip(self.faces, self.opens, strict=True):
+            for i in faces if opens else ():
+                s = s.at[i].set(jnp.where(loads[faces[0]] < 0, OPEN, s[i]))
+        # At the belt's velocity: the side whose own field leaves it, forward if both do.
+        limits = self.limits(loads)
+        force = self.held(self.along(self._driven(y, self._slipping(y, s), s)), s == 0)
+        leaving = jnp.where(force > limits, 1, jnp.where(force < -limits, -1, 0))
+        return jnp.where(s == 0, leaving, s).astype(y.dtype)
+
+    def equilibrium(self) -> Float[Array, " 2n"]:
+        """The closed, forward-slipping equilibrium (Eq. 40) as a state."""
+        mu = self._each(lambda law, V: law.coefficient(self.speed * V), self.V)
+        K = jnp.diag(self.K) if self.K.ndim == 1 else self.K
+        B = jnp.eye(self.n, dtype=K.dtype) if self.B is None else self.B
+        coupled = K - (B * mu[None]) @ self.L
+        x = jnp.linalg.solve(coupled, self.F + B @ (mu * self.P))
+        return jnp.concatenate([x, jnp.zeros_like(x)])
+
+    @property
+    def units(self) -> Float[Array, " 2n"]:
+        """Units [m, ..., m/s, ...] of a scaled state."""
+        length = self.speed / self.omega
+        return jnp.concatenate([jnp.full(self.n, length), jnp.full(self.n, self.speed)])
+
+
+def _solve(W, b) -> Array:
+    """The solution of W x = b for W (f, f, ...) and b (f, ...), lanes last."""
+    if len(b) == 1:
+        return b / W[0]
+    if len(b) == 2:
+        det = W[0, 0] * W[1, 1] - W[0, 1] * W[1, 0]
+        first = W[1, 1] * b[0] - W[0, 1] * b[1]
+        second = W[0, 0] * b[1] - W[1, 0] * b[0]
+        return jnp.stack([first, second]) / det[None]
+    W, b = jnp.moveaxis(W, (0, 1), (-2, -1)), jnp.moveaxis(b, 0, -1)
+    return jnp.moveaxis(jnp.linalg.solve(W, b[..., None])[..., 0], -1, 0)
+
+
+def degrees_of_freedom(mechanism: Mechanism) -> int:
+    """n of a structure; a scene has two."""
+    return mechanism.n if isinstance(mechanism, Structure) else 2
+
+
+def hybrid_system(mechanism: Mechanism) -> HybridSystem:
+    """The scaled system of a scene or a structure."""
+    if isinstance(mechanism, Scene):
+        return _of_scene(mechanism)
+    return _of_structure(mechanism)
+
+
+def _of_scene(scene: Scene) -> HybridSystem:
+    o = scene.oscillator
+    K_n, K_t = stiffness(scene)
+    a, b = o.omega_1**2 + K_t / o.m, o.omega_2**2 + K_n / o.m
+    omega = jnp.sqrt(a + b)
+    f = o.F / o.m / jnp.sqrt(2.0) / omega / o.V
+    unit, zero = o.m * omega * o.V, jnp.zeros_like(f)
+    K = jnp.stack([a, b]) / omega**2
+    preload = getattr(scene, "preload", False)
+    P = scene.contact.P / unit if preload else zero
+    return HybridSystem(
+        laws=(scene.friction,),
+        speed=o.V,
+        omega=omega,
+        force_unit=unit,
+        K=K,
+        C=jnp.stack([2 * o.xi_1 * o.omega_1, 2 * o.xi_2 * o.omega_2]) / omega,
+        F=jnp.stack([f, -f]),
+        T=None,
+        B=None,
+        L=jnp.stack(
+            [jnp.stack([zero, K_n / o.m / omega**2]), jnp.stack([-K_t / o.m / omega**2, zero])]
+        ),
+        P=jnp.stack([P, zero]),
+        V=jnp.ones_like(K),
+        faces=((0, 1),),
+        opens=(preload,),
+    )
+
+
+def _of_structure(structure: Structure) -> HybridSystem:
+    n, dtype = structure.n, structure.M.dtype
+    K, rows, weights, offsets, speeds, faces = structure.K, [], [], [], [], []
+    for name, joint in zip(structure.joint_names, structure.joints, strict=True):
+        if joint.V is None:
+            raise ValueError(f"joint {name}: V must be given, for the motion depends on it")
+        K_n, K_t = joint.stiffness()
+        t = jnp.asarray(structure.direction(joint.tangential), dtype)
+        K = K + K_t * jnp.outer(t, t)
+        rows.append(t)
+        speeds.append(joint.V)
+        faces.append((len(rows) - 1,))
+        P = joint.contact.P if getattr(joint, "preload", False) or joint.normal is None else jnp.zeros((), dtype)
+        offsets.append(P)
+        if joint.normal is None:
+            weights.append(jnp.zeros(n, dtype))
+            continue
+        normal = jnp.asarray(structure.direction(joint.normal), dtype)
+        K = K + K_n * jnp.outer(normal, normal)
+        weights += [K_n * normal, -K_t * t]
+        offsets.append(jnp.zeros((), dtype))
+        rows.append(normal)
+        speeds.append(joint.V)
+        faces[-1] = (len(rows) - 2, len(rows) - 1)
+    T, L, V, P = jnp.stack(rows), jnp.stack(weights), jnp.stack(speeds), jnp.stack(offsets)
+    given = jnp.zeros(n, dtype) if structure.F is None else structure.F
+    # M^-1 of everything at once.
+    solved = jnp.linalg.solve(
+        structure.M, jnp.concatenate([K, structure.C, T.T, given[:, None]], axis=1)
+    )
+    K, C, B, F = jnp.split(solved, [n, 2 * n, 2 * n + len(rows)], axis=1)
+    # Between the highest eigenfrequency and n^(1/4) times it.
+    omega = jnp.sum(K * K.T) ** 0.25
+    speed = V[0]
+    unit = omega * speed
+    return HybridSystem(
+        laws=tuple(joint.friction for joint in structure.joints),
+        speed=speed,
+        omega=omega,
+        force_unit=unit,
+        K=K / omega**2,
+        C=C / omega,
+        F=F[:, 0] / unit,
+        T=T,
+        B=B,
+        L=L / omega**2,
+        P=P / unit,
+        V=V / speed,
+        faces=tuple(faces),
+        opens=tuple(getattr(joint, "preload", False) for joint in structure.joints),
+    )
+
+
+def start_state(start: ArrayLike | Sequence[float], n: int) -> Float[Array, " 2n"]:
+    """`start` as an array [x, v]; `ValueError` unless it has that shape."""
+    state = number("start", jnp.asarray(start))
+    if state.shape != (2 * n,):
+        wanted = f"start must have shape ({2 * n},), got {state.shape}"
+        raise ValueError(f"{wanted}; use jax.vmap for many")
+    return state
+
+
+def scaled_start(system: HybridSystem, start: Array | None) -> Float[Array, " 2n"]:
+    """The start in scaled units, constant: by default the equilibrium with one displacement.
+
+    It is V/omega along the tangential direction of the first joint.
+    """
+    if start is None:
+        y = system.equilibrium()
+        away = jnp.eye(system.n, dtype=y.dtype)[0] if system.T is None else system.T[0]
+        y = y.at[: system.n].add(away / jnp.sum(away**2))
+    else:
+        y = start / system.units
+    return jax.lax.stop_gradient(y)
+
+
+def check_rtol(rtol: Any, dtype: DTypeLike) -> float:
+    """`rtol` if it can be reached in `dtype`; by default 1e-9, or the least that can.
+
+    **Raises:** `ValueError` for one above 0.1, or below 4096 times the rounding error of `dtype`;
+    `TypeError` unless it is a number known at trace time.
+    """
+    least = 4096 * float(jnp.finfo(dtype).eps)
+    if rtol is None:
+        return max(1e-9, least)
+    if isinstance(rtol, (bool, str)) or concrete(rtol) is None or np.ndim(rtol):
+        raise TypeError(f"rtol must be a number, got {rtol!r}")
+    if not 0 < rtol <= 0.1:
+        raise ValueError(f"rtol must be above 0 and at most 0.1, got {rtol!r}")
+    if rtol < least:
+        raise ValueError(f"rtol must be at least {least:.2g} in {jnp.dtype(dtype)}, got {rtol!r}")
+    return float(rtol)

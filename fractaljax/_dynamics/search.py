@@ -1,0 +1,418 @@
+"""From a start to its attractor: a coarse run, then a periodic orbit near where it repeats.
+
+The run keeps its last steps. After every round of steps its returns to the section, the maxima of
+t.x of the first face, are compared. If the last ones nearly repeat, the steps between them are a
+candidate orbit, which Newton's method makes periodic. The orbit is accepted if it is admissible
+(keeps to its itinerary), is near the run, and attracts.
+
+Components are the first axis of every array and scenes the last, which compiles to faster loops.
+"""
+
+import functools
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
+from jaxtyping import Array, Float, Int
+
+from .events import Cubic, step
+from .hybrid import NONE, SECTION, UNUSED, HybridSystem
+from .orbit import (
+    Maps,
+    PeriodicOrbit,
+    Segments,
+    estimated_error,
+    next_start,
+    remesh,
+    solve_periodic_orbit,
+)
+
+_MESHES = 4  # on which a candidate is solved, each finer, until it is accurate
+
+RUNNING, CONVERGED, EQUILIBRIUM, DIVERGED, NOT_PERIODIC, EXHAUSTED = range(6)
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """Tolerances and patience of the search for an attractor, in scaled units."""
+
+    step: float = 0.3  # of the coarse run; no eigenfrequency exceeds 1
+    round_steps: int = 128  # between two looks at the returns
+    finer_after: tuple[int, int] = (16, 48)  # rounds after which the step is halved
+    longest: int = 16  # most returns in one period
+    near: float = 0.15  # gap between returns below which an orbit is tried, relative
+    accepted: float = 0.03  # distance from the orbit at which its multipliers decide, relative
+    approaches: int = 3  # rounds in which the motion approaches an orbit that is not yet near
+    linear: float = 0.5  # size below which a decay at the linear rate ends in equilibrium
+    small: float = 1e-2  # size below which any decay without switches does
+    extrapolated: float = 0.02  # growth in a return, without switches, that is extrapolated
+    divergence: float = 1e6  # size at which a motion diverges: with a small V, many V are ordinary
+    patience: int = 512  # rounds without a maximum
+
+
+class Attractor(eqx.Module):
+    """What the run ended in; scenes, where there are many, are the last axis."""
+
+    segments: Segments
+    status: Int[Array, "..."]
+    period_returns: Int[Array, "..."]  # in one period
+    error: Float[Array, "..."]  # of the periodic orbit, relative
+
+
+class _Run(eqx.Module):
+    """A coarse run with its last steps, oldest first, all in one array."""
+
+    y: Float[Array, "2n ..."]
+    s: Float[Array, "f ..."]
+    guard: Int[Array, "..."]  # that ended the last step
+    steps: Float[Array, "2n+f+2 record ..."]  # state, contact state, duration and guard
+
+
+class _Look(eqx.Module):
+    """The returns of a run, newest first."""
+
+    at: Int[Array, " returns"]  # steps that ended at the section
+    y: Float[Array, "2n returns"]
+    time: Float[Array, " returns"]
+    exists: Array
+
+
+def _advance(system: HybridSystem, run: _Run, h, options: SearchOptions) -> _Run:
+    record = run.steps.shape[1]
+    kept = options.round_steps % record
+
+    def body(k, carry):
+        y, s, guard, steps = carry
+        y_new, s_new, dt, guard = step(system, y, s, guard, h)
+        one = jnp.concatenate([y, s, dt[None], guard.astype(y.dtype)[None]])
+        place = record - options.round_steps + k
+        steps = jax.lax.dynamic_update_index_in_dim(steps, one, place, 1)
+        return y_new, s_new, guard, steps
+
+    steps = jnp.roll(run.steps, -kept, axis=1)
+    carry = run.y, run.s, run.guard, steps
+    return _Run(*jax.lax.fori_loop(0, options.round_steps, body, carry))
+
+
+def _segments(system: HybridSystem, run: _Run) -> Segments:
+    """The last steps of one run as segments."""
+    n, f = len(run.y), len(run.s)
+    y, s, duration, guard = jnp.split(run.steps, [n, n + f, n + f + 1])
+    return Segments(y, duration[0], s, guard[0].astype(int))
+
+
+def _look(steps: Segments, y, count: int) -> _Look:
+    record = steps.duration.shape[0]
+    at = jnp.where(steps.guard == SECTION, jnp.arange(record), -1)
+    at, _ = jax.lax.top_k(at, count)
+    states = jnp.concatenate([steps.y, y[:, None]], axis=1)
+    return _Look(at, states[:, at + 1], jnp.cumsum(steps.duration)[at], at >= 0)
+
+
+def _quintic(y, middle, end, d_0, d_m, d_1, x):
+    """The quintic with these values and slopes at 0, 1/2 and 1, at x; elementwise."""
+    u, v, w = x, x - 0.5, x - 1
+    # Lagrange weights squared, each with the correction of its own slope.
+    at_0, at_m, at_1 = 4 * (v * w) ** 2, 16 * (u * w) ** 2, 4 * (u * v) ** 2
+    return (
+        at_0 * (y + u * (d_0 + 6 * y)) + at_m * (middle + v * d_m) + at_1 * (end + w * (d_1 - 6 * end))
+    )
+
+
+def admissible(system: HybridSystem, segments: Segments, middle) -> Array:
+    """Whether an orbit obeys the friction law along its itinerary; `middle` are its midpoints.
+
+    No guard is below zero inside a segment, and every switch leads to the next contact state.
+    """
+    y, s, h, ends = segments.y, segments.s, segments.duration, next_start(segments.y)
+    at = jnp.stack([y, middle, ends])
+    d = jax.vmap(lambda y: h[None] * system.field(y, s))(at)
+    guards = jax.vmap(lambda y: system.guards(y, s)[1:])  # but the section
+    scale = 1 + jnp.max(jnp.abs(y))
+    # Half a segment each: the cubic through a guard's ends and a point between says where it is
+    # lowest. There the guard itself is evaluated.
+    places = jnp.arange(7) / 6
+    inside = jax.vmap(lambda x: _quintic(*at, *d, x))(places)
+    g = guards(inside)
+    cubics = (Cubic.at_thirds(g[:4]), Cubic.at_thirds(g[3:]))
+    lowest = []
+    for k, cubic in enumerate(cubics):
+        theta, _ = cubic.minimum()
+        theta = jnp.take_along_axis(theta, jnp.argmin(cubic(theta), axis=0)[None], axis=0)[0]
+        lowest.append(_quintic(*at, *d, (k + theta)[None] / 2))
+    g = jnp.concatenate([g, guards(jnp.stack(lowest))])
+    # The quintic is this good in a segment of the default length.
+    holds = jnp.all(g > -1e-8 * scale) & jnp.all(h > -1e-10)
+    _, after = system.switch(ends, s, segments.guard)
+    return holds & jnp.all(after == jnp.roll(s, -1, axis=-1))
+
+
+def _attracts(return_jacobian) -> Array:
+    """Whether no eigenvalue exceeds 1 in modulus by more than 1e-3: by repeated squaring."""
+
+    def square(_, power):
+        return power @ power
+
+    power = jax.lax.fori_loop(0, 13, square, return_jacobian)
+    return jnp.max(jnp.abs(power)) < 1e3
+
+
+def _has_shorter_period(orbit: Segments, returns) -> Array:
+    """Whether the orbit is back at its start before its last return."""
+    start = orbit.y[:, :1]
+    away = jnp.max(jnp.abs(next_start(orbit.y) - start), axis=0)
+    at_section = orbit.guard == SECTION
+    early = at_section & (jnp.cumsum(at_section) < returns)
+    return jnp.any(early & (away < 1e-5 * (1 + jnp.max(jnp.abs(start)))))
+
+
+def _candidate(system, steps: Segments, y, first, last, returns, h, rtol, *, length: int):
+    """The orbit near the steps after `first` up to `last`: segments, error, whether accepted.
+
+    One of a shorter period is not: the same number of segments resolves that period better.
+    """
+    number = jnp.arange(len(steps.duration))
+    chosen = (number > first) & (number <= last)
+    # The chosen steps come first, as a chain must.
+    order = jnp.roll(number, -(first + 1))
+    guard = jnp.where(chosen, steps.guard, UNUSED)[order]
+    duration = jnp.where(chosen, steps.duration, 0)[order]
+    steps = Segments(steps.y[:, order], duration, steps.s[:, order], guard)
+
+    def going(carry):
+        _, found, error, _, tries = carry
+        return (tries == 0) | ((tries < _MESHES) & found.converged & ~(error <= rtol))
+
+    def solve(carry):
+        steps, *_, tries = carry
+        found = solve_periodic_orbit(system, remesh(system, steps, h * 0.8**tries, length))
+        error, middle = estimated_error(system, found)
+        # The orbit's phases have other lengths than those of the steps: they are cut anew.
+        steps = jax.tree.map(lambda x, new: x.at[..., :length].set(new), steps, found.segments)
+        used = jnp.where(number < length, steps.guard, UNUSED)
+        steps = Segments(steps.y, jnp.where(used == UNUSED, 0, steps.duration), steps.s, used)
+        return steps, found, error, middle, tries + 1
+
+    n, N = len(y), length
+    nothing = PeriodicOrbit(
+        segments=jax.tree.map(lambda x: x[..., :length], steps),
+        converged=jnp.array(False),
+        local=Maps(*(jnp.zeros((*shape, N), y.dtype) for shape in ((n, n), (n,), (n,)))),
+        return_jacobian=jnp.eye(n, dtype=y.dtype),
+    )
+    infinite = jnp.asarray(jnp.inf, y.dtype)
+    carry = steps, nothing, infinite, jnp.zeros((n, N), y.dtype), 0
+    _, found, error, middle, _ = jax.lax.while_loop(going, solve, carry)
+    orbit = found.segments
+    near = jnp.max(jnp.abs(orbit.y[:, 0] - y)) < 0.2 * (1 + jnp.max(jnp.abs(y)))
+    moves = jnp.max(jnp.abs(orbit.y[system.n :])) > 1e-4
+    ok = found.converged & near & moves & _attracts(found.return_jacobian)
+    ok = ok & admissible(system, orbit, middle) & ~_has_shorter_period(orbit, returns)
+    return orbit, error, ok
+
+
+class _Progress(eqx.Module):
+    """What the search knows of one scene besides its run."""
+
+    status: Int[Array, "..."]
+    orbit: Segments
+    period_returns: Int[Array, "..."]
+    error: Float[Array, "..."]
+    distance: Float[Array, "..."]  # of the run from that orbit
+    approach: Int[Array, "..."]  # rounds in which it fell
+    widest: Float[Array, "..."]  # gap between returns, in the later half of the run
+    tried: Float[Array, "..."]  # gap at the last attempt
+    returns: Float[Array, "..."]
+    idle: Int[Array, "..."]  # rounds without a return
+
+
+def _judge(system, run: _Run, known: _Progress, rounds, equilibrium, growth, max_returns, h, rtol, *,
+           options: SearchOptions, length: int):
+    """One scene after a round: its run, perhaps extrapolated, and what is known of it."""
+    steps = _segments(system, run)
+    look = _look(steps, run.y, options.longest + 1)
+    active = known.status == RUNNING
+    tiny = jnp.finfo(run.y.dtype).tiny
+    new = jnp.arange(len(steps.guard)) >= len(steps.guard) - options.round_steps
+    returns = known.returns + jnp.sum(new & (steps.guard == SECTION))
+    idle = jnp.where(look.at[0] >= len(steps.guard) - options.round_steps, 0, known.idle + 1)
+
+    # --- near the equilibrium ---
+    away = jnp.sqrt(jnp.sum((look.y - equilibrium[:, None]) ** 2, axis=0))
+    size = jnp.sqrt(jnp.sum((run.y - equilibrium) ** 2)) + tiny
+    diverged = ~(size < options.divergence * (1 + jnp.max(jnp.abs(equilibrium))))
+    last_switch = jnp.max(jnp.where(steps.guard > 0, jnp.arange(len(steps.guard)), -1))
+    smooth = look.exists[3] & (look.at[3] > last_switch)
+    log = jnp.log(away[:3] + tiny)
+    rate, before = log[0] - log[1], log[1] - log[2]
+    duration = look.time[0] - look.time[1]
+    steady = smooth & (jnp.abs(rate - before) < 0.1 * jnp.abs(rate))
+    linear = steady & (away[0] < options.linear) & (rate < 0.7 * growth * duration)
+    decays = linear | (smooth & (away[0] < options.small) & (rate < 0))
+    decays = (growth < 0) & (decays | (size < 1e-6))
+    status = jnp.where(diverged, DIVERGED, jnp.where(decays, EQUILIBRIUM, RUNNING))
+    # Amplitude extrapolation: a slow, steady change without switches skips many returns, but at
+    # most half of the change that is left if it slows down geometrically.
+    left = jnp.abs(rate * before) / jnp.maximum(jnp.abs(before) - jnp.abs(rate), 1e-300)
+    ahead = jnp.minimum(jnp.minimum(0.25, left / 2), 200 * jnp.abs(rate))
+    extrapolates = steady & (jnp.abs(rate) < options.extrapolated) & (status == RUNNING) & active
+    factor = jnp.where(extrapolates, jnp.exp(jnp.sign(rate) * ahead), 1)
+    y_on = jnp.where(extrapolates, equilibrium + factor * (run.y - equilibrium), run.y)
+
+    # --- near a periodic orbit ---
+    scale = 1 + jnp.max(jnp.abs(look.y[:, 0]))
+    apart = jnp.max(jnp.abs(look.y[:, 1:] - look.y[:, :1]), axis=0)
+    apart = jnp.where(look.exists[1:], apart, jnp.inf)
+    closest = jnp.min(apart)
+
+    def distance_from(orbit):
+        gap = jnp.max(jnp.abs(look.y - orbit.y[:, :1]), axis=0)
+        return jnp.min(jnp.where(look.exists, gap, jnp.inf))
+
+    # An earlier orbit is accepted once the motion has approached it in several rounds.
+    now = distance_from(known.orbit)
+    closer = active & (now < known.distance) & (known.distance < jnp.inf)
+    approach = jnp.where(closer, known.approach + 1, 0)
+    distance = jnp.where(closer, now, jnp.inf)
+    ok = approach >= options.approaches
+    # Alternately an orbit of one return and the one that the motion seems to repeat.
+    repeated = 1 + jnp.argmax(apart <= 2 * closest + 1e-6)
+    period_returns = jnp.where(rounds % 2 == 0, 1, repeated)
+    gap = jnp.where(period_returns == 1, apart[0], closest)
+    ready = active & (status == RUNNING) & ~closer & ~extrapolates & (gap < options.near * scale)
+    # After a failure again, once the returns are closer together or some rounds later.
+    ready = ready & ((gap < 0.7 * known.tried) | (rounds % 8 < 2))
+
+    def solve():
+        first, last = look.at[period_returns], look.at[0]
+        return *_candidate(
+            system, steps, look.y[:, 0], first, last, period_returns, h, rtol, length=length
+        ), period_returns
+
+    def keep():
+        return known.orbit, known.error, jnp.array(False), known.period_returns
+
+    orbit, error, found, orbit_returns = jax.lax.cond(ready, solve, keep)
+    orbit, error, orbit_returns = jax.tree.map(
+        lambda new, old: jnp.where(found, new, old),
+        (orbit, error, orbit_returns),
+        (known.orbit, known.error, known.period_returns),
+    )
+    now = distance_from(orbit)
+    # This near, the multipliers decide whether it attracts.
+    ok = ok | (found & (now < options.accepted * scale))
+    distance = jnp.where(found & ~ok, now, distance)
+    late = returns > max_returns / 2
+    widest = jnp.where(late, jnp.maximum(known.widest, closest / scale), known.widest)
+    over = jnp.where((widest < 0.02) | (smooth & (growth < 0)), EXHAUSTED, NOT_PERIODIC)
+    ended = (returns >= max_returns) | (idle > options.patience)
+    over = jnp.where(ended, over, RUNNING)
+    status = jnp.where(status == RUNNING, jnp.where(ok, CONVERGED, over), status)
+    progress = _Progress(
+        status=status,
+        orbit=orbit,
+        period_returns=orbit_returns,
+        error=error,
+        distance=distance,
+        approach=approach,
+        widest=widest,
+        tried=jnp.where(ready, gap, known.tried),
+        returns=returns,
+        idle=idle,
+    )
+    progress = jax.tree.map(lambda new, old: jnp.where(active, new, old), progress, known)
+    # Steps from before an extrapolation are not of this motion.
+    forgotten = steps.guard.shape[0] * extrapolates
+    return y_on, forgotten, progress
+
+
+def _find(system, start, equilibrium, growth, max_returns, h, rtol, *, length, options) -> Attractor:
+    shape, n = start.shape[1:], len(start)
+    s = system.contact_state(start)
+    record = max(4 * length, 4 * options.round_steps)
+    blank = jnp.zeros((n + len(s) + 2, record, *shape), start.dtype).at[-1].set(UNUSED)
+    run = _Run(y=start, s=s, guard=jnp.full(shape, NONE), steps=blank)
+    none, far = jnp.zeros(shape, int), jnp.full(shape, jnp.inf, start.dtype)
+    zero = jnp.zeros(shape, start.dtype)
+    empty = Segments(
+        y=jnp.zeros((n, length, *shape), start.dtype),
+        duration=jnp.zeros((length, *shape), start.dtype),
+        s=jnp.ones((len(s), length, *shape), start.dtype),
+        guard=jnp.full((length, *shape), UNUSED),
+    )
+    known = _Progress(none + RUNNING, empty, none, zero, far, none, zero, far, zero, none)
+    judge = functools.partial(_judge, options=options, length=length)
+
+    def running(carry):
+        return jnp.any(carry[1].status == RUNNING)
+
+    def body(carry):
+        run, known, rounds = carry
+        # A run that takes long to settle may be near the boundary of two basins.
+        finer = sum(rounds >= after for after in options.finer_after)
+        run = _advance(system, run, (options.step / 2.0**finer).astype(start.dtype), options)
+        arguments = system, run, known, equilibrium, growth, max_returns, h, rtol
+
+        def one(arguments):
+            system, run, known, *rest = arguments
+            return judge(system, run, known, rounds, *rest)
+
+        if shape:
+            # Each scene on its own: it has its own number of iterations.
+            first = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), arguments)
+            y, forgotten, known = jax.tree.map(
+                lambda x: jnp.moveaxis(x, 0, -1), jax.lax.map(one, first)
+            )
+        else:
+            y, forgotten, known = one(arguments)
+        moved = forgotten > 0
+        guards = jnp.where(moved[None], UNUSED, run.steps[-1])
+        steps = run.steps.at[-1].set(guards)
+        s = jnp.where(moved[None], system.contact_state(y), run.s)
+        return _Run(y, s, run.guard, steps), known, rounds + 1
+
+    _, known, _ = jax.lax.while_loop(running, body, (run, known, 0))
+    return Attractor(known.orbit, known.status, known.period_returns, known.error)
+
+
+def find(
+    system: HybridSystem,
+    start,
+    equilibrium,
+    growth,
+    max_returns,
+    h,
+    rtol,
+    length: int,
+    options: SearchOptions = SearchOptions(),  # noqa: B008, it is frozen
+) -> Attractor:
+    """The attractor of the motion from `start`, its orbit on `length` segments, in scaled units.
+
+    `start` and `equilibrium` are (2n,), and `growth` is the growth rate at the latter; segments
+    are no longer than h, or as short as `rtol` needs, where so few suffice. Under `jax.vmap` the scenes become the last axis.
+    """
+    search = functools.partial(_find, length=length, options=options)
+
+    @custom_vmap
+    def one(arguments):
+        return search(*arguments)
+
+    @one.def_vmap
+    def rule(axis_size, in_batched, arguments):
+        arguments = jax.tree.map(
+            lambda x, batched: (
+                jnp.moveaxis(x, 0, -1)
+                if batched
+                else jnp.broadcast_to(x[..., None], (*x.shape, axis_size))
+            ),
+            arguments,
+            in_batched[0],
+        )
+        found = search(*arguments)
+        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), found), jax.tree.map(
+            lambda _: True, found
+        )
+
+    return one((system, start, equilibrium, growth, max_returns, h, rtol))
