@@ -205,7 +205,7 @@ class HybridSystem(eqx.Module):
         """
         f = len(s)
         number_of = jnp.arange(f).reshape(f, *(1,) * (s.ndim - 1))
-        guard = jnp.asarray(guard)
+        guard = jnp.broadcast_to(jnp.asarray(guard), s.shape[1:])
         ended = (guard[None] - 1) // 2 == number_of
         ended = ended & (guard[None] > 0)
         lower = guard[None] == 1 + 2 * number_of
@@ -230,7 +230,10 @@ class HybridSystem(eqx.Module):
                 x = self._without_load(x, tangential, normal, changes)
                 k += 1
         # To rounding, the velocity of a face that sticks or starts to slip is the belt's.
-        u = u + self._acceleration(self.held(-self.sliding(u), exact))
+        if self.B is None:
+            u = jnp.where(exact, self._leaf(self.V, u.ndim - 1), u)
+        else:
+            u = u + self._acceleration(self.held(-self.sliding(u), exact))
         return jnp.concatenate([x, u]), new
 
     def _without_load(self, x, tangential, normal, where) -> Array:

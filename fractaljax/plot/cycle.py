@@ -18,7 +18,7 @@ def phase_portrait(cycle: LimitCycle, ax: Axes | None = None, *, direction: int 
     """
     i = _component(cycle, direction)
     ax = given_or_new(ax)
-    period, V = float(cycle.period), float(cycle._system.V)
+    period, V = float(cycle.period), float(cycle._system.speed)
     t, states = (np.asarray(x) for x in cycle.orbit())
     x, v = states[:, i] * 1e6, states[:, 2 + i]
     style: dict[str, Any] = {"color": "tab:blue", "lw": 1.4, "solid_capstyle": "round"}

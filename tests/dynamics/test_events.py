@@ -11,13 +11,13 @@ import pytest
 from numpy.polynomial import Polynomial
 
 from filippov import PLAIN, phases
-from fractaljax._dynamics.events import NONE, Cubic, first_root, step, without_start
-from fractaljax._dynamics.stick_slip import SECTION, sliding_equilibrium, stick_slip
+from fractaljax._dynamics.events import Cubic, first_root, step, without_start
+from fractaljax._dynamics.hybrid import NONE, SECTION, hybrid_system
 from tools import reference_scene
 
 EPS = np.finfo(float).eps
 KINDS = pytest.mark.parametrize("kind", ["any", "guards"])
-found_root = jax.jit(first_root)
+found_root = jax.jit(lambda *ends: first_root(Cubic.through(*ends)))
 
 
 # --- cubics -------------------------------------------------------------------------------
@@ -182,11 +182,12 @@ def test_shallow_dip(depth):
 @jax.jit
 def _stepped(system, y, h):
     def body(carry, _):
-        y, s, t = carry
-        y, s_new, dt, guard = step(system, y, s, h)
-        return (y, s_new, t + dt), (y, s_new, t + dt, dt, guard)
+        y, s, last, t = carry
+        y, s_new, dt, guard = step(system, y, s, last, h)
+        return (y, s_new, guard, t + dt), (y, s_new, t + dt, dt, guard)
 
-    return jax.lax.scan(body, (y, system.contact_state(y), jnp.zeros(())), length=1600)[1]
+    start = y, system.contact_state(y), jnp.array(NONE), jnp.zeros(())
+    return jax.lax.scan(body, start, length=1600)[1]
 
 
 def stepped(system, y, h):
@@ -197,9 +198,9 @@ def stepped(system, y, h):
 @functools.cache
 def reference():
     """Switches and returns of the reference from its start up to 95/omega: times, signs after."""
-    system = stick_slip(reference_scene())
+    system = hybrid_system(reference_scene())
     share = float(system.omega) / PLAIN.omega  # its own unit of time
-    start = np.asarray(sliding_equilibrium(reference_scene(), system).at[0].add(1.0))
+    start = np.asarray(system.equilibrium().at[0].add(1.0))
     y = start * [1 / share, 1 / share, -1, -1] + [0, 0, 1, 1]
     run = list(phases(PLAIN, y, 1e-12, 95 / share, maxima=True))
     times = np.array([p.t1 * share for p in run[:-1]])
@@ -224,21 +225,21 @@ def test_steps_follow_the_motion():
 
 
 def test_end_of_a_step():
-    """After a switch the velocity is the belt's to the last bit, after a return it is zero."""
+    """After a switch the velocity is the belt's to the last bit, after a return nearly zero."""
     system, start, *_ = reference()
     y, s, _, _, guard = stepped(system, start, 0.25)
     before = np.vstack([np.asarray(system.contact_state(start)), s[:-1]])
     for i in (0, 1):
-        ended = (guard // 2 == i) & (guard < SECTION)
+        ended = (guard - 1) // 2 == i
         assert ended.sum() > 20
         np.testing.assert_array_equal(y[ended, 2 + i], 1)
         np.testing.assert_array_equal(ended, s[:, i] != before[:, i])
         slipping = s[:, i] != 0
         assert (s[slipping, i] * (1 - y[slipping, 2 + i]) >= -1e-9).all()
         np.testing.assert_array_equal(y[~slipping, 2 + i], 1)
-    np.testing.assert_array_equal(y[:, 2] == 0, guard == SECTION)
     # A return is a maximum of x1: the velocity falls through zero.
     at = guard == SECTION
+    assert abs(y[at, 2]).max() < 1e-3
     assert (system.field(jnp.asarray(y[at].T), jnp.asarray(s[at].T))[2] < 0).all()
 
 
@@ -246,9 +247,9 @@ def test_steps_of_a_batch():
     """Many motions side by side take the same steps as one by one."""
     system, start, *_ = reference()
     y, s = (jnp.asarray(x[:60].T) for x in stepped(system, start, 0.25)[:2])
-    one = jax.jit(step)
-    together = one(system, y, s, 0.25)
+    one, last = jax.jit(step), np.full(60, NONE)
+    together = one(system, y, s, last, 0.25)
     for k in range(0, 60, 7):
-        alone = one(system, y[:, k], s[:, k], 0.25)
+        alone = one(system, y[:, k], s[:, k], last[k], 0.25)
         for batched, single in zip(together, alone, strict=True):
             np.testing.assert_allclose(batched[..., k], single, rtol=0, atol=1e-13)

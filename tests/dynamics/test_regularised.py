@@ -10,7 +10,7 @@ import pytest
 
 import fractaljax as fj
 from fractaljax._dynamics import regularised
-from fractaljax._dynamics.stick_slip import stick_slip, units
+from fractaljax._dynamics.hybrid import hybrid_system
 from tools import motionless_scene, reference_cycle, reference_scene
 
 K_N = 4e8
@@ -72,7 +72,7 @@ def test_error_is_the_largest_difference(eps):
 @pytest.mark.parametrize("eps", [COARSE, MIDDLE])
 def test_orbit(eps):
     """The motion through one period returns to `state`, and everything told of it is its own."""
-    found, scale = cycle(eps), np.asarray(units(stick_slip(reference_scene())))
+    found, scale = cycle(eps), np.asarray(hybrid_system(reference_scene()).units)
     motion = fj.simulate(reference_scene(), found.state, float(found.period), regularisation=eps)
     end = np.asarray(motion.end)
     np.testing.assert_allclose(end / scale, found.state / scale, rtol=0, atol=1e-8)
@@ -98,7 +98,7 @@ def test_orbit(eps):
 
 def test_multipliers():
     """One is 1, the others attract; their product is the divergence's integral (Liouville)."""
-    found, system = cycle(COARSE), stick_slip(reference_scene())
+    found, system = cycle(COARSE), hybrid_system(reference_scene())
     values = np.asarray(found.multipliers)
     assert abs(values[0] - 1) < 1e-6 and (abs(values[1:]) < 1).all()
     y = found.orbit(4096)[1] / units(system)[None]
@@ -163,7 +163,7 @@ def test_too_few_steps():
 
 def test_field():
     """tanh(v/eps) for sgn v: far from v = 0 that of slip, at v = 0 without friction."""
-    system = stick_slip(reference_scene())
+    system = hybrid_system(reference_scene())
     y = np.random.default_rng(0).normal(size=(4, 100))
 
     def found(u):
