@@ -144,9 +144,7 @@ def stick_slip(scene: Scene) -> StickSlip:
 def sliding_equilibrium(scene: Scene, system: StickSlip) -> Float[Array, "4"]:
     """The sliding equilibrium (Eq. 40) as a scaled state."""
     K_n, K_t = stiffness(scene)
-    x_1, x_2 = static_displacements(
-        scene.oscillator, K_n, K_t, scene.friction.coefficient(system.V)
-    )
+    x_1, x_2 = static_displacements(scene.oscillator, K_n, K_t, scene.friction.mu(system.V))
     length = system.V / system.omega
     return jnp.stack([x_1 / length, x_2 / length, jnp.zeros_like(x_1), jnp.zeros_like(x_1)])
 

@@ -6,16 +6,18 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import ArrayLike
 
-from .._base.parts import Numbers, Part, number, quantity, require_kind
+from .._base.parts import Numbers, Part, concrete, number, quantity, require_kind
+from .._base.toml import Laws
 from .._contact.contact import MU_M_MAX, Contact
 from .._contact.fixed import FixedContact
 from .._contact.fractal import FractalContact
-from .._friction import Coulomb, Friction, Stribeck
+from .._friction import LAWS, Friction
 
 # By their names in files.
-JOINT_LAWS: dict[str, dict[str, type[Part]]] = {
+JOINT_LAWS: Laws = {
     "contact": {"fractal": FractalContact, "fixed": FixedContact},
-    "friction": {"coulomb": Coulomb, "stribeck": Stribeck},
+    "friction": LAWS,
+    "of": LAWS,  # the law that a `Scaled` one scales
 }
 
 Dof = int | str  # a degree of freedom, by index or name
@@ -31,8 +33,11 @@ def friction_for(contact: Contact, friction: Friction) -> Friction:
     require_kind("friction", friction, Friction)
     if not contact.fractal:
         return friction
-    checked = number(friction.lowest, friction.mu_m, at_most=MU_M_MAX)
-    return eqx.tree_at(lambda f: getattr(f, f.lowest), friction, checked)
+    number(friction.lowest, friction.mu_m, at_most=MU_M_MAX)
+    if concrete(friction.mu_m) is None:
+        wanted = f"{friction.lowest} must be at most {MU_M_MAX}"
+        friction = eqx.error_if(friction, ~(friction.mu_m <= MU_M_MAX), wanted)
+    return friction
 
 
 class Joint(Part):
@@ -80,7 +85,7 @@ class Joint(Part):
         law = self.friction
         if self.V is None or not law.velocity_dependent:
             return law.mu_s
-        return law.coefficient(self.V)
+        return law.mu(self.V)
 
 
 def _direction(name: str, value: Any) -> tuple[Dof, ...]:

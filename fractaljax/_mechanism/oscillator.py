@@ -97,7 +97,7 @@ def linearise(
     of direction 2. A law without slope traces neither of them, nor the equilibrium.
     """
     m, V = oscillator.m, oscillator.V
-    mu = friction.coefficient(V) if friction.velocity_dependent else friction.mu_s
+    mu = friction.mu(V) if friction.velocity_dependent else friction.mu_s
     c_1 = 2 * oscillator.xi_1 * oscillator.omega_1
     c_2 = 2 * oscillator.xi_2 * oscillator.omega_2
     if flag("friction_slope", friction_slope) and friction.velocity_dependent:

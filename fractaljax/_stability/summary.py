@@ -102,7 +102,7 @@ def verdict(modes: Stability) -> dict[str, str]:
 
 @jax.jit
 def _friction(law, speed):
-    return law.coefficient(speed), law.mu_s
+    return law.mu(speed), law.mu_s
 
 
 def friction_remark(scene: Scene, speed) -> list[str]:
