@@ -84,7 +84,8 @@ def part_table(part: Part, laws: Laws) -> dict[str, Any]:
         elif "unit" in field.metadata:
             table[name] = Noted(value, "{unit}: {meaning}".format(**field.metadata))
         else:
-            table[name] = value
+            note = field.metadata.get("note")
+            table[name] = value if note is None else Noted(value, note)
     return table
 
 

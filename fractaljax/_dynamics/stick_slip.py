@@ -124,6 +124,8 @@ class StickSlip(eqx.Module):
 
 def stick_slip(scene: Scene) -> StickSlip:
     """The scaled system of a scene."""
+    if scene.preload:
+        raise ValueError("preload has no motion yet: only the source's form, preload=False, has")
     o = scene.oscillator
     K_n, K_t = stiffness(scene)
     a, b = o.omega_1**2 + K_t / o.m, o.omega_2**2 + K_n / o.m
