@@ -1,6 +1,7 @@
 """From a machined surface to a stable mechanism, with gradients all the way back."""
 
 from . import plot as plot
+from ._base.parts import quantity as quantity
 from ._contact.contact import Contact as Contact, ContactState as ContactState, Regime as Regime
 from ._contact.dimensionless import (
     dimensionless_normal_stiffness as dimensionless_normal_stiffness,
@@ -31,7 +32,13 @@ from ._dynamics.simulate import (
     Trajectory as Trajectory,
     simulate as simulate,
 )
-from ._friction import Coulomb as Coulomb, Friction as Friction, Stribeck as Stribeck
+from ._friction import (
+    Coulomb as Coulomb,
+    ExponentialStribeck as ExponentialStribeck,
+    Friction as Friction,
+    HyperbolicStribeck as HyperbolicStribeck,
+    Stribeck as Stribeck,
+)
 from ._identify.files import read_measurement as read_measurement
 from ._identify.identify import Identification as Identification, identify as identify
 from ._identify.measurement import Measurement as Measurement

@@ -1,37 +1,117 @@
 """Friction laws: the coefficient as a function of the sliding speed."""
 
 import abc
-from typing import ClassVar, final
+import dataclasses
+from collections.abc import Callable
+from typing import Any, ClassVar, final
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import ArrayLike
 
-from ._base.parts import Numbers, Part, number, ordered, quantity
+from ._base.parts import (
+    Numbers,
+    Part,
+    concrete,
+    number,
+    ordered,
+    quantity,
+    quantity_name,
+    require_kind,
+)
+from ._base.singular import safe_divide
+
+LAWS: dict[str, type["Friction"]] = {}  # by their names in files
+
+_FASTEST = 100.0  # m/s: a law is followed up to there for its least value
+_SPEEDS = np.concatenate([[0.0], np.geomspace(1e-6, _FASTEST, 161)])
+_BISECTIONS = 60
+
+
+class _FromLaw:
+    """A number that follows from mu, unless a subclass has a field or a property of this name.
+
+    A property would not do: it cannot be overridden by a field.
+    """
+
+    def __init__(self, function: Callable[[Any], Numbers]):
+        self.function = function
+
+    def __get__(self, law: Any, kind: type | None = None) -> Any:
+        if law is None:
+            raise AttributeError("of a law, not of its class")  # not the default of a field
+        return self.function(law)
 
 
 class Friction(Part):
     """A friction law mu(speed), at speeds of at least 0 [m/s].
 
-    A law has `coefficient`, differentiable at 0 from above; slope and sign follow from it. It has
-    mu_s = mu(0) and mu_m, its smallest value, as fields or properties.
+    A law of your own declares its numbers as fields and writes `mu`, differentiable at 0 from
+    above:
+
+        class Falling(fj.Friction, law="falling"):
+            mu_s: jax.Array = fj.quantity("-", "static friction coefficient")
+            c: jax.Array = fj.quantity("s/m", "fall of the friction coefficient with speed")
+
+            def mu(self, speed):
+                return self.mu_s / (1 + self.c * speed)
+
+    Slope, sign and the scaling of `critical_friction` follow from it. `law` is its name in TOML
+    files, which a law without one cannot be written to; `fj.quantity` puts unit and meaning there
+    and makes a number known to sweeps and designs.
+
+    mu_s is mu(0). mu_m, which Eq. 19 takes as dynamic friction, is the least value of mu up to
+    100 m/s, and at least 0; the source means the minimum of its Eq. 38. A field or a property of
+    either name replaces it.
+
+    **Raises:** `ValueError` unless mu(0) > 0 and a field mu_s is mu(0), and for a name of a law
+    that another has.
     """
 
     velocity_dependent: ClassVar[bool] = True  # if False, neither slope nor speed is traced
-    lowest: ClassVar[str] = "mu_m"  # the field that holds mu_m
+    lowest: ClassVar[str] = "mu_m"  # the quantity that holds mu_m
+    # Fields that, times a factor, make the law that times as large; without them it is `Scaled`.
+    amplitudes: ClassVar[tuple[str, ...]] = ()
 
-    mu_s: eqx.AbstractVar[Numbers]
-    mu_m: eqx.AbstractVar[Numbers]
+    mu_s = _FromLaw(lambda law: law.mu(jnp.zeros((), _dtype(law))))
+    mu_m = _FromLaw(lambda law: _least(law))
+
+    def __init_subclass__(cls, law: str | None = None, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if law is None:
+            return
+        known = LAWS.get(law, cls)
+        # A cell of a notebook that is run again makes its class anew.
+        if (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
+            raise ValueError(f"the law {law!r} is {known.__name__} already")
+        LAWS[law] = cls
+
+    def __check_init__(self):
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            plain = isinstance(value, (int, float, np.ndarray)) and not isinstance(value, bool)
+            if plain and not field.metadata.get("static", False):
+                # What a generated __init__ stores is not an array yet.
+                object.__setattr__(self, field.name, number(quantity_name(field), value))
+        if type(self).__module__ == __name__:
+            return
+        static = concrete(number("mu(0)", self.mu(jnp.zeros((), _dtype(self))), above=0))
+        stored = concrete(jnp.asarray(self.mu_s))
+        if static is None or stored is None:
+            return
+        if not np.allclose(stored, static, rtol=8 * float(jnp.finfo(stored.dtype).eps), atol=0):
+            raise ValueError(f"mu_s must be mu(0) = {static}, got {stored}")
 
     @abc.abstractmethod
-    def coefficient(self, speed: ArrayLike) -> Numbers:
-        """mu at sliding speeds >= 0 [m/s]; any shape."""
+    def mu(self, speed: ArrayLike) -> Numbers:
+        """The friction coefficient at sliding speeds >= 0 [m/s]; any shape."""
 
     def slope(self, v: ArrayLike) -> Numbers:
         """dmu/d|v| [s/m] at sliding velocities v [m/s]; any shape."""
         speed = jnp.abs(v)
-        return jax.jvp(self.coefficient, (speed,), (jnp.ones_like(speed),))[1]
+        return jax.jvp(self.mu, (speed,), (jnp.ones_like(speed),))[1]
 
     def branch(self, v: ArrayLike, sign: ArrayLike) -> Numbers:
         """mu of one sliding direction, `sign` = +1 or -1, continued smoothly through v = 0.
@@ -41,38 +121,65 @@ class Friction(Part):
         if not self.velocity_dependent:
             return self.mu_s * sign
         side = jnp.sign(sign)
-        return self.mu_s * sign + side * (self.coefficient(side * v) - self.mu_s)
+        return self.mu_s * sign + side * (self.mu(side * v) - self.mu_s)
+
+    def times(self, factor: ArrayLike) -> "Friction":
+        """The law as a whole times a factor; not checked."""
+        law, names = (self, self.amplitudes) if self.amplitudes else (Scaled(self), ("factor",))
+        scaled = [factor * getattr(law, name) for name in names]
+        return eqx.tree_at(lambda law: [getattr(law, name) for name in names], law, scaled)
+
+
+def _dtype(law: Friction) -> Any:
+    return jnp.result_type(float, *jax.tree.leaves(law))
+
+
+def _least(law: Friction) -> Numbers:
+    """The least value of mu up to 100 m/s, at least 0; differentiable with its place."""
+    fixed = jax.tree.map(jax.lax.stop_gradient, law)
+    speeds = jnp.asarray(_SPEEDS, _dtype(law))
+    place = jnp.argmin(jax.vmap(fixed.mu)(speeds), axis=0)
+    ends = speeds[jnp.maximum(place - 1, 0)], speeds[jnp.minimum(place + 1, len(speeds) - 1)]
+
+    def bisect(_, ends):
+        low, high = ends
+        middle = (low + high) / 2
+        falls = fixed.slope(middle) < 0
+        return jnp.where(falls, middle, low), jnp.where(falls, high, middle)
+
+    _, at = jax.lax.fori_loop(0, _BISECTIONS, bisect, ends)
+    # The place of a minimum moves with the law: a Newton step of 0 length has that derivative.
+    slope, bend = jax.jvp(law.slope, (at,), (jnp.ones_like(at),))
+    step = safe_divide(slope, bend, jnp.zeros_like(bend))
+    return jnp.maximum(law.mu(at - jnp.where(jnp.abs(step) < 1e-6 * at, step, 0)), 0)
 
 
 @final
-class Coulomb(Friction):
+class Coulomb(Friction, law="coulomb"):
     """Constant friction.
 
     **Raises:** `ValueError` unless mu > 0.
     """
 
-    mu: Numbers = quantity("-", "friction coefficient")
+    mu_s: Numbers = quantity("-", "friction coefficient", name="mu")
 
     velocity_dependent: ClassVar[bool] = False
     lowest: ClassVar[str] = "mu"
+    amplitudes: ClassVar[tuple[str, ...]] = ("mu_s",)
 
     def __init__(self, mu: ArrayLike):
-        self.mu = number("mu", mu, above=0)
-
-    @property
-    def mu_s(self):
-        return self.mu
+        self.mu_s = number("mu", mu, above=0)
 
     @property
     def mu_m(self):
-        return self.mu
+        return self.mu_s
 
-    def coefficient(self, speed):
-        return self.mu * jnp.ones_like(speed)
+    def mu(self, speed):
+        return self.mu_s * jnp.ones_like(speed)
 
 
 @final
-class Stribeck(Friction):
+class Stribeck(Friction, law="stribeck"):
     """Friction that falls from mu_s at rest to its minimum mu_m at v_m and rises beyond (Eq. 38).
 
     mu(v) = mu_s - 3 (mu_s - mu_m)/(2 v_m) v + (mu_s - mu_m)/(2 v_m^3) v^3. Beyond sqrt(3) v_m it
@@ -85,11 +192,105 @@ class Stribeck(Friction):
     mu_m: Numbers = quantity("-", "smallest friction coefficient, reached at v_m")
     v_m: Numbers = quantity("m/s", "sliding velocity of the smallest friction")
 
+    amplitudes: ClassVar[tuple[str, ...]] = ("mu_s", "mu_m")
+
     def __init__(self, mu_s: ArrayLike, mu_m: ArrayLike, v_m: ArrayLike):
         self.mu_m = number("mu_m", mu_m, at_least=0)
         self.mu_s = ordered("mu_s", number("mu_s", mu_s, above=0), "mu_m", self.mu_m)
         self.v_m = number("v_m", v_m, above=0)
 
-    def coefficient(self, speed):
+    def mu(self, speed):
         u = speed / self.v_m
         return self.mu_s + (self.mu_s - self.mu_m) * u * (u**2 - 3) / 2
+
+
+@final
+class ExponentialStribeck(Friction, law="exponential"):
+    """Friction that decays from mu_s towards mu_d, with a viscous part.
+
+    mu(v) = mu_d + (mu_s - mu_d) exp(-v/v_0) + viscous v. Its mu_m is mu_d without a viscous part,
+    else the minimum, at v = v_0 ln((mu_s - mu_d)/(viscous v_0)) or at 0. In use for belt models:
+    Papangelo, Ciavarella and Hoffmann (2017).
+
+    **Raises:** `ValueError` unless mu_s > 0, 0 <= mu_d <= mu_s, v_0 > 0 and viscous >= 0.
+    """
+
+    mu_s: Numbers = quantity("-", "static friction coefficient")
+    mu_d: Numbers = quantity("-", "dynamic friction coefficient, without the viscous part")
+    v_0: Numbers = quantity("m/s", "sliding velocity over which friction falls by a factor e")
+    viscous: Numbers = quantity("s/m", "viscous part of the friction coefficient")
+
+    amplitudes: ClassVar[tuple[str, ...]] = ("mu_s", "mu_d", "viscous")
+
+    def __init__(self, mu_s: ArrayLike, mu_d: ArrayLike, v_0: ArrayLike, viscous: ArrayLike = 0.0):
+        self.mu_d = number("mu_d", mu_d, at_least=0)
+        self.mu_s = ordered("mu_s", number("mu_s", mu_s, above=0), "mu_d", self.mu_d)
+        self.v_0 = number("v_0", v_0, above=0)
+        self.viscous = number("viscous", viscous, at_least=0)
+
+    @property
+    def mu_m(self):
+        rise, drop = self.viscous * self.v_0, self.mu_s - self.mu_d
+        falls, ratio = rise < drop, safe_divide(rise, drop, jnp.ones_like(rise * drop))
+        ratio = jnp.where(falls & (ratio > 0), ratio, 1)
+        return jnp.where(falls, self.mu_d + rise * (1 - jnp.log(ratio)), self.mu_s)
+
+    def mu(self, speed):
+        # expm1, so that mu(0) is mu_s to the last digit.
+        fall = (self.mu_s - self.mu_d) * jnp.expm1(-(speed / self.v_0))
+        return self.mu_s + fall + self.viscous * speed
+
+
+@final
+class HyperbolicStribeck(Friction, law="hyperbolic"):
+    """Friction that falls as mu(v) = mu_s/(1 + delta v), towards 0 at high speed: mu_m = 0.
+
+    Source: Leine et al. (1998), doi 10.1023/A:1008289604683.
+
+    **Raises:** `ValueError` unless mu_s > 0 and delta >= 0.
+    """
+
+    mu_s: Numbers = quantity("-", "static friction coefficient")
+    delta: Numbers = quantity("s/m", "rate at which friction falls with the sliding velocity")
+
+    amplitudes: ClassVar[tuple[str, ...]] = ("mu_s",)
+
+    def __init__(self, mu_s: ArrayLike, delta: ArrayLike):
+        self.mu_s = number("mu_s", mu_s, above=0)
+        self.delta = number("delta", delta, at_least=0)
+
+    @property
+    def mu_m(self):
+        return jnp.zeros_like(self.mu_s)
+
+    def mu(self, speed):
+        return self.mu_s / (1 + self.delta * speed)
+
+
+@final
+class Scaled(Friction, law="scaled"):
+    """A friction law times a factor: what scaling makes of a law that names no `amplitudes`.
+
+    **Raises:** `TypeError` unless `of` is a `Friction`; `ValueError` unless factor > 0.
+    """
+
+    of: Friction
+    factor: Numbers = quantity("-", "factor of the friction law")
+
+    amplitudes: ClassVar[tuple[str, ...]] = ("factor",)
+
+    def __init__(self, of: Friction, factor: ArrayLike = 1.0):
+        require_kind("of", of, Friction)
+        self.of = of
+        self.factor = number("factor", factor, above=0)
+
+    @property
+    def velocity_dependent(self):
+        return self.of.velocity_dependent
+
+    @property
+    def mu_m(self):
+        return self.factor * self.of.mu_m
+
+    def mu(self, speed):
+        return self.factor * self.of.mu(speed)

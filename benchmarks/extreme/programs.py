@@ -76,7 +76,7 @@ def rest(x: jax.Array) -> Numbers:
     """`equilibrium` at the sliding velocity of the belt."""
     given = scene(x)
     K_n, K_t = fj.stiffness(given)
-    mu = given.friction.coefficient(given.oscillator.V)
+    mu = given.friction.mu(given.oscillator.V)
     return {"x_0": jnp.stack(fj.equilibrium(given.oscillator, K_n, K_t, mu))}
 
 

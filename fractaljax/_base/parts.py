@@ -159,12 +159,19 @@ def one_line(error: Exception) -> str:
 # --- parts ---------------------------------------------------------------------------------
 
 
-def quantity(unit: str, meaning: str, *, log: bool = False) -> Any:
-    """A numeric field of a `Part`, with its unit and its meaning for files and tables.
+def quantity(unit: str, meaning: str, *, log: bool = False, name: str | None = None) -> Any:
+    """A numeric field of a part, with its unit and its meaning for files and tables.
 
-    `log` marks a scale: it is designed and swept on a logarithmic axis.
+    `log` marks a scale: it is designed and swept on a logarithmic axis. `name` is that of the
+    quantity, and of the argument of `__init__`, where the attribute has another.
     """
-    return eqx.field(metadata={"unit": unit, "meaning": meaning, "log": log})
+    named = {} if name is None else {"name": name}
+    return eqx.field(metadata={"unit": unit, "meaning": meaning, "log": log, **named})
+
+
+def quantity_name(field: dataclasses.Field) -> str:
+    """The name under which files, tables and `replace` know a field of a part."""
+    return field.metadata.get("name", field.name)
 
 
 class Record(eqx.Module):
@@ -180,7 +187,7 @@ class Record(eqx.Module):
             value = getattr(self, field.name)
             if isinstance(value, jax.Array) and not isinstance(value, Tracer):
                 value = value.item() if value.ndim == 0 else np.asarray(value)
-            yield f"{field.name}={value!r}"
+            yield f"{quantity_name(field)}={value!r}"
 
 
 class Part(Record):
@@ -192,7 +199,7 @@ def quantities(part: Part) -> dict[str, tuple[str, ...]]:
     found = {}
     for field in dataclasses.fields(part):
         value = getattr(part, field.name)
-        found[field.name] = (field.name,)
+        found[quantity_name(field)] = (field.name,)
         if isinstance(value, Part):
             found |= {name: (field.name, *path) for name, path in quantities(value).items()}
     return found
@@ -210,12 +217,12 @@ def rebuild(part: _PartT, changes: Mapping[str, Any]) -> _PartT:
     """
     arguments, changed = {}, False
     for field in dataclasses.fields(part):
-        old = getattr(part, field.name)
-        new = changes.get(field.name, old)
+        old, name = getattr(part, field.name), quantity_name(field)
+        new = changes.get(name, old)
         if isinstance(new, Part):
-            new = rebuild(new, {name: x for name, x in changes.items() if name != field.name})
+            new = rebuild(new, {other: x for other, x in changes.items() if other != name})
         changed |= new is not old
-        arguments[field.name] = new
+        arguments[name] = new
     return type(part)(**arguments) if changed else part
 
 

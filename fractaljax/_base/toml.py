@@ -9,7 +9,7 @@ import tomllib
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any, NamedTuple, cast
 
-from .parts import Part, brief
+from .parts import Part, brief, quantity_name
 
 Laws = Mapping[str, Mapping[str, type[Part]]]  # by field, then by the name of the law
 
@@ -76,7 +76,7 @@ def part_table(part: Part, laws: Laws) -> dict[str, Any]:
     """
     table = {}
     for field in dataclasses.fields(part):
-        name, value = field.name, getattr(part, field.name)
+        name, value = quantity_name(field), getattr(part, field.name)
         if isinstance(value, Part):
             table[name] = part_table(value, laws)
             if name in laws:
@@ -84,7 +84,8 @@ def part_table(part: Part, laws: Laws) -> dict[str, Any]:
         elif "unit" in field.metadata:
             table[name] = Noted(value, "{unit}: {meaning}".format(**field.metadata))
         else:
-            table[name] = value
+            note = field.metadata.get("note")
+            table[name] = value if note is None else Noted(value, note)
     return table
 
 
@@ -141,7 +142,7 @@ def read_part(kind: type[Part], table: Mapping[str, Any], laws: Laws, name: str 
     or outside its domain.
     """
     where, inside = (f"[{name}]", f"{name}.") if name else ("the file", "")
-    fields = {field.name: field.type for field in dataclasses.fields(kind)}
+    fields = {quantity_name(field): field.type for field in dataclasses.fields(kind)}
     refuse_unknown(where, table, fields)
     given, parameters = dict(table), inspect.signature(kind.__init__).parameters
     for key, inner in fields.items():

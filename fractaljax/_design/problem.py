@@ -266,9 +266,10 @@ def _slips(x, name) -> bool:
 
 def _with_stiffness(x, states):
     """`x` with contacts of known stiffness where their states (by name) are known already."""
-    parts, zero = parts_with_contacts(x), FixedContact(0.0, 0.0)
+    parts, zero = parts_with_contacts(x), FixedContact(0.0, 0.0, 1.0)
     for name, state in states.items():
-        known = substitute(zero, {"K_n": state.K_n, "K_t": state.K_t})
+        P = parts[name].contact.P  # of a preloaded joint
+        known = substitute(zero, {"K_n": state.K_n, "K_t": state.K_t, "P": P})
         parts[name] = eqx.tree_at(lambda part: part.contact, parts[name], known)
     if isinstance(x, Structure):
         return eqx.tree_at(lambda s: s.joints, x, tuple(parts.values()))
@@ -296,6 +297,8 @@ def _least_damping(x) -> tuple[float, float]:
     for joint in x.joints:
         stiffness = joint.stiffness()
         for each, dofs in zip(stiffness, (joint.normal, joint.tangential), strict=True):
+            if dofs is None:
+                continue
             d = np.asarray(x.direction(dofs), float)
             K = K + float(each) * np.outer(d, d)
     n = len(M)

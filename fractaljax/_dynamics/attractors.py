@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from .._base.parts import number, require_scalar
+from .._base.parts import number
 from .._mechanism.mechanism import Mechanism
 from .cycle import CycleResult, LimitCycle
 from .limit_cycle import limit_cycle
@@ -29,11 +29,10 @@ def attractors(
 
     **Raises:** `ValueError` for starts of another shape, and what `limit_cycle` raises.
     """
-    require_scalar(mechanism)
+    n = degrees_of_freedom(mechanism)
     if starts is None:
         starts = _spread(mechanism)
     starts = number("starts", jnp.asarray(starts, dtype=float))
-    n = degrees_of_freedom(mechanism)
     if starts.ndim != 2 or starts.shape[1] != 2 * n:
         raise ValueError(f"starts must have shape (k, {2 * n}), got {starts.shape}")
     cycles = jax.vmap(

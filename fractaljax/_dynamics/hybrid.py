@@ -16,11 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, DTypeLike, Float
 
-from .._base.parts import concrete, number
+from .._base.parts import concrete, number, require_kind, require_scalar
 from .._friction import Friction
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.scene import Scene, stiffness
-from .._mechanism.structure import Structure
+from .._mechanism.structure import Structure, require_single
 
 OPEN = 2
 # Guards, by number: the section of the Poincare map, two for each face, one for each joint that
@@ -260,7 +260,7 @@ class HybridSystem(eqx.Module):
 
     def equilibrium(self) -> Float[Array, " 2n"]:
         """The closed, forward-slipping equilibrium (Eq. 40) as a state."""
-        mu = self._each(lambda law, V: law.coefficient(self.speed * V), self.V)
+        mu = self._each(lambda law, V: law.mu(self.speed * V), self.V)
         K = jnp.diag(self.K) if self.K.ndim == 1 else self.K
         B = jnp.eye(self.n, dtype=K.dtype) if self.B is None else self.B
         coupled = K - (B * mu[None]) @ self.L
@@ -288,8 +288,16 @@ def _solve(W, b) -> Array:
 
 
 def degrees_of_freedom(mechanism: Mechanism) -> int:
-    """n of a structure; a scene has two."""
-    return mechanism.n if isinstance(mechanism, Structure) else 2
+    """n of a structure; a scene has two.
+
+    **Raises:** `TypeError` for anything else; `ValueError` for one that holds a batch.
+    """
+    if isinstance(mechanism, Structure):
+        require_single(mechanism)
+        return mechanism.n
+    require_kind("mechanism", mechanism, Scene)
+    require_scalar(mechanism)
+    return 2
 
 
 def hybrid_system(mechanism: Mechanism) -> HybridSystem:
@@ -307,8 +315,7 @@ def _of_scene(scene: Scene) -> HybridSystem:
     f = o.F / o.m / jnp.sqrt(2.0) / omega / o.V
     unit, zero = o.m * omega * o.V, jnp.zeros_like(f)
     K = jnp.stack([a, b]) / omega**2
-    preload = getattr(scene, "preload", False)
-    P = scene.contact.P / unit if preload else zero
+    P = zero if scene.normal_load is None else scene.normal_load / unit
     return HybridSystem(
         laws=(scene.friction,),
         speed=o.V,
@@ -325,7 +332,7 @@ def _of_scene(scene: Scene) -> HybridSystem:
         P=jnp.stack([P, zero]),
         V=jnp.ones_like(K),
         faces=((0, 1),),
-        opens=(preload,),
+        opens=(scene.preload,),
     )
 
 
@@ -341,8 +348,8 @@ def _of_structure(structure: Structure) -> HybridSystem:
         rows.append(t)
         speeds.append(joint.V)
         faces.append((len(rows) - 1,))
-        P = joint.contact.P if getattr(joint, "preload", False) or joint.normal is None else jnp.zeros((), dtype)
-        offsets.append(P)
+        P = joint.normal_load
+        offsets.append(jnp.zeros((), dtype) if P is None else P)
         if joint.normal is None:
             weights.append(jnp.zeros(n, dtype))
             continue
@@ -378,7 +385,7 @@ def _of_structure(structure: Structure) -> HybridSystem:
         P=P / unit,
         V=V / speed,
         faces=tuple(faces),
-        opens=tuple(getattr(joint, "preload", False) for joint in structure.joints),
+        opens=tuple(joint.preload and joint.normal is not None for joint in structure.joints),
     )
 
 

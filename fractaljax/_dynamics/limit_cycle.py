@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, ScalarLike
 
-from .._base.parts import concrete, number, raise_unless, require_scalar, whole
+from .._base.parts import concrete, number, raise_unless, whole
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.scene import Scene
 from .._stability.stability import growth_rate
@@ -251,7 +251,6 @@ def limit_cycle(
     **Raises:** `ValueError` for a start of another shape, an rtol above 0.1 or below what the
     precision can hold, less than 16 segments or max_returns below 1; `RuntimeError` if `throw`.
     """
-    require_scalar(mechanism)
     n = degrees_of_freedom(mechanism)
     start = None if start is None else start_state(start, n)
     given = mechanism if start is None else (mechanism, start)

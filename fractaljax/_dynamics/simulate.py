@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, ScalarLike
 
-from .._base.parts import Record, concrete, number, raise_unless, require_scalar, scalar, whole
+from .._base.parts import Record, concrete, number, raise_unless, scalar, whole
 from .._mechanism.mechanism import Mechanism
 from .events import Cubic, guards_and_rates, without_start
-from .hybrid import NONE, HybridSystem, check_rtol, hybrid_system, start_state
+from .hybrid import NONE, HybridSystem, check_rtol, degrees_of_freedom, hybrid_system, start_state
 from .orbit import chosen_guard, flow
 
 if TYPE_CHECKING:
@@ -343,9 +343,8 @@ def simulate(
     **Raises:** `ValueError` for a start of another shape, an argument outside its domain or an
     rtol that the precision cannot hold; `RuntimeError` if `throw`.
     """
-    require_scalar(mechanism)
+    start = start_state(start, degrees_of_freedom(mechanism))
     system = hybrid_system(mechanism)
-    start = start_state(start, system.n)
     t1 = scalar("t1", t1, above=0)
     n = whole("max_steps", max_steps, 1)
     y, end = start / system.units, t1 * system.omega

@@ -1,24 +1,32 @@
 """Joints: contact, friction and the directions in which they act."""
 
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
 import numpy as np
+from jax import Array
+from jax.core import Tracer
 from jaxtyping import ArrayLike
 
-from .._base.parts import Numbers, Part, number, quantity, require_kind
+from .._base.parts import Numbers, Part, brief, concrete, flag, number, quantity, require_kind
+from .._base.toml import Laws
 from .._contact.contact import MU_M_MAX, Contact
 from .._contact.fixed import FixedContact
 from .._contact.fractal import FractalContact
-from .._friction import Coulomb, Friction, Stribeck
+from .._friction import LAWS, Friction
 
 # By their names in files.
-JOINT_LAWS: dict[str, dict[str, type[Part]]] = {
+JOINT_LAWS: Laws = {
     "contact": {"fractal": FractalContact, "fixed": FixedContact},
-    "friction": {"coulomb": Coulomb, "stribeck": Stribeck},
+    "friction": LAWS,
+    "of": LAWS,  # the law that a `Scaled` one scales
 }
 
 Dof = int | str  # a degree of freedom, by index or name
+Direction = Dof | Sequence[Any] | Mapping[Any, float] | ArrayLike
+Stored = tuple[Any, ...]  # a direction as `stored_direction` gives it
 
 
 def friction_for(contact: Contact, friction: Friction) -> Friction:
@@ -31,45 +39,77 @@ def friction_for(contact: Contact, friction: Friction) -> Friction:
     require_kind("friction", friction, Friction)
     if not contact.fractal:
         return friction
-    checked = number(friction.lowest, friction.mu_m, at_most=MU_M_MAX)
-    return eqx.tree_at(lambda f: getattr(f, f.lowest), friction, checked)
+    number(friction.lowest, friction.mu_m, at_most=MU_M_MAX)
+    if concrete(friction.mu_m) is None:
+        wanted = f"{friction.lowest} must be at most {MU_M_MAX}"
+        friction = eqx.error_if(friction, ~(friction.mu_m <= MU_M_MAX), wanted)
+    return friction
+
+
+def require_load(contact: Contact, what: str) -> None:
+    """Refuse a contact without a normal load P, which `what` needs.
+
+    **Raises:** `ValueError` as said.
+    """
+    if getattr(contact, "P", None) is None:
+        raise ValueError(f"{what} needs a contact with a normal load P, got {brief(contact)}")
 
 
 class Joint(Part):
     """A contact with friction between two bodies of a structure, or a body and the ground.
 
-    `tangential` and `normal` each name a degree of freedom, by its index or its name, or a pair
-    (i, j), whose relative displacement x_i - x_j counts. Positive `normal` displacement compresses
-    the joint; friction pushes towards positive `tangential`, as the belt does in Eq. 39. `V` is the
-    sliding velocity; a law without slope needs none.
+    `tangential` and `normal` are directions t and n, rows (n,) of weights of the degrees of
+    freedom. Each is a degree of freedom, by its index or its name, a pair (i, j), whose relative
+    displacement x_i - x_j counts, a mapping {degree of freedom: weight}, or all weights as an array
+    or floats. Positive `normal` displacement n.x compresses the joint. Friction pushes towards
+    positive t.x, as the belt does in Eq. 39. `V` is the sliding velocity; a law without slope needs
+    none.
 
-    **Raises:** `TypeError` for a part of the wrong kind; `ValueError` unless V > 0, if a degree of
-    freedom stands twice, and where `Scene` refuses the friction.
+    The normal force on which friction acts is K_n n.x, the source's form, or, with `preload`,
+    P + K_n n.x with the load P of the contact: x = 0 is the pressed rest. Without `normal` it is P,
+    constant, and neither a normal spring nor a friction face normal to the belt is there. In all
+    forms the tangential spring K_t stays.
+
+    **Raises:** `TypeError` for a part of the wrong kind; `ValueError` unless V > 0, for directions
+    that are zero or have one degree of freedom twice, without a P where it is needed, and where
+    `Scene` refuses the friction.
     """
 
     contact: Any  # a Contact; its kind decides what else it has
     friction: Friction
-    tangential: tuple[Dof, ...] = eqx.field(static=True)
-    normal: tuple[Dof, ...] = eqx.field(static=True)
+    tangential: Stored = eqx.field(static=True)
+    normal: Stored | None = eqx.field(static=True)
+    preload: bool = eqx.field(
+        static=True, metadata={"note": "true: friction acts on P + K_n n.x, false: on K_n n.x"}
+    )
     V: Numbers | None = quantity("m/s", "sliding velocity", log=True)
 
     def __init__(
         self,
         contact: Contact,
         friction: Friction,
-        tangential: Dof | tuple[Dof, ...],
-        normal: Dof | tuple[Dof, ...],
+        tangential: Direction,
+        normal: Direction | None = None,
         V: ArrayLike | None = None,
+        preload: bool = False,
     ):
         self.contact = contact
         self.friction = friction_for(contact, friction)
-        self.tangential = _direction("tangential", tangential)
-        self.normal = _direction("normal", normal)
+        self.tangential = stored_direction("tangential", tangential)
+        self.normal = None if normal is None else stored_direction("normal", normal)
+        self.preload = flag("preload", preload)
+        if self.preload or self.normal is None:
+            require_load(contact, "preload" if self.preload else "a joint without normal")
         if V is None and friction.velocity_dependent:
             raise ValueError("V must be given for friction that depends on the sliding velocity")
         if self.tangential == self.normal:
             raise ValueError(f"tangential and normal must differ, both are {tangential!r}")
         self.V = None if V is None else number("V", V, above=0)
+
+    @property
+    def normal_load(self) -> Numbers | None:
+        """P [N], if the normal force on which friction acts has it; None in the source's form."""
+        return self.contact.P if self.preload or self.normal is None else None
 
     def stiffness(self) -> tuple[Numbers, Numbers]:
         """(K_n, K_t) [N/m], scalars: Eqs. 30 and 36, or as given."""
@@ -80,16 +120,60 @@ class Joint(Part):
         law = self.friction
         if self.V is None or not law.velocity_dependent:
             return law.mu_s
-        return law.coefficient(self.V)
+        return law.mu(self.V)
 
 
-def _direction(name: str, value: Any) -> tuple[Dof, ...]:
-    """One degree of freedom or a pair of different ones, as a tuple."""
-    dofs = tuple(value) if isinstance(value, (list, tuple)) else (value,)
-    dofs = tuple(int(dof) if isinstance(dof, np.integer) else dof for dof in dofs)
-    plain = all(isinstance(dof, (int, str)) and not isinstance(dof, bool) for dof in dofs)
-    if not plain or len(dofs) not in (1, 2) or len(set(dofs)) != len(dofs):
-        raise ValueError(
-            f"{name} must be a degree of freedom or a pair of two, by index or name, got {value!r}"
-        )
-    return dofs
+# --- directions --------------------------------------------------------------------------------
+
+
+def stored_direction(name: str, value: Any) -> Stored:
+    """A direction in a hashable form: (dof,), (dof, dof), ((dof, weight), ...) or weights (n,).
+
+    **Raises:** `ValueError` for anything else; `TypeError` for weights that are traced.
+    """
+    wrong = ValueError(
+        f"{name} must be a degree of freedom or a pair of two, by index or name, a mapping of them "
+        f"to weights or a vector of floats, got {brief(value)}"
+    )
+    if isinstance(value, (np.ndarray, Array)):
+        if value.ndim != 1:
+            raise wrong
+        return _weights(name, list(value), wrong)
+    several = isinstance(value, (Mapping, list, tuple))
+    items: list[Any] = [value]
+    if several:
+        items = list(value.items() if isinstance(value, Mapping) else value)
+    if all(isinstance(item, (list, tuple)) and len(item) == 2 for item in items):
+        dofs, weights = _dofs([dof for dof, _ in items]), [weight for _, weight in items]
+        if not dofs:
+            raise wrong
+        return tuple(zip(dofs, _weights(name, weights, wrong), strict=True))
+    if len(items) <= 2 and (dofs := _dofs(items)):
+        return dofs
+    # Whole numbers are degrees of freedom: (1, 2, 3) is a mistake, (1.0, 2.0, 3.0) a vector.
+    if not several or all(isinstance(item, int) for item in items):
+        raise wrong
+    return _weights(name, items, wrong)
+
+
+def _dofs(items: Sequence[Any]) -> tuple[Dof, ...]:
+    """Different degrees of freedom, or nothing if they are not."""
+    plain = tuple(int(item) if isinstance(item, np.integer) else item for item in items)
+    good = all(isinstance(dof, (int, str)) and not isinstance(dof, bool) for dof in plain)
+    return plain if good and len(set(plain)) == len(plain) else ()
+
+
+def _weights(name: str, values: Sequence[Any], wrong: Exception) -> tuple[float, ...]:
+    if any(isinstance(value, Tracer) for value in values):
+        raise TypeError(f"{name} must be known when a program is traced, got traced weights")
+    if not values or any(isinstance(value, (str, bool, np.bool_)) for value in values):
+        raise wrong
+    try:
+        weights = tuple(map(float, values))
+    except (TypeError, ValueError):
+        raise wrong from None
+    if not all(map(math.isfinite, weights)):
+        raise ValueError(f"the weights of {name} must be finite, got {brief(weights)}")
+    if not any(weights):
+        raise ValueError(f"{name} must not be zero, got {brief(weights)}")
+    return weights

@@ -58,22 +58,32 @@ class Linearised(eqx.Module):
 
 
 def equilibrium(
-    oscillator: Oscillator, K_n: ArrayLike, K_t: ArrayLike, mu: ArrayLike
+    oscillator: Oscillator,
+    K_n: ArrayLike,
+    K_t: ArrayLike,
+    mu: ArrayLike,
+    P: ArrayLike | None = None,
 ) -> tuple[Numbers, Numbers]:
     """Eq. 40 as the linear system it comes from: the static displacements (x_01, x_02) [m].
 
     [[K_1 + K_t, -mu K_n], [mu K_t, K_2 + K_n]] x_0 = [F, -F]/sqrt(2); its determinant is positive.
+    `P` [N] is the load of a preloaded joint, whose friction mu P is added to the first component.
 
-    **Raises:** `TypeError` unless given an `Oscillator`; `ValueError` unless K_n >= 0, K_t >= 0
-    and mu is finite.
+    **Raises:** `TypeError` unless given an `Oscillator`; `ValueError` unless K_n >= 0, K_t >= 0,
+    P > 0 and mu is finite.
     """
     require_kind("oscillator", oscillator, Oscillator)
     K_n, K_t = number("K_n", K_n, at_least=0), number("K_t", K_t, at_least=0)
-    return static_displacements(oscillator, K_n, K_t, number("mu", mu))
+    P = None if P is None else number("P", P, above=0)
+    return static_displacements(oscillator, K_n, K_t, number("mu", mu), P)
 
 
 def static_displacements(
-    oscillator: Oscillator, K_n: ArrayLike, K_t: ArrayLike, mu: ArrayLike
+    oscillator: Oscillator,
+    K_n: ArrayLike,
+    K_t: ArrayLike,
+    mu: ArrayLike,
+    P: ArrayLike | None = None,
 ) -> tuple[Numbers, Numbers]:
     """As `equilibrium`, without checks."""
     # In flexibilities: the determinant and its square leave the range of a float32.
@@ -81,7 +91,26 @@ def static_displacements(
     r_2 = 1 / (oscillator.m * oscillator.omega_2**2 + K_n)
     n, t = mu * K_n * r_2, mu * K_t * r_1
     f = oscillator.F / jnp.sqrt(2.0) / (1 + n * t)
-    return f * (1 - n) * r_1, -f * (1 + t) * r_2
+    x_1, x_2 = f * (1 - n) * r_1, -f * (1 + t) * r_2
+    if P is None:
+        return x_1, x_2
+    along = mu * P * r_1 / (1 + n * t)
+    return x_1 + along, x_2 - mu * K_t * r_2 * along
+
+
+def static_normal_force(
+    oscillator: Oscillator, K_n: ArrayLike, K_t: ArrayLike, mu: ArrayLike, P: ArrayLike
+) -> Array:
+    """P + K_n x_02 [N] of a preloaded joint at its equilibrium, at most 0 where it is open.
+
+    With r_i the flexibilities 1/(K_1 + K_t) and 1/(K_2 + K_n) it is
+    [P - K_n r_2 (1 + mu K_t r_1) F/sqrt(2)]/(1 + mu^2 K_n K_t r_1 r_2), which loses no digits.
+    """
+    r_1 = 1 / (oscillator.m * oscillator.omega_1**2 + K_t)
+    r_2 = 1 / (oscillator.m * oscillator.omega_2**2 + K_n)
+    n, t = mu * K_n * r_2, mu * K_t * r_1
+    lifting = K_n * r_2 * (1 + t) * oscillator.F / jnp.sqrt(2.0)
+    return (jnp.asarray(P) - lifting) / (1 + n * t)
 
 
 def linearise(
@@ -90,21 +119,27 @@ def linearise(
     K_n: ArrayLike,
     K_t: ArrayLike,
     friction_slope: bool = True,
+    P: ArrayLike | None = None,
 ) -> Linearised:
     """Eq. 43 about the equilibrium, at sliding velocity V; with the friction law's slope if asked.
 
-    The slope adds mu'(V) K_n x_02/m to the damping of direction 1 and -mu'(V) K_t x_01/m to that
-    of direction 2. A law without slope traces neither of them, nor the equilibrium.
+    The slope adds mu'(V) N_0/m to the damping of direction 1 and -mu'(V) K_t x_01/m to that of
+    direction 2, where N_0 is K_n x_02, or P + K_n x_02 of a joint with the preload P. A law without
+    slope traces neither of them, nor the equilibrium, but for a preload: where N_0 <= 0 the joint
+    is open, and c_1 is NaN.
     """
     m, V = oscillator.m, oscillator.V
-    mu = friction.coefficient(V) if friction.velocity_dependent else friction.mu_s
+    mu = friction.mu(V) if friction.velocity_dependent else friction.mu_s
     c_1 = 2 * oscillator.xi_1 * oscillator.omega_1
     c_2 = 2 * oscillator.xi_2 * oscillator.omega_2
+    N = None if P is None else static_normal_force(oscillator, K_n, K_t, mu, P)
     if flag("friction_slope", friction_slope) and friction.velocity_dependent:
-        x_01, x_02 = static_displacements(oscillator, K_n, K_t, mu)
+        x_01, x_02 = static_displacements(oscillator, K_n, K_t, mu, P)
         slope = friction.slope(V)
-        c_1 = c_1 + slope * K_n * x_02 / m
+        c_1 = c_1 + slope * (K_n * x_02 if N is None else N) / m
         c_2 = c_2 - slope * K_t * x_01 / m
+    if N is not None:
+        c_1 = jnp.where(N > 0, c_1, jnp.nan)
     return Linearised(
         a=oscillator.omega_1**2 + K_t / m,
         b=oscillator.omega_2**2 + K_n / m,

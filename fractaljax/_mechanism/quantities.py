@@ -20,7 +20,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from .._base.parts import Part, leaf, number, quantities, substitute
+from .._base.parts import Part, number, quantities, quantity_name, substitute
 from .mechanism import Mechanism
 from .scene import Scene, stiffness
 from .structure import Structure
@@ -51,7 +51,7 @@ def own_quantities(x: Part | Structure) -> dict[str, Quantity]:
         if isinstance(value, Part):
             found |= own_quantities(value)
         elif "unit" in meant:
-            found[field.name] = Quantity(
+            found[quantity_name(field)] = Quantity(
                 value, meant["unit"], meant["meaning"], meant.get("log", False)
             )
     return found
@@ -82,7 +82,13 @@ def moved_by(x: Mechanism, name: str) -> set[str]:
     """The own quantities that a name sets; of a structure with the names of their joints."""
     own = own_quantities(x)
     if name not in own:
-        return set(_DERIVED[name].set(x, 1.0))
+        moved = set(_DERIVED[name].set(x, 1.0))
+        if (
+            isinstance(x, Scene) and "friction" in moved
+        ):  # scaled as a whole: any coefficient in it may be its scale
+            law = own_quantities(x.friction)
+            moved |= {each for each in law if law[each].unit == "-"}
+        return moved
     if isinstance(x, Structure) and "." not in name:
         return {f"{joint}.{name}" for joint in x.joint_names if f"{joint}.{name}" in own}
     return {name}
@@ -154,7 +160,10 @@ def _require_all_inside(x, axes):
 
 def substituted(x: Mechanism, values: Mapping[str, ArrayLike]) -> Any:
     """Like `replaced`, without checks, for what has all of them (`with_optional`)."""
-    return _substitute(x, _settings(x, values))
+    settings = _settings(x, values)
+    if "friction" in settings:  # a new law, which may have another structure
+        x = eqx.tree_at(lambda scene: scene.friction, x, settings.pop("friction"))
+    return _substitute(x, settings)
 
 
 def _substitute(x, values):
@@ -176,7 +185,7 @@ def with_optional(x: Mechanism, names: Sequence[str]) -> Any:
     """
     own = own_quantities(x)
     moved = {name for chosen in names for name in moved_by(x, chosen)}
-    missing = {name: 1.0 for name in moved if own[name].value is None}
+    missing = {name: 1.0 for name in moved & own.keys() if own[name].value is None}
     return x.replace(**missing) if missing else x
 
 
@@ -229,17 +238,21 @@ def sliding_friction(scene: Scene) -> Array:
     friction = scene.friction
     if not friction.velocity_dependent:
         return friction.mu_s
-    return friction.coefficient(scene.oscillator.V)
+    return friction.mu(scene.oscillator.V)
 
 
 def with_friction_times(scene: Scene, factor: ArrayLike) -> Scene:
     """The friction law as a whole times `factor`; not checked."""
-    return substitute(scene, _friction_times(scene, factor))
+    return eqx.tree_at(lambda x: x.friction, scene, scene.friction.times(factor))
 
 
 def _friction_times(scene, factor):
-    names = [name for name in quantities(scene.friction) if name in ("mu", "mu_s", "mu_m")]
-    return {name: factor * leaf(scene.friction, (name,)) for name in names}
+    law = scene.friction
+    scaled = law.times(factor)
+    if not law.amplitudes:
+        return {"friction": scaled}
+    names = {path[-1]: name for name, path in quantities(law).items() if len(path) == 1}
+    return {names[field]: getattr(scaled, field) for field in law.amplitudes}
 
 
 # --- derived quantities -------------------------------------------------------------------

@@ -4,18 +4,19 @@ import os
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 from jaxtyping import Array, Float
 
 from .._base.files import write_whole
-from .._base.parts import quantities, rebuild, require_kind, require_scalar
+from .._base.parts import Numbers, flag, quantities, rebuild, require_kind, require_scalar
 from .._base.toml import part_table, read_part, read_toml, write_toml
 from .._contact.contact import Contact
 from .._contact.fractal import FractalContact
 from .._contact.material import Material
 from .._friction import Friction, Stribeck
 from .._surface.surface import Surface
-from .joint import JOINT_LAWS, friction_for
+from .joint import JOINT_LAWS, friction_for, require_load
 from .mechanism import Mechanism
 from .oscillator import Oscillator
 
@@ -23,19 +24,39 @@ from .oscillator import Oscillator
 class Scene(Mechanism):
     """A mass on a belt, with its contact and friction, as one frozen pytree.
 
+    The friction along the belt acts on the normal force K_n x_2, the source's form, or with
+    `preload` on P + K_n x_2, with the load P of the contact: x = 0 is then the pressed rest.
+
     **Raises:** `TypeError` for a part of the wrong kind; `ValueError` if the contact is fractal
-    and the smallest friction exceeds 0.9, where Eq. 19 ends.
+    and the smallest friction exceeds 0.9, where Eq. 19 ends, and for preload without a P.
     """
 
     contact: Any  # a Contact; its kind decides what else it has
     friction: Friction
     oscillator: Oscillator
+    preload: bool = eqx.field(
+        static=True, metadata={"note": "true: friction acts on P + K_n x_2, false: on K_n x_2"}
+    )
 
-    def __init__(self, contact: Contact, friction: Friction, oscillator: Oscillator):
+    def __init__(
+        self,
+        contact: Contact,
+        friction: Friction,
+        oscillator: Oscillator,
+        preload: bool = False,
+    ):
         self.friction = friction_for(contact, friction)
         require_kind("oscillator", oscillator, Oscillator)
         self.contact = contact
         self.oscillator = oscillator
+        self.preload = flag("preload", preload)
+        if self.preload:
+            require_load(contact, "preload")
+
+    @property
+    def normal_load(self) -> Numbers | None:
+        """P [N], if the normal force on which friction acts has it; None in the source's form."""
+        return self.contact.P if self.preload else None
 
     def _rebuilt(self, changes):
         return rebuild(self, changes)

@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Float
 from .._base.files import read_bounded, write_together
 from .._base.parts import number, quantities, rebuild, require_scalar
 from .._base.toml import naming, read_toml
-from .joint import Dof, Joint
+from .joint import Direction, Dof, Joint, stored_direction
 from .matrices import MatrixLike, fitting, mass_matrix, square
 from .mechanism import Mechanism
 from .scene import Scene
@@ -74,7 +74,9 @@ class Structure(Mechanism):
             M=m * jnp.eye(2, dtype=m.dtype),
             C=jnp.diag(2 * xi * omega * m),
             K=jnp.diag(m * omega**2),
-            joints=Joint(scene.contact, scene.friction, "x1", "x2", oscillator.V),
+            joints=Joint(
+                scene.contact, scene.friction, "x1", "x2", oscillator.V, preload=scene.preload
+            ),
             F=jnp.stack([f, -f]),
             names=("x1", "x2"),
         )
@@ -97,22 +99,34 @@ class Structure(Mechanism):
             raise ValueError(f"unknown degree of freedom {dof!r}; the structure has {has}")
         return known.index(dof)
 
-    def direction(self, dofs: tuple[Dof, ...]) -> np.ndarray:
-        """The vector d (n,) of 1, -1 and 0 for which d.x is the displacement that `dofs` names."""
-        d = np.zeros(self.n, self.M.dtype)
-        for dof, sign in zip(dofs, (1, -1), strict=False):
-            d[self.index(dof)] += sign
-        if not d.any():
-            raise ValueError(f"{dofs!r} is one degree of freedom twice")
+    def direction(self, direction: Direction) -> np.ndarray:
+        """The weights d (n,) for which d.x is the displacement in a direction, as `Joint` has it.
+
+        **Raises:** `ValueError` for a direction that is zero or has another length, and as `index`.
+        """
+        stored = stored_direction("direction", direction)
+        if isinstance(stored[0], float):
+            if len(stored) != self.n:
+                raise ValueError(f"a direction must have {self.n} weights, got {len(stored)}")
+            return np.array(stored, self.M.dtype)
+        pairs = stored if isinstance(stored[0], tuple) else zip(stored, (1.0, -1.0), strict=False)
+        weights, d = {}, np.zeros(self.n, self.M.dtype)
+        for dof, weight in pairs:
+            place = self.index(dof)
+            if place in weights:
+                raise ValueError(f"{direction!r} is one degree of freedom twice")
+            weights[place] = weight
+        d[list(weights)] = list(weights.values())
         return d
 
     def _check_joints(self) -> None:
         for name, joint in zip(self.joint_names, self.joints, strict=True):
+            given = (joint.tangential, *([] if joint.normal is None else [joint.normal]))
             try:
-                tangential, normal = map(self.direction, (joint.tangential, joint.normal))
+                directions = [self.direction(each) for each in given]
             except ValueError as error:
                 raise ValueError(f"joint {name}: {error}") from None
-            if (abs(tangential) == abs(normal)).all():
+            if len(directions) == 2 and _parallel(*directions):
                 raise ValueError(
                     f"joint {name}: tangential {joint.tangential!r} and normal {joint.normal!r} "
                     "are one direction"
@@ -208,6 +222,11 @@ def require_single(structure: Structure) -> None:
         )
     for joint in structure.joints:
         require_scalar(joint)
+
+
+def _parallel(t: np.ndarray, n: np.ndarray) -> bool:
+    t, n = (d / np.abs(d).max() for d in (t.astype(float), n.astype(float)))
+    return bool(np.abs(t * (n @ n) - n * (t @ n)).max() <= 1e-12 * (n @ n))
 
 
 def _names(names: Iterable[str] | None, n: int) -> tuple[str, ...] | None:

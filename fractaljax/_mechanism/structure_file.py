@@ -71,12 +71,13 @@ def read_structure(document: dict[str, Any], folder: Path) -> dict[str, Any]:
         F = {_dof(key, names or ()): force for key, force in F.items()}
     elif isinstance(F, np.ndarray) and 1 in F.shape:
         F = F.ravel()
-    attached = {
-        name: toml.read_part(
-            Joint, toml.table_at(joints, name, "joints."), JOINT_LAWS, f"joints.{name}"
-        )
-        for name in joints
-    }
+    attached = {}
+    for name in joints:
+        joint = dict(toml.table_at(joints, name, "joints."))
+        for which in ("tangential", "normal"):
+            if isinstance(joint.get(which), dict):
+                joint[which] = {_dof(key, names or ()): x for key, x in joint[which].items()}
+        attached[name] = toml.read_part(Joint, joint, JOINT_LAWS, f"joints.{name}")
     return {"C": None, **given, "F": F, "joints": attached, "names": names}
 
 
@@ -110,12 +111,27 @@ def _matrix_market(path: Path) -> np.ndarray:
 def structure_text(structure: Any, matrices: str) -> str:
     """The TOML text of a structure whose matrices are in the file `matrices` beside it."""
     table = {"matrices": toml.Noted(matrices, "M, C, K and perhaps F"), "names": structure.names}
-    joints = {
-        name: toml.part_table(joint, JOINT_LAWS)
-        for name, joint in zip(structure.joint_names, structure.joints, strict=True)
-    }
+    joints = {}
+    for name, joint in zip(structure.joint_names, structure.joints, strict=True):
+        directions = {
+            which: _written(getattr(joint, which), structure.names or ())
+            for which in ("tangential", "normal")
+        }
+        joints[name] = toml.part_table(joint, JOINT_LAWS) | directions
     comment = f"A fractaljax structure, in SI units; written by fractaljax {__version__}."
     return toml.write_toml(comment, {"structure": table, "joints": joints})
+
+
+def _written(direction: tuple[Any, ...] | None, names: tuple[str, ...]) -> Any:
+    """A direction in a TOML file: weights by degree of freedom as an inline table."""
+    if direction is None or not isinstance(direction[0], tuple):
+        return direction
+    # An index that is another's name would be read as that name.
+    weights = {
+        str(names[dof] if str(dof) in names and isinstance(dof, int) else dof): weight
+        for dof, weight in direction
+    }
+    return toml.Noted(weights, "")
 
 
 def npz_bytes(structure: Any) -> bytes:

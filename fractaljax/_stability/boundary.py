@@ -206,7 +206,8 @@ class _Plane(eqx.Module):
             K_n, K_t, law = state.K_n, state.K_t, (state.regime, friction.mu_m)
         else:
             (K_n, K_t), law = contact.stiffness(friction.mu_s, friction.mu_m), (None, None)
-        lin = linearise(scene.oscillator, friction, K_n, K_t, self.friction_slope)
+        load, slope = scene.normal_load, self.friction_slope
+        lin = linearise(scene.oscillator, friction, K_n, K_t, slope, load)
         damping = jnp.stack([lin.c_1, lin.c_2]) / jnp.sqrt(lin.a + lin.b)
         growth = growth_rate_of_linearised(lin)
         return _Point(hopf_test_function(lin), critical_frequency(lin), growth, damping, *law)
@@ -256,7 +257,8 @@ class _Field:
         if np.isnan(tests).any():
             place = zip(self.plane.names, self.quantities(us[np.isnan(tests)][0]), strict=True)
             where = ", ".join(f"{name} = {value:.6g}" for name, value in place)
-            raise ValueError(f"stability cannot be computed at {where}")
+            may = "; the joint may be open there" if self.plane.scene.preload else ""
+            raise ValueError(f"stability cannot be computed at {where}{may}")
         return tests, gradients
 
     def damped(self, u) -> bool:

@@ -16,7 +16,12 @@ from jaxtyping import Array, Float
 from .._base.parts import flag, require_scalar
 from .._base.singular import positive_sqrt, safe_divide
 from .._contact.contact import MU_M_MAX
-from .._mechanism.oscillator import Linearised, dimensionless
+from .._mechanism.oscillator import (
+    Linearised,
+    dimensionless,
+    linearise,
+    static_normal_force,
+)
 from .._mechanism.quantities import sliding_friction, with_friction_times
 from .._mechanism.scene import Scene, require_kind, stiffness
 from .linearise import linearised
@@ -66,8 +71,8 @@ def critical_friction(scene: Scene, friction_slope: bool = True) -> Float[Array,
     contact follows as in `stiffness`: K_t of a fractal joint depends on mu_s, its critical area on
     mu_m. The first friction that squeals is searched from 1/500 to 500 times that of the scene, up
     to the limit of Eq. 19 (mu_m <= 0.9): 0 if the least squeals already, infinite if none does,
-    NaN where it cannot be computed. To hold the stiffness,
-    `scene.replace(contact=FixedContact(*stiffness(scene)))`.
+    NaN where it cannot be computed, and where a preloaded joint opens first. To hold the stiffness,
+    `scene.replace(contact=FixedContact(*stiffness(scene)))`, with its P if it is preloaded.
 
     The derivative is that of the root, and 0 where it is 0 or infinite.
 
@@ -82,10 +87,17 @@ def critical_friction(scene: Scene, friction_slope: bool = True) -> Float[Array,
         return jnp.where(none, jnp.inf, sliding_friction(scene) * jnp.where(none, 1, factor))
     K_n, K_t = stiffness(scene)
     m = scene.oscillator.m
-    omega, lin = dimensionless(linearised(scene, friction_slope=False))
+    lin = linearise(scene.oscillator, scene.friction, K_n, K_t, friction_slope=False)
+    omega, lin = dimensionless(lin)
     coupling = positive_sqrt(K_n / m / omega**2 * (K_t / m / omega**2))
     infinite = jnp.full_like(coupling, jnp.inf)
-    return safe_divide(positive_sqrt(critical_coupling(lin)), coupling, infinite)
+    found = safe_divide(positive_sqrt(critical_coupling(lin)), coupling, infinite)
+    if scene.normal_load is None:
+        return found
+    # Its sign changes at most once as friction grows: closed there, it is closed below.
+    mu = jax.lax.stop_gradient(jnp.where(found == jnp.inf, 0, found))
+    N = static_normal_force(scene.oscillator, K_n, K_t, mu, scene.normal_load)
+    return jnp.where(N > 0, found, jnp.nan)
 
 
 def _test(scene, factor, friction_slope):

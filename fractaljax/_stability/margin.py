@@ -47,7 +47,7 @@ def margin(
     if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
         raise TypeError(f"shift must be a real number, got {kind}; friction_slope comes third")
     if isinstance(scene, Structure):
-        return least_damping_ratio(solve(*assembled(scene, friction_slope)).s - shift)
+        return least_damping_ratio(solve(*assembled(scene, friction_slope).matrices).s - shift)
     return margin_of(linearised(scene, friction_slope), shift)
 
 

@@ -14,12 +14,12 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from .._base.parts import Record
-from .._mechanism.oscillator import Linearised, linearise
+from .._mechanism.oscillator import Linearised
 from .._mechanism.quantities import sliding_friction
 from .._mechanism.scene import Scene, stiffness
 from .._mechanism.structure import Structure
 from . import quartic
-from .linearise import assembled, linearised
+from .linearise import assembled, linearised, normal_force
 from .margin import damping_ratios, least_damping_ratio, margin_of
 from .quadratic import solve
 
@@ -41,6 +41,10 @@ class Stability(Record):
     `resolutions` bound the rounding error of the real part of each eigenvalue: a smaller real part
     has no sign. A rigid-body mode of a structure, with K x = 0 within rounding,
     has an eigenvalue and a damping ratio of exactly 0, and does not count in the margin.
+
+    `normal_force` is P + K_n n.x_0 of each joint, P without a normal direction, and NaN in the
+    source's form; None where no joint is preloaded. Where it is not above 0 the joint is open:
+    there is no steady sliding, and all numbers are NaN.
     """
 
     eigenvalues: Complex[Array, " 2*n"]  # [1/s], largest real part first
@@ -50,6 +54,7 @@ class Stability(Record):
     margin: Float[Array, ""]  # > 0 exactly where all modes decay, see `margin`
     resolutions: Float[Array, " 2*n"]  # [1/s]
     shapes: Complex[Array, "2*n n"]  # displacements, the largest of each 1
+    normal_force: Float[Array, " m"] | None  # of each preloaded joint at the equilibrium [N]
     names: tuple[str, ...] | None = eqx.field(static=True)  # of the degrees of freedom
 
     @property
@@ -126,13 +131,14 @@ def growth_rate(scene: Scene | Structure, friction_slope: bool = True) -> Float[
     `friction_slope=False` leaves out the slope of the friction law, as the source's Eq. 43 does.
     Towards coalescing eigenvalues the derivative grows without bound. Exactly there it is infinite,
     and some finite number is returned. NaN where the numbers leave the range in which a sign can
-    be told (`dimensionless`).
+    be told (`dimensionless`), and where a preloaded joint is open at its equilibrium
+    (`Stability.normal_force`).
 
     **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`; or if a structure without F
     has friction with a slope.
     """
     if isinstance(scene, Structure):
-        s = solve(*assembled(scene, friction_slope)).s
+        s = solve(*assembled(scene, friction_slope).matrices).s
         # An argmax: sorting would double the time to compile.
         return s.real[jnp.argmax(s.real)]
     return growth_rate_of_linearised(linearised(scene, friction_slope))
@@ -147,13 +153,14 @@ def growth_rate_of_linearised(lin: Linearised) -> Float[Array, ""]:
 def stability(scene: Scene | Structure, friction_slope: bool = True) -> Stability:
     """Eigenvalues of Eq. 43 and what follows from them; arguments and errors as `growth_rate`."""
     if isinstance(scene, Structure):
-        s, x, error = solve(*assembled(scene, friction_slope))
+        attached = assembled(scene, friction_slope)
+        forces, (s, x, error) = attached.normal_force, solve(*attached.matrices)
         order = jnp.lexsort((-s.imag, -s.real))
         s, x, error = s[order], x[order], error[order]
         margin, names = least_damping_ratio(s), scene.names
     else:
         K_n, K_t = stiffness(scene)
-        lin = linearise(scene.oscillator, scene.friction, K_n, K_t, friction_slope)
+        lin, forces = linearised(scene, friction_slope), normal_force(scene)
         s = quartic.roots(lin)
         x = _displacements(lin, s, sliding_friction(scene) / scene.oscillator.m, K_n, K_t)
         error, margin, names = quartic.resolutions(lin, s), margin_of(lin), ("x1", "x2")
@@ -167,6 +174,7 @@ def stability(scene: Scene | Structure, friction_slope: bool = True) -> Stabilit
         resolutions=error,
         shapes=x / jnp.take_along_axis(x, largest[:, None], axis=1),
         names=names,
+        normal_force=forces,
     )
 
 
@@ -199,8 +207,11 @@ def require_computable(
     modes = stability(scene, friction_slope) if modes is None else modes
     if math.isfinite(modes.growth_rate) and math.isfinite(modes.margin):
         return
+    force = modes.normal_force
+    if force is not None and force[0] <= 0:
+        raise ValueError(f"the joint is open at its equilibrium: P + K_n x_2 is {force[0]:.6g} N")
     K_n, K_t = stiffness(scene)
-    lin = linearise(scene.oscillator, scene.friction, K_n, K_t, friction_slope)
+    lin = linearised(scene, friction_slope)
     found = {
         "K_n [N/m]": K_n,
         "K_t [N/m]": K_t,

@@ -13,7 +13,7 @@ from .._mechanism.scene import Scene, stiffness
 from .._mechanism.structure import Joint, Structure
 from .._surface.roughness import roughness
 from .critical_friction import critical_friction
-from .linearise import NO_EQUILIBRIUM, assemble
+from .linearise import NO_EQUILIBRIUM, NO_PRESSED_EQUILIBRIUM, Assembled, assembled
 from .stability import Stability, require_computable, stability
 
 ABSENT = "-"
@@ -51,6 +51,8 @@ def scene_rows(
             "a_l/a_e": f"{np.exp(np.asarray(state.log_area_ratio)):.6g}",
             "Q_e/(mu_s P)": "not evaluated" if slip is None else f"{slip:.6g}",
         }
+    if modes.normal_force is not None:
+        after |= {"normal force [N]": f"{modes.normal_force[0]:.6g}"}
     critical = {
         "growth rate [1/s]": f"{modes.growth_rate:+.6g}",
         "frequency [Hz]": f"{modes.frequency:.6g}",
@@ -102,7 +104,7 @@ def verdict(modes: Stability) -> dict[str, str]:
 
 @jax.jit
 def _friction(law, speed):
-    return law.coefficient(speed), law.mu_s
+    return law.mu(speed), law.mu_s
 
 
 def friction_remark(scene: Scene, speed) -> list[str]:
@@ -125,14 +127,21 @@ def friction_remark(scene: Scene, speed) -> list[str]:
 def structure_table(structure: Structure, friction_slope: bool = True) -> str:
     """The joints of a structure, its verdict, and its unstable and its least damped modes.
 
-    **Raises:** `ValueError` as `assemble`, if the structure has no equilibrium under F, and if its
-    numbers leave the range of floating-point numbers.
+    **Raises:** `ValueError` as `assemble`, if the structure has no equilibrium under F or a joint
+    is open there, and if its numbers leave the range of floating-point numbers.
     """
     try:
-        matrices = assemble(structure, friction_slope)
+        attached = assembled(structure, friction_slope)
     except RuntimeError:  # a message of many lines from inside a compiled program
-        raise ValueError(NO_EQUILIBRIUM) from None
-    for name, X in zip("MCK", matrices, strict=True):
+        loaded = any(joint.normal_load is not None for joint in structure.joints)
+        raise ValueError(NO_PRESSED_EQUILIBRIUM if loaded else NO_EQUILIBRIUM) from None
+    for name, force in zip(structure.joint_names, _forces(attached), strict=False):
+        if force <= 0:
+            raise ValueError(
+                f"joint {name} is open at the equilibrium: its normal force P + K_n n.x is "
+                f"{force:.6g} N"
+            )
+    for name, X in zip("MCK", attached[:3], strict=True):
         if not np.isfinite(np.asarray(X)).all():
             raise ValueError(f"{name} with the joints attached must be finite")
     modes = stability(structure, friction_slope)
@@ -148,6 +157,8 @@ def structure_table(structure: Structure, friction_slope: bool = True) -> str:
     tables = [table([""], [whole])]
     if structure.joints:
         joints = [_joint_rows(joint) for joint in structure.joints]
+        for rows, force in zip(joints, _forces(modes), strict=False):
+            rows["normal force [N]"] = ABSENT if math.isnan(force) else f"{force:.6g}"
         shown = [name for name in joints[0] if any(rows[name] != ABSENT for rows in joints)]
         joints = [{name: rows[name] for name in shown} for rows in joints]
         tables.append(table(list(structure.joint_names), joints))
@@ -163,6 +174,11 @@ def structure_table(structure: Structure, friction_slope: bool = True) -> str:
         cells = zip(*(_mode_cells(*item) for item in listed), strict=True)
         tables.append(table(columns, [dict(zip(titles, c, strict=True)) for c in cells]))
     return "\n\n".join(tables)
+
+
+def _forces(x: Assembled | Stability) -> list[float]:
+    """The normal force of each joint [N]; none where no joint is preloaded."""
+    return [] if x.normal_force is None else x.normal_force.tolist()
 
 
 def _mode_cells(mode, remark) -> list[str]:

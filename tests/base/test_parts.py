@@ -233,7 +233,7 @@ def test_rebuild():
     assert (changed.surface.D, changed.surface.G, changed.P) == (2.5, 1.342e-10, 100.0)
     assert changed.material is MATERIAL and rebuild(CONTACT, {}) is CONTACT
     scene: Any = rebuild(fj.brake_scene(), {"friction": fj.Coulomb(0.3), "mu": 0.2})
-    assert scene.friction.mu == 0.2
+    assert scene.friction.mu_s == 0.2
 
 
 def test_substitute():

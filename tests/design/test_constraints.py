@@ -156,7 +156,7 @@ def test_refusals(make, message):
 def test_damping_ratio_is_that_of_the_state_matrix():
     """The least -Re/|lambda| of the state matrix, stable and squealing."""
     for scene in (reference_scene(), reference_scene().replace(mu_s=0.1, mu_m=0.05)):
-        mu = scene.friction.coefficient(scene.oscillator.V)
+        mu = scene.friction.mu(scene.oscillator.V)
         A = state_matrix(scene.oscillator, mu, scene.contact.K_n, scene.contact.K_t)
         eigenvalues = np.linalg.eigvals(A)
         expected = (-eigenvalues.real / np.abs(eigenvalues)).min()

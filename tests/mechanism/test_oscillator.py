@@ -80,7 +80,7 @@ def exact_equilibrium(x):
 def test_equilibrium_solves_the_nonlinear_equations(x):
     """To rounding; its signs and couplings are those of Eq. 39, not only of Eq. 40."""
     oscillator, friction = parts(x)
-    found = fj.equilibrium(oscillator, x["K_n"], x["K_t"], friction.coefficient(x["V"]))
+    found = fj.equilibrium(oscillator, x["K_n"], x["K_t"], friction.mu(x["V"]))
     for own, wanted in zip(found, exact_equilibrium(exact(x)), strict=True):
         assert float(own) == pytest.approx(float(wanted), rel=1e-14)
 

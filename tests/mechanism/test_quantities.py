@@ -51,7 +51,7 @@ def test_own_quantities_are_every_number_with_its_value():
 
 def test_names_are_those_of_the_scene_and_the_derived_ones():
     """mu once, also where the scene stores it."""
-    names = ["K_n", "K_t", "mu", "m", "omega_1", "omega_2", "xi_1", "xi_2", "F", "V"]
+    names = ["K_n", "K_t", "P", "mu", "m", "omega_1", "omega_2", "xi_1", "xi_2", "F", "V"]
     assert known_quantities(CONSTANT) == [*names, "K_t/K_n", "omega_1/omega_2"]
     assert known_quantities(BRAKE)[-3:] == ["K_t/K_n", "omega_1/omega_2", "mu"]
 
@@ -67,7 +67,7 @@ def test_units_and_labels():
 
 @pytest.mark.parametrize("name", ["nonsense", "contact", "nu"])
 def test_unknown_names_are_refused_with_the_known_ones(name):
-    with pytest.raises(ValueError, match=f"scene has no quantity '{name}'; it has K_n, K_t, mu"):
+    with pytest.raises(ValueError, match=f"scene has no quantity '{name}'; it has K_n, K_t, P, mu"):
         require_known(CONSTANT, name)
 
 
@@ -115,8 +115,8 @@ def test_a_structure_has_the_numbers_of_its_joints():
     assert value_of(moved, "right.K_n") == 7e6 and value_of(moved, "left.K_n") == 3e6
     with pytest.raises(ValueError, match=r"^K_n differs between the joints: name left.K_n and"):
         value_of(structure, "K_n")
-    with pytest.raises(ValueError, match="structure has no quantity 'P'; it has K_n, K_t, "):
-        require_known(structure, "P")
+    with pytest.raises(ValueError, match="structure has no quantity 'G'; it has K_n, K_t, "):
+        require_known(structure, "G")
     with pytest.raises(ValueError, match=r"must be independent, got V and left\.V"):
         require_independent(structure, ("V", "left.V"))
     require_independent(structure, ("left.V", "right.V"))

@@ -74,7 +74,7 @@ def test_quantities_beside_the_parts_that_hold_them():
         ({"V": math.nan}, "V must be above 0, got nan"),
         ({"mu": 0.3}, "scene has no quantity 'mu'; it has contact, surface, D, G"),
         ({"friction": fj.Coulomb(0.3), "mu_s": 0.5}, "scene has no quantity 'mu_s'; it has"),
-        ({"contact": FIXED, "P": 0.5}, "scene has no quantity 'P'; it has"),
+        ({"contact": FIXED, "G": 0.5}, "scene has no quantity 'G'; it has"),
         *(({name: 1.0}, f"{name} must be a") for name in ("contact", "friction", "oscillator")),
         *(({name: BRAKE}, f"{name} must be a") for name in ("contact", "surface", "material")),
     ],

@@ -79,7 +79,7 @@ def test_replace():
     [
         ({"D": 2.4}, r"^structure has no quantity 'D'; it has M, C, K, F, con"),
         ({"middle.K_n": 1.0}, r"no quantity 'middle.K_n'.*left.K_n.*right.K_n"),
-        ({"left.contact": FIXED, "left.P": 1}, r"structure has no quantity 'left.P'"),
+        ({"left.contact": FIXED, "left.G": 1}, r"structure has no quantity 'left.G'"),
         ({"K_n": -1.0}, r"K_n must be at least 0, got -1\.0"),
         ({"K": np.eye(3)}, r"K must have shape \(4, 4\) as M demands, got \(3, 3\)"),
         ({"left.tangential": 4}, "joint left: unknown degree of freedom 4; .* has 0, 1, 2, 3$"),
@@ -119,7 +119,7 @@ def test_a_scene_as_a_structure():
     assert structure.joints[0].contact is scene.contact
     K_n, K_t = structure.joints[0].stiffness()
     np.testing.assert_allclose([K_n, K_t], fj.stiffness(scene), rtol=1e-14)
-    assert structure.joints[0].coefficient() == scene.friction.coefficient(0.15)
+    assert structure.joints[0].coefficient() == scene.friction.mu(0.15)
 
 
 BAD = [

@@ -295,7 +295,10 @@ BAD = [
 BAD_JOINTS = [
     ("", "the table [joints] is missing"),
     (JOINT.replace("V = 0.2", "speed = 0.2"), "[joints.pad] has the unknown key 'speed'"),
-    (JOINT.replace('normal = "z"', ""), "[joints.pad] lacks the key 'normal'"),
+    (
+        JOINT.replace('normal = "z"', ""),
+        "[joints.pad] a joint without normal needs a contact with a normal load P, got FixedC",
+    ),
     (JOINT.replace('"z"', '"w"'), "joint pad: unknown degree of freedom 'w'; the structure has x"),
     (JOINT.replace('"z"', "1.5"), "[joints.pad] normal must be a degree of freedom or a pair"),
     (JOINT.replace("pad.contact", "pad.spring"), "[joints.pad] has the unknown key 'spring'"),

@@ -107,7 +107,7 @@ def test_gradients_of_the_closed_form():
     for mode in (jax.jacfwd, jax.jacrev):
         found = mode(of_numbers)([jnp.asarray(x) for x in at])
         np.testing.assert_allclose(found, wanted, rtol=1e-11)
-    assert float(gradient(fixed()).friction.mu) == 0  # the scene's own friction does not matter
+    assert float(gradient(fixed()).friction.mu_s) == 0  # the scene's own friction does not matter
 
 
 # --- the first root -----------------------------------------------------------------------

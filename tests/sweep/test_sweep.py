@@ -51,7 +51,7 @@ def test_every_point_once_and_in_its_place(batch_size):
 
 
 def friction_at(mu, V):
-    factor = mu / float(GIVEN.friction.coefficient(V))
+    factor = mu / float(GIVEN.friction.mu(V))
     return GIVEN.replace(mu_s=0.4 * factor, mu_m=0.25 * factor, V=V)
 
 
