@@ -10,8 +10,8 @@ from jaxtyping import Array, ArrayLike, Float
 from .._base.parts import number
 from .._mechanism.mechanism import Mechanism
 from .cycle import CycleResult, LimitCycle
-from .limit_cycle import limit_cycle
 from .hybrid import degrees_of_freedom, hybrid_system
+from .limit_cycle import limit_cycle
 
 
 def attractors(
@@ -23,9 +23,9 @@ def attractors(
 ) -> list[LimitCycle]:
     """Every distinct motion that the starts end in, also those without a cycle.
 
-    Two cycles are the same if their periods and amplitudes agree to 1e-6. `starts` is (k,
-    2n), [x, v] in m and m/s; by default 32 spread about the equilibrium, up to velocities of 2 V. The list is in the order of the starts. `rtol` and `max_returns` are
-    those of `limit_cycle`.
+    Two cycles are the same if their periods and amplitudes agree to 1e-6. `starts` is (k, 2n),
+    [x, v] in m and m/s; by default 32 spread about the equilibrium, up to velocities of 2 V. The
+    list is in the order of the starts. `rtol` and `max_returns` are those of `limit_cycle`.
 
     **Raises:** `ValueError` for starts of another shape, and what `limit_cycle` raises.
     """

@@ -268,6 +268,11 @@ class HybridSystem(eqx.Module):
         return jnp.concatenate([x, jnp.zeros_like(x)])
 
     @property
+    def section_direction(self) -> Float[Array, " n"]:
+        """t of the first face."""
+        return jnp.eye(self.n, dtype=self.F.dtype)[0] if self.T is None else self.T[0]
+
+    @property
     def units(self) -> Float[Array, " 2n"]:
         """Units [m, ..., m/s, ...] of a scaled state."""
         length = self.speed / self.omega
@@ -405,7 +410,7 @@ def scaled_start(system: HybridSystem, start: Array | None) -> Float[Array, " 2n
     """
     if start is None:
         y = system.equilibrium()
-        away = jnp.eye(system.n, dtype=y.dtype)[0] if system.T is None else system.T[0]
+        away = system.section_direction
         y = y.at[: system.n].add(away / jnp.sum(away**2))
     else:
         y = start / system.units

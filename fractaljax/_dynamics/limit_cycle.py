@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from diffrax import AbstractSolver
 
 _SEGMENTS = 64  # one return takes some 35 at rtol 1e-9
+_MOST_SEGMENTS = 4096
 _CROSSINGS = 16  # segments in which x2 may change sign
 
 # In the order of the numbers in `search`.
@@ -42,6 +43,7 @@ _RESULTS = (
     CycleResult.diverged,
     CycleResult.not_periodic,
     CycleResult.exhausted,
+    CycleResult.too_long,
 )
 
 
@@ -135,7 +137,9 @@ def _limit_cycle(
     y = scaled_start(system, start)
     h = jnp.asarray(0.25 * (rtol / 1e-9) ** 0.125, y.dtype)
     max_returns = max_returns.astype(y.dtype)
-    found = search.find(frozen, y, equilibrium, growth, max_returns, h, jnp.asarray(rtol, y.dtype), segments)
+    found = search.find(
+        frozen, y, equilibrium, growth, max_returns, h, jnp.asarray(rtol, y.dtype), segments
+    )
     found = jax.lax.stop_gradient(found)
 
     y, duration = orbit(system, found.segments)
@@ -179,7 +183,9 @@ def _limit_cycle(
         jnp.zeros_like(period)
         if opens or not faces[1:]
         else _time_below_zero(system, closed, row, shift) / period
-        for row, shift, faces, opens in zip(rows, offset[0], system.faces, system.opens, strict=True)
+        for row, shift, faces, opens in zip(
+            rows, offset[0], system.faces, system.opens, strict=True
+        )
     ]
     return LimitCycle(
         period=period / system.omega,
@@ -201,11 +207,11 @@ def _limit_cycle(
     )
 
 
-def _may_need_more_segments(cycle: LimitCycle) -> bool:
+def _needs_more_segments(cycle: LimitCycle) -> bool:
     """Known only of one cycle outside of a compiled program."""
     if concrete(cycle.period) is None or cycle.period.ndim:
         return False
-    finer = CycleResult.inaccurate, CycleResult.not_periodic, CycleResult.exhausted
+    finer = CycleResult.inaccurate, CycleResult.too_long
     return any(bool(cycle.result == member) for member in finer)
 
 
@@ -223,17 +229,19 @@ def limit_cycle(
 ) -> LimitCycle:
     """The limit cycle that the motion from `start` ends in, by the exact law of dry friction.
 
-    A coarse run from `start`, by returns of the Poincare map (from maximum to maximum of x1),
-    finds the itinerary. Newton's method then solves for the periodic orbit, and every derivative
-    is the implicit one of its equations. A period has at most four returns. Derivatives with
-    respect to `start` are zero. An orbit that repels so weakly that the motion does not leave it
-    is returned as `unstable`.
+    A coarse run from `start` is compared at its returns to a section: the maxima of t.x, the
+    tangential displacement of the first joint (of x1 in a scene). Where they repeat, Newton's
+    method solves for the periodic orbit, and every derivative is the implicit one of its
+    equations. A period has at most 16 returns. Derivatives with respect to `start` are zero. An
+    orbit that repels so weakly that the motion does not leave it is returned as `unstable`.
 
     **Arguments:**
 
-    - `scene`: one scene; `jax.vmap` takes many, and a member that fails marks only itself.
-    - `start`: (4,), [x1, x2, v1, v2] in m and m/s; by default the sliding equilibrium, with x1
-      displaced by V/omega, omega^2 = omega_1^2 + omega_2^2 + (K_n + K_t)/m.
+    - `mechanism`: a scene, or a structure of n degrees of freedom whose joints all have a V;
+      `jax.vmap` takes many, and a member that fails marks only itself.
+    - `start`: (2n,), [x, v] in m and m/s; by default the sliding equilibrium, displaced by V/omega
+      along t, where omega^2 is the sum of the squared eigenfrequencies of a scene, and of a
+      structure the root of the sum of their fourth powers.
     - `regularisation`: eps [m/s], to replace sgn v by tanh(v/eps). The cycle is then compared
       with the exact law's from the same start: `regularisation_error` is the largest relative
       difference of period and amplitudes, and the result `depends_on_eps` where it is above
@@ -243,8 +251,9 @@ def limit_cycle(
     - `rtol`: relative tolerance of period and states, 1e-9 by default and at least 9.1e-13; in
       float32 both are 4.9e-4. It sets the number of segments.
     - `max_returns`: returns of the coarse run after which it gives up.
-    - `segments`: number of pieces the orbit is cut into, by default as `rtol` needs: 40 at 1e-9.
-      A cycle of several returns may need more; outside of compiled programs it then gets them.
+    - `segments`: most pieces that the orbit is cut into, 64 by default; one return takes some 35.
+      Outside of compiled programs a longer period gets more; inside, the result says that it
+      needs them.
     - `throw`: raise unless the result is `converged`. Otherwise `result` says what was found, and
       everything is NaN where there is no cycle.
 
@@ -258,9 +267,10 @@ def limit_cycle(
     returns = jnp.asarray(whole("max_returns", max_returns, 1), float)
     count = _SEGMENTS if segments is None else whole("segments", segments, 16)
     cycle = _limit_cycle(mechanism, start, returns, segments=count, rtol=tolerance)
-    if segments is None and _may_need_more_segments(cycle):
-        # A period of several returns needs as many times the segments.
-        cycle = _limit_cycle(mechanism, start, returns, segments=8 * count, rtol=tolerance)
+    while segments is None and count < _MOST_SEGMENTS and _needs_more_segments(cycle):
+        # A long period, or one of many returns.
+        count *= 8
+        cycle = _limit_cycle(mechanism, start, returns, segments=count, rtol=tolerance)
     if regularisation is not None:
         from .regularised import regularised_cycle
 

@@ -18,6 +18,7 @@ from .hybrid import NONE, UNUSED, HybridSystem
 from .runge_kutta import runge_kutta
 
 _ITERATIONS = 16
+_PHASES = 256  # most of one contact state in an orbit
 
 
 class Segments(eqx.Module):
@@ -99,12 +100,9 @@ def maps(
     return ends, Maps(A, system.field(ends, s), c)
 
 
-def _shares(segments: Segments) -> Array:
-    """The share of each segment in the duration of its phase."""
-    ends = segments.used & (segments.guard != NONE)
-    phase = jnp.cumsum(ends) - ends
-    same = (phase[:, None] == phase[None]) & segments.used[None]
-    return jnp.where(segments.used, 1 / jnp.maximum(jnp.sum(same, axis=1), 1), 0)
+def _in_phase(phase, values) -> Array:
+    """The sum of `values` (N,) over the phase of each segment."""
+    return jax.ops.segment_sum(values, phase, len(phase))[phase]
 
 
 def corrections(local: Maps, segments: Segments, gap, guard):
@@ -115,7 +113,9 @@ def corrections(local: Maps, segments: Segments, gap, guard):
     the Jacobian of the return map.
     """
     ends = segments.used & (segments.guard != NONE)
-    share = _shares(segments)
+    phase = jnp.cumsum(ends) - ends
+    share = jnp.where(segments.used, 1 / jnp.maximum(_in_phase(phase, segments.used * 1.0), 1), 0)
+    share = share.astype(gap.dtype)
     b = local.b * share[None]
 
     def chain(before, segment):
@@ -137,10 +137,7 @@ def corrections(local: Maps, segments: Segments, gap, guard):
     # Without segments the equations would be singular.
     jacobian = jnp.where(jnp.any(ends), jacobian, 0)
     first = jnp.linalg.solve(eye - jacobian, shift)
-    of_phase = r @ first + d  # at its end
-    phase = jnp.cumsum(ends) - ends
-    same = (phase[:, None] == phase[None]) & segments.used[:, None]
-    durations = share * jnp.sum(jnp.where(same, of_phase[None], 0), axis=1)
+    durations = share * _in_phase(phase, jnp.where(ends, r @ first + d, 0))
 
     def along(dy, segment):
         A, b, gap, dt = segment
@@ -160,7 +157,7 @@ def remesh(system: HybridSystem, steps: Segments, h, length: int) -> Segments:
     weight = jnp.where(steps.used, weight, 0)
     ends_phase = steps.used & (steps.guard != NONE)
     phase = jnp.cumsum(ends_phase) - ends_phase
-    phases = jnp.arange(length)
+    phases = jnp.arange(min(length, _PHASES))
     own = (phase[None] == phases[:, None]) & steps.used[None]
     size = jnp.sum(jnp.where(own, weight[None], 0), axis=1)
     exists = jnp.any(own, axis=1)
@@ -181,7 +178,7 @@ def remesh(system: HybridSystem, steps: Segments, h, length: int) -> Segments:
     def at(k_in_phase):
         """Old step, and time since its start, where a part of the phase begins."""
         w = begin[p] + size[p] * k_in_phase / jnp.maximum(count[p], 1)
-        k = jnp.sum(ends_w[None] <= w[:, None], axis=1)
+        k = jnp.searchsorted(ends_w, w, side="right")
         k = jnp.clip(k, first_step[p], last_step[p])
         share = (w - (ends_w - weight)[k]) / jnp.where(weight[k] > 0, weight[k], 1)
         return k, jnp.clip(share, 0, 1) * steps.duration[k]

@@ -11,11 +11,11 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix
 from jaxtyping import Array, Float
 
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
 from .cycle import CycleResult, LimitCycle, repels
 from .events import Cubic
@@ -70,13 +70,19 @@ def _settle(system: HybridSystem, eps, y, solver, rtol, max_steps):
     Also whether each was reached within `max_steps` steps.
     """
     K = jnp.diag(system.K) if system.K.ndim == 1 else system.K
-    slowest = 2 * jnp.pi * jnp.sqrt(jnp.linalg.norm(jnp.linalg.inv(K), 2))
+    flexibility = jnp.max(jnp.sum(jnp.abs(jnp.linalg.inv(K)), axis=1))
+    slowest = 2 * jnp.pi * jnp.sqrt(flexibility)
+    away = system.section_direction
     run = functools.partial(solve, system, eps, solver=solver, adjoint=diffrax.ForwardMode())
-    maximum = diffrax.Event(lambda t, y, args, **_: system.section(y), optimistix.Newton(rtol, rtol), False)
+    maximum = diffrax.Event(
+        lambda t, y, args, **_: system.section(y), optimistix.Newton(rtol, rtol), False
+    )
 
     def next_return(y, _):
         found = run(y, 8 * slowest, rtol=rtol, max_steps=max_steps, event=maximum)
         y = found.ys[0]
+        # Exactly on the section, so that it is not met at once again.
+        y = y.at[system.n :].add(-system.section(y) * away / jnp.sum(away**2))
         return y, (y, found.ts[0], found.result != diffrax.RESULTS.max_steps_reached)
 
     steps = _SETTLING * max_steps

@@ -31,7 +31,7 @@ from .orbit import (
 
 _MESHES = 4  # on which a candidate is solved, each finer, until it is accurate
 
-RUNNING, CONVERGED, EQUILIBRIUM, DIVERGED, NOT_PERIODIC, EXHAUSTED = range(6)
+RUNNING, CONVERGED, EQUILIBRIUM, DIVERGED, NOT_PERIODIC, EXHAUSTED, TOO_LONG = range(7)
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,7 @@ class SearchOptions:
     small: float = 1e-2  # size below which any decay without switches does
     extrapolated: float = 0.02  # growth in a return, without switches, that is extrapolated
     divergence: float = 1e6  # size at which a motion diverges: with a small V, many V are ordinary
+    settling: int = 8  # returns after which the record must hold at least two
     patience: int = 512  # rounds without a maximum
 
 
@@ -70,7 +71,7 @@ class _Run(eqx.Module):
     steps: Float[Array, "2n+f+2 record ..."]  # state, contact state, duration and guard
 
 
-class _Look(eqx.Module):
+class _Returns(eqx.Module):
     """The returns of a run, newest first."""
 
     at: Int[Array, " returns"]  # steps that ended at the section
@@ -103,12 +104,12 @@ def _segments(system: HybridSystem, run: _Run) -> Segments:
     return Segments(y, duration[0], s, guard[0].astype(int))
 
 
-def _look(steps: Segments, y, count: int) -> _Look:
+def _returns(steps: Segments, y, count: int) -> _Returns:
     record = steps.duration.shape[0]
     at = jnp.where(steps.guard == SECTION, jnp.arange(record), -1)
     at, _ = jax.lax.top_k(at, count)
     states = jnp.concatenate([steps.y, y[:, None]], axis=1)
-    return _Look(at, states[:, at + 1], jnp.cumsum(steps.duration)[at], at >= 0)
+    return _Returns(at, states[:, at + 1], jnp.cumsum(steps.duration)[at], at >= 0)
 
 
 def _quintic(y, middle, end, d_0, d_m, d_1, x):
@@ -117,7 +118,9 @@ def _quintic(y, middle, end, d_0, d_m, d_1, x):
     # Lagrange weights squared, each with the correction of its own slope.
     at_0, at_m, at_1 = 4 * (v * w) ** 2, 16 * (u * w) ** 2, 4 * (u * v) ** 2
     return (
-        at_0 * (y + u * (d_0 + 6 * y)) + at_m * (middle + v * d_m) + at_1 * (end + w * (d_1 - 6 * end))
+        at_0 * (y + u * (d_0 + 6 * y))
+        + at_m * (middle + v * d_m)
+        + at_1 * (end + w * (d_1 - 6 * end))
     )
 
 
@@ -228,26 +231,38 @@ class _Progress(eqx.Module):
     idle: Int[Array, "..."]  # rounds without a return
 
 
-def _judge(system, run: _Run, known: _Progress, rounds, equilibrium, growth, max_returns, h, rtol, *,
-           options: SearchOptions, length: int):
+def _assess(
+    system,
+    run: _Run,
+    known: _Progress,
+    rounds,
+    equilibrium,
+    growth,
+    max_returns,
+    h,
+    rtol,
+    *,
+    options: SearchOptions,
+    length: int,
+):
     """One scene after a round: its run, perhaps extrapolated, and what is known of it."""
     steps = _segments(system, run)
-    look = _look(steps, run.y, options.longest + 1)
+    seen = _returns(steps, run.y, options.longest + 1)
     active = known.status == RUNNING
     tiny = jnp.finfo(run.y.dtype).tiny
     new = jnp.arange(len(steps.guard)) >= len(steps.guard) - options.round_steps
     returns = known.returns + jnp.sum(new & (steps.guard == SECTION))
-    idle = jnp.where(look.at[0] >= len(steps.guard) - options.round_steps, 0, known.idle + 1)
+    idle = jnp.where(seen.at[0] >= len(steps.guard) - options.round_steps, 0, known.idle + 1)
 
     # --- near the equilibrium ---
-    away = jnp.sqrt(jnp.sum((look.y - equilibrium[:, None]) ** 2, axis=0))
+    away = jnp.sqrt(jnp.sum((seen.y - equilibrium[:, None]) ** 2, axis=0))
     size = jnp.sqrt(jnp.sum((run.y - equilibrium) ** 2)) + tiny
     diverged = ~(size < options.divergence * (1 + jnp.max(jnp.abs(equilibrium))))
     last_switch = jnp.max(jnp.where(steps.guard > 0, jnp.arange(len(steps.guard)), -1))
-    smooth = look.exists[3] & (look.at[3] > last_switch)
+    smooth = seen.exists[3] & (seen.at[3] > last_switch)
     log = jnp.log(away[:3] + tiny)
     rate, before = log[0] - log[1], log[1] - log[2]
-    duration = look.time[0] - look.time[1]
+    duration = seen.time[0] - seen.time[1]
     steady = smooth & (jnp.abs(rate - before) < 0.1 * jnp.abs(rate))
     linear = steady & (away[0] < options.linear) & (rate < 0.7 * growth * duration)
     decays = linear | (smooth & (away[0] < options.small) & (rate < 0))
@@ -262,14 +277,14 @@ def _judge(system, run: _Run, known: _Progress, rounds, equilibrium, growth, max
     y_on = jnp.where(extrapolates, equilibrium + factor * (run.y - equilibrium), run.y)
 
     # --- near a periodic orbit ---
-    scale = 1 + jnp.max(jnp.abs(look.y[:, 0]))
-    apart = jnp.max(jnp.abs(look.y[:, 1:] - look.y[:, :1]), axis=0)
-    apart = jnp.where(look.exists[1:], apart, jnp.inf)
+    scale = 1 + jnp.max(jnp.abs(seen.y[:, 0]))
+    apart = jnp.max(jnp.abs(seen.y[:, 1:] - seen.y[:, :1]), axis=0)
+    apart = jnp.where(seen.exists[1:], apart, jnp.inf)
     closest = jnp.min(apart)
 
     def distance_from(orbit):
-        gap = jnp.max(jnp.abs(look.y - orbit.y[:, :1]), axis=0)
-        return jnp.min(jnp.where(look.exists, gap, jnp.inf))
+        gap = jnp.max(jnp.abs(seen.y - orbit.y[:, :1]), axis=0)
+        return jnp.min(jnp.where(seen.exists, gap, jnp.inf))
 
     # An earlier orbit is accepted once the motion has approached it in several rounds.
     now = distance_from(known.orbit)
@@ -286,9 +301,9 @@ def _judge(system, run: _Run, known: _Progress, rounds, equilibrium, growth, max
     ready = ready & ((gap < 0.7 * known.tried) | (rounds % 8 < 2))
 
     def solve():
-        first, last = look.at[period_returns], look.at[0]
+        first, last = seen.at[period_returns], seen.at[0]
         return *_candidate(
-            system, steps, look.y[:, 0], first, last, period_returns, h, rtol, length=length
+            system, steps, seen.y[:, 0], first, last, period_returns, h, rtol, length=length
         ), period_returns
 
     def keep():
@@ -309,6 +324,8 @@ def _judge(system, run: _Run, known: _Progress, rounds, equilibrium, growth, max
     over = jnp.where((widest < 0.02) | (smooth & (growth < 0)), EXHAUSTED, NOT_PERIODIC)
     ended = (returns >= max_returns) | (idle > options.patience)
     over = jnp.where(ended, over, RUNNING)
+    # A return that the record does not hold is never seen to repeat.
+    over = jnp.where((returns >= options.settling) & ~seen.exists[1], TOO_LONG, over)
     status = jnp.where(status == RUNNING, jnp.where(ok, CONVERGED, over), status)
     progress = _Progress(
         status=status,
@@ -328,7 +345,9 @@ def _judge(system, run: _Run, known: _Progress, rounds, equilibrium, growth, max
     return y_on, forgotten, progress
 
 
-def _find(system, start, equilibrium, growth, max_returns, h, rtol, *, length, options) -> Attractor:
+def _find(
+    system, start, equilibrium, growth, max_returns, h, rtol, *, length, options
+) -> Attractor:
     shape, n = start.shape[1:], len(start)
     s = system.contact_state(start)
     record = max(4 * length, 4 * options.round_steps)
@@ -343,7 +362,7 @@ def _find(system, start, equilibrium, growth, max_returns, h, rtol, *, length, o
         guard=jnp.full((length, *shape), UNUSED),
     )
     known = _Progress(none + RUNNING, empty, none, zero, far, none, zero, far, zero, none)
-    judge = functools.partial(_judge, options=options, length=length)
+    assess = functools.partial(_assess, options=options, length=length)
 
     def running(carry):
         return jnp.any(carry[1].status == RUNNING)
@@ -357,7 +376,7 @@ def _find(system, start, equilibrium, growth, max_returns, h, rtol, *, length, o
 
         def one(arguments):
             system, run, known, *rest = arguments
-            return judge(system, run, known, rounds, *rest)
+            return assess(system, run, known, rounds, *rest)
 
         if shape:
             # Each scene on its own: it has its own number of iterations.
@@ -386,12 +405,13 @@ def find(
     h,
     rtol,
     length: int,
-    options: SearchOptions = SearchOptions(),  # noqa: B008, it is frozen
+    options: SearchOptions = SearchOptions(),
 ) -> Attractor:
     """The attractor of the motion from `start`, its orbit on `length` segments, in scaled units.
 
     `start` and `equilibrium` are (2n,), and `growth` is the growth rate at the latter; segments
-    are no longer than h, or as short as `rtol` needs, where so few suffice. Under `jax.vmap` the scenes become the last axis.
+    are no longer than h, or as short as `rtol` needs, where so few suffice. Under `jax.vmap` the
+    scenes become the last axis.
     """
     search = functools.partial(_find, length=length, options=options)
 

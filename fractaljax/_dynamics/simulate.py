@@ -41,7 +41,9 @@ class Trajectory(Record):
 
     times: Float[Array, " n"]  # at the ends of the steps [s]
     states: Float[Array, "n 2n"]  # [x, v] [m, m/s]
-    contact_states: Float[Array, "n f"]  # from each time on: +1, -1 slip forward, backward, 0 stick, 2 open
+    contact_states: Float[
+        Array, "n f"
+    ]  # from each time on: +1, -1 slip forward, backward, 0 stick, 2 open
     result: SimulationResult
     _system: HybridSystem = eqx.field(repr=False)
     _solution: Any = eqx.field(repr=False)  # diffrax's, of the regularised law
@@ -83,7 +85,11 @@ class Trajectory(Record):
         return times
 
     def switches(self) -> list[tuple[float, int, int, int]]:
-        """Every switch: time [s], direction (1 or 2), contact state before, contact state after."""
+        """Every switch: time [s], face (from 1), contact state before, contact state after.
+
+        The faces of a scene are its directions; those of a structure come joint by joint, along
+        t and, where there is a normal, along n.
+        """
         states, times = np.asarray(self.contact_states), np.asarray(self.times)
         return [
             (float(times[k + 1]), int(i) + 1, int(states[k, i]), int(states[k + 1, i]))
@@ -328,8 +334,9 @@ def simulate(
 
     **Arguments:**
 
-    - `scene`: one scene; `jax.vmap` takes many.
-    - `start`: (4,), [x1, x2, v1, v2] in m and m/s.
+    - `mechanism`: a scene, or a structure of n degrees of freedom whose joints all have a V;
+      `jax.vmap` takes many.
+    - `start`: (2n,), [x, v] in m and m/s.
     - `t1`: end time [s], above 0.
     - `regularisation`: eps [m/s], to replace sgn v by tanh(v/eps); a contact state is then 0 where
       abs(v) < eps. The motion depends on eps: `limit_cycle` compares with the exact law.

@@ -101,7 +101,7 @@ def test_multipliers():
     found, system = cycle(COARSE), hybrid_system(reference_scene())
     values = np.asarray(found.multipliers)
     assert abs(values[0] - 1) < 1e-6 and (abs(values[1:]) < 1).all()
-    y = found.orbit(4096)[1] / units(system)[None]
+    y = found.orbit(4096)[1] / system.units[None]
 
     def divergence(y):
         return jnp.trace(jax.jacfwd(lambda y: regularised.field(0.0, y, (system, COARSE)))(y))
