@@ -265,9 +265,9 @@ def test_a_scene_is_its_structure(name):
     size = float(np.abs(wanted.eigenvalues).max())
     np.testing.assert_allclose(found.eigenvalues, wanted.eigenvalues, rtol=0, atol=1e-12 * size)
     np.testing.assert_allclose(found.normal_force, wanted.normal_force, rtol=1e-12)
-    o, K = scene.oscillator, fj.stiffness(scene)
-    x_1, x_2 = fj.equilibrium(o, *K, scene.friction.mu(o.V), scene.contact.P)
-    force = float(scene.contact.P + K[0] * x_2)
+    o, (K_n, K_t) = scene.oscillator, fj.stiffness(scene)
+    x_1, x_2 = fj.equilibrium(o, K_n, K_t, scene.friction.mu(o.V), scene.contact.P)
+    force = float(scene.contact.P + K_n * x_2)
     assert force == pytest.approx(float(wanted.normal_force[0]), rel=1e-11) and float(x_1) > 0
 
 
