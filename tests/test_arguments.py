@@ -43,7 +43,7 @@ NEVER += [np.ma.masked, np.nan, np.inf, -np.inf, np.array([np.nan]), SCENE, 10**
 
 def takes(name, argument, value) -> bool:
     """The few that are right after all."""
-    if argument == "friction_slope":
+    if argument in ("friction_slope", "preload"):
         return isinstance(value, (bool, np.bool_))
     return (name, argument) == ("dimensionless", "a_e") and value is np.inf
 

@@ -36,7 +36,11 @@ def test_every_value_is_read_back():
         ('law = "fractal"', 'law = "hertz"', '[contact] law must be "fractal" or "fixed"'),
         ('law = "fractal"', "law = [1]", '[contact] law must be "fractal" or "fixed", got [1]'),
         ('law = "fractal"', "", '[contact] law must be "fractal" or "fixed", got'),
-        ('law = "fractal"', 'law = "fixed"', "[contact] has the unknown key 'P'; known are K_n"),
+        (
+            'law = "fractal"',
+            'law = "fixed"',
+            "[contact] has the unknown key 'surface'; known are K_n, K_t, P",
+        ),
         ("[contact.material]", "[contact.matter]", "[contact] has the unknown key 'matter'"),
         ("[oscillator]", "[oscillators]", "the file has the unknown key 'oscillators'"),
         ("V = 0.15", "V = -0.15", "[oscillator] V must be above 0, got -0.15"),

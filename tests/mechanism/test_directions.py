@@ -16,7 +16,7 @@ LAW = fj.ExponentialStribeck(0.4, 0.2, 0.1)
 XYZ = ("x", "y", "z")
 
 
-def structure(tangential, normal=None, names: Any = XYZ, contact=PRESSED, preload=True):
+def structure(tangential, normal=None, names: Any = XYZ, contact=PRESSED, preload: Any = True):
     joint = fj.Joint(contact, LAW, tangential, normal, 0.2, preload)
     return fj.Structure(M, C, K, {"pad": joint}, names=names)
 
@@ -72,7 +72,7 @@ def test_an_index_that_is_anothers_name(tmp_path):
 def test_preload_of_scenes_in_files_and_replaced():
     scene = fj.brake_scene()
     assert not scene.preload and scene.normal_load is None
-    pressed = scene.replace(preload=True, P=1500.0)
+    pressed: Any = scene.replace(preload=True, P=1500.0)
     assert pressed.preload and float(pressed.normal_load) == 1500.0
     again = fj.Scene.from_toml(pressed.to_toml())
     assert again.preload and jax.tree.structure(again) == jax.tree.structure(pressed)
@@ -80,8 +80,8 @@ def test_preload_of_scenes_in_files_and_replaced():
     assert not fj.Scene.from_toml(older).preload  # files of before have none
     fixed = scene.replace(contact=PLAIN)
     assert fixed.contact.P is None and "# P =  # N: normal load" in fixed.to_toml()
-    held = fixed.replace(P=20.0, preload=True)
-    assert float(fj.Scene.from_toml(held.to_toml()).normal_load) == 20.0
+    held: Any = fixed.replace(P=20.0, preload=True)
+    assert fj.Scene.from_toml(held.to_toml()).normal_load == 20.0
     x = structure("x", "y").replace(**{"pad.P": 30.0, "pad.preload": False})
     assert x.joints[0].normal_load is None and float(x.joints[0].contact.P) == 30.0
 
