@@ -461,7 +461,7 @@ def phases(mechanism, z, rtol, t1=np.inf, maxima=False) -> Iterator[Phase]:
         z = put(mechanism, z, *zip(*fixed, strict=True)) if fixed else z
         dense = OdeSolution([t0, *(p.t for p in pieces)], pieces)
         yield Phase(mode, t0, t, start, z, dense, hit or (), steps)
-        if hit is None:
+        if hit is None or t1 - t < 1e-13:
             return
         idle = idle + 1 if t == t0 else 0
         if idle > 20:
@@ -569,10 +569,10 @@ def measure(mechanism, z, T, rtol=1e-12) -> Cycle:
     t_x = np.concatenate([core.joints[0].t, np.zeros(n)])
     trip = list(phases(core, z, rtol, T, maxima=True))
     tops = [p for p in trip if p.event == ("maximum", 0) and 1e-6 < p.t1 < T - 1e-6]
-    higher = max((t_x @ p.end, p.t1) for p in tops)[1] if tops else 0.0
-    if tops and max(t_x @ p.end for p in tops) > t_x @ z + 1e-9:
-        z = next(p.end for p in tops if p.t1 == higher)
-        return measure(mechanism, *close(core, z, T, rtol), rtol)
+    again = next((p.t1 for p in tops if abs(p.end - z).max() < 1e-7), T)
+    higher = max([z, *(p.end for p in tops)], key=lambda y: t_x @ y)
+    if again < T or t_x @ higher > t_x @ z + 1e-9:
+        return measure(mechanism, *close(core, higher, again, rtol), rtol)
     trip = list(phases(core, z, rtol, T))
     stick, second, opened = np.zeros((3, m))
     visits, graze = [], []
