@@ -200,7 +200,13 @@ class Field:
                 events.append(("close" if is_open else "open", i))
                 rows.append(mechanism.normal(i) * (-1 if is_open else 1))
                 by.append(np.zeros(n))
-        self.slips = [(s, f) for s, f in zip(mode, faces, strict=True) if abs(s) == 1]
+        slips = [(s, f) for s, f in zip(mode, faces, strict=True) if abs(s) == 1]
+        self.laws = [f.mu for _, f in slips]
+        self.signs = np.array([s for s, _ in slips])
+        self.D = np.array([f.d for _, f in slips]).reshape(-1, n)
+        self.V = np.array([f.V for _, f in slips])
+        self.load = np.array([f.load for _, f in slips])
+        self.slope = np.array([f.slope for _, f in slips]).reshape(-1, n)
         self.stuck = [i for i, s in enumerate(mode) if s == 0]
         D = np.array([faces[i].d for i in self.stuck]).reshape(-1, n)
         G = D @ inverse @ D.T
@@ -227,9 +233,10 @@ class Field:
         """All but inertia and the multipliers, at states z (..., 2n)."""
         x, v = z[..., : self.n], z[..., self.n :]
         out = self.f - x @ self.K.T - v @ self.C.T
-        for s, f in self.slips:
-            friction = s * f.mu(s * (f.V - v @ f.d)) * (f.load + x @ f.slope)
-            out = out + np.multiply.outer(friction, f.d)
+        if self.laws:
+            speeds = (self.signs * (self.V - v @ self.D.T)).T
+            mu = np.array([law(w) for law, w in zip(self.laws, speeds, strict=True)]).T
+            out = out + (self.signs * mu * (self.load + x @ self.slope.T)) @ self.D
         return out
 
     def rates(self, _t, z) -> np.ndarray:
@@ -243,11 +250,12 @@ class Field:
         """Jacobian of the forces."""
         x, v = z[: self.n], z[self.n :]
         out = np.hstack([-self.K, -self.C])
-        for s, f in self.slips:
-            mu = f.mu(s * (f.V - v @ f.d) + 1e-30j)  # the imaginary part holds the slope
-            load = f.load + f.slope @ x
-            out[:, : self.n] += s * mu.real * np.outer(f.d, f.slope)
-            out[:, self.n :] -= mu.imag / 1e-30 * load * np.outer(f.d, f.d)
+        for k, law in enumerate(self.laws):
+            s, d = self.signs[k], self.D[k]
+            mu = law(s * (self.V[k] - d @ v) + 1e-30j)  # the imaginary part holds the slope
+            load = self.load[k] + self.slope[k] @ x
+            out[:, : self.n] += s * mu.real * np.outer(d, self.slope[k])
+            out[:, self.n :] -= mu.imag / 1e-30 * load * np.outer(d, d)
         return out
 
     def jacobian(self, z) -> np.ndarray:
