@@ -516,7 +516,7 @@ def close(mechanism, z, T, rtol=1e-12, flow=None):
     """The periodic orbit of a scaled mechanism near z, with t.x' = 0 at joint 1, and its period."""
     z, best, size = np.array(z), np.inf, len(z)
     row = np.concatenate([np.zeros(size // 2), mechanism.joints[0].t])
-    for _ in range(30):
+    for count in range(30):
         trip = list(phases(mechanism, z, rtol, T))
         end = trip[-1].end
         residual = np.append(end - z, row @ z)
@@ -526,6 +526,8 @@ def close(mechanism, z, T, rtol=1e-12, flow=None):
         if flow is None or error > 0.1 * best:
             flow = monodromy(mechanism, trip, max(rtol, 1e-10))
         best = min(best, error)
+        if count == 6 and best > 1e-3:
+            break
         speed = mechanism.field(trip[-1].mode).rates(0, end)
         matrix = np.block([[flow - np.eye(size), speed[:, None]], [row[None], np.zeros((1, 1))]])
         step = np.linalg.solve(matrix, -residual)
