@@ -569,6 +569,17 @@ def spread(trip, row) -> tuple[float, float]:
     return min(found), max(found)
 
 
+def shares(mechanism, trip) -> np.ndarray:
+    """The times that first faces stick, second faces stick and joints are open, a row each."""
+    found = np.zeros((3, len(mechanism.joints)))
+    for p in trip:
+        for i, (s, f) in enumerate(zip(p.mode, mechanism.faces, strict=True)):
+            first = i == 0 or mechanism.faces[i - 1].joint != f.joint
+            if s == 0 or (s == OPEN and first):
+                found[2 if s == OPEN else int(not first), f.joint] += p.t1 - p.t0
+    return found
+
+
 def measure(mechanism, z, T, rtol=1e-12) -> Cycle:
     """Everything about the periodic motion of a mechanism through the scaled maximum z of t.x.
 
@@ -584,15 +595,9 @@ def measure(mechanism, z, T, rtol=1e-12) -> Cycle:
     if again < T or t_x @ higher > t_x @ z + 1e-9:
         return measure(mechanism, *close(core, higher, again, rtol), rtol)
     trip = list(phases(core, z, rtol, T))
-    stick, second, opened = np.zeros((3, m))
+    stick, second, opened = shares(core, trip)
     visits, graze = [], []
     for p in trip:
-        for i, (s, f) in enumerate(zip(p.mode, core.faces, strict=True)):
-            first = i == 0 or core.faces[i - 1].joint != f.joint
-            if s == OPEN:
-                opened[f.joint] += (p.t1 - p.t0) * first
-            elif s == 0:
-                (stick if first else second)[f.joint] += p.t1 - p.t0
         joined = visits.pop()[1] if visits and visits[-1][0] == p.mode else 0.0
         visits.append((p.mode, joined + p.t1 - p.t0))
         field_ = core.field(p.mode)
