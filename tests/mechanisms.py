@@ -194,6 +194,28 @@ PROBLEMS: dict[str, dict[str, Any]] = {
         "start": [0.5, -0.9, 0.1, 0.0, 0.0, 0.0],
         "by": ["joints.0.V", "joints.0.K_n", "F.0"],
     },
+    # Two joints that stick together for a third of the period; the first has a lever arm.
+    "stick_together": {
+        "M": [[1.0, 0.0, 0.0], [0.0, 1.3, 0.0], [0.0, 0.0, 0.5]],
+        "C": [[0.2, 0.0, 0.0], [0.0, 0.2, 0.0], [0.0, 0.0, 0.3]],
+        "K": [[1.8, -0.8, 0.1], [-0.8, 2.0, 0.0], [0.1, 0.0, 2.0]],
+        "F": [0.0, 0.0, 0.0],
+        "joints": [
+            {
+                "tangential": [1.0, 0.0, 0.0],
+                "normal": [0.2, 0.0, 1.0],
+                "V": 0.15, "P": 1.0, "K_n": 3.0,
+                "friction": ("hyperbolic", {"mu_s": 0.8, "delta": 1.5}),
+            },
+            {
+                "tangential": [0.0, 1.0, 0.0],
+                "V": 0.15, "P": 1.0,
+                "friction": ("exponential", {"mu_s": 0.7, "mu_d": 0.3, "v_0": 0.4}),
+            },
+        ],
+        "start": [0.3, 0.1, 0.0, 0.0, 0.0, 0.0],
+        "by": ["joints.0.P", "joints.1.P", "joints.0.V", "joints.1.friction.v_0"],
+    },
     # Three joints on three degrees of freedom; each sticks and two lift off.
     "three_joints": {
         "M": [

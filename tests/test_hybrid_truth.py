@@ -17,8 +17,13 @@ from hybrid_truth import (
     phases,
     simulate,
 )
+from mechanisms import PROBLEMS
 
-CYCLES = json.loads((Path(__file__).parent / "reference" / "cycle.json").read_text("utf-8"))["rows"]
+REFERENCE = Path(__file__).parent / "reference"
+CYCLES, TABLE = (
+    json.loads((REFERENCE / f"{name}.json").read_text("utf-8"))["rows"]
+    for name in ("cycle", "mechanisms")
+)
 
 
 def coulomb(mu):
@@ -238,3 +243,24 @@ def test_sticking_faces_of_one_direction_are_impossible():
     twice = {**BELT, "joints": BELT["joints"] * 2}
     with pytest.raises(Impossible):
         simulate(Mechanism.of(twice), [0.0, 1.0], 1.0)
+
+
+def test_every_problem_has_its_row():
+    assert [row["name"] for row in TABLE] == list(PROBLEMS)
+    assert {row["kind"] for row in TABLE} == {"cycle"}
+
+
+@pytest.mark.parametrize("row", TABLE, ids=[row["name"] for row in TABLE])
+def test_tabled_cycle_closes(row):
+    """The tabled state comes back after the tabled period, through the tabled modes."""
+    mechanism = Mechanism.of(PROBLEMS[row["name"]])
+    state, T, durations = np.array(row["state"]), row["period"], {}
+    trip = simulate(mechanism, state, T)
+    np.testing.assert_allclose(
+        trip[-1].end / mechanism.units, state / mechanism.units, rtol=1e-9, atol=1e-9
+    )
+    for mode, duration in [(p.mode, p.t1 - p.t0) for p in trip]:
+        durations[mode] = durations.get(mode, 0.0) + duration
+    for mode, duration in row["itinerary"]:
+        durations[tuple(mode)] -= duration
+    assert max(map(abs, durations.values())) < 1e-9 * T

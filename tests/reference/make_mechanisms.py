@@ -25,9 +25,10 @@ from mechanisms import PROBLEMS  # noqa: E402
 TABLE = HERE / "mechanisms.json"
 STEP = 4e-3  # relative; the widest of the differences
 LEVELS = 3  # each half as wide as the one before
-NARROWEST = 1e-6
+NARROWEST = 1e-5
 NOISE = 2e-13  # relative error of a value
 SAFETY = 10.0
+ENOUGH = 1e-7  # relative error of a derivative by the logarithm of a quantity
 LISTS = [
     "amplitude",
     "velocity_min",
@@ -78,40 +79,52 @@ def numbers(mechanism, state, T, flow=None, rtol=1e-12):
     return z * mechanism.units, period, values, [p.mode for p in trip]
 
 
-def derivative(problem, cycle, known, path):
-    """Derivatives of the values, and their estimated errors."""
-    where, key = place(problem, path)
-    step, table = STEP * abs(where[key]), []
-    ends = [(cycle.state, cycle.period)] * 2
-    while step > NARROWEST * abs(where[key]):
+def differences(problem, cycle, known, path, step):
+    """Extrapolated differences from this step on, and their estimated errors; or None."""
+    table, ends = [], [(cycle.state, cycle.period)] * 2
+    for _ in range(LEVELS):
         try:
             found = [
                 numbers(moved(problem, path, side), state, T, cycle.flow)
                 for side, (state, T) in zip((step, -step), ends, strict=True)
             ]
         except (ArithmeticError, np.linalg.LinAlgError):
-            found = []
-        if not found or any(f[3] != known[3] for f in found):
-            table, ends = [], [(cycle.state, cycle.period)] * 2
-            step /= 4
-            continue
+            return None
+        if any(f[3] != known[3] for f in found):
+            return None
         row = [(found[0][2] - found[1][2]) / (2 * step)]
         for j, above in enumerate(table[-1] if table else []):
             row.append(row[-1] + (row[-1] - above) / (4 ** (j + 1) - 1))
         table.append(row)
-        if len(table) == LEVELS:
-            error = abs(row[-1] - table[-2][-1]) / 4**LEVELS + abs(row[-1] - row[-2]) / 4
-            return row[-1], SAFETY * (error + NOISE * np.maximum(abs(known[2]), 1e-3) / step)
         # The states of half the step, but for terms of third order.
-        half = []
+        ends = []
         for side in (1, -1):
-            odd = side * (found[0][0] - found[1][0]) / 4
-            even = (found[0][0] + found[1][0] - 2 * cycle.state) / 8
-            T_odd = side * (found[0][1] - found[1][1]) / 4
-            T_even = (found[0][1] + found[1][1] - 2 * cycle.period) / 8
-            half.append((cycle.state + odd + even, cycle.period + T_odd + T_even))
-        ends, step = half, step / 2
-    return None
+            odd = [side * (a - b) / 4 for a, b in zip(found[0][:2], found[1][:2], strict=True)]
+            even = [
+                (a + b - 2 * c) / 8
+                for a, b, c in zip(*found[:2], (cycle.state, cycle.period), strict=False)
+            ]
+            ends.append((cycle.state + odd[0] + even[0], cycle.period + odd[1] + even[1]))
+        step /= 2
+    error = abs(row[-1] - table[-2][-1]) / 4 + abs(row[-1] - row[-2]) / 4
+    return row[-1], SAFETY * (error + NOISE * np.maximum(abs(known[2]), 1e-3) / (2 * step))
+
+
+def derivative(problem, cycle, known, path):
+    """Derivatives of the values, and their estimated errors; None where no step will do."""
+    where, key = place(problem, path)
+    best, error = np.zeros(len(known[2])), np.full(len(known[2]), np.inf)
+    step = STEP
+    while step > NARROWEST:
+        found = differences(problem, cycle, known, path, step * abs(where[key]))
+        if found:
+            best = np.where(found[1] < error, found[0], best)
+            error = np.minimum(found[1], error)
+            relative = error * abs(where[key]) / np.maximum(abs(known[2]), 1e-3)
+            if relative.max() < ENOUGH:
+                break
+        step /= 4
+    return (best, error) if np.isfinite(error).all() else None
 
 
 def split(values, errors, n, m):
