@@ -190,9 +190,13 @@ def balance(mechanism, trip):
         x, v = z[:n], z[n:]
         stored = v @ M @ v / 2 + x @ K @ x / 2 - F @ x
         for j in mechanism.joints:
-            N = j.P + (0 if j.n is None else j.K_n * (j.n @ x))
-            if j.lifts:  # the force P - N along n has this potential
-                stored += (max(0, N) ** 2 / (2 * j.K_n)) - j.P * (j.n @ x)
+            press, stretch = (0 if j.n is None else j.n @ x), j.t @ x
+            if j.lifts:  # the force P - N along n has this potential; K_t acts in closed joints
+                assert j.K_t == 0 or j.P + j.K_n * press > 0
+                stored += max(0, j.P + j.K_n * press) ** 2 / (2 * j.K_n) - j.P * press
+            else:
+                stored += j.K_n * press**2 / 2
+            stored += j.K_t * stretch**2 / 2
         return stored
 
     core, work = mechanism.scaled, 0.0
@@ -225,6 +229,28 @@ def test_energy():
     trip = simulate(mechanism, [0.5, 0.0, -1.8, 0.0, 0.38, 0.0], 20.0)
     assert {OPEN} & {p.mode[0] for p in trip}
     assert balance(mechanism, trip) == pytest.approx(0, abs=1e-10)
+
+
+@pytest.mark.parametrize("name", ["second_face", "source_second_face", "stick_together"])
+def test_friction_feeds_what_the_dampers_take_in_a_period(name):
+    row = next(row for row in TABLE if row["name"] == name)
+    mechanism = Mechanism.of(PROBLEMS[name])
+    trip = simulate(mechanism, row["state"], row["period"])
+    assert balance(mechanism, trip) == pytest.approx(0, abs=1e-10)
+
+
+def test_table_agrees_with_the_older_one():
+    old, new = CYCLES[0], next(row for row in TABLE if row["name"] == "source_form")
+    assert new["period"] == pytest.approx(old["period"], rel=1e-12)
+    np.testing.assert_allclose(new["amplitude"], old["amplitude"], rtol=1e-11)
+    for path in ("K_n", "K_t", "V"):
+        known, found = old["derivatives"][path], new["derivatives"][f"joints.0.{path}"]
+        value, error = found["period"]
+        assert value == pytest.approx(known["period"][0], abs=error)
+        for i, (value, error) in enumerate(found["amplitude"], 1):
+            assert value == pytest.approx(known[f"amplitude_{i}"][0], abs=error)
+        value, error = found["stick_fraction"][0]
+        assert value == pytest.approx(known["stick_fraction_1"][0], abs=error)
 
 
 def test_monodromy_is_the_difference_of_the_flow():
