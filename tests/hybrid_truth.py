@@ -1,0 +1,677 @@
+"""An independent solver for any mechanism with joints: event by event, with SciPy's DOP853.
+
+It uses nothing of the package. The motion obeys
+
+    M x'' + C x' + K x = F + sum_j [(P_j - N_j) n_j + mu_j(|w_j|) sgn(w_j) N_j t_j],
+    w_j = V_j - t_j.x',   N_j = max(0, P_j + K_n n_j.x)
+
+and is cut into phases of one mode: every face slips forward (1), slips backward (-1), sticks (0) or
+is OPEN. Inside a phase the motion is smooth. What ends it is interpolated over one step of the
+integrator, its zeros are searched between its extrema, and the step to the first of them is
+integrated again. Inside, time is in 1/omega, velocity in the belt's speed V and length in V/omega.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import pairwise, product
+from typing import Any
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from scipy.integrate import DOP853, OdeSolution, solve_ivp
+from scipy.optimize import brentq
+
+OPEN = 9
+FAR = 1e6  # in V and V/omega: a motion beyond it has diverged
+SAME = 1e-10  # a sliding velocity below it is zero where a motion starts
+NODES = (1 + np.cos(np.pi * (np.arange(12) + 0.5) / 12)) / 2
+FIT = np.linalg.inv(chebyshev.chebvander(2 * NODES - 1, 11))
+
+LAWS = {
+    "coulomb": lambda w, mu: mu + 0 * w,
+    "stribeck": lambda w, mu_s, mu_m, v_m: (
+        mu_s - 1.5 * (mu_s - mu_m) * (w / v_m) + 0.5 * (mu_s - mu_m) * (w / v_m) ** 3
+    ),
+    "exponential": lambda w, mu_s, mu_d, v_0, viscous=0.0: (
+        mu_d + (mu_s - mu_d) * np.exp(-w / v_0) + viscous * w
+    ),
+    "hyperbolic": lambda w, mu_s, delta: mu_s / (1 + delta * w),
+}
+
+
+class Diverged(ArithmeticError):
+    """The motion left every bound."""
+
+
+class Impossible(ArithmeticError):
+    """No mode of the faces agrees with the state."""
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint with the direction t (n,), pressed by P along n (n,) where `preload`.
+
+    Without n its normal force is P. Without `preload` it is K_n n.x, of either sign (the source's
+    form). mu is a function of the sliding speed that can be continued a little below zero.
+    """
+
+    t: np.ndarray
+    V: float
+    mu: Callable
+    n: Any = None
+    P: float = 0.0
+    K_n: float = 0.0
+    K_t: float = 0.0
+    preload: bool = True
+
+    @property
+    def lifts(self) -> bool:
+        return self.n is not None and self.preload
+
+
+@dataclass(frozen=True)
+class Face:
+    """Friction mu(|w|) sgn(w) (load + slope.x) along d, with w = V - d.x'."""
+
+    joint: int
+    d: np.ndarray
+    V: float
+    mu: Callable
+    load: float
+    slope: np.ndarray
+    still: float  # mu(0)
+
+
+@dataclass(frozen=True)
+class Mechanism:
+    """M x'' + C x' + K x = F with joints, SI units."""
+
+    M: np.ndarray
+    C: np.ndarray
+    K: np.ndarray
+    F: np.ndarray
+    joints: tuple[Joint, ...]
+
+    @classmethod
+    def of(cls, problem: dict) -> "Mechanism":
+        """From plain numbers, as in mechanisms.py."""
+        M, C, K, F = (np.array(problem[name], float) for name in "MCKF")
+        joints = []
+        for given in problem["joints"]:
+            law, constants = given["friction"][0], dict(given["friction"][1])
+
+            def mu(w, law=LAWS[law], constants=constants):
+                return law(w, **constants)
+
+            n = None if given.get("normal") is None else np.array(given["normal"], float)
+            rest = {k: given[k] for k in ("P", "K_n", "K_t", "preload") if k in given}
+            t = np.array(given["tangential"], float)
+            joints.append(Joint(t, given["V"], mu, n, **rest))
+        return cls(M, C, K, F, tuple(joints))
+
+    @cached_property
+    def omega(self) -> float:
+        """Scale of time [1/s]: the highest frequency with every joint closed."""
+        K = self.K + sum(
+            j.K_t * np.outer(j.t, j.t) + (0 if j.n is None else j.K_n * np.outer(j.n, j.n))
+            for j in self.joints
+        )
+        return float(np.sqrt(abs(np.linalg.eigvals(np.linalg.solve(self.M, K))).max()))
+
+    @cached_property
+    def units(self) -> np.ndarray:
+        """Scales of [x, x']."""
+        V = max(abs(j.V) for j in self.joints)
+        return np.repeat([V / self.omega, V], len(self.M))
+
+    @cached_property
+    def scaled(self) -> "Mechanism":
+        """The same in units of 1/omega, V and V/omega."""
+        s, V = self.omega, self.units[-1]
+        joints = tuple(
+            replace(
+                j,
+                V=j.V / V,
+                mu=lambda w, mu=j.mu: mu(V * w),
+                P=j.P / (V * s),
+                K_n=j.K_n / s**2,
+                K_t=j.K_t / s**2,
+            )
+            for j in self.joints
+        )
+        return Mechanism(self.M, self.C / s, self.K / s**2, self.F / (V * s), joints)
+
+    @cached_property
+    def faces(self) -> tuple[Face, ...]:
+        found = []
+        for i, j in enumerate(self.joints):
+            still, none = float(j.mu(0.0)), np.zeros(len(self.M))
+            slope = none if j.n is None else j.K_n * j.n
+            load = j.P if j.preload else 0.0
+            found.append(Face(i, j.t, j.V, j.mu, load, slope, still))
+            if j.n is not None and j.K_t:
+                found.append(Face(i, j.n, j.V, j.mu, 0.0, -j.K_t * j.t, still))
+        return tuple(found)
+
+    @cached_property
+    def fields(self) -> dict:
+        return {}
+
+    def field(self, mode) -> "Field":
+        if mode not in self.fields:
+            self.fields[mode] = Field(self, mode)
+        return self.fields[mode]
+
+    def sliding(self, z) -> np.ndarray:
+        """w of every face."""
+        return np.array([f.V - f.d @ z[len(self.M) :] for f in self.faces])
+
+    def normal(self, i) -> np.ndarray:
+        """The row over [1, z] of the joint's normal force while it is closed."""
+        j, n = self.joints[i], len(self.M)
+        row = np.zeros(2 * n + 1)
+        row[0] = j.P if j.preload else 0.0
+        row[1 : n + 1] = 0 if j.n is None else j.K_n * j.n
+        return row
+
+
+class Field:
+    """The smooth motion in one mode, and the guards that are positive while it lasts.
+
+    A guard is g = row.[1, z] + by.forces(z); `events` names what its zero means:
+    ("w", face), ("limit", face, sign of the slip that begins), ("open" or "close", joint).
+    """
+
+    def __init__(self, mechanism: Mechanism, mode: tuple[int, ...]):
+        self.n = n = len(mechanism.M)
+        faces, self.mode = mechanism.faces, mode
+        self.f, self.K, self.C = mechanism.F.copy(), mechanism.K.copy(), mechanism.C
+        inverse = np.linalg.inv(mechanism.M)
+        events, rows, by = [], [], []
+        for i, j in enumerate(mechanism.joints):
+            is_open = any(s == OPEN for s, f in zip(mode, faces, strict=True) if f.joint == i)
+            if is_open:
+                self.f += j.P * j.n
+            else:
+                self.K += j.K_t * np.outer(j.t, j.t)
+                self.K += 0 if j.n is None else j.K_n * np.outer(j.n, j.n)
+            if j.lifts:
+                events.append(("close" if is_open else "open", i))
+                rows.append(mechanism.normal(i) * (-1 if is_open else 1))
+                by.append(np.zeros(n))
+        slips = [(s, f) for s, f in zip(mode, faces, strict=True) if abs(s) == 1]
+        self.laws = [f.mu for _, f in slips]
+        self.signs = np.array([s for s, _ in slips])
+        self.D = np.array([f.d for _, f in slips]).reshape(-1, n)
+        self.V = np.array([f.V for _, f in slips])
+        self.load = np.array([f.load for _, f in slips])
+        self.slope = np.array([f.slope for _, f in slips]).reshape(-1, n)
+        self.stuck = [i for i, s in enumerate(mode) if s == 0]
+        D = np.array([faces[i].d for i in self.stuck]).reshape(-1, n)
+        G = D @ inverse @ D.T
+        if self.stuck and np.linalg.cond(G) > 1e12:
+            raise Impossible("sticking faces of one direction")
+        self.multipliers = -np.linalg.solve(G, D @ inverse)  # of the forces
+        self.inverse = inverse + inverse @ D.T @ self.multipliers
+        for i, (s, f) in enumerate(zip(mode, faces, strict=True)):
+            row = np.zeros(2 * n + 1)
+            if abs(s) == 1:
+                row[0], row[n + 1 :] = s * f.V, -s * f.d
+                events.append(("w", i))
+                rows.append(row)
+                by.append(np.zeros(n))
+            elif s == 0:
+                row[0], row[1 : n + 1] = f.still * f.load, f.still * f.slope
+                for side in (1, -1):
+                    events.append(("limit", i, side))
+                    rows.append(row)
+                    by.append(-side * self.multipliers[self.stuck.index(i)])
+        self.events, self.rows, self.by = events, np.array(rows), np.array(by)
+
+    def forces(self, z) -> np.ndarray:
+        """All but inertia and the multipliers, at states z (..., 2n)."""
+        x, v = z[..., : self.n], z[..., self.n :]
+        out = self.f - x @ self.K.T - v @ self.C.T
+        if self.laws:
+            speeds = (self.signs * (self.V - v @ self.D.T)).T
+            mu = np.array([law(w) for law, w in zip(self.laws, speeds, strict=True)]).T
+            out = out + (self.signs * mu * (self.load + x @ self.slope.T)) @ self.D
+        return out
+
+    def rates(self, _t, z) -> np.ndarray:
+        return np.concatenate([z[self.n :], self.inverse @ self.forces(z)])
+
+    def values(self, z) -> np.ndarray:
+        """The guards at states z (..., 2n)."""
+        return self.rows[:, 0] + z @ self.rows[:, 1:].T + self.forces(z) @ self.by.T
+
+    def slopes(self, z) -> np.ndarray:
+        """Jacobian of the forces."""
+        x, v = z[: self.n], z[self.n :]
+        out = np.hstack([-self.K, -self.C])
+        for k, law in enumerate(self.laws):
+            s, d = self.signs[k], self.D[k]
+            mu = law(s * (self.V[k] - d @ v) + 1e-30j)  # the imaginary part holds the slope
+            load = self.load[k] + self.slope[k] @ x
+            out[:, : self.n] += s * mu.real * np.outer(d, self.slope[k])
+            out[:, self.n :] -= mu.imag / 1e-30 * load * np.outer(d, d)
+        return out
+
+    def jacobian(self, z) -> np.ndarray:
+        top = np.hstack([np.zeros((self.n, self.n)), np.eye(self.n)])
+        return np.vstack([top, self.inverse @ self.slopes(z)])
+
+    def gradients(self, z) -> np.ndarray:
+        """Of the guards, one a row."""
+        return self.rows[:, 1:] + self.by @ self.slopes(z)
+
+
+def choose(mechanism, z, mode, options, decided=()) -> tuple[int, ...]:
+    """The first mode that agrees with the state; options: signs by face, the likely one first.
+
+    A sliding velocity of zero must grow to the side on which the face slips, unless it is decided;
+    a multiplier must lie within its limits.
+    """
+    best, found = -1e-10, None
+    orders = [list(enumerate(o)) for o in options.values()]
+    for picks in sorted(product(*orders), key=lambda p: sum(k for k, _ in p)):
+        trial = list(mode)
+        for i, (_, s) in zip(options, picks, strict=True):
+            trial[i] = s
+        field_ = mechanism.field(tuple(trial))
+        forces = field_.forces(z)
+        acceleration, margin = field_.inverse @ forces, np.inf
+        for i, f in enumerate(mechanism.faces):
+            if trial[i] == 0:
+                limit = f.still * (f.load + f.slope @ z[: field_.n])
+                hold = abs(field_.multipliers[field_.stuck.index(i)] @ forces)
+                at = f.d @ np.linalg.solve(mechanism.M, f.d)
+                margin = min(margin, (limit - hold) * at)
+            elif i in options and i not in decided:
+                margin = min(margin, -trial[i] * (f.d @ acceleration))
+        if margin > 0:
+            return tuple(trial)
+        if margin > best:
+            best, found = margin, tuple(trial)
+    if found is None:
+        raise Impossible(f"no mode after {mode} at {z}")
+    return found
+
+
+def first_mode(mechanism, z) -> tuple[int, ...]:
+    """The mode in which a motion begins."""
+    n, w, mode, options = len(mechanism.M), mechanism.sliding(z), [], {}
+    for i, f in enumerate(mechanism.faces):
+        row = mechanism.normal(f.joint)
+        force, rate = row[0] + row[1:] @ z, row[1 : n + 1] @ z[n:]
+        if mechanism.joints[f.joint].lifts and (force < 0 or (force == 0 and rate < 0)):
+            mode.append(OPEN)
+            continue
+        mode.append(int(np.sign(w[i])) if abs(w[i]) > SAME else 0)
+        if mode[-1] == 0:
+            options[i] = (0, 1, -1)
+    return choose(mechanism, z, tuple(mode), options)
+
+
+def next_mode(mechanism, z, mode, event) -> tuple[tuple[int, ...], dict]:
+    """The mode after an event, and the order of the zero of each guard that it leaves at zero."""
+    kind, at = event[:2]
+    trial, decided = list(mode), ()
+    options: dict[int, tuple] = {i: (0, 1, -1) for i, s in enumerate(mode) if s == 0}
+    zeros: dict[tuple, int] = {}
+    if kind == "maximum":
+        return mode, {event: 1}
+    if kind == "w":
+        options[at] = (-mode[at], 0, mode[at])
+    elif kind == "limit":
+        options[at], decided = (event[2],), (at,)
+    else:
+        w = mechanism.sliding(z)
+        for i, f in enumerate(mechanism.faces):
+            if f.joint == at:
+                options.pop(i, None)
+                trial[i] = OPEN if kind == "open" else int(np.sign(w[i]))
+        zeros["close" if kind == "open" else "open", at] = 1
+    after = choose(mechanism, z, tuple(trial), options, decided)
+    for i in options:
+        if after[i]:
+            alone = decided == (i,) and sum(a != b for a, b in zip(mode, after, strict=True)) == 1
+            zeros["w", i] = 2 if alone else 1
+    return after, zeros
+
+
+def put(mechanism, z, directions, speeds) -> np.ndarray:
+    """The state with these velocities exactly; the impulse that this takes is rounding."""
+    if not len(directions):
+        return z
+    n, D = len(mechanism.M), np.array(directions)
+    reach = np.linalg.solve(mechanism.M, D.T)
+    z = z.copy()
+    z[n:] -= reach @ np.linalg.solve(D @ reach, D @ z[n:] - speeds)
+    return z
+
+
+def extrema(c) -> np.ndarray:
+    """Extrema inside 0..1 of Chebyshev coefficients; other points may be among them."""
+    slope = chebyshev.chebder(c)
+    slope = chebyshev.chebtrim(slope, 1e-15 * abs(slope).max())
+    found = (1 + chebyshev.chebroots(slope).real) / 2
+    return np.sort(found[(found > 0) & (found < 1)])
+
+
+def at(tau, c):
+    return chebyshev.chebval(2 * tau - 1, c)
+
+
+def falls(c) -> Any:
+    """Where in 0..1 the function first falls through zero."""
+    if c[0] > abs(c[1:]).sum():
+        return None
+    for low, high in pairwise([0.0, *extrema(c), 1.0]):
+        if at(low, c) >= 0 > at(high, c):
+            return brentq(at, low, high, (c,), xtol=1e-16)
+    return None
+
+
+def land(field_, guard, z, h, rtol):
+    """The step from z to the zero of a guard near h, integrated instead of interpolated."""
+    end, (row, by) = z, guard
+    for _ in range(4 if h > 0 else 0):
+        end = solve_ivp(field_.rates, (0, h), z, "DOP853", rtol=rtol, atol=rtol, first_step=h)
+        end = end.y[:, -1]
+        value = row[0] + row[1:] @ end + by @ field_.forces(end)
+        shift = value / ((row[1:] + by @ field_.slopes(end)) @ field_.rates(0, end))
+        if not 1e-16 < abs(shift) < min(1e-4, h):  # there, or grazing
+            break
+        h -= shift
+    return h, end
+
+
+@dataclass(frozen=True)
+class Phase:
+    """The motion in one mode; in SI units where `simulate` returns it."""
+
+    mode: tuple[int, ...]
+    t0: float
+    t1: float
+    start: np.ndarray
+    end: np.ndarray
+    dense: Callable
+    event: tuple = ()  # what ended it
+    steps: list = field(repr=False, default_factory=list)  # (start, end, used end, dense)
+
+
+def phases(mechanism, z, rtol, t1=np.inf, maxima=False) -> Iterator[Phase]:
+    """The phases of a scaled mechanism; with `maxima`, cut where t.x of joint 1 is largest too."""
+    z, t, longest, idle = np.array(z, float), 0.0, 3.2 * rtol**0.125, 0
+    n, faces = len(mechanism.M), mechanism.faces
+    top = np.concatenate([np.zeros(n + 1), mechanism.joints[0].t])
+    mode = first_mode(mechanism, z)
+    stuck = [i for i, s in enumerate(mode) if s == 0]
+    z = put(mechanism, z, [faces[i].d for i in stuck], [faces[i].V for i in stuck])
+    w = mechanism.sliding(z)
+    known = {("w", i): 1 for i, s in enumerate(mode) if abs(s) == 1 and abs(w[i]) <= SAME}
+    for i, j in enumerate(mechanism.joints):
+        if j.lifts and mechanism.normal(i) @ [1, *z] == 0:
+            known |= {("open", i): 1, ("close", i): 1}
+    if maxima and abs(top[1:] @ z) < SAME:
+        known["maximum", 0] = 1
+    while True:
+        field_ = mechanism.field(mode)
+        events = [*field_.events, ("maximum", 0)] if maxima else field_.events
+        rows, by = field_.rows, field_.by
+        if maxima:
+            rows, by = np.vstack([rows, top]), np.vstack([by, np.zeros(n)])
+        orders = np.array([known.get(event, 0) for event in events])
+        rate = field_.rates(0, z)
+        value = rows[:, 0] + rows[:, 1:] @ z + by @ field_.forces(z)
+        slope = (rows[:, 1:] + by @ field_.slopes(z)) @ rate
+        solver = DOP853(field_.rates, t, z, t1, max_step=longest, rtol=rtol, atol=rtol)
+        start, t0, steps, pieces, hit = z, t, [], [], None
+        while hit is None and solver.status == "running":
+            with np.errstate(over="ignore", invalid="ignore"):
+                failed = solver.step()
+            if failed or not abs(solver.y).max() < FAR:
+                raise Diverged
+            pieces.append(solver.dense_output())
+            h = solver.t - t
+            Z = pieces[-1](t + h * NODES).T
+            g = rows[:, 0] + Z @ rows[:, 1:].T + field_.forces(Z) @ by.T
+            if not steps:  # zeros that are known at the start are divided out
+                tau = NODES[:, None]
+                g -= np.where(orders > 0, value, 0) + np.where(orders > 1, slope * h * tau, 0)
+                g /= tau**orders
+            c, found = FIT @ g, []
+            for k, event in enumerate(events):
+                late = at(0.0, c[:, k]) < 0
+                if late and event[0] != "maximum" and not steps:
+                    if value[k] < -1e-7:
+                        raise Impossible(f"{event} is past in {mode} at {z}")
+                    if orders[k] or slope[k] < 0:
+                        found.append((0.0, k))
+                        continue
+                place = falls(c[:, k])
+                if place is not None:
+                    found.append((place, k))
+            end, used = solver.y, h
+            if found:
+                place, k = min(found)
+                hit = events[k]
+                used, end = land(field_, (rows[k], by[k]), z, place * h, rtol)
+            steps.append((t, t + h, t + used, pieces[-1]))
+            z, t = np.array(end), t + used
+        fixed = [(faces[i].d, faces[i].V) for i in field_.stuck]
+        if hit and hit[0] == "w":
+            fixed.append((faces[hit[1]].d, faces[hit[1]].V))
+        if hit and hit[0] == "maximum":
+            fixed.append((mechanism.joints[0].t, 0.0))
+        z = put(mechanism, z, *zip(*fixed, strict=True)) if fixed else z
+        dense = OdeSolution([t0, *(p.t for p in pieces)], pieces)
+        yield Phase(mode, t0, t, start, z, dense, hit or (), steps)
+        if hit is None or t1 - t < 1e-13:
+            return
+        idle = idle + 1 if t == t0 else 0
+        if idle > 20:
+            raise Impossible(f"no time passes in {mode} at {z}")
+        mode, known = next_mode(mechanism, z, mode, hit)
+
+
+def simulate(mechanism, start, t1, rtol=1e-12) -> list[Phase]:
+    """The motion from [x, x'] until the time t1, phase by phase."""
+    s, units, found = mechanism.omega, mechanism.units, []
+    for p in phases(mechanism.scaled, np.asarray(start) / units, rtol, t1 * s):
+
+        def dense(t, inner=p.dense):
+            return (inner(np.asarray(t) * s).T * units).T
+
+        ends = p.start * units, p.end * units
+        found.append(Phase(p.mode, p.t0 / s, p.t1 / s, *ends, dense, p.event))
+    return found
+
+
+def monodromy(mechanism, trip, rtol=1e-12) -> np.ndarray:
+    """The derivative of the end of a trip of scaled phases by its start, at a fixed duration."""
+    size = 2 * len(mechanism.M)
+    flow = np.eye(size)
+    for p, after in zip(trip, [*trip[1:], None], strict=True):
+        field_ = mechanism.field(p.mode)
+
+        def rates(_t, y, field_=field_):
+            z, Y = y[:size], y[size:].reshape(size, size)
+            return np.concatenate([field_.rates(0, z), (field_.jacobian(z) @ Y).ravel()])
+
+        if p.t1 > p.t0:
+            y = np.concatenate([p.start, flow.ravel()])
+            y = solve_ivp(rates, (p.t0, p.t1), y, "DOP853", rtol=rtol, atol=rtol).y[:, -1]
+            flow = y[size:].reshape(size, size)
+        if after is not None and after.mode != p.mode:
+            z, g = p.end, field_.gradients(p.end)[field_.events.index(p.event)]
+            before, behind = field_.rates(0, z), mechanism.field(after.mode).rates(0, z)
+            flow = flow + np.outer(behind - before, g @ flow) / (g @ before)
+    return flow
+
+
+def close(mechanism, z, T, rtol=1e-12, flow=None):
+    """The periodic orbit of a scaled mechanism near z, with t.x' = 0 at joint 1, and its period."""
+    z, best, size = np.array(z), np.inf, len(z)
+    row = np.concatenate([np.zeros(size // 2), mechanism.joints[0].t])
+    for count in range(30):
+        trip = list(phases(mechanism, z, rtol, T))
+        end = trip[-1].end
+        residual = np.append(end - z, row @ z)
+        error = abs(residual).max()
+        if error < 2e-14 * max(1, abs(z).max()) or (best < 1e-10 and error > best / 2):
+            return z, T
+        if flow is None or error > 0.1 * best:
+            flow = monodromy(mechanism, trip, max(rtol, 1e-10))
+        best = min(best, error)
+        if count == 6 and best > 1e-3:
+            break
+        speed = mechanism.field(trip[-1].mode).rates(0, end)
+        matrix = np.block([[flow - np.eye(size), speed[:, None]], [row[None], np.zeros((1, 1))]])
+        step = np.linalg.solve(matrix, -residual)
+        z, T = z + step[:-1], T + step[-1]
+        if not 0 < T < 1e6 or abs(step).max() > FAR:
+            break
+    raise ArithmeticError("no periodic orbit")
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """A periodic motion in SI units, or only the `kind` of another motion."""
+
+    kind: str  # "cycle", "equilibrium", "diverged", "not periodic"
+    period: Any = None
+    amplitude: Any = None  # (n,) peak to peak
+    velocity_min: Any = None  # (n,)
+    velocity_max: Any = None
+    stick_fraction: Any = None  # (m,) of the joints' first faces
+    second_stick_fraction: Any = None  # (m,) of their second faces, 0 where there is none
+    open_fraction: Any = None  # (m,)
+    normal_force: Any = None  # (m, 2) smallest and largest
+    state: Any = None  # (2n,) where t.x of joint 1 is largest
+    multipliers: Any = None  # (2n,) largest first
+    itinerary: Any = None  # [(mode, duration)] from `state` on
+    maxima: int = 0  # of t.x of joint 1 in a period
+    margins: Any = None  # see `measure`
+    flow: Any = None  # scaled monodromy matrix
+
+
+def spread(trip, row) -> tuple[float, float]:
+    """The least and the largest value of row.[1, z] over a trip."""
+    found = []
+    for p in trip:
+        for t, end, used, dense in p.steps:
+            c = FIT @ (row[0] + row[1:] @ dense(t + (end - t) * NODES))
+            share = (used - t) / (end - t)
+            found += list(at(np.array([0.0, *(x for x in extrema(c) if x < share), share]), c))
+    return min(found), max(found)
+
+
+def shares(mechanism, trip) -> np.ndarray:
+    """The times that first faces stick, second faces stick and joints are open, a row each."""
+    found = np.zeros((3, len(mechanism.joints)))
+    for p in trip:
+        for i, (s, f) in enumerate(zip(p.mode, mechanism.faces, strict=True)):
+            first = i == 0 or mechanism.faces[i - 1].joint != f.joint
+            if s == 0 or (s == OPEN and first):
+                found[2 if s == OPEN else int(not first), f.joint] += p.t1 - p.t0
+    return found
+
+
+def measure(mechanism, z, T, rtol=1e-12) -> Cycle:
+    """Everything about the periodic motion of a mechanism through the scaled maximum z of t.x.
+
+    margins: "graze", the least extremum of a guard inside a phase; "shortest", the share of the
+    shortest visit to a mode in the period.
+    """
+    core, n, m = mechanism.scaled, len(mechanism.M), len(mechanism.joints)
+    t_x = np.concatenate([core.joints[0].t, np.zeros(n)])
+    trip = list(phases(core, z, rtol, T, maxima=True))
+    tops = [p for p in trip if p.event == ("maximum", 0) and 1e-6 < p.t1 < T - 1e-6]
+    again = next((p.t1 for p in tops if abs(p.end - z).max() < 1e-7), T)
+    higher = max([z, *(p.end for p in tops)], key=lambda y: t_x @ y)
+    if again < T or t_x @ higher > t_x @ z + 1e-9:
+        return measure(mechanism, *close(core, higher, again, rtol), rtol)
+    trip = list(phases(core, z, rtol, T))
+    stick, second, opened = shares(core, trip)
+    visits, graze = [], []
+    for p in trip:
+        joined = visits.pop()[1] if visits and visits[-1][0] == p.mode else 0.0
+        visits.append((p.mode, joined + p.t1 - p.t0))
+        field_ = core.field(p.mode)
+        for k, (t, end, used, dense) in enumerate(p.steps):
+            C = FIT @ field_.values(dense(t + (end - t) * NODES).T)
+            for c in C.T:
+                if abs(c[1]) < 4 * sum(abs(c[2:])) or k == 0:
+                    inside = [x for x in extrema(c) if 1e-3 < x < (used - t) / (end - t) - 1e-3]
+                    slopes = chebyshev.chebder(c, 2)
+                    graze += [abs(at(x, c)) for x in inside if at(x, slopes) > 0]
+    rows = np.hstack([np.zeros((2 * n, 1)), np.eye(2 * n)])
+    ends = np.array([spread(trip, row) for row in rows])
+    forces = np.array([spread(trip, core.normal(i)) for i in range(m)])
+    lifts = np.array([j.lifts for j in core.joints])
+    forces = np.where(lifts[:, None], np.maximum(forces, 0), forces)
+    flow = monodromy(core, trip, rtol)
+    multipliers = np.array(sorted(np.linalg.eigvals(flow), key=abs, reverse=True))
+    unit = mechanism.units
+    lengths = [t for _, t in visits] if len(visits) > 1 else [T]
+    if len(visits) > 1 and visits[0][0] == visits[-1][0]:
+        lengths = [lengths[0] + lengths[-1], *lengths[1:-1]]
+    return Cycle(
+        "cycle",
+        T / mechanism.omega,
+        (ends[:n, 1] - ends[:n, 0]) * unit[:n],
+        ends[n:, 0] * unit[n:],
+        ends[n:, 1] * unit[n:],
+        stick / T,
+        second / T,
+        opened / T,
+        forces * mechanism.omega * unit[-1],
+        z * unit,
+        multipliers,
+        [(mode, t / mechanism.omega) for mode, t in visits],
+        1 + len(tops),
+        {"graze": min(graze, default=np.inf), "shortest": min(lengths) / T},
+        flow,
+    )
+
+
+def cycle(mechanism, start, rtol=1e-12, coarse=1e-8, most=3000, returns=24) -> Cycle:
+    """The stable periodic motion that the start [x, x'] leads to, or what it leads to instead.
+
+    The transient is run at the tolerance `coarse` through at most `most` maxima of t.x of joint 1;
+    a period has up to `returns` of them.
+    """
+    core, near, found = mechanism.scaled, 1e-4, []
+    try:
+        for p in phases(core, np.asarray(start) / mechanism.units, coarse, 1e5, maxima=True):
+            if p.event != ("maximum", 0):
+                continue
+            found.append((p.t1, p.end))
+            if len(found) == most:
+                break
+            gaps = [abs(p.end - z).max() for _, z in found[-2 : -returns - 2 : -1]]
+            back = next((k for k, gap in enumerate(gaps, 1) if gap < near), 0)
+            if not back:
+                continue
+            T, z = p.t1 - found[-1 - back][0], p.end
+            if len(found) > 50 and abs(z[len(z) // 2 :]).max() < 1e-6:
+                return Cycle("equilibrium")
+            try:
+                z, T_new = close(core, z, T, rtol)
+                known = measure(mechanism, z, T_new, rtol)
+            except (ArithmeticError, np.linalg.LinAlgError):
+                known = None
+            if known and abs(z - p.end).max() < 0.05 and abs(T_new / T - 1) < 0.05:
+                others = np.delete(known.multipliers, abs(known.multipliers - 1).argmin())
+                moves = (known.amplitude / mechanism.units[: len(known.amplitude)]).max() > 1e-4
+                if abs(others).max(initial=0) < 1 and moves:
+                    return known
+            near /= 10  # a slow passage
+            if near < 1e-9:
+                break
+    except Diverged:
+        return Cycle("diverged")
+    return Cycle("not periodic")
