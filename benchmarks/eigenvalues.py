@@ -11,7 +11,7 @@ import os
 import statistics
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ import fractaljax as fj
 from fractaljax._mechanism.oscillator import Linearised
 from fractaljax._stability.stability import growth_rate_of_linearised
 
-from .page import both, cell, draw, png, spread, subplots, table, verdict
+from .page import cell, columns as column, draw, filled, png, spread, subplots, table, verdict
 from .timing import compiled, ratio, taking_turns, too_long
 from .truths import eigenvalues, mp
 
@@ -46,20 +46,8 @@ FLUTTER, STABLE = "flutter side", "stable side"
 Columns = tuple[np.ndarray, ...]  # a, b, c_1, c_2, g
 
 
-class Size(NamedTuple):
-    """How much is measured."""
-
-    batches: tuple[int, ...]
-    repeats: int
-    exact: int  # systems of each family, for mpmath
-    near: int  # of each distance from coalescence
-
-
-FULL = Size(tuple(10**k for k in range(8)), 5, 100, 40)
-QUICK = Size((1, 10_000), 3, 10, 4)
-
-
-# Families of systems ------------------------------------------------------------------------------
+FULL = {"batches": tuple(10**k for k in range(8)), "repeats": 5, "exact": 100, "near": 40}
+QUICK = {"batches": (1, 10_000), "repeats": 3, "exact": 10, "near": 4}
 
 
 def stiffnesses(rng, n):
@@ -129,9 +117,6 @@ COALESCING: dict[tuple[float, str], Callable[..., Columns]] = {
 } | {(0.0, "both"): at_coalescence}
 
 
-# Methods ------------------------------------------------------------------------------------------
-
-
 def state_matrices(columns: Columns) -> tuple[np.ndarray, np.ndarray]:
     """[[0, I], [-K, -C]] (n, 4, 4) in units of a power of two near sqrt(a + b), and that (n,).
 
@@ -151,11 +136,6 @@ def state_matrices(columns: Columns) -> tuple[np.ndarray, np.ndarray]:
 closed_form = jax.vmap(growth_rate_of_linearised)
 
 
-def linearised(columns: Columns, dtype: Any = np.float64) -> Linearised:
-    """Systems as the package takes them."""
-    return Linearised(*(jnp.asarray(column, dtype) for column in columns))
-
-
 @functools.partial(jax.vmap, in_axes=0)
 def scene_rates(K_n, K_t, mu) -> jax.Array:
     """Growth rates (n,) of the reference brake with joints of given stiffness and friction."""
@@ -169,7 +149,6 @@ def lapack(A: np.ndarray) -> np.ndarray:
 
 
 def jax_lapack(A) -> jax.Array:
-    """The same by JAX."""
     return jnp.linalg.eigvals(A).real.max(axis=1)
 
 
@@ -212,14 +191,12 @@ def growth_rates(columns: Columns, dtype: Any) -> dict[str, np.ndarray]:
     """Growth rates (n,) by every method that has errors of its own in this precision."""
     matrices, omega = state_matrices(columns)
     A = matrices.astype(dtype)
-    closed = np.asarray(jax.jit(closed_form)(linearised(columns, dtype)))
+    systems = Linearised(*(jnp.asarray(column, dtype) for column in columns))
+    closed = np.asarray(jax.jit(closed_form)(systems))
     by_jax = np.asarray(jax.jit(jax_lapack)(A)) * omega
     if dtype == np.float32:  # NumPy computes these in double precision
         return {CLOSED_32: closed, JAX_32: by_jax}
     return {CLOSED: closed, NUMPY: lapack(A) * omega, JAX: by_jax}
-
-
-# Measuring ----------------------------------------------------------------------------------------
 
 
 def worth(name: str, many: int) -> bool:
@@ -227,23 +204,22 @@ def worth(name: str, many: int) -> bool:
     return name != AT_ONCE or many > CHUNK
 
 
-def times(size: Size) -> list[dict[str, Any]]:
+def times(batches: tuple[int, ...], repeats: int) -> list[dict[str, Any]]:
     """Times of every method in every batch, except those that would take too long."""
-    rng, most = np.random.default_rng(0), size.batches[-1]
+    rng, most = np.random.default_rng(0), batches[-1]
     columns = FAMILIES["random"](rng, most)
     K_n = 10 ** rng.uniform(7, 10, most)
     scenes = K_n, K_n * rng.uniform(0.1, 1, most), rng.uniform(0.05, 0.8, most)
     last: dict[str, tuple[int, float]] = dict.fromkeys(TIMED, (1, 0.0))  # systems, seconds for all
     rows = []
-
-    def wanted(name: str, many: int) -> bool:
-        systems, elapsed = last[name]
-        return worth(name, many) and not too_long(elapsed, many / systems, LIMIT)
-
-    for many in tqdm(size.batches, desc="batch"):
+    for many in tqdm(batches, desc="batch"):
         first = [tuple(column[:many] for column in group) for group in (columns, scenes)]
-        made = {name: timed(name, *first) for name in TIMED if wanted(name, many)}
-        turns = taking_turns({name: call for name, (call, _) in made.items()}, size.repeats)
+        made = {
+            name: timed(name, *first)
+            for name, (systems, elapsed) in last.items()
+            if worth(name, many) and not too_long(elapsed, many / systems, LIMIT)
+        }
+        turns = taking_turns({name: call for name, (call, _) in made.items()}, repeats)
         found = {}
         for name, own in turns.items():
             last[name] = many, statistics.median(own)
@@ -292,36 +268,32 @@ def family(make: Callable[..., Columns], count: int, single: bool = True) -> dic
     return found
 
 
-def measure(quick: bool) -> dict[str, Any]:
-    """Rates by batch, errors by family and by distance from coalescence."""
-    size = QUICK if quick else FULL
-    batches = times(size)
-    large = [row for row in batches if {NUMPY, THREADS} <= set(row["methods"])][-1]
+def measure(batches, repeats: int, exact: int, near: int) -> dict[str, Any]:
+    """Rates by batch, errors by family and by distance from coalescence, at so many systems."""
+    rows = times(batches, repeats)
+    large = [row for row in rows if {NUMPY, THREADS} <= set(row["methods"])][-1]
     own = large["methods"][CLOSED]
     head = {"what": f"{CLOSED} beside {NUMPY}, {large['systems']:,} systems", "wanted": WANTED}
     head |= {"systems": large["systems"], "ratio": own["ratio_to_numpy"]}
     return {
         "headline": [head | {"ratio_to_threads": own["ratio_to_threads"]}],
-        "repeats": size.repeats,
-        "exact_points": {"family": size.exact, "distance": size.near},
-        "batches": batches,
+        "repeats": repeats,
+        "exact_points": {"family": exact, "distance": near},
+        "batches": rows,
         "families": [
-            {"family": name} | family(make, size.exact)
+            {"family": name} | family(make, exact)
             for name, make in tqdm(FAMILIES.items(), desc="family")
         ],
         "coalescing": [
             {"distance": distance, "side": side}
-            | family(make, size.near, distance >= SINGLE or distance == 0)
+            | family(make, near, distance >= SINGLE or distance == 0)
             for (distance, side), make in tqdm(COALESCING.items(), desc="distance")
         ],
     }
 
 
-# The page -----------------------------------------------------------------------------------------
-
-
 def choice(result: dict[str, Any]) -> str:
-    """One sentence: what to use."""
+    """What to use."""
     best = max(result["batches"], key=lambda row: row["methods"][CLOSED]["systems_per_second"])
     own, single = (best["methods"][name]["systems_per_second"] for name in (CLOSED, CLOSED_32))
     errors = [row["errors"] for row in result["families"]]
@@ -371,22 +343,19 @@ def rates(result: dict[str, Any], name: str) -> str:
     """One row of the table of rates: compile time, then rate and ratio in every batch."""
     found = [row["methods"].get(name) for row in result["batches"]]
     compile_s = max((x["compile_s"] or 0 for x in found if x), default=0)
-    cells = [
-        f"{x['systems_per_second']:.2g} ({cell(x['ratio_to_numpy'], '.3g')})" if x else "-"
-        for x in found
-    ]
+    form = "{systems_per_second:.2g} ({ratio_to_numpy:.3g})"
+    cells = [filled(form, x) if x else "-" for x in found]
     return " | ".join([name, cell(compile_s or None, ".1f"), *cells])
 
 
 def errors(row: dict[str, Any]) -> str:
     """One row of the table of errors."""
-    cells = [both(row["errors"].get(name)) for name in WITH_ERRORS]
+    cells = [cell(row["errors"].get(name), ".1e") for name in WITH_ERRORS]
     cells += [str(row["wrong_signs"].get(name, "-")) for name in (CLOSED, CLOSED_32)]
     return " | ".join([name_of(row), f"{row['unstable']:.0%}", *cells])
 
 
 def page(result: dict[str, Any]) -> list[str]:
-    """What to use, where it falls short, two tables, how it was measured."""
     batches, exact = result["batches"], result["exact_points"]
     skipped = [
         f"{name} of {row['systems']:,}"
@@ -447,7 +416,7 @@ def picture(result: dict[str, Any]) -> bytes:
     for name in TIMED:
         rows = [row for row in result["batches"] if name in row["methods"]]
         rates = [row["methods"][name]["systems_per_second"] for row in rows]
-        lines.append(([row["systems"] for row in rows], rates, STYLES[name], name))
+        lines.append((*column(rows, "systems"), rates, STYLES[name], name))
     draw(left, lines, "systems in a batch [-]", "systems a second [1/s]")
 
     def worst(rows, name):
@@ -457,8 +426,8 @@ def picture(result: dict[str, Any]) -> bytes:
     for name in (CLOSED, NUMPY, CLOSED_32, JAX_32):  # JAX in float64 is as NumPy
         for side, line in ((FLUTTER, "-"), (STABLE, "--")):
             rows = [r for r in result["coalescing"] if r["side"] == side and name in r["errors"]]
-            distances = [row["distance"] for row in rows]
-            lines.append((distances, worst(rows, name), STYLES[name][:3] + line, f"{name}, {side}"))
+            style, label = STYLES[name][:3] + line, f"{name}, {side}"
+            lines.append((*column(rows, "distance"), worst(rows, name), style, label))
     draw(middle, lines, "distance from coalescence [-]", error)
     families = result["families"]
     names = [row["family"].replace(" term", "\nterm") for row in families]

@@ -19,17 +19,8 @@ from tqdm import tqdm
 
 import fractaljax as fj
 
-from .loops import (
-    STEP,
-    arrays,
-    brake,
-    differences,
-    loop_gradient,
-    loop_value,
-    plain_loop,
-    tuned_loop,
-)
-from .page import both, cell, draw, png, spread, subplots, table, verdict
+from .loops import STEP, arrays, brake, differences, plain_loop, tuned_loop
+from .page import cell, draw, png, spread, subplots, table, verdict
 from .timing import compiled, ratio, taking_turns, too_long
 from .truths import growth_of_surface, mp
 
@@ -44,20 +35,11 @@ PLAIN, TUNED, ARRAYS = "loop", "tuned loop", "NumPy arrays"
 FORWARD, REVERSE, FORWARD_32 = "forward mode", "reverse mode", "forward mode, float32"
 
 
-class Size(NamedTuple):
-    """How much is measured."""
-
-    points: int  # of the package
-    at_once: int  # of those in one call
-    arrays: int  # of those, for the NumPy arrays
-    loop: int  # for the loops
-    exact: int  # for mpmath
-    repeats: int
-    batches: tuple[int, ...]
-
-
-FULL = Size(1_000_000, 10_000, 20_000, 2000, 48, 9, tuple(10**k for k in range(7)))
-QUICK = Size(10_000, 1000, 1000, 200, 6, 3, (1000,))
+FULL = {"points": 1_000_000, "at_once": 10_000, "arrays": 20_000, "loop": 2000, "exact": 48}
+FULL |= {"repeats": 9, "batches": tuple(10**k for k in range(7))}
+QUICK = {"points": 10_000, "at_once": 1000, "arrays": 1000, "loop": 200, "exact": 6}
+QUICK |= {"repeats": 3, "batches": (1000,)}
+Rows = list[dict[str, Any]]
 
 
 def surfaces(count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -66,9 +48,6 @@ def surfaces(count: int) -> tuple[np.ndarray, np.ndarray]:
     D = rng.uniform(*D_RANGE, count)
     G = np.exp(rng.uniform(math.log(G_RANGE[0]), math.log(G_RANGE[1]), count))
     return D.astype(np.float32).astype(float), G.astype(np.float32).astype(float)
-
-
-# The truth ----------------------------------------------------------------------------------------
 
 
 class Truth(NamedTuple):
@@ -115,9 +94,6 @@ def errors_of(rows: np.ndarray, truth: Truth) -> dict[str, Any]:
     return found
 
 
-# The methods --------------------------------------------------------------------------------------
-
-
 class Method(NamedTuple):
     """A way to values or gradients at the first `points` surfaces."""
 
@@ -138,13 +114,24 @@ class Method(NamedTuple):
         return np.stack([value, *slopes], axis=1)
 
 
+def by_loop(body: Callable, gradient: bool, D: list[float], G: list[float]) -> Callable:
+    """Growth rates (n,), or value and derivatives (n, 3), point by point."""
+
+    def value(d, g):
+        return body(d, g)[0]
+
+    def one(d, g):
+        return differences(value, d, g, STEP, 2) if gradient else value(d, g)
+
+    return lambda: np.array([one(d, g) for d, g in zip(D, G, strict=True)])
+
+
 def loops(b: dict[str, float], D: np.ndarray, G: np.ndarray) -> list[Method]:
     """Both loops, for values and for gradients."""
     return [
-        Method(f"{name}, {what}", what == GRADIENT, len(D), functools.partial(run, body, *lists))
-        for lists in [(D.tolist(), G.tolist())]
+        Method(f"{name}, {what}", gradient, len(D), by_loop(body, gradient, D.tolist(), G.tolist()))
         for name, body in ((PLAIN, plain_loop(b)), (TUNED, tuned_loop(b)))
-        for what, run in ((VALUE, loop_value), (GRADIENT, loop_gradient))
+        for what, gradient in ((VALUE, False), (GRADIENT, True))
     ]
 
 
@@ -190,10 +177,7 @@ def package(name: str, D: np.ndarray, G: np.ndarray, at_once: int) -> Method:
     return Method(name, name != VALUE, len(D), lambda: [run(*part) for part in parts], compile_s)
 
 
-# Measuring ----------------------------------------------------------------------------------------
-
-
-def by_step(D: np.ndarray, G: np.ndarray, truth: Truth) -> list[dict[str, Any]]:
+def by_step(D: np.ndarray, G: np.ndarray, truth: Truth) -> Rows:
     """Errors of the differences of NumPy arrays, by their order and step."""
     growth, at = arrays(brake()), (D[truth.places], G[truth.places])
 
@@ -207,29 +191,19 @@ def by_step(D: np.ndarray, G: np.ndarray, truth: Truth) -> list[dict[str, Any]]:
     ]
 
 
-def best_steps(rows: list[dict[str, Any]]) -> dict[int, float]:
-    """By order the step with the least worst error; only the truth shows which it is."""
-    found = {}
-    for row in sorted(rows, key=lambda row: row["worst"]):
-        found.setdefault(row["order"], row["step"])
-    return found
-
-
-def by_batch(size: Size, D: np.ndarray, G: np.ndarray, steps) -> list[dict[str, Any]]:
+def by_batch(batches, repeats: int, D: np.ndarray, G: np.ndarray, steps) -> Rows:
     """Points a second in one call, by the number of points in it."""
     rows = []
     last: dict[str, tuple[int, float]] = {}  # points, and seconds for all of them
-
-    def wanted(peer: Method) -> bool:
-        points, elapsed = last.get(peer.name, (1, 0.0))
-        return not too_long(elapsed, peer.points / points, LIMIT)
-
-    for many in tqdm(size.batches, desc="batch"):
+    for many in tqdm(batches, desc="batch"):
         first = D[:many], G[:many]
-        methods = [peer for peer in with_arrays(brake(), *first, steps) if wanted(peer)]
-        methods += [package(name, *first, many) for name in (VALUE, FORWARD, REVERSE)]
+        methods = [package(name, *first, many) for name in (VALUE, FORWARD, REVERSE)]
+        for peer in reversed(with_arrays(brake(), *first, steps)):
+            points, elapsed = last.get(peer.name, (1, 0.0))
+            if not too_long(elapsed, peer.points / points, LIMIT):
+                methods.insert(0, peer)
         calls = {method.name: method.run for method in methods}
-        for name, times in taking_turns(calls, min(size.repeats, 5)).items():
+        for name, times in taking_turns(calls, repeats).items():
             last[name] = many, statistics.median(times)
         rates = {name: many / last[name][1] for name in calls}
         rows.append({"points": many, "points_per_second": rates})
@@ -246,8 +220,6 @@ def describe(method: Method, times: dict[str, list[float]], G, truth: Truth) -> 
         "points": method.points,
         "compile_s": method.compile_s,
         "seconds_per_point": statistics.median(own),
-        "seconds_per_point_fastest": min(own),
-        "seconds_per_point_slowest": max(own),
         "points_per_second": 1 / statistics.median(own),
         "ratio_to_loop": ratio(times[f"{PLAIN}, {kind}"], own),
         "ratio_to_tuned_loop": ratio(times[f"{TUNED}, {kind}"], own),
@@ -257,19 +229,17 @@ def describe(method: Method, times: dict[str, list[float]], G, truth: Truth) -> 
     }
 
 
-def measure(quick: bool) -> dict[str, Any]:
+def measure(**size: Any) -> dict[str, Any]:
     """Times and errors of every method, by step and by batch."""
-    size, b = QUICK if quick else FULL, brake()
-    D, G = surfaces(size.points)
-    truth = truth_of(b, D[: size.loop], G[: size.loop], size.exact)
-    steps = by_step(D, G, truth)
-    best = best_steps(steps)
-    methods = [
-        *loops(b, D[: size.loop], G[: size.loop]),
-        *with_arrays(b, D[: size.arrays], G[: size.arrays], best),
-        *(package(name, D, G, size.at_once) for name in (VALUE, FORWARD, REVERSE, FORWARD_32)),
-    ]
-    turns = taking_turns({method.name: method.run for method in methods}, size.repeats)
+    b, (D, G), at_once = brake(), surfaces(size["points"]), size["at_once"]
+    few, more = ((D[: size[name]], G[: size[name]]) for name in ("loop", "arrays"))
+    truth = truth_of(b, *few, size["exact"])
+    steps, best = by_step(D, G, truth), {}
+    for row in sorted(steps, key=lambda row: row["worst"]):
+        best.setdefault(row["order"], row["step"])  # only the truth shows which it is
+    methods = [*loops(b, *few), *with_arrays(b, *more, best)]
+    methods += [package(name, D, G, at_once) for name in (VALUE, FORWARD, REVERSE, FORWARD_32)]
+    turns = taking_turns({method.name: method.run for method in methods}, size["repeats"])
     times = {m.name: [elapsed / m.points for elapsed in turns[m.name]] for m in methods}
     found = {method.name: describe(method, times, G, truth) for method in methods}
     # Forward mode: there are two inputs.
@@ -278,18 +248,15 @@ def measure(quick: bool) -> dict[str, Any]:
     return {
         "headline": [{"what": what, "ratio": ratios["ratio_to_loop"], "wanted": WANTED} | ratios],
         "ranges": {"D": D_RANGE, "G": G_RANGE},
-        "size": size._asdict(),
+        "size": size,
         "exact_points": len(truth.places),
         "loop_step": STEP,
         "best_steps": best,
         "regimes": truth.regimes,
         "methods": list(found.values()),
         "steps": steps,
-        "batches": by_batch(size, D, G, best),
+        "batches": by_batch(size["batches"], min(size["repeats"], 5), D, G, best),
     }
-
-
-# The page -----------------------------------------------------------------------------------------
 
 
 def worst(row: dict[str, Any], what: str = "gradient") -> float:
@@ -298,7 +265,7 @@ def worst(row: dict[str, Any], what: str = "gradient") -> float:
 
 
 def choice(result: dict[str, Any]) -> str:
-    """One sentence: what to use."""
+    """What to use."""
     rows = {row["name"]: row for row in result["methods"]}
     own, single = rows[FORWARD], rows[FORWARD_32]
     peers = [row for name, row in rows.items() if name.startswith(ARRAYS) and row["gradient"]]
@@ -312,10 +279,9 @@ def choice(result: dict[str, Any]) -> str:
 
 
 def page(result: dict[str, Any]) -> list[str]:
-    """What to use, three tables, how it was measured."""
     size, ranges, head = result["size"], result["ranges"], result["headline"][0]
     regimes = ", ".join(f"{name} {share:.0%}" for name, share in result["regimes"].items())
-    steps = {order: [r for r in result["steps"] if r["order"] == order] for order in (2, 4)}
+    steps = [[r for r in result["steps"] if r["order"] == order] for order in (2, 4)]
     batches = result["batches"]
     return [
         choice(result),
@@ -327,22 +293,17 @@ def page(result: dict[str, Any]) -> list[str]:
             "method | compile [s] | time a point [us] | points a second | ratio to the loop"
             " | to the tuned loop | to NumPy arrays | growth rate error / omega: median, worst"
             " | gradient error, relative: median, worst | not finite",
-            (
-                f"{r['name']} | {cell(r['compile_s'], '.1f')} | {r['seconds_per_point'] * 1e6:.3g}"
-                f" | {r['points_per_second']:.3g} | {r['ratio_to_loop']:.3g}"
-                f" | {r['ratio_to_tuned_loop']:.3g} | {r['ratio_to_arrays']:.3g}"
-                f" | {both(r['error_to_40_digits']['growth_rate'])}"
-                f" | {both(r['error_to_40_digits'].get('gradient'))} | {r['not_finite']}"
-                for r in result["methods"]
-            ),
+            result["methods"],
+            "{name} | {compile_s:.1f} | {seconds_per_point!u:.3g} | {points_per_second:.3g}"
+            " | {ratio_to_loop:.3g} | {ratio_to_tuned_loop:.3g} | {ratio_to_arrays:.3g}"
+            " | {error_to_40_digits.growth_rate:.1e} | {error_to_40_digits.gradient:.1e}"
+            " | {not_finite}",
         ),
         "Gradient error of the differences of NumPy arrays by their step, relative:",
         table(
             "step | order 2: median, worst | order 4: median, worst",
-            (
-                f"{x['step']:.1e} | {both(x)} | {both(y)}"
-                for x, y in zip(*steps.values(), strict=True)
-            ),
+            ({"step": x["step"], "two": x, "four": y} for x, y in zip(*steps, strict=True)),
+            "{step:.1e} | {two:.1e} | {four:.1e}",
         ),
         "Points a second in one call, by the number of points in it:",
         table(

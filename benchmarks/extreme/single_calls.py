@@ -1,6 +1,5 @@
 """Quantities that come one call at a time: structures, damping, boundaries, heights, motion."""
 
-import dataclasses
 import itertools
 import math
 import statistics
@@ -25,16 +24,7 @@ from ..transients import SCALE, V, outcomes, reference
 mp: Any = mpmath.mp  # it makes its functions at run time
 WAVES = 3  # of each length in a topography
 Row = dict[str, Any]
-Cases = Iterator[tuple[str, Callable[[], Any], Callable[[Any], float]]]
-
-
-@dataclasses.dataclass(frozen=True)
-class Quantity:
-    """A public quantity with its ranges, and its cases: name, call, error of the call's result."""
-
-    name: str
-    ranges: str
-    cases: Callable[[], Cases]
+Cases = Iterator[tuple[str, Callable[[], Any], Callable[[Any], float]]]  # call, error of its result
 
 
 def chain(rng, n: int, spread: float) -> tuple[np.ndarray, np.ndarray]:
@@ -155,36 +145,32 @@ def identify_cases() -> Cases:
         yield f"lengths times {unit:g}", lambda u=unit: fj.identify(z * u, L / n * u), error
 
 
-QUANTITIES = [
-    Quantity("modal_damping", "ratio 1e-8 to 1e3, chains over 0 to 6 decades", damping_cases),
-    Quantity(
-        "growth_rate of a Structure",
+QUANTITIES = {
+    "modal_damping": ("ratio 1e-8 to 1e3, chains over 0 to 6 decades", damping_cases),
+    "growth_rate of a Structure": (
         "K_n 1e3 to 1e15 N/m on chains over 0 to 6 decades, dampers 1e-6 s times the springs",
         structure_cases,
     ),
-    Quantity(
-        "hopf_boundary",
+    "hopf_boundary": (
         "D 2.05 to 2.95, G 1e-14 to 1e-6 m, P 1e-2 to 1e8 N, K_n 1e3 to 1e15 N/m, xi 1e-6 to 1e3",
         boundary_cases,
     ),
-    Quantity(
-        "topography", "D to 2 + 1e-6 and 3 - 1e-6, G 1e-18 to 1e-4 m, gamma to 10", topography_cases
-    ),
-    Quantity("identify", "lengths 1e-9 to 1e6 times those of a profile", identify_cases),
-]
+    "topography": ("D to 2 + 1e-6 and 3 - 1e-6, G 1e-18 to 1e-4 m, gamma to 10", topography_cases),
+    "identify": ("lengths 1e-9 to 1e6 times those of a profile", identify_cases),
+}
 
 
-def quantity_row(quantity: Quantity) -> Row:
-    """Its worst error and its slowest case, in float64."""
+def quantity_row(name: str, ranges: str, cases: Callable[[], Cases]) -> Row:
+    """The worst error of a quantity and its slowest case, in float64."""
     off, taken = [], {}
-    for name, call, error in tqdm(list(quantity.cases()), desc=quantity.name):
+    for case, call, error in tqdm(list(cases()), desc=name):
         call()
-        taken[name], found = seconds(call)
+        taken[case], found = seconds(call)
         off.append(error(found))
-    slowest, middle = max(taken, key=lambda name: taken[name]), statistics.median(taken.values())
+    slowest, middle = max(taken, key=lambda case: taken[case]), statistics.median(taken.values())
     return {
-        "quantity": quantity.name,
-        "ranges": quantity.ranges,
+        "quantity": name,
+        "ranges": ranges,
         "points": len(off),
         "worst": max(off),
         "not_finite": int((~np.isfinite(off)).sum()),
@@ -194,7 +180,7 @@ def quantity_row(quantity: Quantity) -> Row:
     }
 
 
-# Motion -------------------------------------------------------------------------------------------
+# Motion
 
 
 def bisect(inside: Callable[[float], bool], low: float, high: float) -> tuple[float, float]:
@@ -222,11 +208,10 @@ def scenes() -> dict[str, fj.Scene]:
     """Where the search for a cycle may fail."""
     base, brake = reference(), fj.brake_scene()
 
-    def stiff(G):
+    def sticks(G):
         return float(fj.stiffness(brake.replace(G=G))[1]) > 0
 
-    slip, stuck = bisect(stiff, 1e-11, 1e-10)
-    last, soft = bisect(stiff, 2e-10, 4e-10)
+    slip, plastic = bisect(sticks, 1e-11, 1e-10), bisect(sticks, 2e-10, 4e-10)
     undamped = base.replace(xi_1=0.0, xi_2=0.0)
     return (
         {f"K_n = {K:.0e} N/m": reference(K) for K in 10.0 ** np.arange(6, 14)}
@@ -238,13 +223,12 @@ def scenes() -> dict[str, fj.Scene]:
             "growth 1e-6 omega": barely(1),
             "growth -1e-6 omega": barely(-1),
             "brake": brake,
-            "brake, G at gross slip, outside": brake.replace(G=slip),
-            "brake, G at gross slip, inside": brake.replace(G=stuck),
-            "brake, G at fully plastic, inside": brake.replace(G=last),
-            "brake, G at fully plastic, outside": brake.replace(G=soft),
-            "brake, D = 2.45": brake.replace(D=2.45),
-            "brake, D = 2.9": brake.replace(D=2.9),
+            "brake, G at gross slip, outside": brake.replace(G=slip[0]),
+            "brake, G at gross slip, inside": brake.replace(G=slip[1]),
+            "brake, G at fully plastic, inside": brake.replace(G=plastic[0]),
+            "brake, G at fully plastic, outside": brake.replace(G=plastic[1]),
         }
+        | {f"brake, D = {D:g}": brake.replace(D=D) for D in (2.45, 2.9)}
     )
 
 
@@ -254,14 +238,9 @@ def cycles() -> list[Row]:
     @eqx.filter_jit
     def describe(scene):
         cycle = fj.limit_cycle(scene, throw=False)
-        one = cycle.multipliers[jnp.argmin(jnp.abs(cycle.multipliers - 1))]
         omega = jnp.sqrt(fj.stiffness(scene)[0] / scene.oscillator.m)
-        numbers = {
-            "period": cycle.period,
-            "error": cycle.error,
-            "trivial_multiplier_off": jnp.abs(one - 1),
-            "amplitude": cycle.amplitude[0],
-        }
+        off = jnp.abs(cycle.multipliers - 1).min()
+        numbers = {"period": cycle.period, "error": cycle.error, "trivial_multiplier_off": off}
         return cycle.result, cycle.returns, fj.growth_rate(scene) / omega, numbers
 
     rows = []
