@@ -6,7 +6,6 @@ in families, each hard in its own way.
 """
 
 import functools
-import math
 import os
 import statistics
 from collections.abc import Callable
@@ -24,7 +23,7 @@ from fractaljax._mechanism.oscillator import Linearised
 from fractaljax._stability.stability import growth_rate_of_linearised
 
 from .page import cell, columns as column, draw, filled, png, spread, subplots, table, verdict
-from .timing import compiled, ratio, taking_turns, too_long
+from .timing import in_batches, in_parts, ratio
 from .truths import eigenvalues, mp
 
 TITLE = "Growth rate of two directions in closed form"
@@ -143,13 +142,12 @@ def scene_rates(K_n, K_t, mu) -> jax.Array:
     return fj.growth_rate(fj.Scene(fj.FixedContact(K_n, K_t), fj.Coulomb(mu), oscillator))
 
 
-def lapack(A: np.ndarray) -> np.ndarray:
-    """Largest real parts (n,) of the eigenvalues of matrices (n, 4, 4), by NumPy."""
-    return np.linalg.eigvals(A).real.max(axis=1)
+def largest(eigvals: Callable) -> Callable:
+    """Largest real parts (n,) of the eigenvalues of matrices (n, 4, 4)."""
+    return lambda A: eigvals(A).real.max(axis=1)
 
 
-def jax_lapack(A) -> jax.Array:
-    return jnp.linalg.eigvals(A).real.max(axis=1)
+lapack, jax_lapack = largest(np.linalg.eigvals), largest(jnp.linalg.eigvals)
 
 
 def threaded(parts: list[np.ndarray]) -> list[np.ndarray]:
@@ -158,30 +156,18 @@ def threaded(parts: list[np.ndarray]) -> list[np.ndarray]:
         return list(pool.map(lapack, parts))
 
 
-def program(function: Callable, *systems: jax.Array, size: int = CHUNK) -> tuple[Callable, float]:
-    """A call of a function for all systems, `size` at a time, and the seconds to compile it."""
-    # Of equal lengths, since every shape is a program of its own.
-    split = [jnp.split(column, math.ceil(len(column) / size)) for column in systems]
-    parts = list(zip(*split, strict=True))
-    run, compile_s = compiled(function, *parts[0])
-    return lambda: [run(*part) for part in parts], compile_s
-
-
 def timed(name: str, columns: Columns, scenes: Columns) -> tuple[Callable, float | None]:
     """The call of a method for these systems or scenes, and the seconds it took to compile."""
-
-    def closed(*columns):
-        return closed_form(Linearised(*columns))
-
     if name == SCENES:
-        return program(scene_rates, *map(jnp.asarray, scenes))
+        return in_parts(scene_rates, map(jnp.asarray, scenes), CHUNK)
     if name in (CLOSED, CLOSED_32, AT_ONCE):
         size = len(columns[0]) if name == AT_ONCE else CHUNK
         dtype = np.float32 if name == CLOSED_32 else np.float64
-        return program(closed, *(jnp.asarray(column, dtype) for column in columns), size=size)
+        systems = [jnp.asarray(column, dtype) for column in columns]
+        return in_parts(lambda *systems: closed_form(Linearised(*systems)), systems, size)
     matrices, _ = state_matrices(columns)
     if name == JAX:
-        return program(jax_lapack, jnp.asarray(matrices), size=len(matrices))
+        return in_parts(jax_lapack, [jnp.asarray(matrices)], len(matrices))
     if name == THREADS:
         return functools.partial(threaded, np.array_split(matrices, os.cpu_count() or 1)), None
     return functools.partial(lapack, matrices), None
@@ -210,25 +196,25 @@ def times(batches: tuple[int, ...], repeats: int) -> list[dict[str, Any]]:
     columns = FAMILIES["random"](rng, most)
     K_n = 10 ** rng.uniform(7, 10, most)
     scenes = K_n, K_n * rng.uniform(0.1, 1, most), rng.uniform(0.05, 0.8, most)
-    last: dict[str, tuple[int, float]] = dict.fromkeys(TIMED, (1, 0.0))  # systems, seconds for all
-    rows = []
-    for many in tqdm(batches, desc="batch"):
+    compile_s, rows = {}, []
+
+    def calls(many, quick):
         first = [tuple(column[:many] for column in group) for group in (columns, scenes)]
-        made = {
-            name: timed(name, *first)
-            for name, (systems, elapsed) in last.items()
-            if worth(name, many) and not too_long(elapsed, many / systems, LIMIT)
-        }
-        turns = taking_turns({name: call for name, (call, _) in made.items()}, repeats)
-        found = {}
-        for name, own in turns.items():
-            last[name] = many, statistics.median(own)
-            found[name] = {
-                "compile_s": made[name][1],
+        names = [name for name in TIMED if worth(name, many) and quick(name)]
+        made = {name: timed(name, *first) for name in names}
+        compile_s.update({name: elapsed for name, (_, elapsed) in made.items()})
+        return {name: call for name, (call, _) in made.items()}
+
+    for many, turns in in_batches(calls, batches, repeats, LIMIT):
+        found = {
+            name: {
+                "compile_s": compile_s[name],
                 "systems_per_second": many / statistics.median(own),
                 "ratio_to_numpy": ratio(turns[NUMPY], own) if NUMPY in turns else None,
                 "ratio_to_threads": ratio(turns[THREADS], own) if THREADS in turns else None,
             }
+            for name, own in turns.items()
+        }
         rows.append({"systems": many, "methods": found})
     return rows
 
@@ -292,18 +278,6 @@ def measure(batches, repeats: int, exact: int, near: int) -> dict[str, Any]:
     }
 
 
-def choice(result: dict[str, Any]) -> str:
-    """What to use."""
-    best = max(result["batches"], key=lambda row: row["methods"][CLOSED]["systems_per_second"])
-    own, single = (best["methods"][name]["systems_per_second"] for name in (CLOSED, CLOSED_32))
-    errors = [row["errors"] for row in result["families"]]
-    worst = {n: max(row[n]["worst"] for row in errors) for n in (CLOSED, NUMPY, CLOSED_32)}
-    return f"""Use the default, the closed form in float64 and many systems at a time: {own:.2g} a
-        second, with a worst error, away from coalescence, of {worst[CLOSED]:.0e} of the largest
-        modulus of an eigenvalue, where NumPy has {worst[NUMPY]:.0e}; float32 is
-        {single / own:.1f} times as fast and good to {worst[CLOSED_32]:.0e}."""
-
-
 def name_of(row: dict[str, Any]) -> str:
     """A family as the page names it."""
     if "family" in row:
@@ -323,22 +297,6 @@ def worse(result: dict[str, Any], own: str, peer: str) -> str:
     return f"is above LAPACK's in: {'; '.join(found)}." if found else "is no larger in any family."
 
 
-def in_figures(result: dict[str, Any]) -> str:
-    """Whether the closed form keeps its promise: ratio by batch, error by family."""
-    head = result["headline"][0]
-    slow = [
-        f"{row['systems']:,} ({found:.3g})"
-        for row in result["batches"]
-        if (found := row["methods"][CLOSED]["ratio_to_numpy"]) is not None and found < WANTED
-    ]
-    below = f"The ratio is below {WANTED} in batches of {', '.join(slow)}." if slow else ""
-    return f"""For {head["systems"]:,} systems it has {head["ratio"]:.0f} times the rate of {NUMPY}
-        (wanted >= {head["wanted"]}: {verdict(head)}), and {head["ratio_to_threads"]:.0f} times that
-        of the same spread by hand over a thread a core, as JAX does with the closed form. {below}
-        In float64 its worst error {worse(result, CLOSED, NUMPY)}
-        In float32 its worst error {worse(result, CLOSED_32, JAX_32)}"""
-
-
 def rates(result: dict[str, Any], name: str) -> str:
     """One row of the table of rates: compile time, then rate and ratio in every batch."""
     found = [row["methods"].get(name) for row in result["batches"]]
@@ -348,7 +306,7 @@ def rates(result: dict[str, Any], name: str) -> str:
     return " | ".join([name, cell(compile_s or None, ".1f"), *cells])
 
 
-def errors(row: dict[str, Any]) -> str:
+def error_cells(row: dict[str, Any]) -> str:
     """One row of the table of errors."""
     cells = [cell(row["errors"].get(name), ".1e") for name in WITH_ERRORS]
     cells += [str(row["wrong_signs"].get(name, "-")) for name in (CLOSED, CLOSED_32)]
@@ -356,7 +314,13 @@ def errors(row: dict[str, Any]) -> str:
 
 
 def page(result: dict[str, Any]) -> list[str]:
-    batches, exact = result["batches"], result["exact_points"]
+    batches, exact, head = result["batches"], result["exact_points"], result["headline"][0]
+    best = max((row["methods"] for row in batches), key=lambda x: x[CLOSED]["systems_per_second"])
+    own, single = (best[name]["systems_per_second"] for name in (CLOSED, CLOSED_32))
+    errors = [row["errors"] for row in result["families"]]
+    worst = {n: max(row[n]["worst"] for row in errors) for n in (CLOSED, NUMPY, CLOSED_32)}
+    ratios = {r["systems"]: r["methods"][CLOSED]["ratio_to_numpy"] for r in batches}
+    slow = [f"{n:,} ({found:.3g})" for n, found in ratios.items() if found and found < WANTED]
     skipped = [
         f"{name} of {row['systems']:,}"
         for row in batches
@@ -364,8 +328,16 @@ def page(result: dict[str, Any]) -> list[str]:
         if worth(name, row["systems"]) and name not in row["methods"]
     ]
     return [
-        choice(result),
-        in_figures(result),
+        f"""Use the default, the closed form in float64 and many systems at a time: {own:.2g} a
+        second, with a worst error, away from coalescence, of {worst[CLOSED]:.0e} of the largest
+        modulus of an eigenvalue, where NumPy has {worst[NUMPY]:.0e}; float32 is
+        {single / own:.1f} times as fast and good to {worst[CLOSED_32]:.0e}.""",
+        f"""For {head["systems"]:,} systems it has {head["ratio"]:.0f} times the rate of {NUMPY}
+        (wanted >= {head["wanted"]}: {verdict(head)}), and {head["ratio_to_threads"]:.0f} times that
+        of the same spread by hand over a thread a core, as JAX does with the closed form.
+        {f"The ratio is below {WANTED} in batches of {', '.join(slow)}." if slow else ""}
+        In float64 its worst error {worse(result, CLOSED, NUMPY)}
+        In float32 its worst error {worse(result, CLOSED_32, JAX_32)}""",
         "Systems a second by systems in a batch; in brackets the ratio to NumPy in that batch:",
         table(
             " | ".join(["method", "compile [s]", *(f"{row['systems']:,}" for row in batches)]),
@@ -374,7 +346,7 @@ def page(result: dict[str, Any]) -> list[str]:
         "Errors by family: median, worst:",
         table(
             f"family | unstable | {' | '.join(WITH_ERRORS)} | wrong signs | wrong signs, float32",
-            map(errors, result["families"] + result["coalescing"]),
+            map(error_cells, result["families"] + result["coalescing"]),
         ),
         f"""Times are medians of {result["repeats"]} turns over systems of the random family, the
         methods taking turns, and every ratio the median of the ratios within a turn; compile time,

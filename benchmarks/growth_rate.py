@@ -21,7 +21,7 @@ import fractaljax as fj
 
 from .loops import STEP, arrays, brake, differences, plain_loop, tuned_loop
 from .page import cell, draw, png, spread, subplots, table, verdict
-from .timing import compiled, ratio, taking_turns, too_long
+from .timing import in_batches, in_parts, ratio, taking_turns
 from .truths import growth_of_surface, mp
 
 TITLE = "Growth rate with gradient over surfaces"
@@ -33,8 +33,6 @@ D_RANGE, G_RANGE = (2.35, 2.6), (3e-11, 3e-9)
 VALUE, GRADIENT = "value", "value and gradient"
 PLAIN, TUNED, ARRAYS = "loop", "tuned loop", "NumPy arrays"
 FORWARD, REVERSE, FORWARD_32 = "forward mode", "reverse mode", "forward mode, float32"
-
-
 FULL = {"points": 1_000_000, "at_once": 10_000, "arrays": 20_000, "loop": 2000, "exact": 48}
 FULL |= {"repeats": 9, "batches": tuple(10**k for k in range(7))}
 QUICK = {"points": 10_000, "at_once": 1000, "arrays": 1000, "loop": 200, "exact": 6}
@@ -148,9 +146,8 @@ def with_arrays(b, D: np.ndarray, G: np.ndarray, steps: dict[int, float]) -> lis
     ]
 
 
-@functools.cache
-def program(name: str, at_once: int) -> tuple[Callable, float]:
-    """One of the package's functions of D and G (n,), compiled, and the seconds it took."""
+def package(name: str, D: np.ndarray, G: np.ndarray, at_once: int) -> Method:
+    """One of the package's programs, called for `at_once` points until it has had all."""
     dtype = np.float32 if name == FORWARD_32 else np.float64
     scene = jax.tree.map(lambda x: jnp.asarray(x, dtype), fj.brake_scene())
 
@@ -164,17 +161,9 @@ def program(name: str, at_once: int) -> tuple[Callable, float]:
 
     reverse = jax.value_and_grad(value, argnums=(0, 1))
     function = {VALUE: value, REVERSE: reverse}.get(name, forward)
-    column = jax.ShapeDtypeStruct((at_once,), dtype)
-    return compiled(jax.vmap(function), column, column)
-
-
-def package(name: str, D: np.ndarray, G: np.ndarray, at_once: int) -> Method:
-    """One of the package's programs, called for `at_once` points until it has had all."""
-    run, compile_s = program(name, at_once)
-    dtype = np.float32 if name == FORWARD_32 else np.float64
-    columns = [jnp.split(jnp.asarray(column, dtype), len(D) // at_once) for column in (D, G)]
-    parts = list(zip(*columns, strict=True))
-    return Method(name, name != VALUE, len(D), lambda: [run(*part) for part in parts], compile_s)
+    columns = [jnp.asarray(column, dtype) for column in (D, G)]
+    run, compile_s = in_parts(jax.vmap(function), columns, at_once)
+    return Method(name, name != VALUE, len(D), run, compile_s)
 
 
 def by_step(D: np.ndarray, G: np.ndarray, truth: Truth) -> Rows:
@@ -193,21 +182,17 @@ def by_step(D: np.ndarray, G: np.ndarray, truth: Truth) -> Rows:
 
 def by_batch(batches, repeats: int, D: np.ndarray, G: np.ndarray, steps) -> Rows:
     """Points a second in one call, by the number of points in it."""
-    rows = []
-    last: dict[str, tuple[int, float]] = {}  # points, and seconds for all of them
-    for many in tqdm(batches, desc="batch"):
+
+    def calls(many, quick):
         first = D[:many], G[:many]
-        methods = [package(name, *first, many) for name in (VALUE, FORWARD, REVERSE)]
-        for peer in reversed(with_arrays(brake(), *first, steps)):
-            points, elapsed = last.get(peer.name, (1, 0.0))
-            if not too_long(elapsed, peer.points / points, LIMIT):
-                methods.insert(0, peer)
-        calls = {method.name: method.run for method in methods}
-        for name, times in taking_turns(calls, repeats).items():
-            last[name] = many, statistics.median(times)
-        rates = {name: many / last[name][1] for name in calls}
-        rows.append({"points": many, "points_per_second": rates})
-    return rows
+        methods = [peer for peer in with_arrays(brake(), *first, steps) if quick(peer.name)]
+        methods += [package(name, *first, many) for name in (VALUE, FORWARD, REVERSE)]
+        return {method.name: method.run for method in methods}
+
+    return [
+        {"points": n, "points_per_second": {m: n / statistics.median(t) for m, t in turns.items()}}
+        for n, turns in in_batches(calls, batches, repeats, LIMIT)
+    ]
 
 
 def describe(method: Method, times: dict[str, list[float]], G, truth: Truth) -> dict[str, Any]:
@@ -264,27 +249,20 @@ def worst(row: dict[str, Any], what: str = "gradient") -> float:
     return row["error_to_40_digits"][what]["worst"]
 
 
-def choice(result: dict[str, Any]) -> str:
-    """What to use."""
-    rows = {row["name"]: row for row in result["methods"]}
-    own, single = rows[FORWARD], rows[FORWARD_32]
-    peers = [row for name, row in rows.items() if name.startswith(ARRAYS) and row["gradient"]]
-    peer = min(peers, key=worst)
-    time = {row["name"]: f"{row['seconds_per_point'] * 1e6:.2g} us" for row in rows.values()}
-    return f"""Use forward mode in float64 for the gradient to (D, G), and some
-        {result["size"]["at_once"]:,} points in a call, as `fj.sweep` does: {time[FORWARD]} a point,
-        good to {worst(own):.0e} of its length (reverse mode: {time[REVERSE]}), where the best
-        differences of the quickest peer take {time[peer["name"]]} for {worst(peer):.0e}; float32
-        takes {time[FORWARD_32]} and is good to {worst(single):.0e}."""
-
-
 def page(result: dict[str, Any]) -> list[str]:
     size, ranges, head = result["size"], result["ranges"], result["headline"][0]
     regimes = ", ".join(f"{name} {share:.0%}" for name, share in result["regimes"].items())
     steps = [[r for r in result["steps"] if r["order"] == order] for order in (2, 4)]
-    batches = result["batches"]
+    rows, batches = {row["name"]: row for row in result["methods"]}, result["batches"]
+    by_arrays = (row for n, row in rows.items() if n.startswith(ARRAYS) and row["gradient"])
+    peer = min(by_arrays, key=worst)
+    time = {name: f"{row['seconds_per_point'] * 1e6:.2g} us" for name, row in rows.items()}
     return [
-        choice(result),
+        f"""Use forward mode in float64 for the gradient to (D, G), and some {size["at_once"]:,}
+        points in a call, as `fj.sweep` does: {time[FORWARD]} a point, good to
+        {worst(rows[FORWARD]):.0e} of its length (reverse mode: {time[REVERSE]}), where the best
+        differences of the quickest peer take {time[peer["name"]]} for {worst(peer):.0e}; float32
+        takes {time[FORWARD_32]} and is good to {worst(rows[FORWARD_32]):.0e}.""",
         f"""Value and gradient come at {head["ratio"]:.0f} times the rate of the loop that a user
         writes with brentq, eigvals and central differences (wanted >= {head["wanted"]}:
         {verdict(head)}), {head["ratio_to_tuned_loop"]:.0f} times that of the same loop tuned by
@@ -339,15 +317,11 @@ def picture(result: dict[str, Any]) -> bytes:
     figure, (left, middle, right) = subplots(1, 3, figsize=(19, 6.4))
     methods, batches = result["methods"], result["batches"]
     own = next(row for row in methods if row["name"] == FORWARD)["error_to_40_digits"]["gradient"]
-    lines = [
-        (
-            row["seconds_per_point"] * 1e6,
-            worst(row, "gradient" if row["gradient"] else "growth_rate"),
-            ("C1" if row["compile_s"] is None else "C0") + marker,
-            row["name"],
-        )
-        for row, marker in zip(methods, "osP*^vDX<>h", strict=False)
-    ]
+    lines = []
+    for row, marker in zip(methods, "osP*^vDX<>h", strict=False):
+        error = worst(row, "gradient" if row["gradient"] else "growth_rate")
+        style = ("C1" if row["compile_s"] is None else "C0") + marker
+        lines.append((row["seconds_per_point"] * 1e6, error, style, row["name"]))
     title = "error of the gradient, of its length; of the value, of omega"
     draw(left, lines, "time a point [us]", "worst error [-]", title)
     lines = []

@@ -279,9 +279,9 @@ def gradient_blocks(rows: list[Row]) -> list[str]:
     ]
 
 
-def choice(result: Row) -> str:
-    """Which method to use for one cycle."""
-    rows = result["methods"]
+def page(result: Row) -> list[str]:
+    rows, groups = result["methods"], list(dict.fromkeys(r["group"] for r in result["methods"]))
+    left_out, missing = "; ".join(result["left_out"]), ", ".join(result["not_installed"])
     own, peer = quickest(rows, (OWN,), EQUAL), quickest(rows, (EVENTS, *PEERS), 1e-2)
     assert own and peer
     ratios = "".join(
@@ -289,14 +289,6 @@ def choice(result: Row) -> str:
         f" ({head['what'].split('against ')[1]}; wanted >= {head['wanted']}: {verdict(head)})"
         for head in result["headline"]
     )
-    return f"""Use `fj.limit_cycle` by the exact law: {own["seconds"] * 1e3:.2g} ms for an error of
-        {worst(own):.0e} ({own["setting"]}){ratios}. The quickest transient with an error below
-        0.01, {peer["name"]}, takes {peer["seconds"] * 1e3:.2g} ms for {worst(peer):.0e}."""
-
-
-def page(result: Row) -> list[str]:
-    rows, groups = result["methods"], list(dict.fromkeys(r["group"] for r in result["methods"]))
-    left_out, missing = "; ".join(result["left_out"]), ", ".join(result["not_installed"])
 
     def shown(found):
         outcome = found.get("result", "converged")
@@ -305,7 +297,9 @@ def page(result: Row) -> list[str]:
         return found | {"setting": setting, "off": off}
 
     return [
-        choice(result),
+        f"""Use `fj.limit_cycle` by the exact law: {own["seconds"] * 1e3:.2g} ms for an error of
+        {worst(own):.0e} ({own["setting"]}){ratios}. The quickest transient with an error below
+        0.01, {peer["name"]}, takes {peer["seconds"] * 1e3:.2g} ms for {worst(peer):.0e}.""",
         table(
             "method | setting | compile [s] | periods run | time [ms] | error of the period"
             " | of the amplitude",

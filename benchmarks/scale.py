@@ -331,24 +331,11 @@ def short(count: float) -> str:
     return f"{mantissa}e{int(exponent)}"
 
 
-def choice(result: Result) -> str:
-    """What to use."""
-    own, kept, at_once = (
-        [row for row in result["rows"] if row["way"] == way] for way in (IN_MEMORY, SHARDS, AT_ONCE)
-    )
-    peer, last = at_once[-1], own[-1]
-    same = next(row for row in own if row["points"] == peer["points"])
-    return f"""Use `sweep`: {short(last["points"])} growth rates in {last["seconds"]:.3g} s and
-        {last["peak_beyond_base"] / 1e6:.0f} MB, of which the result is
-        {last["result_bytes"] / 1e6:.0f} MB, while one call of a vmapped program takes
-        {peer["peak_beyond_base"] / same["peak_beyond_base"]:.1f} times the memory and
-        {peer["seconds"] / same["seconds"]:.2f} times the time for {short(same["points"])} points;
-        name a folder (`out=`) where a sweep may be interrupted, which takes
-        {kept[-1]["seconds"] / last["seconds"]:.2f} times the time."""
-
-
 def page(result: Result) -> list[str]:
     rows, killed = result["rows"], result["interrupted"]
+    by_way = ([r for r in rows if r["way"] == way] for way in (IN_MEMORY, SHARDS, AT_ONCE))
+    own, kept, (*_, peer) = by_way
+    same, last = next(r for r in own if r["points"] == peer["points"]), own[-1]
     there = ", ".join(str(kill["batches_there"]) for kill in killed["kills"])
     lost = ", ".join(str(kill["begun_but_not_there"]) for kill in killed["kills"])
     how = "the same to the last bit as" if killed["equal_to_the_last_bit"] else "NOT equal to"
@@ -359,7 +346,13 @@ def page(result: Result) -> list[str]:
         return row | more | {"files": row["files"] or None}
 
     return [
-        choice(result),
+        f"""Use `sweep`: {short(last["points"])} growth rates in {last["seconds"]:.3g} s and
+        {last["peak_beyond_base"] / 1e6:.0f} MB, of which the result is
+        {last["result_bytes"] / 1e6:.0f} MB, while one call of a vmapped program takes
+        {peer["peak_beyond_base"] / same["peak_beyond_base"]:.1f} times the memory and
+        {peer["seconds"] / same["seconds"]:.2f} times the time for {short(same["points"])} points;
+        name a folder (`out=`) where a sweep may be interrupted, which takes
+        {kept[-1]["seconds"] / last["seconds"]:.2f} times the time.""",
         table("what | found | wanted | ", map(in_words, result["headline"])),
         "## More points",
         table(

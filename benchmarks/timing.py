@@ -1,5 +1,6 @@
 """What every benchmark times with, Pythons of their own, and the machine they run on."""
 
+import functools
 import importlib
 import importlib.metadata
 import json
@@ -10,11 +11,12 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 SHORTEST = 0.2  # s: quicker calls are repeated for so long, so that the first ones count little
 
@@ -48,12 +50,28 @@ def ratio(peer: list[float], own: list[float]) -> float:
     return statistics.median(a / b for a, b in zip(peer, own, strict=True))
 
 
-def too_long(elapsed: float, growth: float, limit: float) -> bool:
-    """Whether a call on `growth` times the work would take above `limit` [s].
+def in_batches(
+    calls: Callable[[int, Callable[[str], bool]], dict[str, Callable]],
+    batches: Iterable[int],
+    repeats: int,
+    limit: float,
+) -> Iterator[tuple[int, dict[str, list[float]]]]:
+    """Each batch and the seconds of `calls(batch, quick)`, where `quick(name)` says what to leave.
 
-    A short call is mostly overhead and predicts nothing.
+    That is what would take above `limit` [s], going by the batch before. A short call is mostly
+    overhead and predicts nothing.
     """
-    return elapsed > 0.1 and elapsed * growth > limit
+    last: dict[str, float] = {}  # seconds of the work of one
+    from tqdm import tqdm  # here, since pages list what a scene imports
+
+    def quick(batch: int, name: str) -> bool:
+        return last.get(name, 0) * batch <= limit
+
+    for batch in tqdm(batches, desc="batch"):
+        turns = taking_turns(calls(batch, functools.partial(quick, batch)), repeats)
+        taken = {name: statistics.median(own) for name, own in turns.items()}
+        last |= {name: own / batch if own > 0.1 else 0.0 for name, own in taken.items()}
+        yield batch, turns
 
 
 def compiled(function: Callable, *arguments) -> tuple[Callable, float]:
@@ -61,6 +79,17 @@ def compiled(function: Callable, *arguments) -> tuple[Callable, float]:
     jax.clear_caches()  # no program may profit from the tracing of another
     compile_s, program = seconds(lambda: jax.jit(function).lower(*arguments).compile())
     return program, compile_s
+
+
+def in_parts(function: Callable, columns: Iterable[jax.Array], size: int) -> tuple[Callable, float]:
+    """A call of a function for all of the columns, `size` at a time, and the seconds to compile it.
+
+    Parts are of equal lengths, since every shape is a program of its own.
+    """
+    split = [jnp.split(column, math.ceil(len(column) / size)) for column in columns]
+    parts = list(zip(*split, strict=True))
+    run, compile_s = compiled(function, *parts[0])
+    return lambda: [run(*part) for part in parts], compile_s
 
 
 # Pythons of their own
