@@ -27,7 +27,7 @@ from tqdm import tqdm
 import fractaljax as fj
 
 from .loops import brake, plain_loop
-from .page import draw, png, subplots, table
+from .page import Result, draw, png, subplots, table
 from .timing import compiled, seconds
 from .truths import growth_of_surface, mp
 
@@ -47,25 +47,15 @@ ZOOM, LEVELS = 4.0, 12  # a zoomed grid shrinks by this factor, so many times
 PLACES = 16  # that a scattered method starts from
 STRIDES = np.sqrt([2.0, 3.0, 5.0, 7.0, 11.0]) % 1  # between them: they fill the bounds evenly
 RESTARTS = 4  # of Nelder-Mead, from where it ended
-FULL, QUICK = (  # sides of the grids by task: on the package, zoomed, on the loop
-    {
-        **{"starts": 8, "loop_runs": 4, "dense": 90_000, "polished": 4},
-        "sides": {
-            "one condition": ((64, 256, 1024), (32,), (16, 48)),
-            "envelope": ((64, 256), (32,), (8, 20)),
-            "five variables": ((6, 12), (6,), (3, 5)),
-        },
-    },
-    {
-        **{"starts": 2, "loop_runs": 1, "dense": 10_000, "polished": 2},
-        "sides": {
-            "one condition": ((32,), (16,), (8,)),
-            "five variables": ((5,), (5,), (3,)),
-        },
-    },
-)
+FULL: dict[str, Any] = {"starts": 8, "loop_runs": 4, "dense": 90_000, "polished": 4}
+FULL["sides"] = {  # of the grids by task: on the package, zoomed, on the loop
+    "one condition": ((64, 256, 1024), (32,), (16, 48)),
+    "envelope": ((64, 256), (32,), (8, 20)),
+    "five variables": ((6, 12), (6,), (3, 5)),
+}
+QUICK: dict[str, Any] = {"starts": 2, "loop_runs": 1, "dense": 10_000, "polished": 2}
+QUICK["sides"] = {"one condition": ((32,), (16,), (8,)), "five variables": ((5,), (5,), (3,))}
 Rows = Callable[[np.ndarray], np.ndarray]
-Result = dict[str, Any]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,13 +76,13 @@ class DesignTask:
 
     def quantities(self, u, exp: Callable = math.exp) -> dict[str, Any]:
         """The quantities of the scene at scaled variables u (v,)."""
-        values = {}
-        for i, (name, (low, high)) in enumerate(self.bounds.items()):
+
+        def between(name, low, high, x):
             if name in LOGARITHMIC:
-                values[name] = exp(math.log(low) + u[i] * math.log(high / low))
-            else:
-                values[name] = low + u[i] * (high - low)
-        return values
+                return exp(math.log(low) + x * math.log(high / low))
+            return low + x * (high - low)
+
+        return {name: between(name, *b, u[i]) for i, (name, b) in enumerate(self.bounds.items())}
 
     def scaled(self, quantities: Mapping[str, float]) -> np.ndarray:
         """Scaled variables (v,) of quantities; those beyond a bound by a rounding are on it."""
@@ -130,31 +120,31 @@ def least_stiffness() -> float:
     return float(fj.stiffness(fj.brake_scene())[0])
 
 
-def requirements(np, K_n_min, growth, K_n, log_area_ratio, slip_ratio) -> list[Any]:
+def requirements(np, growth, K_n, log_area_ratio, slip_ratio) -> list[Any]:
     """Each at most 0 where it is met, as `fj.design` scales them; `np` is NumPy or JAX's."""
     return [
         2 * (math.log(AREA_RATIO_MIN) - log_area_ratio),
         10 * (slip_ratio - SLIP_RATIO_MAX),
         np.arcsinh((growth - TARGET) / GROWTH_SCALE),
-        1 - K_n / K_n_min,
+        1 - K_n / least_stiffness(),
     ]
 
 
 def by_package(task: DesignTask) -> Callable[[jax.Array], jax.Array]:
     """Evaluates a design (v,) by the package: a traceable function to a row (1 + k,)."""
-    scene, own, K_n_min = fj.brake_scene(), jnp.asarray(task.scaled(brake())), least_stiffness()
+    scene, own = fj.brake_scene(), jnp.asarray(task.scaled(brake()))
+    least_stiffness()  # computed now, not while tracing
+    conditions = {name: jnp.asarray(values) for name, values in task.conditions.items()}
 
     def at(quantities):
         moved = scene.replace(**quantities)
         state = moved.contact.state(moved.friction.mu_s, moved.friction.mu_m)
-        growth = fj.growth_rate(moved)
-        ratios = state.log_area_ratio, state.slip_ratio
-        return jnp.stack([growth, *requirements(jnp, K_n_min, growth, state.K_n, *ratios)])
+        ratios, growth = (state.log_area_ratio, state.slip_ratio), fj.growth_rate(moved)
+        return jnp.stack([growth, *requirements(jnp, growth, state.K_n, *ratios)])
 
     def evaluate(u):
         quantities = task.quantities(u, jnp.exp)
-        if task.conditions:
-            conditions = {name: jnp.asarray(values) for name, values in task.conditions.items()}
+        if conditions:
             row = jax.vmap(lambda condition: at(quantities | condition))(conditions).max(axis=0)
         else:
             row = at(quantities)
@@ -165,11 +155,11 @@ def by_package(task: DesignTask) -> Callable[[jax.Array], jax.Array]:
 
 def by_loop(task: DesignTask) -> Rows:
     """The same by the loop of a user without the package."""
-    b, own, K_n_min = brake(), task.scaled(brake()), least_stiffness()
+    b, own = brake(), task.scaled(brake())
 
     def at(quantities):
         growth, _, _, *state = plain_loop(b | quantities)(quantities["D"], quantities["G"])
-        return [growth, *requirements(np, K_n_min, growth, *state)]
+        return [growth, *requirements(np, growth, *state)]
 
     def evaluate(u):
         quantities = task.quantities(u)
@@ -194,18 +184,18 @@ class Trace:
         self._each = len(task.every_condition)
         self._start = time.perf_counter()
 
-    def add(self, us: np.ndarray, evaluations: int) -> None:
+    def count(self, evaluations: int) -> None:
+        """Evaluations of designs, at all conditions each."""
+        self.evaluations = (self.evaluations or 0) + evaluations * self._each
+
+    def add(self, us: np.ndarray, evaluations: int = 0) -> None:
         """Designs tried by now, and how many have been evaluated."""
         self.seen.append((time.perf_counter() - self._start, np.array(us)))
         self.count(evaluations)
 
-    def count(self, evaluations: int) -> None:
-        """Further evaluations, at all conditions each."""
-        self.evaluations = (self.evaluations or 0) + evaluations * self._each
-
     def end(self, answer: np.ndarray) -> "Trace":
         """The method's answer (v,), now."""
-        self.add(answer[None], 0)
+        self.add(answer[None])
         self.answer = answer
         return self
 
@@ -240,13 +230,11 @@ def nelder_mead(
         trace.add(u[None], 1)
         return row[0] + PENALTY * np.maximum(row[1:], 0).sum()
 
-    u, best = start, np.inf
+    u, best, bounds = start, np.inf, [(0, 1)] * len(start)
     options = {"xatol": 1e-9, "fatol": 1e-9, "maxfev": 1000, "adaptive": len(u) > 2}
-    bounds = [(0, 1)] * len(u)
+    minimize = functools.partial(scipy.optimize.minimize, merit, bounds=bounds, options=options)
     for _ in range(RESTARTS):
-        found = scipy.optimize.minimize(
-            merit, u, method="Nelder-Mead", bounds=bounds, options=options
-        )
+        found = minimize(u, method="Nelder-Mead")
         u, gained, best = found.x, best - found.fun, found.fun
         if gained < 1e-9:
             break
