@@ -12,6 +12,7 @@ from benchmarks import (
     many_cycles,
     scale,
     scene_cost,
+    timing,
     transients,
     whole_design as designs,
 )
@@ -46,6 +47,21 @@ def test_differences_have_their_order(order):
     np.testing.assert_allclose(found, [power(D, G), *slopes], rtol=1e-10)
 
 
+def test_what_would_take_too_long_in_a_batch_is_left_out(monkeypatch):
+    """Going by the batch before, unless that was short."""
+    each = {"slow": 0.2, "short": 0.05, "quick": 0.001}  # s for one
+
+    def taking_turns(calls, repeats):
+        return {name: [each[name] * many] * repeats for name, many in calls.items()}
+
+    def calls(many, quick):
+        return {name: many for name in each if quick(name)}
+
+    monkeypatch.setattr(timing, "taking_turns", taking_turns)
+    found = [set(turns) for _, turns in timing.in_batches(calls, (1, 100, 1000), 3, limit=2.0)]
+    assert found == [{"slow", "short", "quick"}, {"short", "quick"}, {"quick"}]
+
+
 @pytest.mark.parametrize("family", eigenvalues.FAMILIES)
 def test_truth_and_lapacks_matrices_are_of_the_same_systems(family):
     columns = eigenvalues.FAMILIES[family](np.random.default_rng(2), 3)
@@ -58,9 +74,6 @@ def test_truth_and_lapacks_matrices_are_of_the_same_systems(family):
         np.testing.assert_allclose(np.poly(A), scaled, rtol=1e-10, atol=1e-12)
         exact, size = eigenvalues.exact_growth(*row)
         assert abs(float(exact) - np.roots(scaled).real.max() * unit) < 1e-10 * size
-
-
-# Limit cycles ------------------------------------------------------------------------------------
 
 
 def test_extremes_of_a_sine_are_read_between_its_points():
@@ -137,9 +150,6 @@ def test_ratio_of_many_cycles_is_to_all_cores_at_no_larger_an_error():
     assert [many_cycles.busy(lengths, n) for n in (1, 2, 4)] == [1, 0.875, 0.5]
 
 
-# Designs -----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "task",
     [designs.TASKS[0], *(pytest.param(t, marks=pytest.mark.slow) for t in designs.TASKS[1:])],
@@ -196,9 +206,6 @@ def test_runs_are_compared_as_wholes_by_the_median_start():
     assert [designs.quickest(runs, "near", cold) for cold in (True, False)] == ["b: 4 s", "a: 3 s"]
 
 
-# Sweeps and costs --------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_a_job_gives_the_values_at_its_points(tmp_path):
     lengths, picked = (2, 3, 2, 2), (0, 5, 23)
@@ -244,9 +251,6 @@ def test_the_row_without_a_part_is_the_cheaper_one_when_compiled():
             # Fusion moves the bytes by a little.
             slack = 1.01 if count == "bytes_accessed" else 1
             assert less[count] < slack * costs[count], (row.name, count)
-
-
-# Extremes ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow  # compiles every family
