@@ -8,18 +8,8 @@ import jax
 
 from .page import INDEX, index, measured, write
 
-NAMES = (
-    "contact",
-    "eigenvalues",
-    "extremes",
-    "growth_rate",
-    "limit_cycle",
-    "many_cycles",
-    "scale",
-    "scene_cost",
-    "whole_design",
-)
-PAGES = {name: importlib.import_module(f".{name}", __package__) for name in NAMES}
+NAMES = "contact eigenvalues extremes growth_rate limit_cycle many_cycles scale scene_cost"
+PAGES = {n: importlib.import_module(f".{n}", __package__) for n in (*NAMES.split(), "whole_design")}
 
 
 def main() -> None:
@@ -34,8 +24,8 @@ def main() -> None:
             parser.error(f"NAME must be one of {', '.join(PAGES)}, got {name}")
     jax.config.update("jax_enable_x64", True)
     for name in arguments.names or PAGES:
-        for path in write(arguments.out, name, PAGES[name], measured(PAGES[name], arguments.quick)):
-            print(path)
+        result = measured(PAGES[name], arguments.quick)
+        print(*write(arguments.out, name, PAGES[name], result), sep="\n")
     (arguments.out / INDEX).write_text(index(arguments.out))
     print(arguments.out / INDEX)
 

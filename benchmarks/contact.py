@@ -8,7 +8,6 @@ fixed number of Halley steps; the peer is a loop over SciPy's brentq at several 
 import json
 import math
 import statistics
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,26 +20,19 @@ import fractaljax as fj
 from fractaljax._contact import load_balance
 
 from .loops import scalar_joint
-from .page import both, cell, draw, png, subplots, table
+from .page import draw, png, subplots, table
 from .timing import compiled, seconds
 
 TITLE = "The joint under a given load: error against run time"
 PACKAGES = ("numpy", "scipy")
+FULL = {"count": 379, "copies": 100, "repeats": 9}
+QUICK = {"count": 40, "copies": 2, "repeats": 3}
 TABLE = Path(__file__).parents[1] / "tests" / "reference" / "contact.json"
 INPUTS = ("D", "G", "gamma", "E", "nu", "sigma_y", "H", "P", "mu_s", "mu_m")
 OUTPUTS = ("a_l", "K_n", "K_t")
 STEPS = range(1, 9)
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)  # of ln a_l
 DEFAULT = load_balance._HALLEY_STEPS
-
-
-def rows_of_table(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Inputs (n, 10) and a_l, K_n, K_t (n, 3) of rows spread over the table."""
-    rows = json.loads(TABLE.read_text())["rows"]
-    rows = [row for row in rows if row["regime"] == "elastic_plastic"]
-    rows = rows[:: math.ceil(len(rows) / count)]
-    truth = [[math.exp(float(row["ln_a_l"])), float(row["K_n"]), float(row["K_t"])] for row in rows]
-    return np.array([[row[name] for name in INPUTS] for row in rows], float), np.array(truth)
 
 
 def joint(inputs: jax.Array) -> jax.Array:
@@ -52,11 +44,10 @@ def joint(inputs: jax.Array) -> jax.Array:
     return jnp.stack([state.a_l, state.K_n, state.K_t])
 
 
-def package(steps: int, inputs: np.ndarray, dtype) -> tuple[Callable[[], Any], float]:
+def package(steps: int, rows: jax.Array) -> tuple[Any, float]:
     """A call for all rows at once by this many Halley steps, and the seconds to compile it."""
     load_balance._HALLEY_STEPS = steps
     try:
-        rows = jnp.asarray(inputs, dtype)
         program, compile_s = compiled(jax.vmap(joint), rows)
     finally:
         load_balance._HALLEY_STEPS = DEFAULT
@@ -65,7 +56,7 @@ def package(steps: int, inputs: np.ndarray, dtype) -> tuple[Callable[[], Any], f
     return lambda: program(rows), compile_s
 
 
-def loop(xtol: float, inputs: np.ndarray) -> Callable[[], np.ndarray]:
+def loop(xtol: float, inputs: np.ndarray) -> Any:
     """A loop over the rows by brentq."""
     rows = [dict(zip(INPUTS, row, strict=True)) for row in inputs.tolist()]
 
@@ -76,16 +67,19 @@ def loop(xtol: float, inputs: np.ndarray) -> Callable[[], np.ndarray]:
     return lambda: np.array([one(row) for row in rows])
 
 
-def measure(quick: bool) -> dict[str, Any]:
-    """Errors and times of every method."""
-    count, copies, repeats = (40, 2, 3) if quick else (379, 100, 9)
-    inputs, truth = rows_of_table(count)
-    many = np.tile(inputs, (copies, 1))
+def measure(count: int, copies: int, repeats: int) -> dict[str, Any]:
+    """Errors and times of every method at `count` rows; of the package at so many copies."""
+    rows = json.loads(TABLE.read_text())["rows"]
+    rows = [row for row in rows if row["regime"] == "elastic_plastic"]
+    rows = rows[:: math.ceil(len(rows) / count)]
+    truth = [[math.exp(float(r["ln_a_l"])), float(r["K_n"]), float(r["K_t"])] for r in rows]
+    inputs = np.array([[row[name] for name in INPUTS] for row in rows], float)
     methods: list[dict[str, Any]] = []
     calls = []
-    for bits, dtype in ((64, np.float64), (32, np.float32)):
+    for bits in (64, 32):
+        many = jnp.asarray(np.tile(inputs, (copies, 1)), f"float{bits}")
         for steps in tqdm(STEPS, desc=f"compile, {bits} bits"):
-            call, compile_s = package(steps, many, dtype)
+            call, compile_s = package(steps, many)
             method = {"family": f"fractaljax, float{bits}", "setting": f"{steps} steps"}
             method |= {"default": steps == DEFAULT, "compile_s": compile_s, "n": len(many)}
             methods.append(method)
@@ -107,9 +101,9 @@ def measure(quick: bool) -> dict[str, Any]:
 
 
 def page(result: dict[str, Any]) -> list[str]:
-    """What to use, the table, how it was measured."""
     own = next(method for method in result["methods"] if method["default"])
     peer = result["methods"][-1]
+    errors = " | ".join(f"{{median.{x}:.1e}}, {{worst.{x}:.1e}}" for x in OUTPUTS)
     return [
         f"""Use the default, {own["setting"].split()[0]} Halley steps in float64: K_n to
         {own["median"]["K_n"]:.0e} (median) and {own["worst"]["K_n"]:.0e} (worst) in
@@ -119,13 +113,9 @@ def page(result: dict[str, Any]) -> list[str]:
         table(
             "method | setting | compile [s] | time a joint [ns] | a_l: median, worst"
             " | K_n: median, worst | K_t: median, worst | not finite",
-            (
-                f"{m['family']} | {m['setting']}{' (default)' if m['default'] else ''}"
-                f" | {cell(m['compile_s'], '.1f')} | {m['seconds'] * 1e9:.3g} | "
-                + " | ".join(both({h: m[h][x] for h in ("median", "worst")}) for x in OUTPUTS)
-                + f" | {m['not_finite']}"
-                for m in result["methods"]
-            ),
+            (m | {"mark": " (default)" if m["default"] else ""} for m in result["methods"]),
+            "{family} | {setting}{mark} | {compile_s:.1f} | {seconds!n:.3g}"
+            f" | {errors} | {{not_finite}}",
         ),
         f"""{result["rows"]} joints, each with its own surface, material, load and friction, against
         25 digits from quadrature; errors are relative. The error left after the last step is the

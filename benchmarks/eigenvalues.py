@@ -6,12 +6,11 @@ in families, each hard in its own way.
 """
 
 import functools
-import math
 import os
 import statistics
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,8 +22,8 @@ import fractaljax as fj
 from fractaljax._mechanism.oscillator import Linearised
 from fractaljax._stability.stability import growth_rate_of_linearised
 
-from .page import both, cell, draw, png, spread, subplots, table, verdict
-from .timing import compiled, ratio, taking_turns, too_long
+from .page import cell, columns as column, draw, filled, png, spread, subplots, table, verdict
+from .timing import in_batches, in_parts, ratio
 from .truths import eigenvalues, mp
 
 TITLE = "Growth rate of two directions in closed form"
@@ -46,20 +45,8 @@ FLUTTER, STABLE = "flutter side", "stable side"
 Columns = tuple[np.ndarray, ...]  # a, b, c_1, c_2, g
 
 
-class Size(NamedTuple):
-    """How much is measured."""
-
-    batches: tuple[int, ...]
-    repeats: int
-    exact: int  # systems of each family, for mpmath
-    near: int  # of each distance from coalescence
-
-
-FULL = Size(tuple(10**k for k in range(8)), 5, 100, 40)
-QUICK = Size((1, 10_000), 3, 10, 4)
-
-
-# Families of systems ------------------------------------------------------------------------------
+FULL = {"batches": tuple(10**k for k in range(8)), "repeats": 5, "exact": 100, "near": 40}
+QUICK = {"batches": (1, 10_000), "repeats": 3, "exact": 10, "near": 4}
 
 
 def stiffnesses(rng, n):
@@ -129,9 +116,6 @@ COALESCING: dict[tuple[float, str], Callable[..., Columns]] = {
 } | {(0.0, "both"): at_coalescence}
 
 
-# Methods ------------------------------------------------------------------------------------------
-
-
 def state_matrices(columns: Columns) -> tuple[np.ndarray, np.ndarray]:
     """[[0, I], [-K, -C]] (n, 4, 4) in units of a power of two near sqrt(a + b), and that (n,).
 
@@ -151,11 +135,6 @@ def state_matrices(columns: Columns) -> tuple[np.ndarray, np.ndarray]:
 closed_form = jax.vmap(growth_rate_of_linearised)
 
 
-def linearised(columns: Columns, dtype: Any = np.float64) -> Linearised:
-    """Systems as the package takes them."""
-    return Linearised(*(jnp.asarray(column, dtype) for column in columns))
-
-
 @functools.partial(jax.vmap, in_axes=0)
 def scene_rates(K_n, K_t, mu) -> jax.Array:
     """Growth rates (n,) of the reference brake with joints of given stiffness and friction."""
@@ -163,14 +142,12 @@ def scene_rates(K_n, K_t, mu) -> jax.Array:
     return fj.growth_rate(fj.Scene(fj.FixedContact(K_n, K_t), fj.Coulomb(mu), oscillator))
 
 
-def lapack(A: np.ndarray) -> np.ndarray:
-    """Largest real parts (n,) of the eigenvalues of matrices (n, 4, 4), by NumPy."""
-    return np.linalg.eigvals(A).real.max(axis=1)
+def largest(eigvals: Callable) -> Callable:
+    """Largest real parts (n,) of the eigenvalues of matrices (n, 4, 4)."""
+    return lambda A: eigvals(A).real.max(axis=1)
 
 
-def jax_lapack(A) -> jax.Array:
-    """The same by JAX."""
-    return jnp.linalg.eigvals(A).real.max(axis=1)
+lapack, jax_lapack = largest(np.linalg.eigvals), largest(jnp.linalg.eigvals)
 
 
 def threaded(parts: list[np.ndarray]) -> list[np.ndarray]:
@@ -179,30 +156,18 @@ def threaded(parts: list[np.ndarray]) -> list[np.ndarray]:
         return list(pool.map(lapack, parts))
 
 
-def program(function: Callable, *systems: jax.Array, size: int = CHUNK) -> tuple[Callable, float]:
-    """A call of a function for all systems, `size` at a time, and the seconds to compile it."""
-    # Of equal lengths, since every shape is a program of its own.
-    split = [jnp.split(column, math.ceil(len(column) / size)) for column in systems]
-    parts = list(zip(*split, strict=True))
-    run, compile_s = compiled(function, *parts[0])
-    return lambda: [run(*part) for part in parts], compile_s
-
-
 def timed(name: str, columns: Columns, scenes: Columns) -> tuple[Callable, float | None]:
     """The call of a method for these systems or scenes, and the seconds it took to compile."""
-
-    def closed(*columns):
-        return closed_form(Linearised(*columns))
-
     if name == SCENES:
-        return program(scene_rates, *map(jnp.asarray, scenes))
+        return in_parts(scene_rates, map(jnp.asarray, scenes), CHUNK)
     if name in (CLOSED, CLOSED_32, AT_ONCE):
         size = len(columns[0]) if name == AT_ONCE else CHUNK
         dtype = np.float32 if name == CLOSED_32 else np.float64
-        return program(closed, *(jnp.asarray(column, dtype) for column in columns), size=size)
+        systems = [jnp.asarray(column, dtype) for column in columns]
+        return in_parts(lambda *systems: closed_form(Linearised(*systems)), systems, size)
     matrices, _ = state_matrices(columns)
     if name == JAX:
-        return program(jax_lapack, jnp.asarray(matrices), size=len(matrices))
+        return in_parts(jax_lapack, [jnp.asarray(matrices)], len(matrices))
     if name == THREADS:
         return functools.partial(threaded, np.array_split(matrices, os.cpu_count() or 1)), None
     return functools.partial(lapack, matrices), None
@@ -212,14 +177,12 @@ def growth_rates(columns: Columns, dtype: Any) -> dict[str, np.ndarray]:
     """Growth rates (n,) by every method that has errors of its own in this precision."""
     matrices, omega = state_matrices(columns)
     A = matrices.astype(dtype)
-    closed = np.asarray(jax.jit(closed_form)(linearised(columns, dtype)))
+    systems = Linearised(*(jnp.asarray(column, dtype) for column in columns))
+    closed = np.asarray(jax.jit(closed_form)(systems))
     by_jax = np.asarray(jax.jit(jax_lapack)(A)) * omega
     if dtype == np.float32:  # NumPy computes these in double precision
         return {CLOSED_32: closed, JAX_32: by_jax}
     return {CLOSED: closed, NUMPY: lapack(A) * omega, JAX: by_jax}
-
-
-# Measuring ----------------------------------------------------------------------------------------
 
 
 def worth(name: str, many: int) -> bool:
@@ -227,32 +190,31 @@ def worth(name: str, many: int) -> bool:
     return name != AT_ONCE or many > CHUNK
 
 
-def times(size: Size) -> list[dict[str, Any]]:
+def times(batches: tuple[int, ...], repeats: int) -> list[dict[str, Any]]:
     """Times of every method in every batch, except those that would take too long."""
-    rng, most = np.random.default_rng(0), size.batches[-1]
+    rng, most = np.random.default_rng(0), batches[-1]
     columns = FAMILIES["random"](rng, most)
     K_n = 10 ** rng.uniform(7, 10, most)
     scenes = K_n, K_n * rng.uniform(0.1, 1, most), rng.uniform(0.05, 0.8, most)
-    last: dict[str, tuple[int, float]] = dict.fromkeys(TIMED, (1, 0.0))  # systems, seconds for all
-    rows = []
+    compile_s, rows = {}, []
 
-    def wanted(name: str, many: int) -> bool:
-        systems, elapsed = last[name]
-        return worth(name, many) and not too_long(elapsed, many / systems, LIMIT)
-
-    for many in tqdm(size.batches, desc="batch"):
+    def calls(many, quick):
         first = [tuple(column[:many] for column in group) for group in (columns, scenes)]
-        made = {name: timed(name, *first) for name in TIMED if wanted(name, many)}
-        turns = taking_turns({name: call for name, (call, _) in made.items()}, size.repeats)
-        found = {}
-        for name, own in turns.items():
-            last[name] = many, statistics.median(own)
-            found[name] = {
-                "compile_s": made[name][1],
+        names = [name for name in TIMED if worth(name, many) and quick(name)]
+        made = {name: timed(name, *first) for name in names}
+        compile_s.update({name: elapsed for name, (_, elapsed) in made.items()})
+        return {name: call for name, (call, _) in made.items()}
+
+    for many, turns in in_batches(calls, batches, repeats, LIMIT):
+        found = {
+            name: {
+                "compile_s": compile_s[name],
                 "systems_per_second": many / statistics.median(own),
                 "ratio_to_numpy": ratio(turns[NUMPY], own) if NUMPY in turns else None,
                 "ratio_to_threads": ratio(turns[THREADS], own) if THREADS in turns else None,
             }
+            for name, own in turns.items()
+        }
         rows.append({"systems": many, "methods": found})
     return rows
 
@@ -292,44 +254,28 @@ def family(make: Callable[..., Columns], count: int, single: bool = True) -> dic
     return found
 
 
-def measure(quick: bool) -> dict[str, Any]:
-    """Rates by batch, errors by family and by distance from coalescence."""
-    size = QUICK if quick else FULL
-    batches = times(size)
-    large = [row for row in batches if {NUMPY, THREADS} <= set(row["methods"])][-1]
+def measure(batches, repeats: int, exact: int, near: int) -> dict[str, Any]:
+    """Rates by batch, errors by family and by distance from coalescence, at so many systems."""
+    rows = times(batches, repeats)
+    large = [row for row in rows if {NUMPY, THREADS} <= set(row["methods"])][-1]
     own = large["methods"][CLOSED]
     head = {"what": f"{CLOSED} beside {NUMPY}, {large['systems']:,} systems", "wanted": WANTED}
     head |= {"systems": large["systems"], "ratio": own["ratio_to_numpy"]}
     return {
         "headline": [head | {"ratio_to_threads": own["ratio_to_threads"]}],
-        "repeats": size.repeats,
-        "exact_points": {"family": size.exact, "distance": size.near},
-        "batches": batches,
+        "repeats": repeats,
+        "exact_points": {"family": exact, "distance": near},
+        "batches": rows,
         "families": [
-            {"family": name} | family(make, size.exact)
+            {"family": name} | family(make, exact)
             for name, make in tqdm(FAMILIES.items(), desc="family")
         ],
         "coalescing": [
             {"distance": distance, "side": side}
-            | family(make, size.near, distance >= SINGLE or distance == 0)
+            | family(make, near, distance >= SINGLE or distance == 0)
             for (distance, side), make in tqdm(COALESCING.items(), desc="distance")
         ],
     }
-
-
-# The page -----------------------------------------------------------------------------------------
-
-
-def choice(result: dict[str, Any]) -> str:
-    """One sentence: what to use."""
-    best = max(result["batches"], key=lambda row: row["methods"][CLOSED]["systems_per_second"])
-    own, single = (best["methods"][name]["systems_per_second"] for name in (CLOSED, CLOSED_32))
-    errors = [row["errors"] for row in result["families"]]
-    worst = {n: max(row[n]["worst"] for row in errors) for n in (CLOSED, NUMPY, CLOSED_32)}
-    return f"""Use the default, the closed form in float64 and many systems at a time: {own:.2g} a
-        second, with a worst error, away from coalescence, of {worst[CLOSED]:.0e} of the largest
-        modulus of an eigenvalue, where NumPy has {worst[NUMPY]:.0e}; float32 is
-        {single / own:.1f} times as fast and good to {worst[CLOSED_32]:.0e}."""
 
 
 def name_of(row: dict[str, Any]) -> str:
@@ -351,43 +297,30 @@ def worse(result: dict[str, Any], own: str, peer: str) -> str:
     return f"is above LAPACK's in: {'; '.join(found)}." if found else "is no larger in any family."
 
 
-def in_figures(result: dict[str, Any]) -> str:
-    """Whether the closed form keeps its promise: ratio by batch, error by family."""
-    head = result["headline"][0]
-    slow = [
-        f"{row['systems']:,} ({found:.3g})"
-        for row in result["batches"]
-        if (found := row["methods"][CLOSED]["ratio_to_numpy"]) is not None and found < WANTED
-    ]
-    below = f"The ratio is below {WANTED} in batches of {', '.join(slow)}." if slow else ""
-    return f"""For {head["systems"]:,} systems it has {head["ratio"]:.0f} times the rate of {NUMPY}
-        (wanted >= {head["wanted"]}: {verdict(head)}), and {head["ratio_to_threads"]:.0f} times that
-        of the same spread by hand over a thread a core, as JAX does with the closed form. {below}
-        In float64 its worst error {worse(result, CLOSED, NUMPY)}
-        In float32 its worst error {worse(result, CLOSED_32, JAX_32)}"""
-
-
 def rates(result: dict[str, Any], name: str) -> str:
     """One row of the table of rates: compile time, then rate and ratio in every batch."""
     found = [row["methods"].get(name) for row in result["batches"]]
     compile_s = max((x["compile_s"] or 0 for x in found if x), default=0)
-    cells = [
-        f"{x['systems_per_second']:.2g} ({cell(x['ratio_to_numpy'], '.3g')})" if x else "-"
-        for x in found
-    ]
+    form = "{systems_per_second:.2g} ({ratio_to_numpy:.3g})"
+    cells = [filled(form, x) if x else "-" for x in found]
     return " | ".join([name, cell(compile_s or None, ".1f"), *cells])
 
 
-def errors(row: dict[str, Any]) -> str:
+def error_cells(row: dict[str, Any]) -> str:
     """One row of the table of errors."""
-    cells = [both(row["errors"].get(name)) for name in WITH_ERRORS]
+    cells = [cell(row["errors"].get(name), ".1e") for name in WITH_ERRORS]
     cells += [str(row["wrong_signs"].get(name, "-")) for name in (CLOSED, CLOSED_32)]
     return " | ".join([name_of(row), f"{row['unstable']:.0%}", *cells])
 
 
 def page(result: dict[str, Any]) -> list[str]:
-    """What to use, where it falls short, two tables, how it was measured."""
-    batches, exact = result["batches"], result["exact_points"]
+    batches, exact, head = result["batches"], result["exact_points"], result["headline"][0]
+    best = max((row["methods"] for row in batches), key=lambda x: x[CLOSED]["systems_per_second"])
+    own, single = (best[name]["systems_per_second"] for name in (CLOSED, CLOSED_32))
+    errors = [row["errors"] for row in result["families"]]
+    worst = {n: max(row[n]["worst"] for row in errors) for n in (CLOSED, NUMPY, CLOSED_32)}
+    ratios = {r["systems"]: r["methods"][CLOSED]["ratio_to_numpy"] for r in batches}
+    slow = [f"{n:,} ({found:.3g})" for n, found in ratios.items() if found and found < WANTED]
     skipped = [
         f"{name} of {row['systems']:,}"
         for row in batches
@@ -395,8 +328,16 @@ def page(result: dict[str, Any]) -> list[str]:
         if worth(name, row["systems"]) and name not in row["methods"]
     ]
     return [
-        choice(result),
-        in_figures(result),
+        f"""Use the default, the closed form in float64 and many systems at a time: {own:.2g} a
+        second, with a worst error, away from coalescence, of {worst[CLOSED]:.0e} of the largest
+        modulus of an eigenvalue, where NumPy has {worst[NUMPY]:.0e}; float32 is
+        {single / own:.1f} times as fast and good to {worst[CLOSED_32]:.0e}.""",
+        f"""For {head["systems"]:,} systems it has {head["ratio"]:.0f} times the rate of {NUMPY}
+        (wanted >= {head["wanted"]}: {verdict(head)}), and {head["ratio_to_threads"]:.0f} times that
+        of the same spread by hand over a thread a core, as JAX does with the closed form.
+        {f"The ratio is below {WANTED} in batches of {', '.join(slow)}." if slow else ""}
+        In float64 its worst error {worse(result, CLOSED, NUMPY)}
+        In float32 its worst error {worse(result, CLOSED_32, JAX_32)}""",
         "Systems a second by systems in a batch; in brackets the ratio to NumPy in that batch:",
         table(
             " | ".join(["method", "compile [s]", *(f"{row['systems']:,}" for row in batches)]),
@@ -405,7 +346,7 @@ def page(result: dict[str, Any]) -> list[str]:
         "Errors by family: median, worst:",
         table(
             f"family | unstable | {' | '.join(WITH_ERRORS)} | wrong signs | wrong signs, float32",
-            map(errors, result["families"] + result["coalescing"]),
+            map(error_cells, result["families"] + result["coalescing"]),
         ),
         f"""Times are medians of {result["repeats"]} turns over systems of the random family, the
         methods taking turns, and every ratio the median of the ratios within a turn; compile time,
@@ -447,7 +388,7 @@ def picture(result: dict[str, Any]) -> bytes:
     for name in TIMED:
         rows = [row for row in result["batches"] if name in row["methods"]]
         rates = [row["methods"][name]["systems_per_second"] for row in rows]
-        lines.append(([row["systems"] for row in rows], rates, STYLES[name], name))
+        lines.append((*column(rows, "systems"), rates, STYLES[name], name))
     draw(left, lines, "systems in a batch [-]", "systems a second [1/s]")
 
     def worst(rows, name):
@@ -457,8 +398,8 @@ def picture(result: dict[str, Any]) -> bytes:
     for name in (CLOSED, NUMPY, CLOSED_32, JAX_32):  # JAX in float64 is as NumPy
         for side, line in ((FLUTTER, "-"), (STABLE, "--")):
             rows = [r for r in result["coalescing"] if r["side"] == side and name in r["errors"]]
-            distances = [row["distance"] for row in rows]
-            lines.append((distances, worst(rows, name), STYLES[name][:3] + line, f"{name}, {side}"))
+            style, label = STYLES[name][:3] + line, f"{name}, {side}"
+            lines.append((*column(rows, "distance"), worst(rows, name), style, label))
     draw(middle, lines, "distance from coalescence [-]", error)
     families = result["families"]
     names = [row["family"].replace(" term", "\nterm") for row in families]

@@ -19,18 +19,9 @@ from tqdm import tqdm
 
 import fractaljax as fj
 
-from .loops import (
-    STEP,
-    arrays,
-    brake,
-    differences,
-    loop_gradient,
-    loop_value,
-    plain_loop,
-    tuned_loop,
-)
-from .page import both, cell, draw, png, spread, subplots, table, verdict
-from .timing import compiled, ratio, taking_turns, too_long
+from .loops import STEP, arrays, brake, differences, plain_loop, tuned_loop
+from .page import cell, draw, png, spread, subplots, table, verdict
+from .timing import in_batches, in_parts, ratio, taking_turns
 from .truths import growth_of_surface, mp
 
 TITLE = "Growth rate with gradient over surfaces"
@@ -42,22 +33,11 @@ D_RANGE, G_RANGE = (2.35, 2.6), (3e-11, 3e-9)
 VALUE, GRADIENT = "value", "value and gradient"
 PLAIN, TUNED, ARRAYS = "loop", "tuned loop", "NumPy arrays"
 FORWARD, REVERSE, FORWARD_32 = "forward mode", "reverse mode", "forward mode, float32"
-
-
-class Size(NamedTuple):
-    """How much is measured."""
-
-    points: int  # of the package
-    at_once: int  # of those in one call
-    arrays: int  # of those, for the NumPy arrays
-    loop: int  # for the loops
-    exact: int  # for mpmath
-    repeats: int
-    batches: tuple[int, ...]
-
-
-FULL = Size(1_000_000, 10_000, 20_000, 2000, 48, 9, tuple(10**k for k in range(7)))
-QUICK = Size(10_000, 1000, 1000, 200, 6, 3, (1000,))
+FULL = {"points": 1_000_000, "at_once": 10_000, "arrays": 20_000, "loop": 2000, "exact": 48}
+FULL |= {"repeats": 9, "batches": tuple(10**k for k in range(7))}
+QUICK = {"points": 10_000, "at_once": 1000, "arrays": 1000, "loop": 200, "exact": 6}
+QUICK |= {"repeats": 3, "batches": (1000,)}
+Rows = list[dict[str, Any]]
 
 
 def surfaces(count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -66,9 +46,6 @@ def surfaces(count: int) -> tuple[np.ndarray, np.ndarray]:
     D = rng.uniform(*D_RANGE, count)
     G = np.exp(rng.uniform(math.log(G_RANGE[0]), math.log(G_RANGE[1]), count))
     return D.astype(np.float32).astype(float), G.astype(np.float32).astype(float)
-
-
-# The truth ----------------------------------------------------------------------------------------
 
 
 class Truth(NamedTuple):
@@ -115,9 +92,6 @@ def errors_of(rows: np.ndarray, truth: Truth) -> dict[str, Any]:
     return found
 
 
-# The methods --------------------------------------------------------------------------------------
-
-
 class Method(NamedTuple):
     """A way to values or gradients at the first `points` surfaces."""
 
@@ -138,13 +112,24 @@ class Method(NamedTuple):
         return np.stack([value, *slopes], axis=1)
 
 
+def by_loop(body: Callable, gradient: bool, D: list[float], G: list[float]) -> Callable:
+    """Growth rates (n,), or value and derivatives (n, 3), point by point."""
+
+    def value(d, g):
+        return body(d, g)[0]
+
+    def one(d, g):
+        return differences(value, d, g, STEP, 2) if gradient else value(d, g)
+
+    return lambda: np.array([one(d, g) for d, g in zip(D, G, strict=True)])
+
+
 def loops(b: dict[str, float], D: np.ndarray, G: np.ndarray) -> list[Method]:
     """Both loops, for values and for gradients."""
     return [
-        Method(f"{name}, {what}", what == GRADIENT, len(D), functools.partial(run, body, *lists))
-        for lists in [(D.tolist(), G.tolist())]
+        Method(f"{name}, {what}", gradient, len(D), by_loop(body, gradient, D.tolist(), G.tolist()))
         for name, body in ((PLAIN, plain_loop(b)), (TUNED, tuned_loop(b)))
-        for what, run in ((VALUE, loop_value), (GRADIENT, loop_gradient))
+        for what, gradient in ((VALUE, False), (GRADIENT, True))
     ]
 
 
@@ -161,9 +146,8 @@ def with_arrays(b, D: np.ndarray, G: np.ndarray, steps: dict[int, float]) -> lis
     ]
 
 
-@functools.cache
-def program(name: str, at_once: int) -> tuple[Callable, float]:
-    """One of the package's functions of D and G (n,), compiled, and the seconds it took."""
+def package(name: str, D: np.ndarray, G: np.ndarray, at_once: int) -> Method:
+    """One of the package's programs, called for `at_once` points until it has had all."""
     dtype = np.float32 if name == FORWARD_32 else np.float64
     scene = jax.tree.map(lambda x: jnp.asarray(x, dtype), fj.brake_scene())
 
@@ -177,23 +161,12 @@ def program(name: str, at_once: int) -> tuple[Callable, float]:
 
     reverse = jax.value_and_grad(value, argnums=(0, 1))
     function = {VALUE: value, REVERSE: reverse}.get(name, forward)
-    column = jax.ShapeDtypeStruct((at_once,), dtype)
-    return compiled(jax.vmap(function), column, column)
+    columns = [jnp.asarray(column, dtype) for column in (D, G)]
+    run, compile_s = in_parts(jax.vmap(function), columns, at_once)
+    return Method(name, name != VALUE, len(D), run, compile_s)
 
 
-def package(name: str, D: np.ndarray, G: np.ndarray, at_once: int) -> Method:
-    """One of the package's programs, called for `at_once` points until it has had all."""
-    run, compile_s = program(name, at_once)
-    dtype = np.float32 if name == FORWARD_32 else np.float64
-    columns = [jnp.split(jnp.asarray(column, dtype), len(D) // at_once) for column in (D, G)]
-    parts = list(zip(*columns, strict=True))
-    return Method(name, name != VALUE, len(D), lambda: [run(*part) for part in parts], compile_s)
-
-
-# Measuring ----------------------------------------------------------------------------------------
-
-
-def by_step(D: np.ndarray, G: np.ndarray, truth: Truth) -> list[dict[str, Any]]:
+def by_step(D: np.ndarray, G: np.ndarray, truth: Truth) -> Rows:
     """Errors of the differences of NumPy arrays, by their order and step."""
     growth, at = arrays(brake()), (D[truth.places], G[truth.places])
 
@@ -207,33 +180,19 @@ def by_step(D: np.ndarray, G: np.ndarray, truth: Truth) -> list[dict[str, Any]]:
     ]
 
 
-def best_steps(rows: list[dict[str, Any]]) -> dict[int, float]:
-    """By order the step with the least worst error; only the truth shows which it is."""
-    found = {}
-    for row in sorted(rows, key=lambda row: row["worst"]):
-        found.setdefault(row["order"], row["step"])
-    return found
-
-
-def by_batch(size: Size, D: np.ndarray, G: np.ndarray, steps) -> list[dict[str, Any]]:
+def by_batch(batches, repeats: int, D: np.ndarray, G: np.ndarray, steps) -> Rows:
     """Points a second in one call, by the number of points in it."""
-    rows = []
-    last: dict[str, tuple[int, float]] = {}  # points, and seconds for all of them
 
-    def wanted(peer: Method) -> bool:
-        points, elapsed = last.get(peer.name, (1, 0.0))
-        return not too_long(elapsed, peer.points / points, LIMIT)
-
-    for many in tqdm(size.batches, desc="batch"):
+    def calls(many, quick):
         first = D[:many], G[:many]
-        methods = [peer for peer in with_arrays(brake(), *first, steps) if wanted(peer)]
+        methods = [peer for peer in with_arrays(brake(), *first, steps) if quick(peer.name)]
         methods += [package(name, *first, many) for name in (VALUE, FORWARD, REVERSE)]
-        calls = {method.name: method.run for method in methods}
-        for name, times in taking_turns(calls, min(size.repeats, 5)).items():
-            last[name] = many, statistics.median(times)
-        rates = {name: many / last[name][1] for name in calls}
-        rows.append({"points": many, "points_per_second": rates})
-    return rows
+        return {method.name: method.run for method in methods}
+
+    return [
+        {"points": n, "points_per_second": {m: n / statistics.median(t) for m, t in turns.items()}}
+        for n, turns in in_batches(calls, batches, repeats, LIMIT)
+    ]
 
 
 def describe(method: Method, times: dict[str, list[float]], G, truth: Truth) -> dict[str, Any]:
@@ -246,8 +205,6 @@ def describe(method: Method, times: dict[str, list[float]], G, truth: Truth) -> 
         "points": method.points,
         "compile_s": method.compile_s,
         "seconds_per_point": statistics.median(own),
-        "seconds_per_point_fastest": min(own),
-        "seconds_per_point_slowest": max(own),
         "points_per_second": 1 / statistics.median(own),
         "ratio_to_loop": ratio(times[f"{PLAIN}, {kind}"], own),
         "ratio_to_tuned_loop": ratio(times[f"{TUNED}, {kind}"], own),
@@ -257,19 +214,17 @@ def describe(method: Method, times: dict[str, list[float]], G, truth: Truth) -> 
     }
 
 
-def measure(quick: bool) -> dict[str, Any]:
+def measure(**size: Any) -> dict[str, Any]:
     """Times and errors of every method, by step and by batch."""
-    size, b = QUICK if quick else FULL, brake()
-    D, G = surfaces(size.points)
-    truth = truth_of(b, D[: size.loop], G[: size.loop], size.exact)
-    steps = by_step(D, G, truth)
-    best = best_steps(steps)
-    methods = [
-        *loops(b, D[: size.loop], G[: size.loop]),
-        *with_arrays(b, D[: size.arrays], G[: size.arrays], best),
-        *(package(name, D, G, size.at_once) for name in (VALUE, FORWARD, REVERSE, FORWARD_32)),
-    ]
-    turns = taking_turns({method.name: method.run for method in methods}, size.repeats)
+    b, (D, G), at_once = brake(), surfaces(size["points"]), size["at_once"]
+    few, more = ((D[: size[name]], G[: size[name]]) for name in ("loop", "arrays"))
+    truth = truth_of(b, *few, size["exact"])
+    steps, best = by_step(D, G, truth), {}
+    for row in sorted(steps, key=lambda row: row["worst"]):
+        best.setdefault(row["order"], row["step"])  # only the truth shows which it is
+    methods = [*loops(b, *few), *with_arrays(b, *more, best)]
+    methods += [package(name, D, G, at_once) for name in (VALUE, FORWARD, REVERSE, FORWARD_32)]
+    turns = taking_turns({method.name: method.run for method in methods}, size["repeats"])
     times = {m.name: [elapsed / m.points for elapsed in turns[m.name]] for m in methods}
     found = {method.name: describe(method, times, G, truth) for method in methods}
     # Forward mode: there are two inputs.
@@ -278,18 +233,15 @@ def measure(quick: bool) -> dict[str, Any]:
     return {
         "headline": [{"what": what, "ratio": ratios["ratio_to_loop"], "wanted": WANTED} | ratios],
         "ranges": {"D": D_RANGE, "G": G_RANGE},
-        "size": size._asdict(),
+        "size": size,
         "exact_points": len(truth.places),
         "loop_step": STEP,
         "best_steps": best,
         "regimes": truth.regimes,
         "methods": list(found.values()),
         "steps": steps,
-        "batches": by_batch(size, D, G, best),
+        "batches": by_batch(size["batches"], min(size["repeats"], 5), D, G, best),
     }
-
-
-# The page -----------------------------------------------------------------------------------------
 
 
 def worst(row: dict[str, Any], what: str = "gradient") -> float:
@@ -297,28 +249,20 @@ def worst(row: dict[str, Any], what: str = "gradient") -> float:
     return row["error_to_40_digits"][what]["worst"]
 
 
-def choice(result: dict[str, Any]) -> str:
-    """One sentence: what to use."""
-    rows = {row["name"]: row for row in result["methods"]}
-    own, single = rows[FORWARD], rows[FORWARD_32]
-    peers = [row for name, row in rows.items() if name.startswith(ARRAYS) and row["gradient"]]
-    peer = min(peers, key=worst)
-    time = {row["name"]: f"{row['seconds_per_point'] * 1e6:.2g} us" for row in rows.values()}
-    return f"""Use forward mode in float64 for the gradient to (D, G), and some
-        {result["size"]["at_once"]:,} points in a call, as `fj.sweep` does: {time[FORWARD]} a point,
-        good to {worst(own):.0e} of its length (reverse mode: {time[REVERSE]}), where the best
-        differences of the quickest peer take {time[peer["name"]]} for {worst(peer):.0e}; float32
-        takes {time[FORWARD_32]} and is good to {worst(single):.0e}."""
-
-
 def page(result: dict[str, Any]) -> list[str]:
-    """What to use, three tables, how it was measured."""
     size, ranges, head = result["size"], result["ranges"], result["headline"][0]
     regimes = ", ".join(f"{name} {share:.0%}" for name, share in result["regimes"].items())
-    steps = {order: [r for r in result["steps"] if r["order"] == order] for order in (2, 4)}
-    batches = result["batches"]
+    steps = [[r for r in result["steps"] if r["order"] == order] for order in (2, 4)]
+    rows, batches = {row["name"]: row for row in result["methods"]}, result["batches"]
+    by_arrays = (row for n, row in rows.items() if n.startswith(ARRAYS) and row["gradient"])
+    peer = min(by_arrays, key=worst)
+    time = {name: f"{row['seconds_per_point'] * 1e6:.2g} us" for name, row in rows.items()}
     return [
-        choice(result),
+        f"""Use forward mode in float64 for the gradient to (D, G), and some {size["at_once"]:,}
+        points in a call, as `fj.sweep` does: {time[FORWARD]} a point, good to
+        {worst(rows[FORWARD]):.0e} of its length (reverse mode: {time[REVERSE]}), where the best
+        differences of the quickest peer take {time[peer["name"]]} for {worst(peer):.0e}; float32
+        takes {time[FORWARD_32]} and is good to {worst(rows[FORWARD_32]):.0e}.""",
         f"""Value and gradient come at {head["ratio"]:.0f} times the rate of the loop that a user
         writes with brentq, eigvals and central differences (wanted >= {head["wanted"]}:
         {verdict(head)}), {head["ratio_to_tuned_loop"]:.0f} times that of the same loop tuned by
@@ -327,22 +271,17 @@ def page(result: dict[str, Any]) -> list[str]:
             "method | compile [s] | time a point [us] | points a second | ratio to the loop"
             " | to the tuned loop | to NumPy arrays | growth rate error / omega: median, worst"
             " | gradient error, relative: median, worst | not finite",
-            (
-                f"{r['name']} | {cell(r['compile_s'], '.1f')} | {r['seconds_per_point'] * 1e6:.3g}"
-                f" | {r['points_per_second']:.3g} | {r['ratio_to_loop']:.3g}"
-                f" | {r['ratio_to_tuned_loop']:.3g} | {r['ratio_to_arrays']:.3g}"
-                f" | {both(r['error_to_40_digits']['growth_rate'])}"
-                f" | {both(r['error_to_40_digits'].get('gradient'))} | {r['not_finite']}"
-                for r in result["methods"]
-            ),
+            result["methods"],
+            "{name} | {compile_s:.1f} | {seconds_per_point!u:.3g} | {points_per_second:.3g}"
+            " | {ratio_to_loop:.3g} | {ratio_to_tuned_loop:.3g} | {ratio_to_arrays:.3g}"
+            " | {error_to_40_digits.growth_rate:.1e} | {error_to_40_digits.gradient:.1e}"
+            " | {not_finite}",
         ),
         "Gradient error of the differences of NumPy arrays by their step, relative:",
         table(
             "step | order 2: median, worst | order 4: median, worst",
-            (
-                f"{x['step']:.1e} | {both(x)} | {both(y)}"
-                for x, y in zip(*steps.values(), strict=True)
-            ),
+            ({"step": x["step"], "two": x, "four": y} for x, y in zip(*steps, strict=True)),
+            "{step:.1e} | {two:.1e} | {four:.1e}",
         ),
         "Points a second in one call, by the number of points in it:",
         table(
@@ -378,15 +317,11 @@ def picture(result: dict[str, Any]) -> bytes:
     figure, (left, middle, right) = subplots(1, 3, figsize=(19, 6.4))
     methods, batches = result["methods"], result["batches"]
     own = next(row for row in methods if row["name"] == FORWARD)["error_to_40_digits"]["gradient"]
-    lines = [
-        (
-            row["seconds_per_point"] * 1e6,
-            worst(row, "gradient" if row["gradient"] else "growth_rate"),
-            ("C1" if row["compile_s"] is None else "C0") + marker,
-            row["name"],
-        )
-        for row, marker in zip(methods, "osP*^vDX<>h", strict=False)
-    ]
+    lines = []
+    for row, marker in zip(methods, "osP*^vDX<>h", strict=False):
+        error = worst(row, "gradient" if row["gradient"] else "growth_rate")
+        style = ("C1" if row["compile_s"] is None else "C0") + marker
+        lines.append((row["seconds_per_point"] * 1e6, error, style, row["name"]))
     title = "error of the gradient, of its length; of the value, of omega"
     draw(left, lines, "time a point [us]", "worst error [-]", title)
     lines = []

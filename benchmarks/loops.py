@@ -32,7 +32,7 @@ def brake() -> Numbers:
     return {name: float(value) for name, value in (numbers | {"P": scene.contact.P}).items()}
 
 
-# Equation by equation -----------------------------------------------------------------------------
+# Equation by equation
 
 
 def plain_loop(b: Numbers) -> Callable[[float, float], tuple[Any, ...]]:
@@ -100,7 +100,7 @@ def plain_loop(b: Numbers) -> Callable[[float, float], tuple[Any, ...]]:
     return growth
 
 
-# The reduced load balance, for scalars and for arrays ---------------------------------------------
+# The reduced load balance, for scalars and for arrays
 
 
 def by_brentq(load, half, r, factor, xtol=1e-15) -> float:
@@ -226,7 +226,7 @@ def arrays(b: Numbers) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     return lambda D, G: np.linalg.eigvals(matrices(*at(D, G)[1:3])).real.max(axis=1)
 
 
-# Values and differences ---------------------------------------------------------------------------
+# Values and differences
 
 
 def differences(growth: Callable, D, G, step: float, order: int) -> list[Any]:
@@ -237,17 +237,3 @@ def differences(growth: Callable, D, G, step: float, order: int) -> list[Any]:
         by_D = by_D + weight / step * (growth(D + move, G) - growth(D - move, G))
         by_log_G = by_log_G + weight / step * (growth(D, G * up) - growth(D, G / up))
     return [growth(D, G), by_D, by_log_G]
-
-
-def loop_value(growth: Callable, D: list[float], G: list[float]) -> np.ndarray:
-    """Growth rates (n,) of a loop."""
-    return np.array([growth(d, g)[0] for d, g in zip(D, G, strict=True)])
-
-
-def loop_gradient(growth: Callable, D: list[float], G: list[float]) -> np.ndarray:
-    """Value and derivatives to D and ln G (n, 3) of a loop."""
-
-    def value(d, g):
-        return growth(d, g)[0]
-
-    return np.array([differences(value, d, g, STEP, 2) for d, g in zip(D, G, strict=True)])

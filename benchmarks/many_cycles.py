@@ -7,15 +7,11 @@ devices, the methods taking turns.
 
 import concurrent.futures
 import functools
-import json
 import multiprocessing
 import os
 import statistics
-import subprocess
-import sys
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,12 +21,15 @@ import fractaljax as fj
 from fractaljax._dynamics import transient
 from fractaljax._dynamics.stick_slip import scaled_start, sliding_equilibrium, stick_slip
 
-from .page import both, cell, draw, png, spread, subplots, table, verdict
-from .timing import compiled, ratio, seconds, taking_turns, versions
+from .page import draw, png, spread, subplots, table, verdict
+from .timing import compiled, devices, ended, ratio, seconds, started, taking_turns, versions
 from .transients import heyoka_events, last_period, law, outcomes, reference
 
 TITLE = "Many limit cycles"
 PACKAGES = ("numpy", "heyoka")
+FULL = {"cycles": 4096, "sample": 256, "repeats": 7, "segments": (None, 24)}
+FULL |= {"batches": (1, 16, 256)}
+QUICK = {"cycles": 64, "sample": 8, "repeats": 1, "segments": (None,), "batches": ()}
 RANGE = (2e8, 6e8)  # of K_n [N/m]
 DEVICES = 2
 FINE = 96  # segments of the truth
@@ -39,23 +38,6 @@ SETTLED = (6e-10, 2e-10, 1e-10, 1e-11)  # how well three maxima of the peer agre
 PERIODS = 4000  # of the peer, at most
 Row = dict[str, Any]
 Timed = tuple[Row, Callable]  # a row without times, and its call
-
-
-class Size(NamedTuple):
-    """How much is measured."""
-
-    cycles: int
-    sample: int  # of them for the peer
-    repeats: int
-    segments: tuple[int | None, ...]  # None for the default
-    batches: tuple[int, ...]  # beside `cycles`
-
-
-FULL = Size(4096, 256, 7, (None, 24), (1, 16, 256))
-QUICK = Size(64, 8, 1, (None,), ())
-
-
-# The package --------------------------------------------------------------------------------------
 
 
 def many(segments: int | None = None) -> Callable:
@@ -80,25 +62,20 @@ def batch(segments: int | None, K_n: jax.Array, devices: int = 1) -> tuple[Calla
     return lambda: program(K_n), compile_s
 
 
-def own_batches(size: Size, K_n: jax.Array, truth: np.ndarray) -> list[Timed]:
-    """The package by segments and devices, with what it finds and how well."""
-    found = []
-    for segments in size.segments:
-        label = f"{segments} segments" if segments else "default"
-        for devices in (1, DEVICES):
-            call, compile_s = batch(segments, K_n, devices)
-            period, amplitude, result = call()
-            off = np.abs(np.stack([period, amplitude], axis=1) / truth - 1)
-            row = {
-                "name": f"fj.limit_cycle, {label}",
-                "devices": devices,
-                "cycles": len(K_n),
-                "compile_s": compile_s,
-                "results": outcomes(result),
-                "error": spread(off[np.asarray(result == fj.CycleResult.converged)]),
-            }
-            found.append((row, call))
-    return found
+def own_batch(segments: int | None, devices: int, K_n: jax.Array, truth: np.ndarray) -> Timed:
+    """The package: what it finds and how well."""
+    call, compile_s = batch(segments, K_n, devices)
+    period, amplitude, result = call()
+    off = np.abs(np.stack([period, amplitude], axis=1) / truth - 1)
+    row = {
+        "name": f"fj.limit_cycle, {f'{segments} segments' if segments else 'default'}",
+        "devices": devices,
+        "cycles": len(K_n),
+        "compile_s": compile_s,
+        "results": outcomes(result),
+        "error": spread(off[np.asarray(result == fj.CycleResult.converged)]),
+    }
+    return row, call
 
 
 def lanes(K_n: jax.Array) -> Row:
@@ -125,23 +102,15 @@ def busy(lengths: np.ndarray, together: int) -> float:
     return float(np.mean([np.mean(group) / np.max(group) for group in groups]))
 
 
-# The peer -----------------------------------------------------------------------------------------
-
-
 def one_transient(K_n: float, settled: float) -> tuple[float, float, int]:
-    """Period [s], amplitude [m] and number of periods run."""
+    """Period [s], amplitude [m] and number of periods run, by the peer."""
     numbers = law(K_n)
     found = heyoka_events(numbers, PERIODS, settled)()
     return *last_period(numbers, found), len(found[0]) // 2
 
 
-def peer(pool: Any, K_n: list[float], truth: np.ndarray) -> list[Timed]:
-    """heyoka over all processes of a pool, where it is installed.
-
-    It stops by the loosest rule that gives the error wanted.
-    """
-    if "heyoka" not in versions("heyoka"):
-        return []
+def peer(pool: Any, K_n: list[float], truth: np.ndarray) -> Timed:
+    """heyoka over all processes of a pool, by the loosest rule that gives the error wanted."""
     each = max(1, len(K_n) // (8 * (os.cpu_count() or 1)))
 
     def transients(settled):
@@ -161,21 +130,15 @@ def peer(pool: Any, K_n: list[float], truth: np.ndarray) -> list[Timed]:
         "periods": {"median": float(np.median(found[:, 2])), "most": found[:, 2].max()},
         "error": spread(off),
     }
-    return [(row, lambda: transients(settled))]
-
-
-# Measuring ----------------------------------------------------------------------------------------
+    return row, lambda: transients(settled)
 
 
 def headline(rows: list[Row], times: list[list[float]]) -> list[Row]:
     """The ratio to the peer, of the package over all devices at no larger an error."""
     if "heyoka" not in rows[-1]["name"]:
         return []
-    able = [
-        i
-        for i, r in enumerate(rows[:-1])
-        if r["devices"] == DEVICES and r["error"]["worst"] < EQUAL
-    ]
+    able = [i for i, r in enumerate(rows[:-1]) if r["error"]["worst"] < EQUAL]
+    able = [i for i in able if rows[i]["devices"] == DEVICES]
     best = min(able, key=lambda i: rows[i]["seconds_a_cycle"])
     what = f"many cycles to {EQUAL:g}: {rows[best]['name']}, against {rows[-1]['name']}"
     return [{"what": what, "ratio": ratio(times[-1], times[best]), "wanted": WANTED}]
@@ -189,17 +152,18 @@ def by_count(count: int, repeats: int) -> Row:
     return {"cycles": count, "compile_s": compile_s, "seconds_a_cycle": taken / count}
 
 
-def in_this_process(size: Size) -> Row:
-    """All numbers, in a process that has the virtual devices."""
-    K_n = jnp.linspace(*RANGE, size.cycles)
+def in_this_process(cycles: int, sample: int, repeats: int, segments, batches) -> Row:
+    """All numbers, in a process that has the virtual devices; the peer gets a sample."""
+    K_n = jnp.linspace(*RANGE, cycles)
     *truth, results = jax.jit(many(FINE))(K_n)
-    truth, every = np.stack(truth, axis=1), size.cycles // size.sample
+    truth, every = np.stack(truth, axis=1), cycles // sample
     spawn = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(DEVICES, mp_context=spawn) as pool:
-        timed = own_batches(size, K_n, truth)
-        timed += peer(pool, np.asarray(K_n)[::every].tolist(), truth[::every])
+        timed = [own_batch(n, m, K_n, truth) for n in segments for m in (1, DEVICES)]
+        if "heyoka" in versions("heyoka"):
+            timed.append(peer(pool, np.asarray(K_n)[::every].tolist(), truth[::every]))
         calls = {str(i): call for i, (_, call) in enumerate(timed)}
-        taken = taking_turns(calls, size.repeats).values()
+        taken = taking_turns(calls, repeats).values()
     rows = [row for row, _ in timed]
     times = [[t / row["cycles"] for t in ts] for row, ts in zip(rows, taken, strict=True)]
     for row, own in zip(rows, times, strict=True):
@@ -207,30 +171,18 @@ def in_this_process(size: Size) -> Row:
     return {
         "range": RANGE,
         "fine": FINE,
-        "repeats": size.repeats,
-        "not_converged_with_fine": size.cycles - outcomes(results).get("converged", 0),
+        "repeats": repeats,
+        "not_converged_with_fine": cycles - outcomes(results).get("converged", 0),
         "methods": rows,
         "headline": headline(rows, times),
-        "batches": [*(by_count(n, size.repeats) for n in size.batches), rows[0]],
+        "batches": [*(by_count(n, repeats) for n in batches), rows[0]],
         "lanes": lanes(K_n),
     }
 
 
-def measure(quick: bool) -> Row:
+def measure(**size: Any) -> Row:
     """The same in a process of its own."""
-    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={DEVICES}"
-    done = subprocess.run(
-        [sys.executable, "-m", __name__, "quick" if quick else "full"],
-        cwd=Path(__file__).parents[1],
-        env=os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"},
-        stdout=subprocess.PIPE,
-        text=True,
-        check=True,
-    )
-    return json.loads(done.stdout.splitlines()[-1])
-
-
-# The page -----------------------------------------------------------------------------------------
+    return ended(started(__name__, devices(DEVICES), **size))
 
 
 def rate(found: Row) -> float:
@@ -238,23 +190,14 @@ def rate(found: Row) -> float:
     return 1 / found["seconds_a_cycle"]
 
 
-def choice(result: Row) -> str:
-    """Which method to use for many cycles."""
-    one, two = result["methods"][:2]
+def page(result: Row) -> list[str]:
+    rows, (low, high), lanes = result["methods"], result["range"], result["lanes"]
+    one, two, peer = rows[0], rows[1], rows[-1]
     ratios = "".join(
         f"; {head['what'].split(': ')[1].split(' against')[0]} is {head['ratio']:.1f} times as fast"
         f" as the best peer on as many cores (wanted >= {head['wanted']}: {verdict(head)})"
         for head in result["headline"]
     )
-    return f"""Use `jax.vmap` over `fj.limit_cycle`: {rate(one):.0f} cycles a second on one device,
-        {rate(two):.0f} over {two["devices"]} with `jax.shard_map`, errors up to
-        {two["error"]["worst"]:.0e}{ratios}."""
-
-
-def page(result: Row) -> list[str]:
-    """One sentence, the tables, how they were measured."""
-    rows, (low, high), lanes = result["methods"], result["range"], result["lanes"]
-    peer = rows[-1]
     about_peer = "Not installed: heyoka."
     if "periods" in peer:
         about_peer = f"""heyoka runs in {peer["devices"]} processes, over a sample of
@@ -263,17 +206,20 @@ def page(result: Row) -> list[str]:
             {peer["periods"]["most"]:.0f} at most. It agrees with the package's {result["fine"]}
             segments to {peer["error"]["worst"]:.0e}, so each confirms the other."""
     busy = (f"{share:.0%} of the time with {n} together" for n, share in lanes["busy"].items())
+
+    def shown(row):
+        found = ", ".join(f"{n} {name}" for name, n in row.get("results", {}).items())
+        return row | {"rate": rate(row), "found": found or None}
+
     return [
-        choice(result),
+        f"""Use `jax.vmap` over `fj.limit_cycle`: {rate(one):.0f} cycles a second on one device,
+        {rate(two):.0f} over {two["devices"]} with `jax.shard_map`, errors up to
+        {two["error"]["worst"]:.0e}{ratios}.""",
         table(
             "method | devices or cores | cycles | compile [s] | cycles a second"
             " | error: median, worst | results",
-            (
-                f"{r['name']} | {r['devices']} | {r['cycles']} | {cell(r['compile_s'], '.1f')}"
-                f" | {rate(r):.0f} | {both(r['error'], '.0e')} | "
-                + (", ".join(f"{n} {name}" for name, n in r.get("results", {}).items()) or "-")
-                for r in rows
-            ),
+            map(shown, rows),
+            "{name} | {devices} | {cycles} | {compile_s:.1f} | {rate:.0f} | {error:.0e} | {found}",
         ),
         f"""K_n {low:.0e} to {high:.0e} N/m; medians of {result["repeats"]} calls, the methods
         taking turns. Errors are relative, of period and amplitude, against the package with
@@ -283,11 +229,8 @@ def page(result: Row) -> list[str]:
         "By the number of cycles in one call, on one device:",
         table(
             "cycles | compile [s] | time a cycle [ms] | cycles a second",
-            (
-                f"{r['cycles']} | {r['compile_s']:.1f} | {r['seconds_a_cycle'] * 1e3:.3g}"
-                f" | {rate(r):.0f}"
-                for r in result["batches"]
-            ),
+            map(shown, result["batches"]),
+            "{cycles} | {compile_s:.1f} | {seconds_a_cycle!m:.3g} | {rate:.0f}",
         ),
         f"""A loop under `jax.vmap` ends when its slowest member does. The search for a cycle takes
         {lanes["turns"]["mean"]:.1f} returns of the Poincare map in the mean and
@@ -309,8 +252,3 @@ def picture(result: Row) -> bytes:
         lines.append((rows[0]["cycles"], rate(row), style, label))
     draw(ax, lines, "cycles in one call [-]", "cycles a second")
     return png(figure)
-
-
-if __name__ == "__main__":
-    jax.config.update("jax_enable_x64", True)
-    print(json.dumps(in_this_process(QUICK if sys.argv[1] == "quick" else FULL)))

@@ -1,32 +1,60 @@
 """A benchmark's page: numbers, text and picture side by side in a folder, and the index of all.
 
-A page is a module with TITLE, PACKAGES (whose versions it names), `measure(quick)` for its numbers,
-`page(result)` for its blocks of Markdown and `picture(result)` for its PNG.
+A page is a module with TITLE, PACKAGES (whose versions it names), `measure` for its numbers, whose
+arguments are FULL or QUICK, `page(result)` for its blocks of Markdown, the first of which says what
+to use, and `picture(result)` for its PNG.
 """
 
 import io
 import json
+import string
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .timing import machine_name, others_running, ran_on, this_machine, versions
+from .timing import machine_name, others_running, this_machine, versions
 
 INDEX = "README.md"  # the page that a folder is shown with
+UNITS = {"m": 1e3, "u": 1e6, "n": 1e9, "M": 1e-6}
 Result = dict[str, Any]
 
 
-def table(head: str, rows: Iterable[str]) -> str:
-    """A Markdown table from a heading and rows with cells apart by ` | `."""
-    lines = [head, " | ".join(["---"] * (head.count("|") + 1)), *rows]
-    return "\n".join(f"| {line} |" for line in lines)
+class Cells(string.Formatter):
+    """Fills `{key.key!unit:form}` from a row; median and worst as a pair, what is missing as -."""
+
+    def get_field(self, field_name: str, args: Any, kwargs: Any) -> tuple[Any, str]:
+        value = kwargs
+        for key in field_name.split("."):
+            value = value.get(key) if value else None
+        return value, field_name
+
+    def convert_field(self, value: Any, conversion: str | None) -> Any:
+        return value if value is None or conversion is None else value * UNITS[conversion]
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        if value is None:
+            return "-"
+        if isinstance(value, dict):
+            return ", ".join(format(value[how], format_spec) for how in ("median", "worst"))
+        return format(value, format_spec)
 
 
-def cell(value: Any, form: str) -> str:
-    """A number as a table shows it, or a dash."""
-    return "-" if value is None else format(value, form)
+cell = Cells().format_field  # a number as a table shows it, or a dash
+
+
+def filled(template: str, row: Result) -> str:
+    """The template with the numbers of a row."""
+    return Cells().vformat(template, (), row)
+
+
+def table(head: str, rows: Iterable[Any], template: str = "") -> str:
+    """A Markdown table from a heading and rows, given as text or as what fills the template."""
+    lines = (filled(template, row) if template else row for row in rows)
+    return "\n".join(
+        f"| {x} |" for x in (head, " | ".join(["---"] * (head.count("|") + 1)), *lines)
+    )
 
 
 def spread(errors: Any) -> dict[str, float]:
@@ -34,38 +62,29 @@ def spread(errors: Any) -> dict[str, float]:
     return {"median": float(np.median(errors)), "worst": float(np.max(errors))}
 
 
-def both(errors: dict[str, float] | None, form: str = ".1e") -> str:
-    """Median and worst in one cell."""
-    return f"{errors['median']:{form}}, {errors['worst']:{form}}" if errors else "-"
-
-
-# Ratios and bounds that a page promises -----------------------------------------------------------
+# What a page promises: {what, ratio, wanted} or {what, value, wanted: [low, high]}
 
 
 def held(head: Result) -> bool:
     """Whether a ratio is as large as wanted, or a value within its two bounds."""
     if "ratio" in head:
         return head["ratio"] >= head["wanted"]
-    low, high = head["wanted"]
-    return low <= head["value"] <= high
+    return head["wanted"][0] <= head["value"] <= head["wanted"][1]
 
 
 def verdict(head: Result) -> str:
-    """The same in a word."""
     return "held" if held(head) else "**missed**"
 
 
 def in_words(head: Result) -> str:
     """Cells: what is compared, what was measured, what was wanted, the verdict."""
-    if "ratio" in head:
-        found, wanted = f"{head['ratio']:.3g} times", f"at least {head['wanted']:g} times"
-    else:
-        low, high = head["wanted"]
-        found, wanted = f"{head['value']:.3g}", f"{low:g} to {high:g}"
-    return f"{head['what']} | {found} | {wanted} | {verdict(head)}"
+    found, wanted = "{ratio:.3g} times", "at least {wanted:g} times"
+    if "value" in head:
+        found, wanted = "{value:.3g}", "{:g} to {:g}".format(*head["wanted"])
+    return f"{head['what']} | {filled(f'{found} | {wanted}', head)} | {verdict(head)}"
 
 
-# Pictures -----------------------------------------------------------------------------------------
+# Pictures
 
 
 def subplots(*shape: int, **options: Any) -> tuple[Any, Any]:
@@ -87,6 +106,12 @@ def draw(ax: Any, lines: Iterable[tuple], xlabel: str, ylabel: str, title: str =
     ax.legend(loc="best", fontsize="small")
 
 
+def columns(rows: Iterable[Result], *keys: str) -> tuple[list[Any], ...]:
+    """What stands in rows under each key."""
+    rows = list(rows)
+    return tuple([row[key] for row in rows] for key in keys)
+
+
 def png(figure: Any, dpi: int = 110) -> bytes:
     """A figure of pyplot as the content of a file; the figure is closed."""
     from matplotlib import pyplot
@@ -97,20 +122,22 @@ def png(figure: Any, dpi: int = 110) -> bytes:
     return content.getvalue()
 
 
-# Pages --------------------------------------------------------------------------------------------
+# Pages and their index
 
 
 def measured(module: Any, quick: bool) -> Result:
     """All numbers of a page, as they are read back from its JSON."""
-    busy = others_running()
-    found = module.measure(quick)
-    about = {"machine": this_machine(busy), "versions": versions("jax", *module.PACKAGES)}
-    return json.loads(json.dumps({"quick": quick} | about | found))
+    about = {"quick": quick, "machine": this_machine(others_running())}
+    about["versions"] = versions("jax", *module.PACKAGES)
+    return json.loads(json.dumps(about | module.measure(**module.QUICK if quick else module.FULL)))
 
 
 def text(module: Any, result: Result) -> str:
     """The Markdown of a page. Tables and lists are kept; of a paragraph the line breaks go."""
-    blocks = [f"# {module.TITLE}", *module.page(result), ran_on(result)]
+    machine = result["machine"]
+    ran_on = f"""{machine_name(machine)}, {machine["others_running"]:.1f} other programs running
+        before; {", ".join(" ".join(pair) for pair in result["versions"].items())}."""
+    blocks = [f"# {module.TITLE}", *module.page(result), ran_on]
     kept = (b if b.startswith(("| ", "- ")) else " ".join(b.split()) for b in blocks if b)
     return "\n\n".join(kept) + "\n"
 
@@ -128,9 +155,6 @@ def write(folder: Path, name: str, module: Any, result: Result) -> list[Path]:
     return list(files)
 
 
-# The index ----------------------------------------------------------------------------------------
-
-
 def stored(folder: Path) -> dict[str, Result]:
     """Numbers of the pages in a folder, by name."""
     return {path.stem: json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))}
@@ -139,12 +163,12 @@ def stored(folder: Path) -> dict[str, Result]:
 def index(folder: Path) -> str:
     """The page of all pages: what is held, what to use, on which machine."""
     results = stored(folder)
-    heads = [
-        (name, head) for name, result in results.items() for head in result.get("headline", [])
-    ]
+    heads = [(name, head) for name in results for head in results[name].get("headline", [])]
     missed = sum(not held(head) for _, head in heads)
     machines = dict.fromkeys(machine_name(result["machine"]) for result in results.values())
     opening = {name: (folder / f"{name}.md").read_text().split("\n\n")[:2] for name in results}
+    promises = (f"{in_words(head)} | [{name}]({name}.md)" for name, head in heads)
+    use = (f"- [{title[2:]}]({name}.md). {first}" for name, (title, first) in opening.items())
     blocks = [
         "# Error against run time",
         f"Of {len(heads)} ratios and bounds to hold, {len(heads) - missed} are held and {missed}"
@@ -152,15 +176,9 @@ def index(folder: Path) -> str:
         f" {' and on '.join(machines)}. Absolute times mean little elsewhere; ratios are between"
         " methods that took turns in one run.",
         "## Ratios to hold",
-        table(
-            "what | measured | wanted |  | page",
-            (f"{in_words(head)} | [{name}]({name}.md)" for name, head in heads),
-        ),
+        table("what | measured | wanted |  | page", promises),
         "## What to use",
-        "\n".join(
-            f"- [{title.removeprefix('# ')}]({name}.md). {first}"
-            for name, (title, first) in opening.items()
-        ),
+        "\n".join(use),
         "## On an accelerator",
         accelerators(results),
     ]

@@ -1,13 +1,12 @@
 """Scale: `sweep` over more and more points, in memory and in shards, interrupted, and shared.
 
-Every sweep is one of the growth rate over D, G, mu_s and V in a Python process of its own
-(`python -m benchmarks.scale JSON`, the fields of a `Job`), so that its peak of memory is its own.
-Beside it all points in one call of the vmapped program, which is what a user has without `sweep`.
+Every sweep is one of the growth rate over D, G, mu_s and V in a Python process of its own, so that
+its peak of memory is its own. Beside it all points in one call of the vmapped program, which is
+what a user has without `sweep`.
 """
 
 import contextlib
 import hashlib
-import json
 import math
 import os
 import resource
@@ -20,7 +19,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from unittest import mock
 
 import jax
@@ -30,50 +29,33 @@ import numpy as np
 import fractaljax as fj
 from fractaljax._sweep.shards import Shards
 
-from .page import cell, draw, in_words, png, subplots, table
+from .page import columns, draw, in_words, png, subplots, table
+from .timing import devices, ended, ratio, started
 
 TITLE = "Scale: a sweep over more and more points"
 PACKAGES = ("jaxlib", "numpy")
-LINEAR, OWN_MEMORY = 0.1, 100e6  # how far from 1 a slope may be; bytes beyond the result
+# Lengths of the axes, from few points to many; repeats up to 1e7 points; most points in one call;
+# points of every result beside a single call and 40 digits; lengths of the axes of what is
+# interrupted or shared; a batch of what is interrupted; turns of what is shared.
+SIDES = ((10,) * 4, (100, 10, 10, 10), (100, 100, 10, 10), (100, 100, 100, 10), (100,) * 4)
+FULL = {"sides": SIDES, "repeats": 3, "most_at_once": 10_000_000, "checked": 16}
+FULL |= {"lengths": (100, 100, 20, 20), "batch": 8192, "turns": 3}
+QUICK = {"sides": SIDES[:2], "repeats": 1, "most_at_once": 10_000, "checked": 4}
+QUICK |= {"lengths": (100, 100, 10, 5), "batch": 1024, "turns": 1}
+LINEAR, OWN_MEMORY = 0.1, 100  # how far from 1 a slope may be; MB beyond the result
 KILLS = (0.25, 0.5, 0.75)  # shares of the batches that are there when a sweep is killed
 IN_MEMORY, SHARDS, AT_ONCE = "sweep, in memory", "sweep, in shards", "one call of jax.vmap"
 RANGES = {"D": (2.3, 2.6), "G": (1e-11, 1e-9), "mu_s": (0.3, 0.5), "V": (0.05, 0.3)}
+WAYS = (  # name, devices of a process, processes
+    ("one device, in memory", 1, 1),
+    ("two devices, in memory", 2, 1),
+    ("one process, in shards", 1, 1),
+    ("two processes, in shards", 1, 2),
+)
 Result = dict[str, Any]
 
 
-class Size(NamedTuple):
-    """How much is measured."""
-
-    sides: tuple[tuple[int, ...], ...]  # lengths of the axes, from few points to many
-    at_once: int  # most points in one call
-    repeats: int  # of a sweep up to 1e7 points; beyond, one
-    checked: int  # points of every result beside a single call and 40 digits
-    shared: tuple[int, ...]  # lengths of the axes of what is interrupted or shared
-    batch: int  # of what is interrupted
-    turns: int  # of what is shared
-
-
-SIDES = ((10,) * 4, (100, 10, 10, 10), (100, 100, 10, 10), (100, 100, 100, 10), (100,) * 4)
-FULL = Size(SIDES, 10_000_000, 3, 16, (100, 100, 20, 20), 8192, 3)
-QUICK = Size(SIDES[:2], 10_000, 1, 4, (100, 100, 10, 5), 1024, 1)
-
-
-# One sweep, in its process ------------------------------------------------------------------------
-
-
-class Job(NamedTuple):
-    """A sweep of the growth rate over the axes of `RANGES`, and how it is run."""
-
-    lengths: tuple[int, ...]  # of the axes
-    repeats: int = 1
-    batch: int | None = None  # points at a time, by default those of `sweep`
-    at_once: bool = False  # all points in one call of a vmapped program instead
-    shards: str | None = None  # folder in which every repeat keeps its batches
-    begun: str | None = None  # file to which the number of every batch that is begun is added
-    warm: bool = True  # whether the program is compiled before the clock starts
-    picked: tuple[int, ...] = ()  # points whose values are returned
-    port: int | None = None  # of the first of two processes
-    rank: int = 0
+# One sweep, in its process
 
 
 def axes(lengths) -> dict[str, Any]:
@@ -90,35 +72,35 @@ def at(lengths, point: int) -> dict[str, float]:
     return {name: float(axis[place]) for (name, axis), place in places}
 
 
-def swept(job: Job, folder: str | None) -> np.ndarray:
+def swept(lengths, batch: int | None, folder: Path | None) -> np.ndarray:
     """Growth rates over the grid."""
-    scene, given = fj.brake_scene(), axes(job.lengths)
-    return np.asarray(fj.sweep(fj.growth_rate, scene, job.batch, False, out=folder, **given))
+    given = axes(lengths)
+    return np.asarray(fj.sweep(fj.growth_rate, fj.brake_scene(), batch, False, out=folder, **given))
 
 
 class _Enough(Exception):
     """The first batch is there."""
 
 
-def first_batch(job: Job) -> None:
+def first_batch(lengths, batch: int | None) -> None:
     """Trace, compile and run one batch of the sweep, with axes of the same lengths."""
     stop = mock.patch.object(Shards, "write", side_effect=_Enough)
     with tempfile.TemporaryDirectory() as folder, stop, contextlib.suppress(_Enough):
-        swept(job, folder)
+        swept(lengths, batch, Path(folder))
 
 
-def whole_grid(job: Job) -> Callable[[], np.ndarray]:
+def whole_grid(lengths) -> Callable[[], np.ndarray]:
     """A call that makes the grid and gives it to a program compiled for all points at once."""
     scene = fj.brake_scene()
 
     def growth(*values):
         return fj.growth_rate(scene.replace(**dict(zip(RANGES, values, strict=True))))
 
-    flat = [jax.ShapeDtypeStruct((math.prod(job.lengths),), float)] * len(RANGES)
+    flat = [jax.ShapeDtypeStruct((math.prod(lengths),), float)] * len(RANGES)
     program = jax.jit(jax.vmap(growth)).lower(*flat).compile()
 
     def run():
-        grid = np.meshgrid(*axes(job.lengths).values(), indexing="ij")
+        grid = np.meshgrid(*axes(lengths).values(), indexing="ij")
         return np.asarray(program(*(jnp.asarray(values.ravel()) for values in grid)))
 
     return run
@@ -153,111 +135,80 @@ def log_begun(file: str) -> None:
     Shards.has = logged
 
 
-def in_this_process(job: Job) -> Result:
+def in_this_process(
+    lengths,
+    repeats: int = 1,
+    batch: int | None = None,  # points at a time, by default those of `sweep`
+    at_once: bool = False,  # all points in one call of a vmapped program instead
+    shards: str | None = None,  # folder in which every repeat keeps its batches
+    begun: str | None = None,  # file to which the number of every batch that is begun is added
+    warm: bool = True,  # whether the program is compiled before the clock starts
+    picked=(),  # points whose values are returned
+    port: int | None = None,  # of the first of two processes
+    rank: int = 0,
+) -> Result:
     """Run it: seconds of every repeat, bytes beyond those held before, and picked values."""
-    if job.port is not None:
-        jax.distributed.initialize(f"127.0.0.1:{job.port}", 2, job.rank)
-    if job.begun is not None:
-        log_begun(job.begun)
+    if port is not None:
+        jax.distributed.initialize(f"127.0.0.1:{port}", 2, rank)
+    if begun is not None:
+        log_begun(begun)
     start = time.perf_counter()
-    at_once = whole_grid(job) if job.at_once else None
-    if job.warm and not job.at_once:
-        first_batch(job)
+    call = whole_grid(lengths) if at_once else None
+    if warm and not at_once:
+        first_batch(lengths, batch)
     prepared = time.perf_counter() - start
     forget_peak()
     base = peak_memory()
     times, result = [], np.empty(0)
-    for repeat in range(job.repeats):
+    for repeat in range(repeats):
         del result
-        folder = None if job.shards is None else str(Path(job.shards) / str(repeat))
-        if job.port is not None:
+        folder = None if shards is None else Path(shards) / str(repeat)
+        if port is not None:
             from jax.experimental.multihost_utils import sync_global_devices
 
             sync_global_devices(f"repeat {repeat} begins")
         start = time.perf_counter()
-        result = swept(job, folder) if at_once is None else at_once()
+        result = swept(lengths, batch, folder) if call is None else call()
         times.append(time.perf_counter() - start)
-    peak = peak_memory()
     return {
+        "peak_beyond_base": peak_memory() - base,
+        "base_bytes": base,
+        "result_bytes": result.nbytes,
         "device": jax.devices()[0].device_kind,
         "devices": jax.local_device_count(),
-        "prepared_s": prepared,
-        "seconds": times,
-        "base_bytes": base,
-        "peak_bytes": peak,
-        "result_bytes": result.nbytes,
-        "values": result.ravel()[list(job.picked)].tolist(),
+        "compile_s": prepared,
+        "times": times,
+        "values": result.ravel()[list(picked)].tolist(),
         "sha256": hashlib.sha256(result.tobytes()).hexdigest(),
     }
 
 
-# Sweeps in processes of their own -----------------------------------------------------------------
+# Sweeps in processes of their own
 
 
-def started(job: Job, devices: int | None = None) -> subprocess.Popen:
-    """The process of a job; on so many virtual devices of the processor where they are given."""
-    flags = {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}"}
-    return subprocess.Popen(
-        [sys.executable, "-m", "benchmarks.scale", json.dumps(job._asdict())],
-        cwd=Path(__file__).parents[1],
-        env=os.environ | ({"JAX_PLATFORMS": "cpu"} | flags if devices else {}),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
-def ended(process: subprocess.Popen) -> Result:
-    """The numbers of a job."""
-    said, complaint = process.communicate()
-    if process.returncode:
-        raise RuntimeError(f"a sweep failed: {complaint}")
-    return json.loads(said.splitlines()[-1])
+def begin(environment: dict[str, str] | None = None, **job: Any) -> subprocess.Popen:
+    """The process of a sweep."""
+    return started(__name__, environment or {}, **job)
 
 
 def files(folder: str) -> list[Path]:
-    """The batches that the first repeat of a job has kept in its folder."""
+    """The batches that the first repeat of a sweep has kept in its folder."""
     return list((Path(folder) / "0").glob("[0-9]*.npz"))
 
 
-def ladder(size: Size) -> list[Result]:
-    """Time, memory, files and errors of every way to every number of points."""
-    from tqdm import tqdm
-
-    rows = []
-    steps = [
-        (way, lengths)
-        for way in (IN_MEMORY, SHARDS, AT_ONCE)
-        for lengths in size.sides
-        if way != AT_ONCE or math.prod(lengths) <= size.at_once
-    ]
-    for way, lengths in tqdm(steps, desc="more points"):
-        points = math.prod(lengths)
-        repeats = size.repeats if points <= 10_000_000 else 1
-        picked = np.random.default_rng(0).integers(points, size=size.checked).tolist()
-        with tempfile.TemporaryDirectory() as place:
-            shards = place if way == SHARDS else None
-            job = Job(lengths, repeats, None, way == AT_ONCE, shards, picked=tuple(picked))
-            found = ended(started(job))
-            kept = files(place)
-            on_disk = sum(file.stat().st_size for file in kept) if kept else None
-        rows.append(
-            {
-                "way": way,
-                "points": points,
-                "repeats": repeats,
-                "device": found["device"],
-                "compile_s": found["prepared_s"],
-                "seconds": statistics.median(found["seconds"]),
-                "base_bytes": found["base_bytes"],
-                "peak_beyond_base": found["peak_bytes"] - found["base_bytes"],
-                "result_bytes": found["result_bytes"],
-                "disk_bytes": on_disk,
-                "files": len(kept),
-                **errors(lengths, picked, found["values"]),
-            }
-        )
-    return rows
+def measured(way: str, lengths, repeats: int, checked: int) -> Result:
+    """Time, memory, files and errors of one way to one number of points."""
+    points = math.prod(lengths)
+    repeats = repeats if points <= 10_000_000 else 1
+    picked = np.random.default_rng(0).integers(points, size=checked).tolist()
+    with tempfile.TemporaryDirectory() as place:
+        job = {"at_once": way == AT_ONCE, "shards": place if way == SHARDS else None}
+        found = ended(begin(lengths=lengths, repeats=repeats, picked=picked, **job))
+        kept = [file.stat().st_size for file in files(place)]
+    row = {"way": way, "points": points, "repeats": repeats, "files": len(kept)}
+    row |= {"seconds": statistics.median(found["times"]), "disk_bytes": sum(kept) or None}
+    shown = "device", "compile_s", "base_bytes", "peak_beyond_base", "result_bytes"
+    return row | {key: found[key] for key in shown} | errors(lengths, picked, found["values"])
 
 
 def errors(lengths, picked, values) -> dict[str, float]:
@@ -277,15 +228,16 @@ def errors(lengths, picked, values) -> dict[str, float]:
     return {"off_single": max(single) / b["omega_1"], "off_exact": max(exact) / b["omega_1"]}
 
 
-def interrupted(size: Size) -> Result:
+def interrupted(lengths, batch: int) -> Result:
     """A sweep killed in the middle, more than once, and finished; beside one left alone."""
-    whole = ended(started(Job(size.shared, batch=size.batch, warm=False)))
-    batches, kills = -(-math.prod(size.shared) // size.batch), []
+    job: Result = {"lengths": lengths, "batch": batch, "warm": False}
+    whole = ended(begin(**job))
+    batches, kills = -(-math.prod(lengths) // batch), []
     with tempfile.TemporaryDirectory() as place:
         log = Path(place) / "begun.txt"
-        job = Job(size.shared, batch=size.batch, shards=place, begun=str(log), warm=False)
+        job |= {"shards": place, "begun": str(log)}
         for share in KILLS:
-            process = started(job)
+            process = begin(**job)
             while process.poll() is None and len(files(place)) < share * batches:
                 time.sleep(1e-3)
             process.send_signal(signal.SIGKILL)
@@ -294,10 +246,10 @@ def interrupted(size: Size) -> Result:
                 there = {int(file.stem) for file in files(place)}
                 lost = set(map(int, log.read_text().split())) - there
                 kills.append({"batches_there": len(there), "begun_but_not_there": len(lost)})
-        resumed = ended(started(job))
+        resumed = ended(begin(**job))
         begun, complete = log.read_text().split(), len(files(place))
     return {
-        "points": math.prod(size.shared),
+        "points": math.prod(lengths),
         "batches": batches,
         "batches_at_the_end": complete,
         "kills": kills,
@@ -313,41 +265,27 @@ def free_port() -> int:
         return free.getsockname()[1]
 
 
-WAYS = (  # name, devices of a process, processes
-    ("one device, in memory", 1, 1),
-    ("two devices, in memory", 2, 1),
-    ("one process, in shards", 1, 1),
-    ("two processes, in shards", 1, 2),
-)
-
-
-def shared(size: Size) -> list[Result]:
+def shared(lengths, turns: int) -> list[Result]:
     """One device and two, one process and two, of this processor; each in its turn."""
     times: dict[str, list[float]] = {name: [] for name, _, _ in WAYS}
     counts, hashes = {}, set()
-    for _ in range(size.turns):
-        for name, devices, processes in WAYS:
+    for _ in range(turns):
+        for name, count, processes in WAYS:
             with tempfile.TemporaryDirectory() as place:
-                port = free_port() if processes > 1 else None
-                job = Job(size.shared, shards=place if "shards" in name else None, port=port)
-                jobs = [started(job._replace(rank=rank), devices) for rank in range(processes)]
+                job = {"lengths": lengths, "shards": place if "shards" in name else None}
+                job["port"] = free_port() if processes > 1 else None
+                jobs = [begin(devices(count), **job, rank=rank) for rank in range(processes)]
                 found = [ended(process) for process in jobs]
             counts[name] = sum(one["devices"] for one in found)
             hashes |= {one["sha256"] for one in found}
-            times[name].append(max(one["seconds"][0] for one in found))
-    peers = {True: times[WAYS[2][0]], False: times[WAYS[0][0]]}
-    return [
-        {
-            "name": name,
-            "device_count": counts[name],
-            "points_a_second": math.prod(size.shared) / statistics.median(own),
-            "beside_one": statistics.median(
-                peer / t for peer, t in zip(peers["shards" in name], own, strict=True)
-            ),
-            "equal_to_the_last_bit": len(hashes) == 1,
-        }
-        for name, own in times.items()
-    ]
+            times[name].append(max(one["times"][0] for one in found))
+    rows = []
+    for name, own in times.items():
+        alone = times[WAYS[2 if "shards" in name else 0][0]]
+        row = {"name": name, "device_count": counts[name], "beside_one": ratio(alone, own)}
+        row["points_a_second"] = math.prod(lengths) / statistics.median(own)
+        rows.append(row | {"equal_to_the_last_bit": len(hashes) == 1})
+    return rows
 
 
 def slope(rows: list[Result], key: str) -> float:
@@ -356,35 +294,35 @@ def slope(rows: list[Result], key: str) -> float:
     return math.log(y[1] / y[0]) / math.log(x[1] / x[0])
 
 
-def measure(quick: bool) -> Result:
-    """The ladder, the sweep that is killed and the one that is shared."""
-    size = QUICK if quick else FULL
-    rows, killed = ladder(size), interrupted(size)
+def measure(sides, repeats, most_at_once, checked, lengths, batch: int, turns: int) -> Result:
+    """The sweeps of more and more points, the one that is killed and the one that is shared."""
+    from tqdm import tqdm
+
+    steps = [(way, side) for way in (IN_MEMORY, SHARDS, AT_ONCE) for side in sides]
+    steps = [step for step in steps if step[0] != AT_ONCE or math.prod(step[1]) <= most_at_once]
+    rows = [measured(*step, repeats, checked) for step in tqdm(steps, desc="more points")]
+    killed, bounds = interrupted(lengths, batch), []
     own = {way: [row for row in rows if row["way"] == way] for way in (IN_MEMORY, SHARDS)}
-    bounds = []
     for way, found in own.items():
-        what, value = (
-            f"{way}: slope of log time over log points, last decade",
-            slope(found, "seconds"),
-        )
-        bounds.append((what, value, [1 - LINEAR, 1 + LINEAR]))
+        what = f"{way}: slope of log time over log points, last decade"
+        bounds.append((what, slope(found, "seconds"), [1 - LINEAR, 1 + LINEAR]))
     for way, found in own.items():
         most = max(row["peak_beyond_base"] - row["result_bytes"] for row in found) / 1e6
-        bounds.append((f"{way}: most memory beyond the result [MB]", most, [0, OWN_MEMORY / 1e6]))
+        bounds.append((f"{way}: most memory beyond the result [MB]", most, [0, OWN_MEMORY]))
     again = killed["computed_again"] / max(len(killed["kills"]), 1)
     bounds.append(("batches computed again after a kill", again, [0, 1]))
     return {
         "headline": [dict(zip(("what", "value", "wanted"), b, strict=True)) for b in bounds],
-        "checked": size.checked,
-        "turns": size.turns,
+        "checked": checked,
+        "turns": turns,
         "rows": rows,
         "interrupted": killed,
-        "shared_points": math.prod(size.shared),
-        "shared": shared(size),
+        "shared_points": math.prod(lengths),
+        "shared": shared(lengths, turns),
     }
 
 
-# The page -----------------------------------------------------------------------------------------
+# The page
 
 
 def short(count: float) -> str:
@@ -393,53 +331,38 @@ def short(count: float) -> str:
     return f"{mantissa}e{int(exponent)}"
 
 
-def choice(result: Result) -> str:
-    """One sentence: what to use."""
-    own, kept, at_once = (
-        [row for row in result["rows"] if row["way"] == way] for way in (IN_MEMORY, SHARDS, AT_ONCE)
-    )
-    peer, last = at_once[-1], own[-1]
-    same = next(row for row in own if row["points"] == peer["points"])
-    return f"""Use `sweep`: {short(last["points"])} growth rates in {last["seconds"]:.3g} s and
+def page(result: Result) -> list[str]:
+    rows, killed = result["rows"], result["interrupted"]
+    by_way = ([r for r in rows if r["way"] == way] for way in (IN_MEMORY, SHARDS, AT_ONCE))
+    own, kept, (*_, peer) = by_way
+    same, last = next(r for r in own if r["points"] == peer["points"]), own[-1]
+    there = ", ".join(str(kill["batches_there"]) for kill in killed["kills"])
+    lost = ", ".join(str(kill["begun_but_not_there"]) for kill in killed["kills"])
+    how = "the same to the last bit as" if killed["equal_to_the_last_bit"] else "NOT equal to"
+    equal = all(way["equal_to_the_last_bit"] for way in result["shared"])
+
+    def shown(row):
+        more = {"count": short(row["points"]), "rate": row["points"] / row["seconds"]}
+        return row | more | {"files": row["files"] or None}
+
+    return [
+        f"""Use `sweep`: {short(last["points"])} growth rates in {last["seconds"]:.3g} s and
         {last["peak_beyond_base"] / 1e6:.0f} MB, of which the result is
         {last["result_bytes"] / 1e6:.0f} MB, while one call of a vmapped program takes
         {peer["peak_beyond_base"] / same["peak_beyond_base"]:.1f} times the memory and
         {peer["seconds"] / same["seconds"]:.2f} times the time for {short(same["points"])} points;
         name a folder (`out=`) where a sweep may be interrupted, which takes
-        {kept[-1]["seconds"] / last["seconds"]:.2f} times the time."""
-
-
-def row_cells(row: Result) -> str:
-    """Time, memory, files and errors of one sweep."""
-
-    def megabytes(count):
-        return cell(None if count is None else count / 1e6, ".3g")
-
-    return (
-        f"{row['way']} | {short(row['points'])} | {row['seconds']:.3g}"
-        f" | {row['points'] / row['seconds']:.3g} | {megabytes(row['peak_beyond_base'])}"
-        f" | {megabytes(row['result_bytes'])} | {row['files'] or '-'}"
-        f" | {megabytes(row['disk_bytes'])} | {row['compile_s']:.1f} | {row['off_single']:.0e}"
-        f" | {row['off_exact']:.0e}"
-    )
-
-
-def page(result: Result) -> list[str]:
-    """What to use, what is promised, the tables, how they were measured."""
-    rows, killed = result["rows"], result["interrupted"]
-    there = ", ".join(str(kill["batches_there"]) for kill in killed["kills"])
-    lost = ", ".join(str(kill["begun_but_not_there"]) for kill in killed["kills"])
-    how = "the same to the last bit as" if killed["equal_to_the_last_bit"] else "NOT equal to"
-    equal = all(way["equal_to_the_last_bit"] for way in result["shared"])
-    return [
-        choice(result),
+        {kept[-1]["seconds"] / last["seconds"]:.2f} times the time.""",
         table("what | found | wanted | ", map(in_words, result["headline"])),
         "## More points",
         table(
             "way | points | time [s] | points a second | peak memory [MB] | of it the result [MB]"
             " | files | on disk [MB] | before the first batch is there [s]"
             " | error beside single calls | error to 40 digits",
-            map(row_cells, rows),
+            map(shown, rows),
+            "{way} | {count} | {seconds:.3g} | {rate:.3g} | {peak_beyond_base!M:.3g}"
+            " | {result_bytes!M:.3g} | {files} | {disk_bytes!M:.3g} | {compile_s:.1f}"
+            " | {off_single:.0e} | {off_exact:.0e}",
         ),
         f"""Growth rates of the reference brake over D, G, mu_s and V in double precision, each row
         in a Python process of its own on {", ".join(sorted({row["device"] for row in rows}))}. Time
@@ -459,11 +382,8 @@ def page(result: Result) -> list[str]:
         "## Shared",
         table(
             "way | devices in all | points a second | beside one",
-            (
-                f"{way['name']} | {way['device_count']} | {way['points_a_second']:.3g}"
-                f" | {way['beside_one']:.2f}"
-                for way in result["shared"]
-            ),
+            result["shared"],
+            "{name} | {device_count} | {points_a_second:.3g} | {beside_one:.2f}",
         ),
         f"""{short(result["shared_points"])} points; devices are virtual ones of this processor, all
         on the same cores, and processes talk over the loopback address: this shows the cost of
@@ -482,20 +402,14 @@ def picture(result: Result) -> bytes:
     times, memory = [], []
     for way, style in STYLES.items():
         rows = [row for row in result["rows"] if row["way"] == way]
-        points = [row["points"] for row in rows]
-        times.append((points, [row["seconds"] for row in rows], style, way))
-        memory.append((points, [row["peak_beyond_base"] / 1e6 for row in rows], style, way))
+        points, taken, peak = columns(rows, "points", "seconds", "peak_beyond_base")
+        times.append((points, taken, style, way))
+        memory.append((points, np.divide(peak, 1e6), style, way))
     rows = [row for row in result["rows"] if row["way"] == IN_MEMORY]
-    points = [row["points"] for row in rows]
-    line = [rows[-1]["seconds"] * n / points[-1] for n in points]
+    points, taken, needed = columns(rows, "points", "seconds", "result_bytes")
+    line = [taken[-1] * n / points[-1] for n in points]
     times.append((points, line, "k-", "in proportion to the points"))
-    needed = [row["result_bytes"] / 1e6 for row in rows]
-    memory.append((points, needed, "k-", "the result itself"))
+    memory.append((points, np.divide(needed, 1e6), "k-", "the result itself"))
     draw(left, times, "points [-]", "time [s]")
     draw(right, memory, "points [-]", "peak memory beyond the base [MB]")
     return png(figure)
-
-
-if __name__ == "__main__":
-    jax.config.update("jax_enable_x64", True)
-    print(json.dumps(in_this_process(Job(**json.loads(sys.argv[1])))))

@@ -6,21 +6,20 @@ not need must not be there, so the row without it is the cheaper one in every co
 """
 
 import collections
-import json
+import functools
 import statistics
-import subprocess
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import fractaljax as fj
 
-from .page import png, subplots, table
-from .timing import seconds
+from .page import columns, png, subplots, table
+from .timing import ended, seconds, started
 
 TITLE = "What a scene costs"
 PACKAGES = ()
@@ -28,30 +27,29 @@ HEAVY = ("diffrax", "optimistix", "optax", "matplotlib", "scipy", "tqdm")
 COUNTS = {"operations": "operations", "flops": "FLOPs", "bytes_accessed": "bytes moved"}
 
 
-# Questions ----------------------------------------------------------------------------------------
-
-
-def fixed(friction=None) -> fj.Scene:
-    """The source's section 3.3: K_n and K_t given, constant friction unless another law is."""
-    friction = fj.Coulomb(0.4) if friction is None else friction
+def fixed(friction: Any) -> fj.Scene:
+    """The source's section 3.3: K_n and K_t given."""
     return fj.Scene(fj.FixedContact(4e8, 2e8), friction, fj.brake_scene().oscillator)
 
 
-def fractal(ratio=None) -> fj.Scene:
-    """The reference brake; with a ratio K_t/K_n it has no tangential law."""
+def coulomb() -> fj.Scene:
+    return fixed(fj.Coulomb(0.4))
+
+
+def stribeck() -> fj.Scene:
+    return fixed(fj.Stribeck(0.4, 0.25, 0.5))
+
+
+def normal() -> fj.Scene:
+    """The reference brake with a ratio K_t/K_n in place of its tangential law."""
     scene = fj.brake_scene()
-    contact = fj.FractalContact(scene.contact.surface, scene.contact.material, 1907.3, ratio)
-    return fj.Scene(contact, scene.friction, scene.oscillator)
+    contact = fj.FractalContact(scene.contact.surface, scene.contact.material, 1907.3, 0.5)
+    return scene.replace(contact=contact)
 
 
 def amplitude(scene: fj.Scene, **options: Any) -> jax.Array:
     """Peak to peak of x_1 [m] on the limit cycle."""
     return fj.limit_cycle(scene, throw=False, **options).amplitude[0]
-
-
-def regularised_amplitude(scene: fj.Scene) -> jax.Array:
-    """The same with sgn(v) replaced by tanh(v/eps), eps = 0.003 m/s."""
-    return amplitude(scene, regularisation=0.003)
 
 
 def by_surface(measure: Callable) -> Callable:
@@ -70,7 +68,7 @@ def by_surface(measure: Callable) -> Callable:
 
 def worst(measure: Callable) -> Callable:
     """The largest value of a measure at nine conditions of load and friction."""
-    loads, frictions = jnp.meshgrid(jnp.array([0.9, 1.0, 1.1]), jnp.array([0.36, 0.4, 0.44]))
+    loads, frictions = np.meshgrid([0.9, 1.0, 1.1], [0.36, 0.4, 0.44])
 
     def over(scene):
         def at(load, mu_s):
@@ -82,53 +80,32 @@ def worst(measure: Callable) -> Callable:
 
 
 class Row(NamedTuple):
-    """A question, and the row that has one part less."""
+    """A question: its name, the place of the row with one part less, the function, its scene."""
 
     name: str
-    without: str | None
-    ask: Callable[[], tuple[Callable, fj.Scene]]  # the function, and the scene that it is given
-    quick: bool = True  # compiles in seconds
+    without: int | None
+    function: Callable
+    scene: Callable[[], fj.Scene]
 
 
-def stribeck() -> fj.Scene:
-    """Known stiffness, friction that falls."""
-    return fixed(fj.Stribeck(0.4, 0.25, 0.5))
-
-
-def worst_growth_rate() -> tuple[Callable, fj.Scene]:
-    """The question of the envelope, at equilibrium."""
-    return by_surface(worst(fj.growth_rate)), fractal()
-
-
-def worst_amplitude() -> tuple[Callable, fj.Scene]:
-    """The same in motion."""
-    return by_surface(worst(amplitude)), fractal(0.5)
-
-
-COULOMB = "growth rate, stiffness given, Coulomb"
-STRIBECK = "growth rate, stiffness given, Stribeck"
-NORMAL, LAWS = "growth rate, normal contact law", "growth rate, both contact laws"
-GRADIENT, SLOPES = "growth rate with gradient by D, G", "amplitude with gradient by D, G"
-AMPLITUDE, NORMAL_AMPLITUDE = "amplitude, stiffness given", "amplitude, normal contact law"
-REGULARISED = "amplitude, stiffness given, regularised law"
+growth, brake = fj.growth_rate, fj.brake_scene
+regularised = functools.partial(amplitude, regularisation=0.003)  # eps [m/s]
 ROWS = (
-    Row(COULOMB, None, lambda: (fj.growth_rate, fixed())),
-    Row(STRIBECK, COULOMB, lambda: (fj.growth_rate, stribeck())),
-    Row(NORMAL, STRIBECK, lambda: (fj.growth_rate, fractal(0.5))),
-    Row(LAWS, NORMAL, lambda: (fj.growth_rate, fractal())),
-    Row("all eigenvalues, both contact laws", LAWS, lambda: (fj.stability, fractal())),
-    Row(GRADIENT, LAWS, lambda: (by_surface(fj.growth_rate), fractal())),
-    Row("worst growth rate of 9 conditions, with gradient", GRADIENT, worst_growth_rate),
-    Row(AMPLITUDE, STRIBECK, lambda: (amplitude, stribeck()), False),
-    Row(REGULARISED, STRIBECK, lambda: (regularised_amplitude, stribeck()), False),
-    Row(NORMAL_AMPLITUDE, AMPLITUDE, lambda: (amplitude, fractal(0.5)), False),
-    Row(SLOPES, NORMAL_AMPLITUDE, lambda: (by_surface(amplitude), fractal(0.5)), False),
-    Row("worst amplitude of 9 conditions, with gradient", SLOPES, worst_amplitude, False),
+    Row("growth rate, stiffness given, Coulomb", None, growth, coulomb),
+    Row("growth rate, stiffness given, Stribeck", 0, growth, stribeck),
+    Row("growth rate, normal contact law", 1, growth, normal),
+    Row("growth rate, both contact laws", 2, growth, brake),
+    Row("all eigenvalues, both contact laws", 3, fj.stability, brake),
+    Row("growth rate with gradient by D, G", 3, by_surface(growth), brake),
+    Row("worst growth rate of 9 conditions, with gradient", 5, by_surface(worst(growth)), brake),
+    Row("amplitude, stiffness given", 1, amplitude, stribeck),
+    Row("amplitude, stiffness given, regularised law", 1, regularised, stribeck),
+    Row("amplitude, normal contact law", 7, amplitude, normal),
+    Row("amplitude with gradient by D, G", 9, by_surface(amplitude), normal),
+    Row("worst amplitude of 9 conditions, with gradient", 10, by_surface(worst(amplitude)), normal),
 )
-BY_NAME = {row.name: row for row in ROWS}
-
-
-# Measuring ----------------------------------------------------------------------------------------
+IN_SECONDS = tuple(row for row in ROWS if "amplitude" not in row.name)  # to compile
+FULL, QUICK = {"repeats": 51, "rows": ROWS}, {"repeats": 5, "rows": IN_SECONDS}
 
 
 def operations(jaxpr) -> collections.Counter:
@@ -145,19 +122,20 @@ def operations(jaxpr) -> collections.Counter:
 
 def traced(row: Row):
     """The program of a row, traced and not yet compiled, and the scene it is for."""
-    function, scene = row.ask()
-    return jax.jit(function).trace(scene), scene
+    scene = row.scene()
+    return jax.jit(row.function).trace(scene), scene
 
 
-def cost(row: Row, repeats: int) -> dict[str, Any]:
-    """Every number of a row, in this process."""
+def in_this_process(place: int, repeats: int) -> dict[str, Any]:
+    """Every number of a row."""
+    row = ROWS[place]
     trace_s, (program, scene) = seconds(traced, row)
     compile_s, compiled = seconds(lambda: program.lower().compile())
     found: Any = compiled.cost_analysis() or {}
     found = found[0] if isinstance(found, list) else found  # so it was in older versions
     return {
         "name": row.name,
-        "without": row.without,
+        "without": None if row.without is None else ROWS[row.without].name,
         "operations": operations(program.jaxpr.jaxpr).total(),
         "flops": found.get("flops"),
         "bytes_accessed": found.get("bytes accessed"),
@@ -168,33 +146,16 @@ def cost(row: Row, repeats: int) -> dict[str, Any]:
     }
 
 
-def in_a_process(row: Row, repeats: int) -> dict[str, Any]:
-    """`cost` in a Python that has done nothing else, and imported nothing that is not needed."""
-    done = subprocess.run(
-        [sys.executable, "-m", "benchmarks.scene_cost", row.name, str(repeats)],
-        cwd=Path(__file__).parents[1],
-        capture_output=True,
-        text=True,
-    )
-    if done.returncode:
-        raise RuntimeError(f"{row.name}: {done.stderr}")
-    return json.loads(done.stdout)
-
-
-def measure(quick: bool) -> dict[str, Any]:
-    """The cost of every row."""
+def measure(repeats: int, rows: tuple[Row, ...]) -> dict[str, Any]:
+    """Each row in a Python that has done nothing else, and imported nothing that is not needed."""
     from tqdm import tqdm  # here, since every row lists its imports
 
-    repeats, rows = 5 if quick else 51, [row for row in ROWS if row.quick or not quick]
-    found = [in_a_process(row, repeats) for row in tqdm(rows, desc="scene")]
+    places = tqdm([ROWS.index(row) for row in rows], desc="scene")
+    found = [ended(started(__name__, {}, place=i, repeats=repeats)) for i in places]
     return {"repeats": repeats, "rows": found}
 
 
-# The page -----------------------------------------------------------------------------------------
-
-
 def page(result: dict[str, Any]) -> list[str]:
-    """One sentence, the table, how it was measured."""
     rows = {row["name"]: row for row in result["rows"]}
     dearer = [
         f"{name} ({words})"
@@ -208,12 +169,9 @@ def page(result: dict[str, Any]) -> list[str]:
         table(
             "question | operations | FLOPs | bytes moved | trace [s] | compile [s] | run [us]"
             " | libraries loaded",
-            (
-                f"{r['name']} | {r['operations']} | {r['flops']:.3g} | {r['bytes_accessed']:.3g}"
-                f" | {r['trace_s']:.2f} | {r['compile_s']:.2f} | {r['run_s'] * 1e6:.3g}"
-                f" | {', '.join(r['heavy_modules']) or '-'}"
-                for r in result["rows"]
-            ),
+            (r | {"heavy": ", ".join(r["heavy_modules"]) or None} for r in rows.values()),
+            "{name} | {operations} | {flops:.3g} | {bytes_accessed:.3g} | {trace_s:.2f}"
+            " | {compile_s:.2f} | {run_s!u:.3g} | {heavy}",
         ),
         f"""Each row is measured in a Python process of its own, in double precision. Operations are
         those of the traced program before any compiler has seen them. FLOPs and bytes are the
@@ -226,22 +184,18 @@ def page(result: dict[str, Any]) -> list[str]:
 
 def picture(result: dict[str, Any]) -> bytes:
     """Operations at the left, times at the right, a bar for each row."""
-    rows = result["rows"]
-    places = range(len(rows))
-    figure, (left, right) = subplots(1, 2, figsize=(14, 0.45 * len(rows) + 1.6), sharey=True)
-    left.barh(places, [row["operations"] for row in rows], color="tab:blue", edgecolor="k")
+    names, counts, compile_s, run_s = columns(
+        result["rows"], "name", "operations", "compile_s", "run_s"
+    )
+    places = range(len(names))
+    figure, (left, right) = subplots(1, 2, figsize=(14, 0.45 * len(names) + 1.6), sharey=True)
+    left.barh(places, counts, color="tab:blue", edgecolor="k")
     left.set(xscale="log", xlabel="operations of the traced program [-]", yticks=places)
-    left.set_yticklabels([row["name"] for row in rows])
+    left.set_yticklabels(names)
     left.invert_yaxis()
-    for key, marker, colour in (("compile", "s", "tab:orange"), ("run", "o", "tab:blue")):
-        times = [row[f"{key}_s"] for row in rows]
-        right.plot(times, places, marker, c=colour, mec="k", label=key)
+    right.plot(compile_s, places, "s", c="tab:orange", mec="k", label="compile")
+    right.plot(run_s, places, "o", c="tab:blue", mec="k", label="run")
     right.set(xscale="log", xlabel="time for one scene [s]")
     right.grid(True, which="major", alpha=0.4)
     right.legend(loc="best")
     return png(figure)
-
-
-if __name__ == "__main__":
-    jax.config.update("jax_enable_x64", True)
-    print(json.dumps(cost(BY_NAME[sys.argv[1]], int(sys.argv[2]))))

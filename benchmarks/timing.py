@@ -1,16 +1,22 @@
-"""What every benchmark times with, and the machine it ran on."""
+"""What every benchmark times with, Pythons of their own, and the machine they run on."""
 
+import functools
+import importlib
 import importlib.metadata
+import json
 import math
 import os
 import platform
 import statistics
+import subprocess
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 SHORTEST = 0.2  # s: quicker calls are repeated for so long, so that the first ones count little
 
@@ -35,11 +41,8 @@ def taking_turns(calls: dict[str, Callable], repeats: int) -> dict[str, list[flo
         return (time.perf_counter() - start) / often
 
     often = {n: math.ceil(SHORTEST / min(each(c, 1), each(c, 1))) for n, c in calls.items()}
-    times: dict[str, list[float]] = {name: [] for name in calls}
-    for _ in range(repeats):
-        for name, call in calls.items():
-            times[name].append(each(call, often[name]))
-    return times
+    turns = [{n: each(c, often[n]) for n, c in calls.items()} for _ in range(repeats)]
+    return {name: [turn[name] for turn in turns] for name in calls}
 
 
 def ratio(peer: list[float], own: list[float]) -> float:
@@ -47,20 +50,86 @@ def ratio(peer: list[float], own: list[float]) -> float:
     return statistics.median(a / b for a, b in zip(peer, own, strict=True))
 
 
-def too_long(elapsed: float, growth: float, limit: float) -> bool:
-    """Whether a call on `growth` times the work would take above `limit` [s].
+def in_batches(
+    calls: Callable[[int, Callable[[str], bool]], dict[str, Callable]],
+    batches: Iterable[int],
+    repeats: int,
+    limit: float,
+) -> Iterator[tuple[int, dict[str, list[float]]]]:
+    """Each batch and the seconds of `calls(batch, quick)`, where `quick(name)` says what to leave.
 
-    A short call is mostly overhead and predicts nothing.
+    That is what would take above `limit` [s], going by the batch before. A short call is mostly
+    overhead and predicts nothing.
     """
-    return elapsed > 0.1 and elapsed * growth > limit
+    last: dict[str, float] = {}  # seconds of the work of one
+    from tqdm import tqdm  # here, since pages list what a scene imports
+
+    def quick(batch: int, name: str) -> bool:
+        return last.get(name, 0) * batch <= limit
+
+    for batch in tqdm(batches, desc="batch"):
+        turns = taking_turns(calls(batch, functools.partial(quick, batch)), repeats)
+        taken = {name: statistics.median(own) for name, own in turns.items()}
+        last |= {name: own / batch if own > 0.1 else 0.0 for name, own in taken.items()}
+        yield batch, turns
 
 
 def compiled(function: Callable, *arguments) -> tuple[Callable, float]:
     """The compiled program, and the seconds of tracing and compiling it."""
     jax.clear_caches()  # no program may profit from the tracing of another
-    start = time.perf_counter()
-    program = jax.jit(function).lower(*arguments).compile()
-    return program, time.perf_counter() - start
+    compile_s, program = seconds(lambda: jax.jit(function).lower(*arguments).compile())
+    return program, compile_s
+
+
+def in_parts(function: Callable, columns: Iterable[jax.Array], size: int) -> tuple[Callable, float]:
+    """A call of a function for all of the columns, `size` at a time, and the seconds to compile it.
+
+    Parts are of equal lengths, since every shape is a program of its own.
+    """
+    split = [jnp.split(column, math.ceil(len(column) / size)) for column in columns]
+    parts = list(zip(*split, strict=True))
+    run, compile_s = compiled(function, *parts[0])
+    return lambda: [run(*part) for part in parts], compile_s
+
+
+# Pythons of their own
+
+
+def started(module: str, environment: dict[str, str], **arguments: Any) -> subprocess.Popen:
+    """`module.in_this_process` of such arguments in another Python."""
+    child = "from benchmarks.timing import answer; answer()"
+    return subprocess.Popen(
+        [sys.executable, "-c", child, module, json.dumps(arguments)],
+        cwd=Path(__file__).parents[1],
+        env=os.environ | environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def ended(process: subprocess.Popen) -> Any:
+    """What it returned."""
+    said, complaint = process.communicate()
+    if process.returncode:
+        raise RuntimeError(f"{process.args} failed: {complaint}")
+    return json.loads(said.splitlines()[-1])
+
+
+def answer() -> None:
+    """The other end of `started`."""
+    jax.config.update("jax_enable_x64", True)
+    module, arguments = sys.argv[1:]
+    print(json.dumps(importlib.import_module(module).in_this_process(**json.loads(arguments))))
+
+
+def devices(count: int) -> dict[str, str]:
+    """An environment in which JAX sees so many virtual devices on the processor."""
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={count}"
+    return {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
+
+
+# The machine
 
 
 def versions(*packages: str) -> dict[str, str]:
@@ -86,22 +155,10 @@ def machine_name(machine: dict[str, Any]) -> str:
     return f"{device}{machine['cpu']}, {machine['cores']} cores"
 
 
-def ran_on(result: dict[str, Any]) -> str:
-    """The line of a page that names the machine, how busy it was, and the versions."""
-    machine = result["machine"]
-    versions = ", ".join(f"{name} {version}" for name, version in result["versions"].items())
-    return (
-        f"{machine_name(machine)}, {machine['others_running']:.1f} other programs running before;"
-        f" {versions}."
-    )
-
-
 def cpu() -> str:
     """The processor's name, where the system tells it."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else platform.processor() or platform.machine()
 

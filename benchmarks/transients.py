@@ -20,28 +20,14 @@ import fractaljax as fj
 from .timing import compiled
 
 # F acts at 45 degrees; mass is 1 kg.
-OSCILLATOR = {
-    "omega_1": 2000 * math.pi,
-    "omega_2": 1600 * math.pi,
-    "xi_1": 1e-3,
-    "xi_2": 7e-3,
-    "F": 5.0,
-}
+OSCILLATOR = {"omega_1": 2000 * math.pi, "omega_2": 1600 * math.pi}
+OSCILLATOR |= {"xi_1": 1e-3, "xi_2": 7e-3, "F": 5.0}
 K_N, KAPPA, MU_S, MU_M, V_M, V = 4e8, 0.5, 0.4, 0.25, 0.5, 0.15
 SCALE = 2e4  # sqrt(K_n/m) [1/s]
 PERIOD = 6.467445952469732345405 / SCALE  # s
 AMPLITUDE = 2.290139035337965256497 * V / SCALE  # m: peak to peak of x1
-OUTCOMES = (
-    "converged",
-    "inaccurate",
-    "not_periodic",
-    "too_stiff",
-    "exhausted",
-    "equilibrium",
-    "diverged",
-    "depends_on_eps",
-    "unstable",
-)
+OUTCOMES = ("converged", "inaccurate", "not_periodic", "too_stiff", "exhausted", "equilibrium")
+OUTCOMES += ("diverged", "depends_on_eps", "unstable")
 
 CAP = 8  # longest step of a Taylor series, in eps: dv/dt is of order 1, so no layer is jumped
 # Periods by eps/V, after which the transient is less than a tenth of the floor: the slowest
@@ -54,6 +40,7 @@ REARMED = 1e-3  # time after the start of a slip from which its end is searched
 
 Extremes = tuple[np.ndarray, np.ndarray]  # times and values of x1
 Run = Callable[[], Extremes]
+States = Callable[[], np.ndarray]  # (n, 4) at the times that are read
 
 
 def reference(K_n: Any = K_N, mu_s: Any = MU_S, V: Any = V) -> fj.Scene:
@@ -108,15 +95,6 @@ def accelerations(tanh: Callable, numbers: tuple[float, ...], eps: Any) -> Calla
     return of
 
 
-# Reading a run ------------------------------------------------------------------------------------
-
-
-def reading(periods: int) -> np.ndarray:
-    """Times of the window at the end of so many periods."""
-    end = periods * PERIOD * SCALE
-    return np.linspace(end - WINDOW * PERIOD * SCALE, end, READINGS)
-
-
 def extremes_of(t: np.ndarray, x: np.ndarray, u: np.ndarray, rate: np.ndarray) -> Extremes:
     """Of x with the velocity u, where the cubics through u and its rates are zero."""
     (i,) = np.nonzero(u[:-1] * u[1:] < 0)
@@ -130,11 +108,6 @@ def extremes_of(t: np.ndarray, x: np.ndarray, u: np.ndarray, rate: np.ndarray) -
     return t[i] + s * h, x[i] + h * s * (u_0 + s * (d_0 / 2 + s * (q / 3 + s * p / 4)))
 
 
-def extremes(law: Law, eps: float, t: np.ndarray, y: np.ndarray) -> Extremes:
-    """Of x1, from states (n, 4) at times (n,)."""
-    return extremes_of(t, y[:, 0], y[:, 2], accelerations(np.tanh, law.numbers, eps)(*y.T)[0])
-
-
 def last_period(law: Law, found: Extremes) -> tuple[float, float]:
     """Period [s] and peak to peak of x1 [m], from the last maximum backwards."""
     t, x = found
@@ -142,29 +115,23 @@ def last_period(law: Law, found: Extremes) -> tuple[float, float]:
     return float(t[last] - t[last - 2]) * law.time, float(x[last] - x[last - 1]) * law.length
 
 
-# Integrators of the tanh law; eps in units of V ---------------------------------------------------
+# Integrators of the tanh law; eps in units of V
 
 
-def scipy_run(solver: str, law: Law, eps: float, rtol: float, periods: int) -> Run:
-    """By solve_ivp."""
-    of, times = accelerations(math.tanh, law.numbers, eps), reading(periods)
+def scipy_states(solver: str, law: Law, eps: float, rtol: float, times: np.ndarray) -> States:
+    of = accelerations(math.tanh, law.numbers, eps)
+    options: Any = {"t_eval": times, "rtol": rtol, "atol": rtol}
 
     def rates(_, y):
         x_1, x_2, u_1, u_2 = y.tolist()
         return [u_1, u_2, *of(x_1, x_2, u_1, u_2)]
 
-    options: Any = {"t_eval": times, "rtol": rtol, "atol": rtol}
-
-    def run() -> Extremes:
-        found = solve_ivp(rates, (0, times[-1]), law.start, solver, **options)
-        return extremes(law, eps, found.t, found.y.T)
-
-    return run
+    return lambda: solve_ivp(rates, (0, times[-1]), law.start, solver, **options).y.T
 
 
 @functools.cache
 def diffrax_program(solver: str) -> tuple[Callable, float]:
-    """By diffrax: states at times (n,) from a start, eps and rtol; and seconds to compile it."""
+    """States at times (n,) from a start, eps and rtol; and seconds to compile it."""
     start, numbers = law().start, law().numbers
 
     def term(numbers, moving=1.0):
@@ -198,34 +165,32 @@ def diffrax_program(solver: str) -> tuple[Callable, float]:
     return compiled(run, *map(jnp.array, (start, reading(3), 1e-2, 1e-4)))
 
 
-def diffrax_run(solver: str, law: Law, eps: float, rtol: float, periods: int) -> Run:
-    """The same as a run."""
-    program, times = diffrax_program(solver)[0], reading(periods)
-    arguments = [jnp.array(x) for x in (law.start, times, eps, rtol)]
+def diffrax_states(solver: str, law: Law, eps: float, rtol: float, times: np.ndarray) -> States:
+    program, arguments = diffrax_program(solver)[0], map(jnp.array, (law.start, times, eps, rtol))
+    call = functools.partial(program, *arguments)
 
-    def run() -> Extremes:
-        states = np.asarray(program(*arguments))
+    def run():
+        states = np.asarray(call())
         if not np.isfinite(states).all():
             raise RuntimeError(f"more than {MAX_STEPS} steps")
-        return extremes(law, eps, times, states)
+        return states
 
     return run
 
 
-def heyoka_run(_: str, law: Law, eps: float, tolerance: float, periods: int) -> Run:
-    """By heyoka, the step capped."""
+def heyoka_states(_: str, law: Law, eps: float, tolerance: float, times: np.ndarray) -> States:
+    """The step capped."""
     import heyoka as hy  # pyright: ignore[reportMissingImports]
 
-    y, times = hy.make_vars("x1", "x2", "u1", "u2"), reading(periods)
+    y = hy.make_vars("x1", "x2", "u1", "u2")
     rates = [*y[2:], *accelerations(hy.tanh, law.numbers, eps)(*y)]
     system = list(zip(y, rates, strict=True))
     integrator = hy.taylor_adaptive(system, list(law.start), tol=tolerance)
 
-    def run() -> Extremes:
+    def run():
         integrator.time, integrator.state[:] = 0.0, law.start
         integrator.propagate_until(times[0], max_delta_t=CAP * eps)
-        states = integrator.propagate_grid(times, max_delta_t=CAP * eps)[-1]
-        return extremes(law, eps, times, states)
+        return integrator.propagate_grid(times, max_delta_t=CAP * eps)[-1]
 
     return run
 
@@ -245,31 +210,50 @@ def numba_rates(numbers: tuple[float, ...], eps: float) -> Any:
     return numba.cfunc(lsoda_sig)(rates)
 
 
-def numbalsoda_run(solver: str, law: Law, eps: float, rtol: float, periods: int) -> Run:
-    """By numbalsoda's LSODA or DOP853."""
+def numbalsoda_states(solver: str, law: Law, eps: float, rtol: float, times: np.ndarray) -> States:
     import numbalsoda  # pyright: ignore[reportMissingImports]
 
-    times, start = np.concatenate([[0.0], reading(periods)]), np.array(law.start)
+    times, start = np.concatenate([[0.0], times]), np.array(law.start)
     solve = {"LSODA": numbalsoda.lsoda, "DOP853": numbalsoda.dop853}[solver]
     address, nothing = numba_rates(law.numbers, eps).address, np.zeros(1)
 
-    def run() -> Extremes:
+    def run():
         states, success = solve(address, start, times, nothing, rtol, rtol, 10_000_000)
         if not success:
             raise RuntimeError(f"numbalsoda's {solver} gave up")
-        return extremes(law, eps, times[1:], states[1:])
+        return states[1:]
 
     return run
 
 
-RUNS = {
-    "SciPy": scipy_run,
-    "diffrax": diffrax_run,
-    "numbalsoda": numbalsoda_run,
-    "heyoka": heyoka_run,
+STATES: dict[str, Callable[..., States]] = {
+    "SciPy": scipy_states,
+    "diffrax": diffrax_states,
+    "numbalsoda": numbalsoda_states,
+    "heyoka": heyoka_states,
 }
 
-# The exact law, from event to event: the best that an integrator can do ---------------------------
+
+def reading(periods: int) -> np.ndarray:
+    """Times of the window at the end of so many periods."""
+    end = periods * PERIOD * SCALE
+    return np.linspace(end - WINDOW * PERIOD * SCALE, end, READINGS)
+
+
+def tanh_run(family: str, law: Law, eps: float, rtol: float, periods: int) -> Run:
+    """By a library and its solver, as in "SciPy LSODA"."""
+    library, _, solver = family.partition(" ")
+    times, of = reading(periods), accelerations(np.tanh, law.numbers, eps)
+    states = STATES[library.rstrip(",")](solver, law, eps, rtol, times)
+
+    def run() -> Extremes:
+        y = states()
+        return extremes_of(times, y[:, 0], y[:, 2], of(*y.T)[0])
+
+    return run
+
+
+# The exact law, from event to event: the best that an integrator can do
 
 
 @functools.cache

@@ -65,7 +65,6 @@ def mechanism(*row) -> dict[str, Any]:
             "x_0": [x[0], x[1]],
             "mu_c": mp.sqrt(critical) * m / mp.sqrt(K_n * K_t) if K_t else mp.inf,
             "modulus": max(abs(z) for z in s),
-            "omega": mp.sqrt(a + b),
         }
 
 

@@ -27,7 +27,7 @@ from tqdm import tqdm
 import fractaljax as fj
 
 from .loops import brake, plain_loop
-from .page import cell, draw, png, subplots, table
+from .page import Result, draw, png, subplots, table
 from .timing import compiled, seconds
 from .truths import growth_of_surface, mp
 
@@ -47,11 +47,15 @@ ZOOM, LEVELS = 4.0, 12  # a zoomed grid shrinks by this factor, so many times
 PLACES = 16  # that a scattered method starts from
 STRIDES = np.sqrt([2.0, 3.0, 5.0, 7.0, 11.0]) % 1  # between them: they fill the bounds evenly
 RESTARTS = 4  # of Nelder-Mead, from where it ended
+FULL: dict[str, Any] = {"starts": 8, "loop_runs": 4, "dense": 90_000, "polished": 4}
+FULL["sides"] = {  # of the grids by task: on the package, zoomed, on the loop
+    "one condition": ((64, 256, 1024), (32,), (16, 48)),
+    "envelope": ((64, 256), (32,), (8, 20)),
+    "five variables": ((6, 12), (6,), (3, 5)),
+}
+QUICK: dict[str, Any] = {"starts": 2, "loop_runs": 1, "dense": 10_000, "polished": 2}
+QUICK["sides"] = {"one condition": ((32,), (16,), (8,)), "five variables": ((5,), (5,), (3,))}
 Rows = Callable[[np.ndarray], np.ndarray]
-Result = dict[str, Any]
-
-
-# Tasks --------------------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,13 +76,13 @@ class DesignTask:
 
     def quantities(self, u, exp: Callable = math.exp) -> dict[str, Any]:
         """The quantities of the scene at scaled variables u (v,)."""
-        values = {}
-        for i, (name, (low, high)) in enumerate(self.bounds.items()):
+
+        def between(name, low, high, x):
             if name in LOGARITHMIC:
-                values[name] = exp(math.log(low) + u[i] * math.log(high / low))
-            else:
-                values[name] = low + u[i] * (high - low)
-        return values
+                return exp(math.log(low) + x * math.log(high / low))
+            return low + x * (high - low)
+
+        return {name: between(name, *b, u[i]) for i, (name, b) in enumerate(self.bounds.items())}
 
     def scaled(self, quantities: Mapping[str, float]) -> np.ndarray:
         """Scaled variables (v,) of quantities; those beyond a bound by a rounding are on it."""
@@ -99,21 +103,14 @@ class DesignTask:
 
 
 SURFACE: dict[str, tuple[float, float]] = {"D": (2.3, 2.8), "G": (1e-11, 1e-9)}
-_LOADS, _FRICTIONS = np.meshgrid(np.linspace(1700, 2100, 5), np.linspace(0.35, 0.45, 5))
+_P, _MU_S = np.meshgrid(np.linspace(1700, 2100, 5), np.linspace(0.35, 0.45, 5))
+ENVELOPE = {"P": tuple(_P.ravel().tolist()), "mu_s": tuple(_MU_S.ravel().tolist())}
+MORE = {"P": (1000.0, 4000.0), "omega_1": (5000.0, 8000.0), "omega_2": (4000.0, 6500.0)}
+FIVE = "Nearest in D, G, P, omega_1, omega_2"
 TASKS = (
     DesignTask("one condition", "D and G, one condition", SURFACE),
-    DesignTask(
-        "envelope",
-        "D and G, worst of 25 conditions",
-        SURFACE,
-        {"P": tuple(_LOADS.ravel().tolist()), "mu_s": tuple(_FRICTIONS.ravel().tolist())},
-    ),
-    DesignTask(
-        "five variables",
-        "Nearest in D, G, P, omega_1, omega_2",
-        SURFACE | {"P": (1000.0, 4000.0), "omega_1": (5000.0, 8000.0), "omega_2": (4000.0, 6500.0)},
-        nearest=True,
-    ),
+    DesignTask("envelope", "D and G, worst of 25 conditions", SURFACE, ENVELOPE),
+    DesignTask("five variables", FIVE, SURFACE | MORE, nearest=True),
 )
 
 
@@ -123,31 +120,31 @@ def least_stiffness() -> float:
     return float(fj.stiffness(fj.brake_scene())[0])
 
 
-def requirements(np, K_n_min, growth, K_n, log_area_ratio, slip_ratio) -> list[Any]:
+def requirements(np, growth, K_n, log_area_ratio, slip_ratio) -> list[Any]:
     """Each at most 0 where it is met, as `fj.design` scales them; `np` is NumPy or JAX's."""
     return [
         2 * (math.log(AREA_RATIO_MIN) - log_area_ratio),
         10 * (slip_ratio - SLIP_RATIO_MAX),
         np.arcsinh((growth - TARGET) / GROWTH_SCALE),
-        1 - K_n / K_n_min,
+        1 - K_n / least_stiffness(),
     ]
 
 
 def by_package(task: DesignTask) -> Callable[[jax.Array], jax.Array]:
     """Evaluates a design (v,) by the package: a traceable function to a row (1 + k,)."""
-    scene, own, K_n_min = fj.brake_scene(), jnp.asarray(task.scaled(brake())), least_stiffness()
+    scene, own = fj.brake_scene(), jnp.asarray(task.scaled(brake()))
+    least_stiffness()  # computed now, not while tracing
+    conditions = {name: jnp.asarray(values) for name, values in task.conditions.items()}
 
     def at(quantities):
         moved = scene.replace(**quantities)
         state = moved.contact.state(moved.friction.mu_s, moved.friction.mu_m)
-        growth = fj.growth_rate(moved)
-        ratios = state.log_area_ratio, state.slip_ratio
-        return jnp.stack([growth, *requirements(jnp, K_n_min, growth, state.K_n, *ratios)])
+        ratios, growth = (state.log_area_ratio, state.slip_ratio), fj.growth_rate(moved)
+        return jnp.stack([growth, *requirements(jnp, growth, state.K_n, *ratios)])
 
     def evaluate(u):
         quantities = task.quantities(u, jnp.exp)
-        if task.conditions:
-            conditions = {name: jnp.asarray(values) for name, values in task.conditions.items()}
+        if conditions:
             row = jax.vmap(lambda condition: at(quantities | condition))(conditions).max(axis=0)
         else:
             row = at(quantities)
@@ -158,17 +155,15 @@ def by_package(task: DesignTask) -> Callable[[jax.Array], jax.Array]:
 
 def by_loop(task: DesignTask) -> Rows:
     """The same by the loop of a user without the package."""
-    b, conditions = brake(), task.every_condition
-    own, K_n_min = task.scaled(b), least_stiffness()
+    b, own = brake(), task.scaled(brake())
+
+    def at(quantities):
+        growth, _, _, *state = plain_loop(b | quantities)(quantities["D"], quantities["G"])
+        return [growth, *requirements(np, growth, *state)]
 
     def evaluate(u):
-        quantities, rows = task.quantities(u), []
-        for condition in conditions:
-            growth, _, _, *state = plain_loop(b | quantities | condition)(
-                quantities["D"], quantities["G"]
-            )
-            rows.append([growth, *requirements(np, K_n_min, growth, *state)])
-        row = np.max(rows, axis=0)
+        quantities = task.quantities(u)
+        row = np.max([at(quantities | condition) for condition in task.every_condition], axis=0)
         if task.nearest:
             row[0] = np.sum((np.asarray(u) - own) ** 2)
         return row
@@ -176,7 +171,7 @@ def by_loop(task: DesignTask) -> Rows:
     return evaluate
 
 
-# Methods ------------------------------------------------------------------------------------------
+# Methods
 
 
 class Trace:
@@ -189,18 +184,18 @@ class Trace:
         self._each = len(task.every_condition)
         self._start = time.perf_counter()
 
-    def add(self, us: np.ndarray, evaluations: int) -> None:
+    def count(self, evaluations: int) -> None:
+        """Evaluations of designs, at all conditions each."""
+        self.evaluations = (self.evaluations or 0) + evaluations * self._each
+
+    def add(self, us: np.ndarray, evaluations: int = 0) -> None:
         """Designs tried by now, and how many have been evaluated."""
         self.seen.append((time.perf_counter() - self._start, np.array(us)))
         self.count(evaluations)
 
-    def count(self, evaluations: int) -> None:
-        """Further evaluations, at all conditions each."""
-        self.evaluations = (self.evaluations or 0) + evaluations * self._each
-
     def end(self, answer: np.ndarray) -> "Trace":
         """The method's answer (v,), now."""
-        self.add(answer[None], 0)
+        self.add(answer[None])
         self.answer = answer
         return self
 
@@ -208,18 +203,10 @@ class Trace:
 def by_design(task: DesignTask, start: np.ndarray) -> Trace:
     """`fj.design` as its users call it, from the surface at `start`; only its answer is seen."""
     scene, trace = fj.brake_scene().replace(**task.quantities(start)), Trace(task)
-    found = fj.design(
-        scene,
-        dict(task.bounds),
-        fj.growth_rate,
-        TARGET,
-        least_stiffness(),
-        envelope=dict(task.conditions) or None,
-        area_ratio_min=AREA_RATIO_MIN,
-        slip_ratio_max=SLIP_RATIO_MAX,
-        progress=False,
-    )
-    surface = found.scene.contact.surface
+    floors = {"area_ratio_min": AREA_RATIO_MIN, "slip_ratio_max": SLIP_RATIO_MAX}
+    required: Any = {"envelope": dict(task.conditions) or None, "progress": False} | floors
+    what = dict(task.bounds), fj.growth_rate, TARGET, least_stiffness()
+    surface = fj.design(scene, *what, **required).scene.contact.surface
     trace.end(task.scaled({"D": float(surface.D), "G": float(surface.G)}))
     trace.evaluations = None
     return trace
@@ -236,19 +223,18 @@ def nelder_mead(
     task: DesignTask, evaluate: Rows, start: np.ndarray, trace: Trace | None = None
 ) -> Trace:
     """Nelder and Mead's simplex on an exact penalty, started again from its own answers."""
-    trace = Trace(task) if trace is None else trace
+    trace = trace or Trace(task)
 
     def merit(u):
         row = scaled_row(task, evaluate(u))
         trace.add(u[None], 1)
         return row[0] + PENALTY * np.maximum(row[1:], 0).sum()
 
-    u, best = start, np.inf
+    u, best, bounds = start, np.inf, [(0, 1)] * len(start)
     options = {"xatol": 1e-9, "fatol": 1e-9, "maxfev": 1000, "adaptive": len(u) > 2}
+    minimize = functools.partial(scipy.optimize.minimize, merit, bounds=bounds, options=options)
     for _ in range(RESTARTS):
-        found = scipy.optimize.minimize(
-            merit, u, method="Nelder-Mead", bounds=[(0, 1)] * len(u), options=options
-        )
+        found = minimize(u, method="Nelder-Mead")
         u, gained, best = found.x, best - found.fun, found.fun
         if gained < 1e-9:
             break
@@ -263,7 +249,7 @@ def slsqp(
     trace: Trace | None = None,
 ) -> Trace:
     """Sequential quadratic programming; without a Jacobian by SciPy's differences."""
-    trace = Trace(task) if trace is None else trace
+    trace = trace or Trace(task)
 
     @functools.lru_cache(1)  # objective and constraints ask for the same design
     def row_at(place: bytes) -> np.ndarray:
@@ -292,16 +278,13 @@ def slsqp(
     return trace.end(np.clip(found.x, 0, 1))
 
 
-def scattered(task: DesignTask, solve: Callable[..., Trace], evaluate: Rows, *rest: Any) -> Trace:
+def scattered(task: DesignTask, evaluate: Rows, solve: Callable, start: np.ndarray) -> Trace:
     """The best that another method finds from many places, the start being the first."""
-    *more, start = rest
-    trace, ends = Trace(task), []
-    for i in range(PLACES):
-        place = (start + i * STRIDES[: len(start)]) % 1
-        ends.append(solve(task, evaluate, *more, place, trace).answer)
-    us = np.array(ends)
+    trace, strides = Trace(task), STRIDES[: len(start)]
+    us = [solve((start + i * strides) % 1, trace).answer for i in range(PLACES)]
     trace.count(len(us))
-    return trace.end(better((np.inf, np.inf, start), us, np.array([evaluate(u) for u in us]))[2])
+    rows = np.array([evaluate(u) for u in us])
+    return trace.end(better((np.inf, np.inf, start), np.array(us), rows)[2])
 
 
 def better(best: tuple, us: np.ndarray, rows: np.ndarray) -> tuple:
@@ -341,117 +324,79 @@ class Method(NamedTuple):
     runs: int | None = None  # at most so many starts
 
 
-def methods(
-    task: DesignTask, sides: dict[str, tuple[int, ...]], loop_runs: int
-) -> tuple[list[Method], Rows]:
-    """Every method for a task, its programs compiled apart, and what evaluates designs (n, v).
-
-    `sides` are those of the grids, `loop_runs` the most starts of a method on the loop.
-    """
-    evaluate, v = by_package(task), len(task.bounds)
+def methods(task: DesignTask, sides, loop_runs: int) -> tuple[list[Method], Rows]:
+    """Every method for a task, its programs compiled apart, and what evaluates designs (n, v)."""
+    evaluate, loop, v = by_package(task), by_loop(task), len(task.bounds)
     one, one_s = compiled(evaluate, jnp.zeros(v))
     slopes, slopes_s = compiled(jax.jacfwd(evaluate), jnp.zeros(v))
     many, many_s = compiled(jax.vmap(evaluate), jnp.zeros((CHUNK, v)))
-    loop = by_loop(task)
+    of = functools.partial
 
     def rows(us):
         parts = (us[i : i + CHUNK] for i in range(0, len(us), CHUNK))
         whole = (np.asarray(many(jnp.asarray(np.resize(part, (CHUNK, v))))) for part in parts)
         return np.concatenate(list(whole))[: len(us)]
 
-    def program(u):
+    def loop_rows(us):
+        return np.array([loop(u) for u in us])
+
+    def own(u):
         return np.asarray(one(u))
 
     def jacobian(u):
         return np.asarray(slopes(u))
 
-    def loop_rows(us):
-        return np.array([loop(u) for u in us])
-
-    found = []
-    if set(task.bounds) == {"D", "G"}:
-        found.append(Method("fj.design", "design", functools.partial(by_design, task), None))
-    for name, family, families, solve, own, compile_s, loops in (
-        ("SLSQP", "slsqp", "scattered", slsqp, (program, jacobian), one_s + slopes_s, (loop, None)),
-        ("Nelder-Mead", "simplex", "simplices", nelder_mead, (program,), one_s, (loop,)),
-    ):
-        single, places = functools.partial(solve, task), f"{name} from {PLACES} places"
-        several = functools.partial(scattered, task, solve)
-        for title, style, way in ((name, family, single), (places, families, several)):
-            call = functools.partial(way, *own)
-            found.append(Method(f"{title}, package", style, call, compile_s))
-            call = functools.partial(way, *loops)
-            found.append(Method(f"{title}, loop", f"{style} loop", call, 0.0, loop_runs))
-    for key, title, family, levels in (
-        ("package", "grid of {}^{}, package", "grid", 1),
-        ("zoom", "zoomed grid of {}^{}, package", "zoom", LEVELS),
-        ("loop", "grid of {}^{}, loop", "grid loop", 1),
-    ):
-        on, compile_s, runs = (loop_rows, 0.0, loop_runs) if key == "loop" else (rows, many_s, None)
-        for side in sides[key]:
-            call = functools.partial(grid, task, on, side, levels=levels)
-            found.append(Method(title.format(side, v), family, call, compile_s, runs))
-    return found, rows
-
-
-# Measuring ----------------------------------------------------------------------------------------
+    by_slopes, by_differences = of(slsqp, task, own, jacobian), of(slsqp, task, loop, None)
+    simplex, plain_simplex = of(nelder_mead, task, own), of(nelder_mead, task, loop)
+    on_package, on_loop = of(scattered, task, own), of(scattered, task, loop)
+    places, all_s, n = f"from {PLACES} places", one_s + slopes_s, loop_runs
+    grids, zooms, loop_grids = sides
+    found = [
+        Method("fj.design", "design", of(by_design, task), None),
+        Method("SLSQP, package", "slsqp", by_slopes, all_s),
+        Method("SLSQP, loop", "slsqp loop", by_differences, 0.0, n),
+        Method(f"SLSQP {places}, package", "scattered", of(on_package, by_slopes), all_s),
+        Method(f"SLSQP {places}, loop", "scattered loop", of(on_loop, by_differences), 0.0, n),
+        Method("Nelder-Mead, package", "simplex", simplex, one_s),
+        Method("Nelder-Mead, loop", "simplex loop", plain_simplex, 0.0, n),
+        Method(f"Nelder-Mead {places}, package", "simplices", of(on_package, simplex), one_s),
+        Method(f"Nelder-Mead {places}, loop", "simplices loop", of(on_loop, plain_simplex), 0.0, n),
+    ]
+    for side in grids:
+        on_grid = of(grid, task, rows, side)
+        found.append(Method(f"grid of {side}^{v}, package", "grid", on_grid, many_s))
+    for side in zooms:
+        zoomed = of(grid, task, rows, side, levels=LEVELS)
+        found.append(Method(f"zoomed grid of {side}^{v}, package", "zoom", zoomed, many_s))
+    for side in loop_grids:
+        on_grid = of(grid, task, loop_rows, side)
+        found.append(Method(f"grid of {side}^{v}, loop", "grid loop", on_grid, 0.0, n))
+    return found if set(task.bounds) == {"D", "G"} else found[1:], rows
 
 
-class Size(NamedTuple):
-    """How much is measured: starts, and sides of the grids of every task."""
-
-    starts: int
-    loop_runs: int  # starts of the methods on the loop
-    dense: int  # designs of the grid below the optimum
-    polished: int  # of them
-    sides: dict[str, dict[str, tuple[int, ...]]]
+# Measuring
 
 
-FULL = Size(
-    starts=8,
-    loop_runs=4,
-    dense=90_000,
-    polished=4,
-    sides={
-        "one condition": {"package": (64, 256, 1024), "zoom": (32,), "loop": (16, 48)},
-        "envelope": {"package": (64, 256), "zoom": (32,), "loop": (8, 20)},
-        "five variables": {"package": (6, 12), "zoom": (6,), "loop": (3, 5)},
-    },
-)
-QUICK = Size(
-    starts=2,
-    loop_runs=1,
-    dense=10_000,
-    polished=2,
-    sides={
-        "one condition": {"package": (32,), "zoom": (16,), "loop": (8,)},
-        "five variables": {"package": (5,), "zoom": (5,), "loop": (3,)},
-    },
-)
-
-
-def optimum(task: DesignTask, rows: Rows, size: Size) -> Result:
+def optimum(task: DesignTask, rows: Rows, dense: int, polished: int) -> Result:
     """The best of a dense grid, polished on the loop; and its growth rate beside 40 digits."""
     variables, loop = len(task.bounds), by_loop(task)
-    axes = [np.linspace(0, 1, round(size.dense ** (1 / variables)))] * variables
+    axes = [np.linspace(0, 1, round(dense ** (1 / variables)))] * variables
     us = np.array(list(itertools.product(*axes)))
     found = rows(us)
     values = np.where(found[:, 1:].max(axis=1) <= 0, found[:, 0], np.inf)
     merit = scaled_row(task, found)
     merit = merit[:, 0] + 10 * np.maximum(merit[:, 1:], 0).sum(axis=1)  # infeasible ones last
     order = np.argsort(np.where(np.isfinite(values), merit - 1e6, merit))
-    spread = order[: size.polished**3 : size.polished**2]
-    ends = [slsqp(task, loop, None, us[i]).answer for i in spread]
-    polished = [(u, loop(u)) for u in ends if u is not None]
-    polished = [(u, row) for u, row in polished if row[1:].max() <= MEETS]
-    best, row = min(polished, key=lambda pair: pair[1][0])
+    chosen = order[: polished**3 : polished**2]
+    ends = [slsqp(task, loop, None, us[i]).answer for i in chosen]
+    met = [(u, row) for u in ends if u is not None and (row := loop(u))[1:].max() <= MEETS]
+    best, row = min(met, key=lambda pair: pair[1][0])
     near = 1e-8 * task.scale(row[0])
     return {
-        "u": best.tolist(),
         "value": float(row[0]),
         "quantities": task.quantities(best),
         "polished": len(ends),
-        "agree": sum(bool(other[0] - row[0] <= near) for _, other in polished),
+        "agree": sum(bool(other[0] - row[0] <= near) for _, other in met),
         "dense": len(us),
         "dense_gap": float(values.min() - row[0]),
         "off_exact": off_exact(task, best, row),
@@ -490,15 +435,12 @@ def thinned(points: np.ndarray) -> list[list[float]]:
 def reached(curves: list[np.ndarray], gap: float) -> Result:
     """How many starts come this near, and the median time over all of them, if half do."""
     times = [np.append(c[0][c[1] <= gap], math.inf)[0] for c in curves]
-    return {
-        "starts": sum(math.isfinite(t) for t in times),
-        "seconds": finite(float(np.median(times))),
-    }
+    return {"starts": sum(map(math.isfinite, times)), "seconds": finite(np.median(times))}
 
 
-def finite(value: float) -> float | None:
+def finite(value: Any) -> float | None:
     """A number, or None where there is none."""
-    return value if math.isfinite(value) else None
+    return float(value) if math.isfinite(value) else None
 
 
 def solved(task: DesignTask, method: Method, rows: Rows, best: float, starts) -> Result:
@@ -520,7 +462,7 @@ def solved(task: DesignTask, method: Method, rows: Rows, best: float, starts) ->
         "starts": len(traces),
         "seconds": float(np.median(walls)),
         "evaluations": float(np.median(counts)) if counts else None,
-        "gap": {"median": finite(float(np.median(gaps))), "worst": finite(max(gaps))},
+        "gap": {"median": finite(np.median(gaps)), "worst": finite(max(gaps))},
         "violation": float(np.maximum(answers[:, 1:].max(axis=1), 0).max()),
         "near": reached(curves, NEAR),
         "exact": reached(curves, EXACT),
@@ -528,32 +470,21 @@ def solved(task: DesignTask, method: Method, rows: Rows, best: float, starts) ->
     }
 
 
-def measure(quick: bool) -> Result:
-    """The optimum of every task, and every run of every method."""
-    size = QUICK if quick else FULL
+def measure(starts: int, loop_runs: int, dense: int, polished: int, sides: Result) -> Result:
+    """The optimum of every task, and every run of every method; on the loop from fewer starts."""
     tasks, runs = [], []
-    for task in (task for task in TASKS if task.name in size.sides):
-        ways, rows = methods(task, size.sides[task.name], size.loop_runs)
-        truth = optimum(task, rows, size)
-        tasks.append(
-            {
-                "name": task.name,
-                "title": task.title,
-                "unit": "-" if task.nearest else "1/s",
-                "nearest": task.nearest,
-                "conditions": len(task.every_condition),
-                "bounds": dict(task.bounds),
-                "optimum": truth,
-            }
-        )
-        starts = task.starts(size.starts)
-        runs += [
-            solved(task, way, rows, truth["value"], starts) for way in tqdm(ways, desc=task.name)
-        ]
-    return {"starts": size.starts, "near": NEAR, "exact": EXACT, "tasks": tasks, "runs": runs}
+    for task in (task for task in TASKS if task.name in sides):
+        ways, rows = methods(task, sides[task.name], loop_runs)
+        best = optimum(task, rows, dense, polished)
+        about = {"name": task.name, "title": task.title, "nearest": task.nearest}
+        about |= {"conditions": len(task.every_condition), "bounds": dict(task.bounds)}
+        tasks.append(about | {"optimum": best})
+        given = rows, best["value"], task.starts(starts)
+        runs += [solved(task, way, *given) for way in tqdm(ways, desc=task.name)]
+    return {"starts": starts, "tasks": tasks, "runs": runs}
 
 
-# The page -----------------------------------------------------------------------------------------
+# The page
 
 
 def took(run: Result, cold: bool) -> float:
@@ -571,37 +502,6 @@ def quickest(runs: list[Result], near: str, cold: bool) -> str | None:
     return None if best is None else f"{best['name']}: {took(best, cold):.2g} s"
 
 
-def choice(result: Result) -> str:
-    """What to use."""
-    runs = [run for run in result["runs"] if run["task"] == result["tasks"][0]["name"]]
-    cases = (("near", True), ("exact", True), ("exact", False))
-    near, exact, later = (quickest(runs, *case) or "no method" for case in cases)
-    own = next(run for run in runs if run["family"] == "design")
-    return f"""The quickest ways to one design of D and G from any start are, to 1 % and compiling
-        included, {near}; to 1e-6, {exact}; and for later designs, {later}. `fj.design` comes within
-        1e-6 from {own["exact"]["starts"]} of {own["starts"]} starts, in {took(own, True):.2g} s the
-        first time and {took(own, False):.2g} s after."""
-
-
-def run_cells(run: Result) -> str:
-    """One row of a task's table."""
-    counts = (
-        f"{run[near]['starts']} of {run['starts']} | {cell(run[near]['seconds'], '.3g')}"
-        for near in ("near", "exact")
-    )
-    return " | ".join(
-        [
-            run["name"],
-            cell(run["compile_s"] or None, ".1f"),
-            f"{run['seconds']:.3g}",
-            cell(run["evaluations"], ".0f"),
-            *(cell(run["gap"][key], ".0e") for key in ("median", "worst")),
-            f"{run['violation']:.0e}",
-            *counts,
-        ]
-    )
-
-
 def task_blocks(task: Result, runs: list[Result]) -> list[str]:
     """The task, the optimum and how sure it is, and the table of the methods."""
     best = task["optimum"]
@@ -612,36 +512,40 @@ def task_blocks(task: Result, runs: list[Result]) -> list[str]:
     return [
         f"## {task['title']}",
         f"""The {aim} within {bounds}{f", {conditions}" if task["conditions"] > 1 else ""}. The
-        optimum is {best["value"]:.10g} {task["unit"]} at {at}: {best["agree"]} of
-        {best["polished"]} polished designs agree to 1e-8, the best of {best["dense"]} on a grid is
-        {best["dense_gap"]:.1e} above it, and the growth rate there is {best["off_exact"]:.0e} 1/s
-        off 40 digits.""",
+        optimum is {best["value"]:.10g} {"-" if task["nearest"] else "1/s"} at {at}: {best["agree"]}
+        of {best["polished"]} polished designs agree to 1e-8, the best of {best["dense"]} on a grid
+        is {best["dense_gap"]:.1e} above it, and the growth rate there is
+        {best["off_exact"]:.0e} 1/s off 40 digits.""",
         table(
             "method | compile [s] | a run [s] | evaluations | gap: median | gap: worst | violation"
             " | to 1 %: starts | time [s] | to 1e-6: starts | time [s]",
-            map(run_cells, runs),
+            (run | {"compile_s": run["compile_s"] or None} for run in runs),
+            "{name} | {compile_s:.1f} | {seconds:.3g} | {evaluations:.0f} | {gap.median:.0e}"
+            " | {gap.worst:.0e} | {violation:.0e} | {near.starts} of {starts} | {near.seconds:.3g}"
+            " | {exact.starts} of {starts} | {exact.seconds:.3g}",
         ),
     ]
 
 
 def page(result: Result) -> list[str]:
-    """What to use, the quickest, every task, how it was measured."""
-    own = {
-        t["name"]: [r for r in result["runs"] if r["task"] == t["name"]] for t in result["tasks"]
-    }
+    tasks, runs = result["tasks"], result["runs"]
+    own = {task["name"]: [run for run in runs if run["task"] == task["name"]] for task in tasks}
     all_by_design = all(rows[0]["family"] == "design" for rows in own.values())
     cases = [(near, cold) for near in ("near", "exact") for cold in (True, False)]
+    best = {name: [quickest(rows, *case) for case in cases] for name, rows in own.items()}
+    near, _, exact, later = (found or "no method" for found in best[tasks[0]["name"]])
+    design = next(run for run in runs if run["family"] == "design")
     return [
-        choice(result),
+        f"""The quickest ways to one design of D and G from any start are, to 1 % and compiling
+        included, {near}; to 1e-6, {exact}; and for later designs, {later}. `fj.design` comes within
+        1e-6 from {design["exact"]["starts"]} of {design["starts"]} starts, in
+        {took(design, True):.2g} s the first time and {took(design, False):.2g} s after.""",
         "The shortest whole run that comes so near from every start:",
         table(
             "task | to 1 %, first design | later ones | to 1e-6, first design | later ones",
-            (
-                " | ".join([t["title"], *(quickest(own[t["name"]], *c) or "-" for c in cases)])
-                for t in result["tasks"]
-            ),
+            (" | ".join([t["title"], *(x or "-" for x in best[t["name"]])]) for t in tasks),
         ),
-        *(block for task in result["tasks"] for block in task_blocks(task, own[task["name"]])),
+        *(block for task in tasks for block in task_blocks(task, own[task["name"]])),
         f"""The reference brake, with the requirements of `fj.design`: growth rate at most
         {TARGET:.4f} 1/s, K_n no less than that of the brake, a_l at least {AREA_RATIO_MIN:g} a_e,
         Q_e at most {SLIP_RATIO_MAX:g} mu_s P. The peers evaluate them by a plain loop of NumPy,
@@ -692,27 +596,27 @@ def picture(result: Result) -> bytes:
     """Median gap to the optimum over time: a column for every task, below with compiling."""
     tasks = result["tasks"]
     figure, axes = subplots(2, len(tasks), figsize=(5.2 * len(tasks), 9.2), sharey=True)
-    for column, task in zip(axes.T, tasks, strict=True):
-        for ax, cold in zip(column, (False, True), strict=True):
-            drawn = []
-            for run in (run for run in result["runs"] if run["task"] == task["name"]):
-                colour, style, label = STYLES[run["family"]]
-                t, gap = median_curve(run["curves"])
-                if not len(t):
-                    continue
-                end = max(run["seconds"], t[0])
-                t = np.append(t[t <= end], end) + (run["compile_s"] if cold else 0)
-                gap = np.append(gap[: len(t) - 1], run["gap"]["median"])
-                ax.step(t, gap, colour + style[1:], where="post", lw=1.5)
-                shown = None if label in [line[3] for line in drawn] else label
-                drawn.append((t[-1], gap[-1], colour + style, shown))
-            xlabel = "time of the first design, with compiling [s]" if cold else "time [s]"
-            draw(ax, drawn, xlabel, "gap to the optimum [-]", task["title"])
-            ax.set_ylim(FLOOR / 2, 1e3)
-            ax.get_legend().remove()
-    found = (pair for ax in axes.flat for pair in zip(*ax.get_legend_handles_labels(), strict=True))
-    shown = {label: handle for handle, label in found}
-    names = [label for _, _, label in STYLES.values() if label in shown]
-    handles = [shown[name] for name in names]
-    figure.legend(handles, names, loc="outside lower center", ncols=4, fontsize="small")
+    handles = {}
+    for (column, task), cold in itertools.product(zip(axes.T, tasks, strict=True), (False, True)):
+        ax, drawn = column[int(cold)], []
+        for run in (run for run in result["runs"] if run["task"] == task["name"]):
+            colour, style, label = STYLES[run["family"]]
+            t, gap = median_curve(run["curves"])
+            if not len(t):
+                continue
+            end = max(run["seconds"], t[0])
+            t = np.append(t[t <= end], end) + (run["compile_s"] if cold else 0)
+            gap = np.append(gap[: len(t) - 1], run["gap"]["median"])
+            ax.step(t, gap, colour + style[1:], where="post", lw=1.5)
+            drawn.append((t[-1], gap[-1], colour + style, label))
+        xlabel = "time of the first design, with compiling [s]" if cold else "time [s]"
+        draw(ax, drawn, xlabel, "gap to the optimum [-]", task["title"])
+        ax.set_ylim(FLOOR / 2, 1e3)
+        ax.get_legend().remove()
+        handles |= {
+            name: handle for handle, name in zip(*ax.get_legend_handles_labels(), strict=True)
+        }
+    names = [label for _, _, label in STYLES.values() if label in handles]
+    shown = [handles[name] for name in names]
+    figure.legend(shown, names, loc="outside lower center", ncols=4, fontsize="small")
     return png(figure, dpi=100)

@@ -105,9 +105,11 @@ def places(rng: np.random.Generator, n: int, k: int) -> np.ndarray:
 
 
 def single(columns: np.ndarray) -> np.ndarray:
-    """Joints or areas (n, 10 or 5) rounded to float32, kept inside their domain."""
-    x = columns.astype(np.float32)
-    one = np.float32(1)
+    """Joints, mechanisms or areas rounded to float32, kept inside their domain."""
+    x, one = columns.astype(np.float32), np.float32(1)
+    if x.shape[1] == MECHANISM_COLUMNS:
+        x[:, 9] = np.maximum(x[:, 9], x[:, 10])
+        return x
     x[:, 0] = np.clip(x[:, 0], np.nextafter(2 * one, 3 * one), np.nextafter(3 * one, 2 * one))
     if x.shape[1] == JOINT_COLUMNS:
         x[:, 6] = np.maximum(x[:, 5], x[:, 6])

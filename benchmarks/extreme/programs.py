@@ -10,66 +10,43 @@ import fractaljax as fj
 Numbers = dict[str, jax.Array]
 
 
-def joint(x: jax.Array) -> tuple[fj.Surface, fj.Material, Any, dict[str, Any]]:
+def joint(x: jax.Array) -> tuple[tuple[Any, ...], dict[str, Any]]:
     """Surface, material, load and frictions of a row (10,)."""
     D, G, gamma, E, nu, sigma_y, H, P, mu_s, mu_m = x
     frictions = {"mu_s": mu_s, "mu_m": mu_m}
-    return fj.Surface(D, G, gamma), fj.Material(E, nu, sigma_y, H), P, frictions
+    return (fj.Surface(D, G, gamma), fj.Material(E, nu, sigma_y, H), P), frictions
 
 
 def state(x: jax.Array) -> Numbers:
     """What `contact_state` gives, but the regime."""
-    surface, material, P, frictions = joint(x)
-    found = fj.contact_state(surface, material, P, **frictions)
-    return {name: value for name, value in vars(found).items() if name != "regime"}
-
-
-def contact_stiffness(x: jax.Array) -> Numbers:
-    """K_n and K_t of `contact_state` alone."""
-    found = state(x)
-    return {name: found[name] for name in ("K_n", "K_t")}
-
-
-def regime(x: jax.Array) -> Any:
-    """The regime of `contact_state`."""
-    surface, material, P, frictions = joint(x)
-    return fj.contact_state(surface, material, P, **frictions).regime
+    given, frictions = joint(x)
+    found = vars(fj.contact_state(*given, **frictions))
+    return {name: value for name, value in found.items() if name != "regime"}
 
 
 def load_there_and_back(x: jax.Array) -> Numbers:
     """`contact_load` at the real area that `contact_state` has under the load P."""
-    surface, material, P, frictions = joint(x)
+    (surface, material, P), frictions = joint(x)
     A_r = fj.contact_state(surface, material, P, **frictions).A_r
     return {"P": fj.contact_load(surface, material, A_r, mu_m=frictions["mu_m"])}
 
 
 def scene(x: jax.Array) -> fj.Scene:
     """The scene of a row (12,): known stiffness, friction that falls."""
-    m, omega_1, omega_2, xi_1, xi_2, F, V, K_n, K_t, mu_s, mu_m, v_m = x
-    return fj.Scene(
-        fj.FixedContact(K_n, K_t),
-        fj.Stribeck(mu_s, mu_m, v_m),
-        fj.Oscillator(m, omega_1, omega_2, xi_1, xi_2, F, V),
-    )
+    *oscillator, K_n, K_t, mu_s, mu_m, v_m = x
+    contact, friction = fj.FixedContact(K_n, K_t), fj.Stribeck(mu_s, mu_m, v_m)
+    return fj.Scene(contact, friction, fj.Oscillator(*oscillator))
 
 
-def squeal(x: jax.Array, friction_slope: bool = True) -> Numbers:
+def squeal(x: jax.Array) -> Numbers:
     """`growth_rate`, `margin` and what `stability` gives."""
-    given = scene(x)
-    found = fj.stability(given, friction_slope=friction_slope)
-    return {
-        "growth_rate": fj.growth_rate(given, friction_slope=friction_slope),
-        "margin": fj.margin(given, friction_slope=friction_slope),
-        "real": found.eigenvalues.real,
-        "imaginary": found.eigenvalues.imag,
-        "damping_ratio": found.damping_ratio,
-    }
+    found = fj.stability(scene(x))
+    more = {"real": found.eigenvalues.real, "imaginary": found.eigenvalues.imag}
+    return growth_and_margin(x) | more | {"damping_ratio": found.damping_ratio}
 
 
 def growth_and_margin(x: jax.Array) -> Numbers:
-    """`growth_rate` and `margin` alone."""
-    given = scene(x)
-    return {"growth_rate": fj.growth_rate(given), "margin": fj.margin(given)}
+    return {"growth_rate": fj.growth_rate(scene(x)), "margin": fj.margin(scene(x))}
 
 
 def rest(x: jax.Array) -> Numbers:
@@ -91,9 +68,6 @@ def roughness(x: jax.Array) -> Numbers:
     return dict(vars(fj.roughness(fj.Surface(D, G, gamma), L, L_s)))
 
 
-def of_rows(function, *options):
+def of_rows(function):
     """The compiled program of a function over rows (n, k), and of its two derivatives."""
-    one = lambda x: function(x, *options)  # noqa: E731
-    return jax.jit(jax.vmap(one)), *(
-        jax.jit(jax.vmap(mode(one))) for mode in (jax.jacfwd, jax.jacrev)
-    )
+    return [jax.jit(jax.vmap(f)) for f in (function, jax.jacfwd(function), jax.jacrev(function))]

@@ -1,6 +1,5 @@
 """Quantities that come one call at a time: structures, damping, boundaries, heights, motion."""
 
-import dataclasses
 import itertools
 import math
 import statistics
@@ -25,16 +24,7 @@ from ..transients import SCALE, V, outcomes, reference
 mp: Any = mpmath.mp  # it makes its functions at run time
 WAVES = 3  # of each length in a topography
 Row = dict[str, Any]
-Cases = Iterator[tuple[str, Callable[[], Any], Callable[[Any], float]]]
-
-
-@dataclasses.dataclass(frozen=True)
-class Quantity:
-    """A public quantity with its ranges, and its cases: name, call, error of the call's result."""
-
-    name: str
-    ranges: str
-    cases: Callable[[], Cases]
+Cases = Iterator[tuple[str, tuple]]  # a name, and what the quantity is computed from
 
 
 def chain(rng, n: int, spread: float) -> tuple[np.ndarray, np.ndarray]:
@@ -45,51 +35,44 @@ def chain(rng, n: int, spread: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def damping_cases() -> Cases:
-    """The damping ratios that come back from the matrix, by mpmath."""
     rng = np.random.default_rng(5)
-    for spread in (0.0, 1.0, 3.0, 6.0):
-        for ratio in (1e-8, 0.01, 1e3):
-            M, K = chain(rng, 4, spread)
+    for spread, ratio in itertools.product((0.0, 1.0, 3.0, 6.0), (1e-8, 0.01, 1e3)):
+        name = f"masses and springs over {spread:g} decades, ratio {ratio:g}"
+        yield name, (*chain(rng, 4, spread), ratio)
 
-            def error(C, M=M, K=K, ratio=ratio):
-                with mp.workdps(40):
-                    root = mp.diag([mp.sqrt(mp.mpf(m)) for m in np.diag(M)]) ** -1
-                    squares, X = mp.eigsy(root * mp.matrix(K.tolist()) * root)
-                    own = X.T * root * mp.matrix(np.asarray(C).tolist()) * root * X
-                    w = [mp.sqrt(square) for square in squares]
-                    off = (abs(own[i, i] / (2 * w[i]) / ratio - 1) * w[i] for i in range(4))
-                    return float(max(off) / max(w))
 
-            name = f"masses and springs over {spread:g} decades, ratio {ratio:g}"
-            yield name, lambda M=M, K=K, ratio=ratio: fj.modal_damping(M, K, ratio), error
+def damping_error(C, M, K, ratio) -> float:
+    """Of the damping ratios that come back from the matrix, by mpmath."""
+    with mp.workdps(40):
+        root = mp.diag([mp.sqrt(mp.mpf(m)) for m in np.diag(M)]) ** -1
+        squares, X = mp.eigsy(root * mp.matrix(K.tolist()) * root)
+        own = X.T * root * mp.matrix(np.asarray(C).tolist()) * root * X
+        w = [mp.sqrt(square) for square in squares]
+        return float(max(abs(own[i, i] / (2 * w[i]) / ratio - 1) * w[i] for i in range(4)) / max(w))
 
 
 def structure_cases() -> Cases:
-    """Largest real part of a chain with one joint, by mpmath; beside the largest modulus."""
     rng = np.random.default_rng(6)
-    for spread in (0.0, 1.0, 3.0, 6.0):
-        for K_n in (1e3, 1e6, 1e9, 1e12, 1e15):
-            M, K = chain(rng, 6, spread)
-            joint = fj.Joint(fj.FixedContact(K_n, K_n / 2), fj.Coulomb(0.4), 2, 3)
-            structure = fj.Structure(M, 1e-6 * K, K, joint)
+    for spread, K_n in itertools.product((0.0, 1.0, 3.0, 6.0), (1e3, 1e6, 1e9, 1e12, 1e15)):
+        M, K = chain(rng, 6, spread)
+        joint = fj.Joint(fj.FixedContact(K_n, K_n / 2), fj.Coulomb(0.4), 2, 3)
+        yield f"K_n = {K_n:g} N/m, {spread:g} decades", (fj.Structure(M, 1e-6 * K, K, joint),)
 
-            def error(found, structure=structure):
-                M, C, K = (mp.matrix(np.asarray(x).tolist()) for x in fj.assemble(structure))
-                with mp.workdps(60):
-                    A, n = mp.zeros(12), 6
-                    for i in range(n):
-                        A[i, n + i] = 1
-                    A[n:, :n], A[n:, n:] = -(M**-1) * K, -(M**-1) * C
-                    s = mp.eig(A, left=False, right=False)
-                    exact, size = max(mp.re(z) for z in s), max(abs(z) for z in s)
-                    return float(abs(mp.mpf(float(found)) - exact) / size)
 
-            name = f"K_n = {K_n:g} N/m, {spread:g} decades"
-            yield name, lambda structure=structure: fj.growth_rate(structure), error
+def structure_error(found, structure: fj.Structure) -> float:
+    """Of the largest real part, by mpmath; beside the largest modulus."""
+    M, C, K = (mp.matrix(np.asarray(x).tolist()) for x in fj.assemble(structure))
+    with mp.workdps(60):
+        A, n = mp.zeros(12), 6
+        for i in range(n):
+            A[i, n + i] = 1
+        A[n:, :n], A[n:, n:] = -(M**-1) * K, -(M**-1) * C
+        s = mp.eig(A, left=False, right=False)
+        exact, size = max(mp.re(z) for z in s), max(abs(z) for z in s)
+        return float(abs(mp.mpf(float(found)) - exact) / size)
 
 
 def boundary_cases() -> Cases:
-    """Growth rate on the boundary, beside the frequency of the imaginary pair."""
     scene = fj.brake_scene()
     stiff = scene.replace(contact=fj.FixedContact(4e8, 2e8))
     for own, x, y in (
@@ -98,93 +81,85 @@ def boundary_cases() -> Cases:
         (stiff, ("K_n", 1e3, 1e15), ("mu_s", 0.26, 2.0)),
         (stiff, ("xi_1", 1e-6, 1e3), ("xi_2", 1e-6, 1e3)),
     ):
+        yield f"{x[0]} and {y[0]}", (own, x, y)
 
-        def error(found):
-            rates = [np.abs(b.growth_rate) / (2 * np.pi * b.frequency) for b in found.branches]
-            return float(max((rate.max() for rate in rates), default=0.0))
 
-        name = f"{x[0]} and {y[0]}"
-        yield name, lambda own=own, x=x, y=y: fj.hopf_boundary(own, x, y), error
+def boundary_error(found, *_) -> float:
+    """Growth rate on the boundary, beside the frequency of the imaginary pair."""
+    rates = [np.abs(b.growth_rate) / (2 * np.pi * b.frequency) for b in found.branches]
+    return float(max((rate.max() for rate in rates), default=0.0))
 
 
 def topography_cases() -> Cases:
-    """The double sum of Eq. 13 on a grid of 16 x 16, wave by wave; beside the largest height."""
-    key, n, L = jax.random.key(1), 16, 1e-3
-    for D in (2 + 1e-6, 2.5, 3 - 1e-6):
-        for G in (1e-18, 1e-10, 1e-4):
-            for gamma in (1.05, 1.5, 10.0):
-                surface = fj.Surface(D, G, gamma)
-
-                def error(z, surface=surface):
-                    exact = double_sum(surface, L, n, key)
-                    return float(np.abs(np.asarray(z) - exact).max() / np.abs(exact).max())
-
-                def call(surface=surface):
-                    return fj.topography(surface, L, n, key=key, M=WAVES)
-
-                yield f"D = {D:.7g}, G = {G:g} m, gamma = {gamma:g}", call, error
+    ends = (2 + 1e-6, 2.5, 3 - 1e-6), (1e-18, 1e-10, 1e-4), (1.05, 1.5, 10.0)
+    for D, G, gamma in itertools.product(*ends):
+        given = fj.Surface(D, G, gamma), 1e-3, 16, jax.random.key(1)
+        yield f"D = {D:.7g}, G = {G:g} m, gamma = {gamma:g}", given
 
 
-def double_sum(surface: fj.Surface, length: float, n: int, key) -> np.ndarray:
-    """Eq. 13 by extended doubles, its phases being those that the package draws."""
+def heights(surface: fj.Surface, length: float, n: int, key) -> jax.Array:
+    return fj.topography(surface, length, n, key=key, M=WAVES)
+
+
+def topography_error(z, surface: fj.Surface, length: float, n: int, key) -> float:
+    """Beside the largest height of Eq. 13 wave by wave, its phases being the package's."""
     D, G, gamma = (np.longdouble(float(x)) for x in (surface.D, surface.G, surface.gamma))
     L = np.longdouble(length)
     count = 1 + int(np.floor(np.log(n / 2) / np.log(float(gamma)) + 1e-9))
     phases = np.asarray(random_phases(key, count, WAVES)).astype(np.longdouble)
     x = (np.arange(n) * L / n)[:, None]
     y, pi = x.T, np.longdouble("3.14159265358979323846264338327950288")
-    z = np.zeros((n, n), np.longdouble)
-    for i in range(count):
-        for m in range(WAVES):
-            angle, phase = pi * (m + 1) / WAVES, 2 * pi * phases[i, m]
-            wave = 2 * pi * gamma**i / L * (x * np.cos(angle) + y * np.sin(angle))
-            z += gamma ** (i * (D - 3)) * (np.cos(phase) - np.cos(wave + phase))
-    return L * (G / L) ** (D - 2) * np.sqrt(np.log(gamma) / WAVES) * z
+    exact = np.zeros((n, n), np.longdouble)
+    for i, m in itertools.product(range(count), range(WAVES)):
+        angle, phase = pi * (m + 1) / WAVES, 2 * pi * phases[i, m]
+        wave = 2 * pi * gamma**i / L * (x * np.cos(angle) + y * np.sin(angle))
+        exact += gamma ** (i * (D - 3)) * (np.cos(phase) - np.cos(wave + phase))
+    exact *= L * (G / L) ** (D - 2) * np.sqrt(np.log(gamma) / WAVES)
+    return float(np.abs(np.asarray(z) - exact).max() / np.abs(exact).max())
 
 
 def identify_cases() -> Cases:
-    """One profile in other units: D must stay, and G go with the unit of length."""
-    surface, n, L = fj.Surface(2.4, 1e-10), 1024, 1e-3
-    z = np.asarray(fj.topography(surface, L, n, key=jax.random.key(2))[:, 0])
-    given = fj.identify(z, L / n)
+    n, L = 1024, 1e-3
+    z = fj.topography(fj.Surface(2.4, 1e-10), L, n, key=jax.random.key(2))[:, 0]
     for unit in (1e-9, 1e-3, 1e3, 1e6):
-
-        def error(found, unit=unit):
-            return max(abs(found.D - given.D), abs(np.log(found.G / given.G / unit)))
-
-        yield f"lengths times {unit:g}", lambda u=unit: fj.identify(z * u, L / n * u), error
+        yield f"lengths times {unit:g}", (np.asarray(z), L / n, unit)
 
 
-QUANTITIES = [
-    Quantity("modal_damping", "ratio 1e-8 to 1e3, chains over 0 to 6 decades", damping_cases),
-    Quantity(
-        "growth_rate of a Structure",
-        "K_n 1e3 to 1e15 N/m on chains over 0 to 6 decades, dampers 1e-6 s times the springs",
-        structure_cases,
-    ),
-    Quantity(
-        "hopf_boundary",
-        "D 2.05 to 2.95, G 1e-14 to 1e-6 m, P 1e-2 to 1e8 N, K_n 1e3 to 1e15 N/m, xi 1e-6 to 1e3",
-        boundary_cases,
-    ),
-    Quantity(
-        "topography", "D to 2 + 1e-6 and 3 - 1e-6, G 1e-18 to 1e-4 m, gamma to 10", topography_cases
-    ),
-    Quantity("identify", "lengths 1e-9 to 1e6 times those of a profile", identify_cases),
-]
+def identified(z: np.ndarray, step: float, unit: float = 1.0) -> Any:
+    return fj.identify(z * unit, step * unit)
 
 
-def quantity_row(quantity: Quantity) -> Row:
-    """Its worst error and its slowest case, in float64."""
+def identify_error(found, z: np.ndarray, step: float, unit: float) -> float:
+    """One profile in other units: D must stay, and G go with the unit of length."""
+    given = identified(z, step)
+    return max(abs(found.D - given.D), abs(np.log(found.G / given.G / unit)))
+
+
+STRUCTURES = "K_n 1e3 to 1e15 N/m on chains over 0 to 6 decades, dampers 1e-6 s times the springs"
+BOUNDARIES = "D 2.05 to 2.95, G 1e-14 to 1e-6 m, P 1e-2 to 1e8 N, K_n 1e3 to 1e15 N/m, xi 1e-6 to"
+CHAINS = "ratio 1e-8 to 1e3, chains over 0 to 6 decades"
+SURFACES = "D to 2 + 1e-6 and 3 - 1e-6, G 1e-18 to 1e-4 m, gamma to 10"
+UNITS = "lengths 1e-9 to 1e6 times those of a profile"
+QUANTITIES = {  # ranges, cases, the quantity, its error
+    "modal_damping": (CHAINS, damping_cases, fj.modal_damping, damping_error),
+    "growth_rate of a Structure": (STRUCTURES, structure_cases, fj.growth_rate, structure_error),
+    "hopf_boundary": (BOUNDARIES + " 1e3", boundary_cases, fj.hopf_boundary, boundary_error),
+    "topography": (SURFACES, topography_cases, heights, topography_error),
+    "identify": (UNITS, identify_cases, identified, identify_error),
+}
+
+
+def quantity_row(name: str, ranges: str, cases: Callable, call: Callable, error: Callable) -> Row:
+    """The worst error of a quantity and its slowest case, in float64."""
     off, taken = [], {}
-    for name, call, error in tqdm(list(quantity.cases()), desc=quantity.name):
-        call()
-        taken[name], found = seconds(call)
-        off.append(error(found))
-    slowest, middle = max(taken, key=lambda name: taken[name]), statistics.median(taken.values())
+    for case, given in tqdm(list(cases()), desc=name):
+        call(*given)
+        taken[case], found = seconds(call, *given)
+        off.append(error(found, *given))
+    slowest, middle = max(taken, key=lambda case: taken[case]), statistics.median(taken.values())
     return {
-        "quantity": quantity.name,
-        "ranges": quantity.ranges,
+        "quantity": name,
+        "ranges": ranges,
         "points": len(off),
         "worst": max(off),
         "not_finite": int((~np.isfinite(off)).sum()),
@@ -194,7 +169,7 @@ def quantity_row(quantity: Quantity) -> Row:
     }
 
 
-# Motion -------------------------------------------------------------------------------------------
+# Motion
 
 
 def bisect(inside: Callable[[float], bool], low: float, high: float) -> tuple[float, float]:
@@ -222,11 +197,10 @@ def scenes() -> dict[str, fj.Scene]:
     """Where the search for a cycle may fail."""
     base, brake = reference(), fj.brake_scene()
 
-    def stiff(G):
+    def sticks(G):
         return float(fj.stiffness(brake.replace(G=G))[1]) > 0
 
-    slip, stuck = bisect(stiff, 1e-11, 1e-10)
-    last, soft = bisect(stiff, 2e-10, 4e-10)
+    slip, plastic = bisect(sticks, 1e-11, 1e-10), bisect(sticks, 2e-10, 4e-10)
     undamped = base.replace(xi_1=0.0, xi_2=0.0)
     return (
         {f"K_n = {K:.0e} N/m": reference(K) for K in 10.0 ** np.arange(6, 14)}
@@ -238,13 +212,12 @@ def scenes() -> dict[str, fj.Scene]:
             "growth 1e-6 omega": barely(1),
             "growth -1e-6 omega": barely(-1),
             "brake": brake,
-            "brake, G at gross slip, outside": brake.replace(G=slip),
-            "brake, G at gross slip, inside": brake.replace(G=stuck),
-            "brake, G at fully plastic, inside": brake.replace(G=last),
-            "brake, G at fully plastic, outside": brake.replace(G=soft),
-            "brake, D = 2.45": brake.replace(D=2.45),
-            "brake, D = 2.9": brake.replace(D=2.9),
+            "brake, G at gross slip, outside": brake.replace(G=slip[0]),
+            "brake, G at gross slip, inside": brake.replace(G=slip[1]),
+            "brake, G at fully plastic, inside": brake.replace(G=plastic[0]),
+            "brake, G at fully plastic, outside": brake.replace(G=plastic[1]),
         }
+        | {f"brake, D = {D:g}": brake.replace(D=D) for D in (2.45, 2.9)}
     )
 
 
@@ -254,14 +227,9 @@ def cycles() -> list[Row]:
     @eqx.filter_jit
     def describe(scene):
         cycle = fj.limit_cycle(scene, throw=False)
-        one = cycle.multipliers[jnp.argmin(jnp.abs(cycle.multipliers - 1))]
         omega = jnp.sqrt(fj.stiffness(scene)[0] / scene.oscillator.m)
-        numbers = {
-            "period": cycle.period,
-            "error": cycle.error,
-            "trivial_multiplier_off": jnp.abs(one - 1),
-            "amplitude": cycle.amplitude[0],
-        }
+        off = jnp.abs(cycle.multipliers - 1).min()
+        numbers = {"period": cycle.period, "error": cycle.error, "trivial_multiplier_off": off}
         return cycle.result, cycle.returns, fj.growth_rate(scene) / omega, numbers
 
     rows = []

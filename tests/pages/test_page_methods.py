@@ -12,11 +12,11 @@ from benchmarks import (
     many_cycles,
     scale,
     scene_cost,
+    timing,
     transients,
     whole_design as designs,
 )
-from benchmarks.extreme.families import FAMILIES, family_rows
-from benchmarks.extremes import corner_rows
+from benchmarks.extremes import FAMILIES, corner_rows, family_rows
 from benchmarks.growth_rate import surfaces
 from benchmarks.timing import versions
 from fractaljax._sweep.shards import Shards
@@ -47,6 +47,21 @@ def test_differences_have_their_order(order):
     np.testing.assert_allclose(found, [power(D, G), *slopes], rtol=1e-10)
 
 
+def test_what_would_take_too_long_in_a_batch_is_left_out(monkeypatch):
+    """Going by the batch before, unless that was short."""
+    each = {"slow": 0.2, "short": 0.05, "quick": 0.001}  # s for one
+
+    def taking_turns(calls, repeats):
+        return {name: [each[name] * many] * repeats for name, many in calls.items()}
+
+    def calls(many, quick):
+        return {name: many for name in each if quick(name)}
+
+    monkeypatch.setattr(timing, "taking_turns", taking_turns)
+    found = [set(turns) for _, turns in timing.in_batches(calls, (1, 100, 1000), 3, limit=2.0)]
+    assert found == [{"slow", "short", "quick"}, {"short", "quick"}, {"quick"}]
+
+
 @pytest.mark.parametrize("family", eigenvalues.FAMILIES)
 def test_truth_and_lapacks_matrices_are_of_the_same_systems(family):
     columns = eigenvalues.FAMILIES[family](np.random.default_rng(2), 3)
@@ -61,9 +76,6 @@ def test_truth_and_lapacks_matrices_are_of_the_same_systems(family):
         assert abs(float(exact) - np.roots(scaled).real.max() * unit) < 1e-10 * size
 
 
-# Limit cycles ------------------------------------------------------------------------------------
-
-
 def test_extremes_of_a_sine_are_read_between_its_points():
     t = np.linspace(0, 20, 401)
     found, values = transients.extremes_of(t, np.sin(t), np.cos(t), -np.sin(t))
@@ -75,7 +87,8 @@ def test_extremes_of_a_sine_are_read_between_its_points():
 def test_transient_is_over_where_it_is_read():
     """Half as many periods again move the error by less than a fifth of the floor."""
     law, periods = transients.law(), transients.PERIODS[1e-2]
-    runs = (transients.scipy_run("LSODA", law, 1e-2, 1e-8, n) for n in (periods, 3 * periods // 2))
+    counts = periods, 3 * periods // 2
+    runs = (transients.tanh_run("SciPy LSODA", law, 1e-2, 1e-8, count) for count in counts)
     short, long = (
         np.array(limit_cycle.relative(*transients.last_period(law, run()))) for run in runs
     )
@@ -86,15 +99,15 @@ def test_transient_is_over_where_it_is_read():
 def test_every_integrator_solves_the_same_law():
     """Shorter than a cycle needs: what they read agrees to what their tolerance lets pass."""
     law, read = transients.law(), []
-    for library, solver, rtol, bound in (
-        ("SciPy", "LSODA", 1e-10, 0),
-        ("diffrax", "Tsit5", 1e-10, 1e-6),
-        ("diffrax", "KenCarp4", 1e-6, 1e-5),
-        ("numbalsoda", "LSODA", 1e-10, 1e-6),
-        ("heyoka", "", 1e-10, 1e-6),
+    for family, rtol, bound in (
+        ("SciPy LSODA", 1e-10, 0),
+        ("diffrax Tsit5", 1e-10, 1e-6),
+        ("diffrax KenCarp4", 1e-6, 1e-5),
+        ("numbalsoda LSODA", 1e-10, 1e-6),
+        ("heyoka", 1e-10, 1e-6),
     ):
-        if library in versions("scipy", "diffrax", "numbalsoda", "heyoka") or library == "SciPy":
-            run = transients.RUNS[library](solver, law, 1e-2, rtol, 6)
+        if family.split()[0] in ("SciPy", *versions("diffrax", "numbalsoda", "heyoka")):
+            run = transients.tanh_run(family, law, 1e-2, rtol, 6)
             read.append(transients.last_period(law, run()))
             np.testing.assert_allclose(read[-1], read[0], rtol=bound)
 
@@ -135,9 +148,6 @@ def test_ratio_of_many_cycles_is_to_all_cores_at_no_larger_an_error():
     assert many_cycles.headline(rows[:2], times[:2]) == []
     lengths = np.array([1.0, 1.0, 2.0, 4.0])
     assert [many_cycles.busy(lengths, n) for n in (1, 2, 4)] == [1, 0.875, 0.5]
-
-
-# Designs -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -196,18 +206,15 @@ def test_runs_are_compared_as_wholes_by_the_median_start():
     assert [designs.quickest(runs, "near", cold) for cold in (True, False)] == ["b: 4 s", "a: 3 s"]
 
 
-# Sweeps and costs --------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_a_job_gives_the_values_at_its_points(tmp_path):
     lengths, picked = (2, 3, 2, 2), (0, 5, 23)
-    found = scale.in_this_process(scale.Job(lengths, 2, 10, shards=str(tmp_path), picked=picked))
+    found = scale.in_this_process(lengths, 2, 10, shards=str(tmp_path), picked=picked)
     scenes = [fj.brake_scene().replace(**scale.at(lengths, point)) for point in picked]
     np.testing.assert_allclose(found["values"], list(map(fj.growth_rate, scenes)), rtol=1e-9)
-    assert len(found["seconds"]) == 2 and found["result_bytes"] == 8 * 24
+    assert len(found["times"]) == 2 and found["result_bytes"] == 8 * 24
     assert len(scale.files(str(tmp_path))) == 3
-    once = scale.in_this_process(scale.Job(lengths, at_once=True, picked=picked))
+    once = scale.in_this_process(lengths, at_once=True, picked=picked)
     np.testing.assert_allclose(once["values"], found["values"], rtol=1e-9)
 
 
@@ -229,25 +236,21 @@ def test_the_row_without_a_part_traces_fewer_operations():
 
     found = scene_cost.operations(jax.make_jaxpr(twice)(1.0).jaxpr)
     assert (found["mul"], found["add"]) == (1, 2)  # the second add is the loop's counter
-    counts = {}
-    for row in scene_cost.ROWS:
-        if row.quick:
-            jaxpr = scene_cost.traced(row)[0].jaxpr.jaxpr
-            counts[row.name] = scene_cost.operations(jaxpr).total()
-            assert counts.get(row.without, 0) < counts[row.name]
+    counts = []
+    for row in scene_cost.IN_SECONDS:
+        counts.append(scene_cost.operations(scene_cost.traced(row)[0].jaxpr.jaxpr).total())
+        assert row.without is None or counts[row.without] < counts[-1]
 
 
 @pytest.mark.slow  # compiles limit cycles and their gradients, minutes
 def test_the_row_without_a_part_is_the_cheaper_one_when_compiled():
-    found = {row.name: scene_cost.cost(row, repeats=1) for row in scene_cost.ROWS}
-    for row in found.values():
-        for count in scene_cost.COUNTS if row["without"] else ():
+    found = [scene_cost.in_this_process(place, 1) for place in range(len(scene_cost.ROWS))]
+    for row, costs in zip(scene_cost.ROWS, found, strict=True):
+        less = costs if row.without is None else found[row.without]
+        for count in scene_cost.COUNTS if less is not costs else ():
             # Fusion moves the bytes by a little.
             slack = 1.01 if count == "bytes_accessed" else 1
-            assert found[row["without"]][count] < slack * row[count], (row["name"], count)
-
-
-# Extremes ----------------------------------------------------------------------------------------
+            assert less[count] < slack * costs[count], (row.name, count)
 
 
 @pytest.mark.slow  # compiles every family
