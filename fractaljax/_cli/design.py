@@ -81,7 +81,7 @@ def _run(arguments) -> int:
     """
     from .. import plot
     from .._design.design import design
-    from .._design.design_file import design_text, read_design, save_design
+    from .._design.design_file import design_files, read_design
     from .._mechanism.scene import brake_scene
     from .._mechanism.structure import Structure, load
 
@@ -96,12 +96,13 @@ def _run(arguments) -> int:
             x, options = read_design(arguments.repeat)
     with output(arguments.out) as write:
         best = design(x, **options, progress=not arguments.quiet)
-        files, heights = {}, []
-        if not isinstance(x, Structure):
-            files = {
-                "design.toml": _scene_text(best).encode(),
-                "run.toml": design_text(best).encode(),
-            }
+        heights, designed = [], arguments.out / "design.toml"
+        if isinstance(x, Structure):
+            made = best.scene._files(designed)
+        else:
+            made = {designed: _scene_text(best).encode()}
+        made |= design_files(best, arguments.out / "run.toml")
+        files = {path.name: content for path, content in made.items()}
         files["history.csv"] = _history_text(best).encode()
         if best.has_surface and set(best.bounds) <= {"D", "G"}:
             files["design.png"] = picture(plot.design(best).figure)
@@ -112,9 +113,6 @@ def _run(arguments) -> int:
             side, dx = len(surfaces.after), surfaces.dx
             heights = [f"topography.npy: {side} x {side} heights in m, dx = {dx:g} m"]
         written = write(files)
-        if isinstance(x, Structure):
-            best.scene.save(arguments.out / "design.toml")
-            save_design(best, arguments.out / "run.toml")
     *table, promise = str(best).splitlines()
     print("\n".join([*table, *_remarks(x, options), written, *heights, promise]))
     return 1 if best.violated else 0

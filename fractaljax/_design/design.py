@@ -7,6 +7,7 @@ answer (`search.py`). What is required is in `problem.py`.
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -14,6 +15,7 @@ import jax
 import numpy as np
 from jaxtyping import ScalarLike
 
+from .._base.files import write_together
 from .._base.parts import Record, brief, flag, scalar, whole
 from .._base.table import table
 from .._mechanism.mechanism import Mechanism
@@ -23,7 +25,7 @@ from .._stability.stability import growth_rate, require_computable
 from .._surface.roughness import Roughness, roughness
 from .._surface.topography import Topographies, topography
 from . import constraints as limits
-from .design_file import read_design, save_design
+from .design_file import design_files, read_design
 from .envelope import Envelope, condition_text
 from .problem import DEFAULT_BOUNDS, DesignProblem, describe, state_problem
 from .search import (
@@ -141,9 +143,11 @@ class Design(Record):
     def save(self, path: str | os.PathLike) -> None:
         """Write scenes, options, results and history to a TOML file, for `repeat_design`.
 
-        **Raises:** `OSError` if the file cannot be written.
+        A structure, given and designed, has files of its own beside it: all are written or none.
+
+        **Raises:** `OSError` if a file cannot be written.
         """
-        save_design(self, path)
+        write_together(design_files(self, Path(path)))
 
     def __repr__(self) -> str:
         shown = self.initial, self.scene, self.friction_slope, self.active, self.wavelengths

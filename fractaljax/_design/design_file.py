@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._base.files import read_bounded, write_whole
+from .._base.files import read_bounded
 from .._base.parts import brief
 from .._base.toml import naming, read_toml, refuse_unknown, table_at, write_toml
 from .._base.versions import versions, versions_differ
@@ -31,21 +31,23 @@ OPTIONS += ("lattice", "seed")  # the arguments of `design` that a file holds
 _NOT_RESULTS = {"scene", "initial", "result", "history", "options"}  # of the fields of a `Design`
 
 
-def save_design(best: Any, path: str | os.PathLike) -> None:
-    """Write a `Design` to a file that `repeat_design` runs again.
+def design_files(best: Any, path: Path) -> dict[Path, bytes]:
+    """The content of the file of a `Design` at `path`, and of those beside it.
 
-    A structure, given and designed, has files of its own beside it: `run.given.toml` of `run.toml`.
-
-    **Raises:** `OSError` if a file cannot be written.
+    A structure, given and designed, has files of its own: `run.given.toml` of `run.toml`.
     """
-    for name, x in _ends(best).items():
-        if isinstance(x, Structure):
-            x.save(_beside(Path(path), name))
-    write_whole(path, design_text(best, Path(path)).encode())
-
-
-def design_text(best: Any, path: Path = Path("run.toml")) -> str:
-    """The text of the file of a `Design`, to be written to `path`."""
+    heads: dict[str, Any] = {
+        **versions(),
+        "precision": str(jax.tree.leaves(best.initial)[0].dtype),
+    }
+    files = {}
+    for name, x in (("given", best.initial), ("designed", best.scene)):
+        if isinstance(x, Scene):
+            heads[name] = x.to_toml()
+        else:
+            beside = _beside(path, name)
+            heads[name] = beside.name
+            files |= x._files(beside)
     options = dict(best.options)
     for name in ("objective", "solver"):
         options[name] = options[name] and _function_name(options[name])
@@ -57,19 +59,14 @@ def design_text(best: Any, path: Path = Path("run.toml")) -> str:
             "names": tolerance.names,
             "covariance": np.asarray(tolerance.covariance, float).tolist(),
         }
-    heads = dict(versions()) | {"precision": str(jax.tree.leaves(best.initial)[0].dtype)}
-    for name, x in _ends(best).items():
-        heads[name] = x.to_toml() if isinstance(x, Scene) else _beside(path, name).name
     tables = {
         "options": {name: options[name] for name in OPTIONS},
         "result": {"outcome": best.outcome}
         | {name: value for name, value in vars(best).items() if name not in _NOT_RESULTS},
         "history": {name: column.tolist() for name, column in best.history.items()},
     }
-    return write_toml(
-        "A fractaljax design, in SI units: `fractaljax design --repeat` runs it again.",
-        heads | tables,
-    )
+    comment = "A fractaljax design, in SI units: `fractaljax design --repeat` runs it again."
+    return files | {path: write_toml(comment, heads | tables).encode()}
 
 
 def read_design(
@@ -91,10 +88,6 @@ def read_design(
     if others := versions_differ(document):
         warnings.warn(f"{path} was {others}: digits may differ", stacklevel=3)
     return found
-
-
-def _ends(best) -> dict[str, Any]:
-    return {"given": best.initial, "designed": best.scene}
 
 
 def _beside(path: Path, name: str) -> Path:

@@ -178,7 +178,10 @@ class Structure(Mechanism):
         batch, if `path` itself ends in .npz, and if there is a .npz file of that name which the
         TOML file at `path` does not name.
         """
-        path = Path(path)
+        write_together(self._files(Path(path)))
+
+    def _files(self, path: Path) -> dict[Path, bytes]:
+        """What `save` writes to `path`, by file; errors as there."""
         matrices = path.with_suffix(".npz")
         if matrices == path:
             raise ValueError(f"path must be that of the TOML file, got {str(path)!r}")
@@ -190,7 +193,7 @@ class Structure(Mechanism):
             )
         text = structure_text(self, matrices.name).encode()
         # The TOML file comes last, so that it never names matrices of another structure.
-        write_together({matrices: npz_bytes(self), path: text})
+        return {matrices: npz_bytes(self), path: text}
 
 
 def _names_matrices(path: Path, matrices: str) -> bool:

@@ -174,6 +174,24 @@ def test_failure_writes_nothing(capsys, tmp_path, monkeypatch, where, error, sta
     assert list(tmp_path.iterdir()) == []
 
 
+def test_files_of_a_structure_are_written_together(capsys):
+    """The structure, its design and all matrices; or nothing, where one of them cannot be."""
+    fj.Structure.from_scene(fj.brake_scene()).save("belt.toml")
+    arguments = ["design", "belt.toml", "--bounds", "D=2.3:2.8", "--target", 1e6, "--quiet"]
+    Path("old").mkdir()
+    Path("old/design.npz").write_text("mine")
+    status, out, err = run(capsys, *arguments, "--out", "old")
+    assert (status, out) == (2, "") and "design.npz is not of a structure saved as" in err
+    assert {file.name: file.read_text() for file in Path("old").iterdir()} == {"design.npz": "mine"}
+    status, out, err = run(capsys, *arguments, "--out", "new")
+    assert (status, err) == (0, "") and "written to new: design.npz, design.toml, run." in out
+    fj.Structure.load("new/design.toml")
+    repeated = run(capsys, "design", "--repeat", "new/run.toml", "--out", "again", "--quiet")
+    assert repeated == (0, out.replace("to new", "to again"), "")
+    for file in Path("new").glob("*.toml"):
+        assert Path("again", file.name).read_bytes() == file.read_bytes()
+
+
 def test_repetition_of_a_run_of_other_versions(capsys, tmp_path, monkeypatch):
     """A warning is one line on standard error, and the command continues."""
 
