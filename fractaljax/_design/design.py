@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import ScalarLike
 
 from .._base.files import write_together
-from .._base.parts import Record, brief, flag, scalar, whole
+from .._base.parts import Record, brief, flag, whole
 from .._base.table import table
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import replaced
@@ -30,14 +30,10 @@ from .envelope import Envelope, condition_text
 from .problem import DEFAULT_BOUNDS, DesignProblem, describe, state_problem
 from .search import (
     Evaluation,
-    Evaluator,
-    OnAverage,
     Search,
     Solver,
-    WorstCase,
-    best_of,
     choose_starts,
-    expected_shortfall,
+    evaluator_of,
     screened_designs,
     slsqp,
 )
@@ -50,7 +46,6 @@ _LATTICE = {False: (1024, 48), True: (256, 24)}  # whether under many conditions
 _LATTICE_MAX = 1_000_000, 1000
 _STARTS_MAX = 10_000
 _SEED_MAX = 2**63 - 1  # of a JAX key
-_TEMPERATURE = 0.02  # of the smooth maximum over an envelope
 _ACTIVE = 1e-4  # a requirement met by less than this is called active
 _WAVELENGTHS = (1e-3, 1e-6)  # [m], of the roughness that is reported
 
@@ -262,9 +257,8 @@ def design(
         slip_ratio_max=slip_ratio_max,
         friction_slope=friction_slope,
     )
-    averaged = _averaged(risk, envelope)
     problem = state_problem(x, bounds, **stated)
-    evaluator = evaluator_of(problem, envelope, averaged)
+    evaluator = evaluator_of(problem, envelope, risk)
     count, designs = screened(problem, starts, lattice)
     options = {"bounds": dict(bounds), **stated, "risk": risk, "solver": solver}
     options |= {"starts": starts, "lattice": lattice, "seed": seed}
@@ -275,67 +269,22 @@ def design(
     if objective is None and before.worst[0] <= 0:
         return _conclude(x, problem, options, before, before, own[None], 0, 0)
     us, scale = choose_starts(own, designs, evaluator.screen(designs), count)
-    slack = slack_of(problem, robust=envelope is not None or tolerance is not None)
-    search = Search(evaluator, solver or slsqp, slack, 1.0 if objective is None else scale)
-    path, after, failed = best_of(search, us, progress)
+    search = Search(evaluator, solver or slsqp, 1.0 if objective is None else scale)
+    path, after, failed = search.best(us, progress)
     return _conclude(x, problem, options, before, after, path, len(us), failed)
 
 
 def screened(problem: DesignProblem, starts: int | None, lattice: int | None):
     """How many designs to start from, and those (n, v) to choose them from."""
     variables = len(problem.names)
-    robust = bool(problem.conditions) or problem.scatter is not None
     if lattice is None:
-        lattice = _LATTICE[robust][min(variables, 2) - 1]
+        lattice = _LATTICE[problem.robust][min(variables, 2) - 1]
     lattice = whole("lattice", lattice, 1, _LATTICE_MAX[min(variables, 2) - 1])
     count = lattice ** min(variables, 2)
     starts = whole("starts", min(_STARTS, count) if starts is None else starts, 1, _STARTS_MAX)
     if starts > count:
         raise ValueError(f"starts must be at most the {count} of the lattice, got {starts}")
     return starts, screened_designs(lattice, variables)
-
-
-def slack_of(problem: DesignProblem, robust: bool) -> float:
-    """By how much requirements are overfulfilled, so that rounding cannot undo them.
-
-    Nor can a condition between those that an envelope was searched at.
-    """
-    eps = float(np.finfo(problem.low.dtype).eps)
-    return max(1e-6 if robust else 1e-9, 3e4 * eps)
-
-
-def _averaged(risk, envelope: Envelope | None) -> tuple[np.ndarray, float | np.ndarray] | None:
-    """The places that an average over an envelope is taken at, and its `OnAverage.risk`."""
-    pair = (risk, None) if isinstance(risk, str) else risk
-    kind, number = pair if isinstance(pair, (tuple, list)) and len(pair) == 2 else (None, None)
-    if kind == "worst" and number is None:
-        return None
-    if kind == "smooth":
-        number = _TEMPERATURE if number is None else number
-        number = float(scalar("temperature of risk", number, above=0))
-    elif kind == "cvar" and number is not None:
-        number = float(scalar("alpha of risk", number, at_least=0, below=1))
-    else:
-        raise ValueError(
-            f'risk must be "worst", "smooth", ("smooth", T) or ("cvar", alpha), got {brief(risk)}'
-        )
-    if envelope is None:
-        raise ValueError(f"risk {risk!r} needs an envelope")
-    if kind == "smooth":
-        return envelope.coarse_grid(), number
-    places = envelope.cells()
-    return places, expected_shortfall(len(places), number)
-
-
-def evaluator_of(problem: DesignProblem, envelope: Envelope | None, averaged=None) -> Evaluator:
-    """What evaluates designs over all conditions that are asked for."""
-    if envelope is None:
-        return Evaluator(problem)
-    return (
-        WorstCase(problem, envelope)
-        if averaged is None
-        else (OnAverage(problem, envelope, *averaged))
-    )
 
 
 def _conclude(
@@ -362,7 +311,7 @@ def _conclude(
     for name, place in zip(problem.names, path[-1].tolist(), strict=True):
         residuals |= {f"{name} >= lower bound": -place, f"{name} <= upper bound": place - 1}
     violated = tuple(name for name, residual in residuals.items() if not residual <= 0)
-    active = max(_ACTIVE, 100 * slack_of(problem, robust=False))
+    active = max(_ACTIVE, 100 * problem.rounding)
     more: dict[str, Any] = {}
     if envelope is not None or tolerance is not None:
         i = names.index("growth_rate <= target")
@@ -370,7 +319,7 @@ def _conclude(
             float(problem.target + problem.growth_scale * np.sinh(evaluation.residuals[0, i]))
             for evaluation in (before, after)
         )
-    if after.places is not None and envelope is not None:
+    if envelope is not None:
         at = [envelope.condition(place) for place in after.places[0, 1:]]
         more["worst_of"] = dict(zip(names, at, strict=True))
         more["worst"] = at[int(np.argmax(after.residuals[0]))]

@@ -118,7 +118,7 @@ class Envelope(Record):
         ]
         which = places[:, 0].astype(int)
         columns += [np.asarray(values)[which] for values in self.samples.values()]
-        return np.stack(columns, axis=1)
+        return np.array(columns).reshape(len(self.names), len(places)).T
 
     def condition(self, place: np.ndarray) -> dict[str, float]:
         """The quantities at one place, by name."""
@@ -188,6 +188,14 @@ class Envelope(Record):
         if self.samples:
             shown.append(f"{self.sample_count} samples of {', '.join(self.samples)}")
         return ", ".join(shown)
+
+
+class _Alone(Envelope):
+    def __init__(self):
+        self.ranges, self.samples = {}, {}
+
+
+ALONE = _Alone()  # a scene as it is: one condition, of nothing
 
 
 def _numbers(name, values) -> tuple[float, ...]:

@@ -16,9 +16,9 @@ from .._base.parts import Record, brief, flag, scalar, whole
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import replaced
 from .constraints import Constraint
-from .design import Design, design, screened, slack_of
+from .design import Design, design, screened
 from .problem import DesignProblem, describe, state_problem
-from .search import Evaluator, Search, best_of, slsqp
+from .search import Evaluator, Search, slsqp
 
 _STARTS = 6  # of each member of the front
 _POINTS_MAX = 1000
@@ -125,7 +125,7 @@ def pareto(
         raise ValueError(f"the least {names[0]} and the least {names[1]} are one design")
     _, designs = screened(problem, None, made["lattice"])
     known = Evaluator(problem).evaluate(designs)
-    solver, slack = made["solver"] or slsqp, slack_of(problem, robust=False)
+    solver = made["solver"] or slsqp
     found = []
     for share in tqdm(np.linspace(1, 0, points), desc="pareto", disable=not progress):
         limit = low + share * (high - low)
@@ -137,7 +137,7 @@ def pareto(
         between = share * places[0] + (1 - share) * places[1]
         starts = np.concatenate([places, between[None], promising[: _STARTS - 3]])
         evaluator = Evaluator(problem_at(limit, high - low))
-        path, _, _ = best_of(Search(evaluator, solver, slack, scale), starts, progress=False)
+        path, _, _ = Search(evaluator, solver, scale).best(starts, progress=False)
         # The last limit leaves no room for the slack: there is the second end alone.
         us = np.stack([path[-1], *places])
         ends_here = evaluator.evaluate(us)

@@ -139,6 +139,16 @@ class DesignProblem(eqx.Module):
     # --- in NumPy: many ------------------------------------------------------------------
 
     @property
+    def robust(self) -> bool:
+        """Whether there is an envelope or a tolerance."""
+        return bool(self.conditions) or self.scatter is not None
+
+    @property
+    def rounding(self) -> float:
+        """Of a residual."""
+        return 3e4 * float(np.finfo(self.low.dtype).eps)
+
+    @property
     def asked(self) -> list[Any]:
         """The constraints of the user, in their order."""
         pairs = zip(self.constraints, self.functions, strict=True)
@@ -205,7 +215,7 @@ def linearise(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray):
 
 def evaluate(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray) -> np.ndarray:
     """Objective and residuals (n, 1 + k) of designs us (n, v), each at a condition (n, c)."""
-    if not problem.conditions and problem.scatter is None:
+    if not problem.robust:
         return linearise(problem, us, conditions)[0]  # compiled already
     return _in_batches(_evaluate, problem, us, conditions).astype(float)
 

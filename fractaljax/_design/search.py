@@ -8,13 +8,15 @@ constrained optimization problems", 1976.)
 
 import concurrent.futures
 import dataclasses
+import functools
 import queue
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from .envelope import Envelope
+from .._base.parts import brief, scalar
+from .envelope import ALONE, Envelope
 from .problem import DesignProblem, evaluate, linearise
 from .tolerance import low_discrepancy
 
@@ -26,6 +28,7 @@ _NEW = 1e-7  # by which a condition must be worse than the working ones
 _NEAR = 0.05  # a requirement met by more than this on the grid is met between its points
 _UNKNOWN = 1e3  # stands for a residual without a number
 _PENALTY = 10.0  # of unmet requirements, by which starts are ranked
+_TEMPERATURE = 0.02  # of the smooth maximum over an envelope
 
 
 def slsqp(objective: Callable, constraints: Callable, start: np.ndarray, bounds: np.ndarray):
@@ -37,22 +40,10 @@ def slsqp(objective: Callable, constraints: Callable, start: np.ndarray, bounds:
     """
     from scipy.optimize import minimize
 
-    limits = {
-        "type": "ineq",
-        "fun": lambda z: -constraints(z)[0],
-        "jac": lambda z: -constraints(z)[1],
-    }
-    options = {"ftol": 1e-12, "maxiter": 100}
-    found = minimize(
-        objective,
-        start,
-        jac=True,
-        bounds=bounds,
-        constraints=[limits],
-        method="SLSQP",
-        options=options,
-    )
-    return found.x
+    fun, jac = (lambda z: -constraints(z)[0]), (lambda z: -constraints(z)[1])
+    limits = {"type": "ineq", "fun": fun, "jac": jac}
+    more: Any = {"method": "SLSQP", "options": {"ftol": 1e-12, "maxiter": 100}}
+    return minimize(objective, start, jac=True, bounds=bounds, constraints=limits, **more).x
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +51,7 @@ class Evaluation:
     """Objective and residuals of n designs, and the places where each is at its worst."""
 
     rows: np.ndarray  # (n, 1 + k)
-    places: np.ndarray | None = None  # (n, 1 + k, 1 + ranges)
+    places: np.ndarray  # (n, 1 + k, 1 + ranges)
 
     @property
     def values(self) -> np.ndarray:
@@ -75,95 +66,82 @@ class Evaluation:
     @property
     def worst(self) -> np.ndarray:
         """The largest residual (n,); infinite without a number, or without a value."""
-        return np.nan_to_num(self.rows[:, 1:].max(axis=1) + 0 * self.rows[:, 0], nan=np.inf)
+        return np.where(np.isfinite(self.values), self.residuals.max(axis=1), np.inf)
 
     def of(self, i: int) -> "Evaluation":
         """That of one design alone, still with a leading axis."""
-        places = None if self.places is None else self.places[i : i + 1]
-        return Evaluation(self.rows[i : i + 1], places)
+        return Evaluation(self.rows[i : i + 1], self.places[i : i + 1])
 
 
 @dataclasses.dataclass(frozen=True)
 class Evaluator:
-    """A problem at one condition."""
+    """Every requirement at every condition of an envelope, the objective at its worst."""
 
     problem: DesignProblem
+    envelope: Envelope = ALONE
+
+    @property
+    def likely(self) -> np.ndarray:
+        """Conditions (m, c) that are a first guess at the worst."""
+        return self.envelope.values(self.envelope.likely(_LIKELY))
 
     @property
     def working(self) -> np.ndarray:
         """The conditions (m, c) that a design is first solved for."""
-        return np.zeros((1, 0))
-
-    def evaluate(self, us: np.ndarray) -> Evaluation:
-        """Designs us (n, v), over all conditions."""
-        return Evaluation(evaluate(self.problem, us, np.zeros((len(us), 0))))
-
-    def screen(self, us: np.ndarray) -> np.ndarray:
-        """Objective and residuals (n, 1 + k), roughly: to choose starts by."""
-        return np.nan_to_num(self._at_all(us, self.working), nan=np.inf).max(axis=1)
+        return self.likely
 
     @property
     def minimax(self) -> bool:
         """Whether the objective is the largest of those at many conditions."""
-        return False
+        return self.problem.objective is not None and self.envelope is not ALONE
 
-    def average(self, rows: np.ndarray, jacobians: np.ndarray):
-        """What a design must keep to, from rows (m, 1 + k) at conditions and their Jacobians."""
-        return rows, jacobians
+    def screen(self, us: np.ndarray) -> np.ndarray:
+        """Objective and residuals (n, 1 + k) of us (n, v), roughly: to choose starts by."""
+        return self._at_all(us, self.likely).max(axis=1)
 
-    def exchange(self, us: np.ndarray, working: list[np.ndarray]) -> list[np.ndarray]:
-        """Conditions (m, c) at which each of us (n, v) is worse than at all its working ones."""
-        return [conditions[:0] for conditions in working]
-
-    def _at_all(self, us, conditions):
-        """Rows (n, m, 1 + k) of every design at every condition."""
-        n, m = len(us), len(conditions)
-        flat = evaluate(self.problem, np.repeat(us, m, axis=0), np.tile(conditions, (n, 1)))
-        return flat.reshape(n, m, -1)
-
-
-@dataclasses.dataclass(frozen=True)
-class WorstCase(Evaluator):
-    """Every requirement at every condition of an envelope, the objective at its worst."""
-
-    envelope: Envelope
-
-    @property
-    def working(self):
-        return self.envelope.values(self.envelope.likely(_LIKELY))
-
-    @property
-    def minimax(self):
-        return self.problem.objective is not None
-
-    def evaluate(self, us):
-        envelope = self.envelope
-        grid = envelope.grid()
-        each = np.nan_to_num(self._at_all(us, envelope.values(grid)), nan=np.inf)
-        best, rows = each.argmax(axis=1), each.max(axis=1)
+    def evaluate(self, us: np.ndarray) -> Evaluation:
+        """Designs us (n, v), over all conditions."""
+        grid = self.envelope.grid()
+        each = self._at_all(us, self.envelope.values(grid))
+        places, rows = grid[each.argmax(axis=1)], each.max(axis=1)
         near = rows > -_NEAR
         near[:, 0] = self.problem.objective is not None
         which, column = np.nonzero(near)
 
         def residual(places, i):
-            found = evaluate(self.problem, us[which[i]], envelope.values(places))
-            return np.nan_to_num(found, nan=np.inf)[np.arange(len(i)), column[i]]
+            return self._at(us[which[i]], self.envelope.values(places))[
+                np.arange(len(i)), column[i]
+            ]
 
-        places = grid[best]
-        places[near], rows[near] = envelope.climb(residual, places[near], rows[near])
+        places[near], rows[near] = self.envelope.climb(residual, places[near], rows[near])
         return Evaluation(rows, places)
 
-    def exchange(self, us, working):
+    def average(self, rows: np.ndarray, jacobians: np.ndarray):
+        """What a design must keep to, from rows (m, 1 + k) at conditions and their Jacobians."""
+        return rows, jacobians
+
+    def exchange(self, us: np.ndarray, working: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Conditions (m, c) at which each of us (n, v) is worse than at all its working ones."""
         found, new = self.evaluate(us), []
-        assert found.places is not None
         counts = [len(conditions) for conditions in working]
-        known = evaluate(self.problem, np.repeat(us, counts, axis=0), np.concatenate(working))
-        pieces = np.split(np.nan_to_num(known, nan=np.inf), np.cumsum(counts)[:-1])
+        known = self._at(np.repeat(us, counts, axis=0), np.concatenate(working))
+        pieces = np.split(known, np.cumsum(counts)[:-1])
         for rows, places, piece in zip(found.rows, found.places, pieces, strict=True):
             worse = rows > piece.max(axis=0) + _NEW
             worse[1:] &= rows[1:] > 0
             new.append(self.envelope.values(np.unique(places[worse], axis=0)))
         return new
+
+    def _at(self, us, conditions):
+        """Rows (n, 1 + k) of designs (n, v), each at a condition; infinite without a number."""
+        rows = evaluate(self.problem, us, conditions)
+        return np.where(np.isnan(rows), np.inf, rows)
+
+    def _at_all(self, us, conditions):
+        """Rows (n, m, 1 + k) of every design at every condition."""
+        n, m = len(us), len(conditions)
+        rows = self._at(np.repeat(us, m, axis=0), np.tile(conditions, (n, 1)))
+        return rows.reshape(n, m, -1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,26 +152,28 @@ class OnAverage(Evaluator):
     weights (m,) of the ordered residuals.
     """
 
-    envelope: Envelope
-    places: np.ndarray
-    risk: float | np.ndarray
+    places: np.ndarray = dataclasses.field(kw_only=True)
+    risk: float | np.ndarray = dataclasses.field(kw_only=True)
 
     @property
     def working(self):
         return self.envelope.values(self.places)
 
-    def screen(self, us):
-        likely = self.envelope.values(self.envelope.likely(_LIKELY))
-        return np.nan_to_num(self._at_all(us, likely), nan=np.inf).max(axis=1)
+    @property
+    def minimax(self):
+        return False
 
     def evaluate(self, us):
         each = self._at_all(us, self.working)
         rows = np.stack([self._average(rows)[0] for rows in each])
-        return Evaluation(rows, self.places[np.nan_to_num(each, nan=np.inf).argmax(axis=1)])
+        return Evaluation(rows, self.places[each.argmax(axis=1)])
 
     def average(self, rows, jacobians):
         row, weights = self._average(rows)
         return row[None], np.einsum("mk,mkv->kv", weights, jacobians)[None]
+
+    def exchange(self, us, working):
+        return [conditions[:0] for conditions in working]
 
     def _average(self, rows):
         """The columns of rows (m, 1 + k) on average, and the derivative (m, 1 + k) by them."""
@@ -201,6 +181,31 @@ class OnAverage(Evaluator):
         if self.problem.objective is None:
             row[0], weights[:, 0] = rows[0, 0], np.arange(len(rows)) == 0
         return row, weights
+
+
+def evaluator_of(problem: DesignProblem, envelope: Envelope | None, risk: Any) -> Evaluator:
+    """What evaluates designs over the conditions of an envelope, at a risk as in `design`."""
+    match risk:
+        case "worst":
+            return Evaluator(problem, envelope or ALONE)
+        case "smooth":
+            kind, number = "smooth", _TEMPERATURE
+        case ("smooth" as kind, given):
+            number = float(scalar("temperature of risk", given, above=0))
+        case ("cvar" as kind, given):
+            number = float(scalar("alpha of risk", given, at_least=0, below=1))
+        case _:
+            raise ValueError(
+                'risk must be "worst", "smooth", ("smooth", T) or ("cvar", alpha), got '
+                + brief(risk)
+            )
+    if envelope is None:
+        raise ValueError(f"risk {risk!r} needs an envelope")
+    if kind == "smooth":
+        return OnAverage(problem, envelope, places=envelope.coarse_grid(), risk=number)
+    places = envelope.cells()
+    weights = expected_shortfall(len(places), number)
+    return OnAverage(problem, envelope, places=places, risk=weights)
 
 
 def averaged(rows: np.ndarray, risk: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -260,6 +265,7 @@ def choose_starts(own: np.ndarray, designs: np.ndarray, rows: np.ndarray, count:
 # --- landing on the constraints ------------------------------------------------------------
 
 
+@dataclasses.dataclass
 class _Functions:
     """What a solver asks, from one evaluation at each point: minimise f subject to c <= 0.
 
@@ -268,11 +274,14 @@ class _Functions:
     cannot undo it.
     """
 
-    def __init__(self, rows_at: Callable, aim, limited, slack: float, scale: float, extra: bool):
-        self.rows_at, self.aim, self.limited = rows_at, aim, limited
-        self.slack, self.scale, self.extra = slack, scale, extra
-        self.seen: list[np.ndarray] = []
-        self._rows = None
+    rows_at: Callable
+    aim: np.ndarray  # (1 + k,), whether a column is
+    limited: np.ndarray
+    slack: float
+    scale: float  # of the objective
+    extra: bool
+    seen: list[np.ndarray] = dataclasses.field(default_factory=list)  # where rows were asked for
+    _rows: Any = None
 
     def at(self, z):
         """Rows and their Jacobians at z, which is u (v,) or, with the extra variable, (u, t)."""
@@ -352,28 +361,57 @@ class Search:
 
     evaluator: Evaluator
     solver: Solver
-    slack: float
     scale: float = 1.0  # of the objective
 
-    def solve(self, starts: np.ndarray, progress: bool) -> tuple[list[np.ndarray], Evaluation]:
-        """The way (s, v) from every start (n, v), and what its ends are, evaluated afresh.
+    @property
+    def slack(self) -> float:
+        """By how much requirements are overfulfilled, so that rounding cannot undo them.
+
+        Nor can a condition between those that an envelope was searched at.
+        """
+        problem = self.evaluator.problem
+        return max(1e-6 if problem.robust else 1e-9, problem.rounding)
+
+    def best(self, starts: np.ndarray, progress: bool):
+        """The way (s, v) to the best end of all, what it is, and how many starts (n, v) failed.
+
+        The first of those whose ends are equally good: the given design leads the starts, and its
+        way begins where the reader does.
+        """
+        paths, found = self._solve(starts, progress)
+        failed = found.worst > 0
+        if failed.all():
+            model = found.residuals[:, : self.evaluator.problem.model_residuals]
+            best = int(np.lexsort((found.worst, model.max(axis=1, initial=0)))[0])
+            return paths[best], found.of(best), len(starts)
+        values = np.where(failed, np.inf, found.values)
+        best = int(np.flatnonzero(values <= values.min() + 1e-8 * abs(values.min()))[0])
+        # A solver may have stopped early: once more from where it is.
+        (again,) = self._land([paths[best]])
+        polished = self._ends([again])
+        if polished.worst[0] <= 0 and polished.values[0] < values[best]:
+            return again, polished, int(failed.sum())
+        return paths[best], found.of(best), int(failed.sum())
+
+    def _solve(self, starts, progress):
+        """The ways from all starts, and what their ends are.
 
         Where none meets every requirement they end inside the model, if that is possible, and
         there as close as can be to all the rest.
         """
-        paths = self.land([start[None] for start in starts], progress=progress)
-        found, problem = self._ends(paths), self.evaluator.problem
+        paths = self._land([start[None] for start in starts], progress=progress)
+        found = self._ends(paths)
         if (found.worst <= 0).any():
             return paths, found
+        problem = self.evaluator.problem
         model = np.arange(len(problem.residual_names)) < problem.model_residuals
         # Into the model, on to the rest of the requirements, and if they hold to the objective.
         for violated in (model, ~model, None):
             outside = (found.residuals[:, model] > 0).any(axis=1)
             going = found.worst <= 0 if violated is None else outside == (violated is model)
             chosen = np.flatnonzero(going)
-            for i, path in zip(
-                chosen, self.land([paths[i] for i in chosen], violated), strict=True
-            ):
+            landed = self._land([paths[i] for i in chosen], violated)
+            for i, path in zip(chosen, landed, strict=True):
                 paths[i] = path
             found = self._ends(paths)
         return paths, found
@@ -381,7 +419,7 @@ class Search:
     def _ends(self, paths) -> Evaluation:
         return self.evaluator.evaluate(np.array([path[-1] for path in paths]))
 
-    def land(self, paths: list[np.ndarray], violated=None, progress: bool = False):
+    def _land(self, paths, violated=None, progress=False):
         """Ways (s, v) continued to the least objective that meets every requirement.
 
         With some requirements (k,) marked as violated, to the least of their largest residual that
@@ -394,28 +432,23 @@ class Search:
         limited = columns > 0 if violated is None else (columns > 0) & (columns < aim.argmax())
         with tqdm(total=len(paths), desc="design", unit="start", disable=not progress) as bar:
 
-            def landing(path):
-                def task(ask):
-                    found = self._land(path, aim, limited, ask)
-                    bar.update()
-                    return found
+            def task(path, ask):
+                found = self._continued(path, aim, limited, ask)
+                bar.update()
+                return found
 
-                return task
+            return in_lockstep([functools.partial(task, path) for path in paths], self._answer)
 
-            return in_lockstep([landing(path) for path in paths], self._answer)
-
-    def _land(self, path, aim, limited, ask):
+    def _continued(self, path, aim, limited, ask):
+        """One way, continued by a solver that asks for rows and for new conditions."""
         path, working = list(path), self.evaluator.working
         extra = not aim[0] or self.evaluator.minimax
         for _ in range(_ROUNDS):
-            functions = _Functions(
-                lambda u, working=working: ask(("linearise", u, working)),
-                aim,
-                limited,
-                self.slack,
-                self.scale,
-                extra,
-            )
+
+            def rows_at(u, working=working):
+                return ask((self._linearise, u, working))
+
+            functions = _Functions(rows_at, aim, limited, self.slack, self.scale, extra)
             start, bounds = path[-1], np.tile([0.0, 1.0], (len(path[-1]), 1))
             if extra:
                 largest = functions.at(np.append(start, 0))[0][:, aim].max()
@@ -423,50 +456,26 @@ class Search:
                 bounds = np.append(bounds, [[-np.inf, np.inf]], axis=0)
             z = self.solver(functions.objective, functions.constraints, start, bounds)
             path += [*functions.seen, np.clip(np.asarray(z, float)[: len(path[-1])], 0, 1)]
-            new = ask(("exchange", path[-1], working))
+            new = ask((self.evaluator.exchange, path[-1], working))
             if not len(new):
                 break
             working = np.concatenate([working, new])
         return np.array(path)
 
     def _answer(self, questions):
-        """For designs (v,) at working conditions (m, c): rows and Jacobians, or new conditions."""
+        """What (method, design (v,), working conditions (m, c)) ask, each method once for all."""
         replies: dict[int, Any] = {}
-        for kind in ("linearise", "exchange"):
-            asked = [i for i, question in enumerate(questions) if question[0] == kind]
-            us = np.array([questions[i][1] for i in asked])
-            working = [questions[i][2] for i in asked]
+        for method in (self._linearise, self.evaluator.exchange):
+            asked = [i for i, question in enumerate(questions) if question[0] == method]
             if asked:
-                reply = self.evaluator.exchange if kind == "exchange" else self._linearise
-                replies |= zip(asked, reply(us, working), strict=True)
+                us, working = zip(*(questions[i][1:] for i in asked), strict=True)
+                replies |= zip(asked, method(np.array(us), working), strict=True)
         return [replies[i] for i in range(len(questions))]
 
     def _linearise(self, us, working):
+        """Rows and Jacobians of each of us (n, v) at its working conditions."""
         counts = [len(conditions) for conditions in working]
         many = np.repeat(us, counts, axis=0)
         found = linearise(self.evaluator.problem, many, np.concatenate(working))[:2]
         pieces = (np.split(x, np.cumsum(counts)[:-1]) for x in found)
         return [self.evaluator.average(*piece) for piece in zip(*pieces, strict=True)]
-
-
-def best_of(search: Search, starts: np.ndarray, progress: bool):
-    """The way (s, v) to the best end, what it is, and how many starts failed.
-
-    The first of those whose ends are equally good: the given design leads the starts, and its way
-    begins where the reader does.
-    """
-    paths, found = search.solve(starts, progress)
-    failed = found.worst > 0
-    if failed.all():
-        model = found.residuals[:, : search.evaluator.problem.model_residuals]
-        outside = np.maximum(np.nan_to_num(model.max(axis=1, initial=0), nan=np.inf), 0)
-        best = int(np.lexsort((found.worst, outside))[0])
-        return paths[best], found.of(best), len(starts)
-    values = np.where(failed, np.inf, found.values)
-    best = int(np.flatnonzero(values <= values.min() + 1e-8 * abs(values.min()))[0])
-    # A solver may have stopped early: once more from where it is.
-    (again,) = search.land([paths[best]])
-    polished = search.evaluator.evaluate(again[-1:])
-    if polished.worst[0] <= 0 and polished.values[0] < values[best]:
-        return again, polished, int(failed.sum())
-    return paths[best], found.of(best), int(failed.sum())
