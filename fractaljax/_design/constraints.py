@@ -7,6 +7,7 @@ ln(a_e/a_l) below the critical area, where the quantity itself no longer changes
 
 import abc
 import math
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -85,6 +86,25 @@ class Constraint(Record):
         if self.at_most is None:
             return f"{self.symbol} >= {self.at_least:.6g}{unit}"
         return f"{self.at_least:.6g} <= {self.symbol} <= {self.at_most:.6g}{unit}"
+
+
+class Plain(Constraint):
+    """A function of the user's that is a residual itself."""
+
+    function: Callable[[Any], Any] = eqx.field(static=True)
+
+    def __init__(self, function: Callable[[Any], Any]):
+        self.at_least, self.at_most, self.function = None, None, function
+
+    def measure(self, scene):
+        return self.function(scene)
+
+    def __call__(self, scene):
+        return self.function(scene)
+
+    @property
+    def name(self):
+        return getattr(self.function, "__name__", repr(self.function))
 
 
 def _surface(scene: Mechanism, symbol: str) -> Surface:

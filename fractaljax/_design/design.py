@@ -238,30 +238,18 @@ def design(
     **Raises:** `ValueError` for bounds on what `x` lacks, empty, inverted or without its own value,
     for an envelope of what it lacks or the design moves, and for options outside their domain.
     """
-    envelope = None if envelope is None else Envelope.of(envelope)
-    tolerance = None if tolerance is None else Tolerance.of(tolerance)
-    bounds = DEFAULT_BOUNDS if bounds is None else bounds
+    options = {name: value for name, value in locals().items() if name not in ("x", "progress")}
+    options["bounds"] = DEFAULT_BOUNDS if bounds is None else bounds
+    options["envelope"] = envelope = None if envelope is None else Envelope.of(envelope)
+    options["tolerance"] = None if tolerance is None else Tolerance.of(tolerance)
     progress = flag("progress", progress)
     if solver is not None and not callable(solver):
         raise TypeError(f"solver must be a function, got {brief(solver)}")
     whole("seed", seed, 0, _SEED_MAX)
-    stated: dict[str, Any] = dict(
-        objective=objective,
-        target=target,
-        K_n_min=K_n_min,
-        constraints=constraints,
-        envelope=envelope,
-        tolerance=tolerance,
-        quantile=quantile,
-        area_ratio_min=area_ratio_min,
-        slip_ratio_max=slip_ratio_max,
-        friction_slope=friction_slope,
-    )
-    problem = state_problem(x, bounds, **stated)
+    problem = state_problem(x, **options)
+    options["bounds"] = dict(options["bounds"])
     evaluator = evaluator_of(problem, envelope, risk)
     count, designs = screened(problem, starts, lattice)
-    options = {"bounds": dict(bounds), **stated, "risk": risk, "solver": solver}
-    options |= {"starts": starts, "lattice": lattice, "seed": seed}
     own = np.asarray(problem.start, float)
     before = evaluator.evaluate(own[None])
     if not np.isfinite(before.rows).all() and isinstance(x, Scene):
@@ -303,7 +291,7 @@ def _conclude(
         # exp(ln G) and the scaling back may end a rounding beyond a bound.
         ends = {
             name: np.asarray(np.clip(value, *options["bounds"][name]), problem.low.dtype)
-            for name, value in problem.values(path[-1]).items()
+            for name, value in problem.quantities(path[-1]).items()
         }
         final = replaced(x, ends)
     names, envelope, tolerance = (problem.residual_names, options["envelope"], options["tolerance"])

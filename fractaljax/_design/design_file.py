@@ -26,7 +26,7 @@ from .problem import state_problem
 from .tolerance import Tolerance
 
 _PACKAGE = __name__.split(".")[0]
-OPTIONS = (*[*inspect.signature(state_problem).parameters][1:], "risk", "solver", "starts")
+OPTIONS = (*[*inspect.signature(state_problem).parameters][1:-1], "risk", "solver", "starts")
 OPTIONS += ("lattice", "seed")  # the arguments of `design` that a file holds
 _NOT_RESULTS = {"scene", "initial", "result", "history", "options"}  # of the fields of a `Design`
 

@@ -4,7 +4,6 @@ The second objective becomes a requirement, at most a limit. A family of limits 
 and the value it has where the first objective is least gives the front (epsilon-constraint).
 """
 
-import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -108,14 +107,11 @@ def pareto(
                 f"no design meets every requirement, seen at the least {name}: "
                 f"{', '.join(end.violated)}"
             )
-    made = ends[0].options
-    shared = [*inspect.signature(state_problem).parameters][1:]
-    stated = {name: made[name] for name in shared}
-    own = made["constraints"]
+    made: dict[str, Any] = {**ends[0].options}
 
     def problem_at(limit: float, scale: float) -> DesignProblem:
-        limited = _Second(second, limit, scale)
-        return state_problem(x, **stated | {"objective": first, "constraints": (*own, limited)})
+        constraints: Any = (*made["constraints"], _Second(second, limit, scale))
+        return state_problem(x, **made | {"constraints": constraints})
 
     problem = problem_at(0.0, 1.0)
     places = np.stack([problem.scaled(end.scene) for end in ends])

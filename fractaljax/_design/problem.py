@@ -8,7 +8,6 @@ far it is from carrying load elastically. Where quantities scatter, a residual i
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -35,7 +34,7 @@ from .._mechanism.quantities import (
 from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure, require_single
 from .._stability.stability import growth_rate
-from .constraints import Constraint
+from .constraints import Constraint, Plain
 from .envelope import Envelope
 from .tolerance import Tolerance, nodes, quantile
 
@@ -67,13 +66,12 @@ class DesignProblem(eqx.Module):
     K_n_min: tuple[Float[Array, ""], ...]  # of each of the contacts
     area_ratio_min: Float[Array, ""]
     slip_ratio_max: Float[Array, ""]
-    constraints: tuple[Constraint | None, ...]  # None where `functions` has a plain function
+    constraints: tuple[Constraint, ...]
     scatter: Scatter | None
     names: tuple[str, ...] = eqx.field(static=True)
     logarithmic: tuple[bool, ...] = eqx.field(static=True)
     contacts: tuple[str, ...] = eqx.field(static=True)  # fractal ones that the design moves
     objective: Callable[[Any], Any] | None = eqx.field(static=True)
-    functions: tuple[Callable[[Any], Any] | None, ...] = eqx.field(static=True)
     friction_slope: bool = eqx.field(static=True)
     conditions: tuple[str, ...] = eqx.field(static=True)  # quantities of the envelope
 
@@ -113,12 +111,12 @@ class DesignProblem(eqx.Module):
                 model.append(10 * (state.slip_ratio - self.slip_ratio_max))
             stiff.append((K_n_min - state.K_n) / jnp.where(K_n_min > 0, K_n_min, 1))
         pressing = jnp.arcsinh((growth - self.target) / self.growth_scale)
-        own = [jnp.asarray(asked(x)) for asked in self.asked]
+        own = [jnp.asarray(asked(x)) for asked in self.constraints]
         value = jnp.sum((u - self.start) ** 2) if self.objective is None else self.objective(x)
-        surface = own_quantities(x) if "" in states else {}
-        numbers = {name: surface[name].value for name in ("D", "G") if surface}
-        numbers |= self.quantities(u)
-        numbers |= {"objective": value, "growth_rate": growth}
+        numbers = {}
+        if "" in states:  # of a scene
+            numbers |= {"D": x.contact.surface.D, "G": x.contact.surface.G}
+        numbers |= self.quantities(u) | {"objective": value, "growth_rate": growth}
         for name, state in states.items():
             for key in ("K_n", "K_t", "log_area_ratio", "slip_ratio"):
                 if getattr(state, key) is not None:
@@ -149,12 +147,6 @@ class DesignProblem(eqx.Module):
         return 3e4 * float(np.finfo(self.low.dtype).eps)
 
     @property
-    def asked(self) -> list[Any]:
-        """The constraints of the user, in their order."""
-        pairs = zip(self.constraints, self.functions, strict=True)
-        return [function if constraint is None else constraint for constraint, function in pairs]
-
-    @property
     def model_residuals(self) -> int:
         """How many residuals, the first, keep the joints inside the model."""
         return sum(_slips(self.x, name) + 1 for name in self.contacts)
@@ -168,28 +160,13 @@ class DesignProblem(eqx.Module):
             model.append(f"{of}a_l >= area_ratio_min a_e")
             model += [f"{of}Q_e <= slip_ratio_max mu_s P"] * _slips(self.x, name)
             stiff.append(f"{of}K_n >= K_n_min")
-        own = [
-            asked.name if isinstance(asked, Constraint) else getattr(asked, "__name__", repr(asked))
-            for asked in self.asked
-        ]
+        own = [asked.name for asked in self.constraints]
         return [*model, "growth_rate <= target", *stiff, *own]
-
-    def values(self, u: np.ndarray) -> dict[str, float]:
-        """The designed quantities at scaled variables u (v,), to rounding."""
-        low, high = np.asarray(self.low, float), np.asarray(self.high, float)
-        unscale = {
-            name: math.exp if log else float
-            for name, log in zip(self.names, self.logarithmic, strict=True)
-        }
-        return {
-            name: unscale[name](v)
-            for name, v in zip(self.names, low + u * (high - low), strict=True)
-        }
 
     def scaled(self, x: Mechanism) -> np.ndarray:
         """The scaled variables (v,) of a scene or structure."""
         values = np.array([float(value_of(x, name)) for name in self.names])
-        values = np.where(self.logarithmic, np.log(np.abs(values)), values)
+        values = np.log(values, out=values, where=self.logarithmic)
         low, high = np.asarray(self.low, float), np.asarray(self.high, float)
         return np.clip((values - low) / (high - low), 0, 1)
 
@@ -334,8 +311,9 @@ def state_problem(
     area_ratio_min: float,
     slip_ratio_max: float,
     friction_slope: bool,
+    **_: Any,
 ) -> DesignProblem:
-    """Check the arguments of `design` that state a problem, which that documents."""
+    """Check the arguments of `design` that state a problem, which that documents; no others."""
     if isinstance(x, Scene):
         require_scalar(x)
     elif isinstance(x, Structure):
@@ -372,10 +350,9 @@ def state_problem(
     everything = dict.fromkeys([*ranges, *(tolerance.quantities if tolerance else ())])
     require_independent(x, tuple(everything))
     logarithmic = tuple(_is_scale(x, name) and low > 0 for name, (low, _) in bounds.items())
-    low, high, own = (
-        np.array([math.log(v) if log else v for v, log in zip(column, logarithmic, strict=True)])
-        for column in (*zip(*bounds.values(), strict=True), [float(value_of(x, n)) for n in bounds])
-    )
+    own = [float(value_of(x, name)) for name in bounds]
+    ends = np.array([*zip(*bounds.values(), strict=True), own])
+    low, high, own = np.log(ends, out=ends, where=logarithmic)
     damping, frequency = _least_damping(x)
     own_condition = np.array([float(value_of(x, name)) for name in conditions])
     x = with_optional(x, tuple(everything))
@@ -390,7 +367,7 @@ def state_problem(
         target=-damping / 2 if target is None else scalar("target", target),
         growth_scale=max(damping, 1e-4 * frequency),
         K_n_min=(least,) * len(contacts),
-        constraints=tuple(c if isinstance(c, Constraint) else None for c in constraints),
+        constraints=tuple(c if isinstance(c, Constraint) else Plain(c) for c in constraints),
         scatter=scatter,
     )
     # In the precision of the scene, whatever that of the arguments.
@@ -402,7 +379,6 @@ def state_problem(
         logarithmic=logarithmic,
         contacts=contacts,
         objective=objective,
-        functions=tuple(None if isinstance(c, Constraint) else c for c in constraints),
         friction_slope=flag("friction_slope", friction_slope),
         conditions=conditions,
     )

@@ -87,7 +87,9 @@ def test_scaled_variables_are_logarithms_of_scales():
     bounds = {"D": (2.3, 2.8), "P": (500.0, 8000.0), "mu_s": (0.3, 0.5)}
     problem = stated(bounds=bounds)
     assert problem.logarithmic == (False, True, False)
-    np.testing.assert_allclose(list(problem.values(np.full(3, 0.5)).values()), [2.55, 2000, 0.4])
+    np.testing.assert_allclose(
+        list(problem.quantities(jnp.full(3, 0.5)).values()), [2.55, 2000, 0.4]
+    )
     np.testing.assert_allclose(problem.scaled(fj.brake_scene()), problem.start, rtol=1e-12)
     moved = problem.moved(jnp.array([0.2, 0.5, 1.0]), problem.own_condition)
     assert pytest.approx(2000) == moved.contact.P and moved.friction.mu_s == pytest.approx(0.5)
