@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 import fractaljax as fj
 from fractaljax._mechanism.oscillator import Linearised
-from fractaljax._stability.stability import growth_rate_of_linearised
+from fractaljax._stability.quartic import rightmost_root
 
 from .page import cell, columns as column, draw, filled, png, spread, subplots, table, verdict
 from .timing import in_batches, in_parts, ratio
@@ -132,7 +132,7 @@ def state_matrices(columns: Columns) -> tuple[np.ndarray, np.ndarray]:
     return A, omega
 
 
-closed_form = jax.vmap(growth_rate_of_linearised)
+closed_form = jax.vmap(lambda lin: rightmost_root(lin).real)
 
 
 @functools.partial(jax.vmap, in_axes=0)

@@ -1,9 +1,10 @@
 """`fractaljax stability`, `cycle` and `scene`."""
 
 from pathlib import Path
+from typing import Any
 
 from .output import csv_text, output, picture
-from .parsing import add_constant_friction, add_scene_file, load_scene
+from .parsing import add_constant_friction, add_scene_file, load_given
 
 _SAMPLES = 512  # of one period
 
@@ -24,16 +25,12 @@ def _stability(arguments) -> int:
     Of a structure (a file with a table of that name): the joints, and the modes that are unstable
     or least damped.
     """
-    from .._mechanism.scene import brake_scene
-    from .._mechanism.structure import Structure, load
+    from .._mechanism.structure import Structure
     from .._stability.summary import stability_table, structure_table
 
-    subject = brake_scene() if arguments.scene is None else load(arguments.scene)
-    slope = not arguments.constant_friction
-    if isinstance(subject, Structure):
-        print(structure_table(subject, slope))
-    else:
-        print(stability_table(subject, slope))
+    subject = load_given(arguments.scene, structures=True)
+    table: Any = structure_table if isinstance(subject, Structure) else stability_table
+    print(table(subject, not arguments.constant_friction))
     return 0
 
 
@@ -65,7 +62,7 @@ def _cycle(arguments) -> int:
     from .._dynamics.summary import cycle_table
     from .._stability.stability import require_computable
 
-    scene = load_scene(arguments)
+    scene = load_given(arguments.scene)
     require_computable(scene)
     options = {name: getattr(arguments, name) for name in ("start", "rtol", "max_returns")}
     options = {name: value for name, value in options.items() if value is not None}

@@ -4,7 +4,14 @@ import inspect
 from pathlib import Path
 
 from .output import csv_text, npy, output, picture
-from .parsing import add_constant_friction, add_scene_file, low_and_high, number, pairs_of, remarks
+from .parsing import (
+    add_constant_friction,
+    add_scene_file,
+    load_given,
+    number,
+    pairs_of,
+    remarks,
+)
 
 _UNITS = {"G": "m", "growth_rate": "1/s", "K_n": "N/m", "K_t": "N/m"}  # of the history
 _LIMITS = {  # option: class of `fractaljax.constraints`, and its meaning
@@ -82,12 +89,10 @@ def _run(arguments) -> int:
     from .. import plot
     from .._design.design import design
     from .._design.design_file import design_files, read_design
-    from .._mechanism.scene import brake_scene
-    from .._mechanism.structure import Structure, load
+    from .._mechanism.structure import Structure
 
     if arguments.repeat is None:
-        x = brake_scene() if arguments.scene is None else load(arguments.scene)
-        options = _options(arguments)
+        x, options = load_given(arguments.scene, structures=True), _options(arguments)
     else:
         given = [name for name in arguments.own if getattr(arguments, name) not in (None, False)]
         if given:
@@ -170,13 +175,15 @@ def _constraints(arguments) -> list:
     more["friction_slope"] = not arguments.constant_friction
     found = []
     for name, (kind, _) in _LIMITS.items():
-        limits = low_and_high(f"--{name}", getattr(arguments, name.replace("-", "_")))
-        if limits is None:
+        text = getattr(arguments, name.replace("-", "_"))
+        if text is None:
             continue
+        low, _, high = text.partition(":")
+        asked = {"at_least": low, "at_most": high}
+        asked = {end: number(f"--{name}", x) if x else None for end, x in asked.items()}
         law = getattr(constraints, kind)
         takes = inspect.signature(law).parameters
-        asked = dict(zip(("at_least", "at_most"), limits, strict=True))
-        if asked.get("at_most") is not None and "at_most" not in takes:
+        if asked["at_most"] is not None and "at_most" not in takes:
             raise ValueError(f"--{name} has a lower limit only: LOW:")
         found.append(law(**{key: x for key, x in (asked | more).items() if key in takes}))
     return found

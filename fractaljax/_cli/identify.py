@@ -4,6 +4,7 @@ import shlex
 from pathlib import Path
 
 from .output import output, picture
+from .parsing import load_given
 
 _FOLDER = Path("fractaljax-identification")
 _OPTIONS = {
@@ -49,9 +50,8 @@ def _run(arguments) -> int:
     from .. import plot
     from .._identify.files import read_measurement
     from .._identify.identify import identify
-    from .._mechanism.scene import Scene, brake_scene
 
-    base = brake_scene() if arguments.scene is None else Scene.load(arguments.scene)
+    base = load_given(arguments.scene)
     if not base.contact.fractal:
         raise ValueError(f"{arguments.scene}: its joint is fixed and takes no surface")
     names = ("dx", "dy", "unit", "position_unit", "channel")

@@ -6,10 +6,7 @@ import re
 import sys
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from .._mechanism.scene import Scene
+from typing import Any
 
 
 class _Once(argparse.Action):
@@ -100,19 +97,14 @@ def add_constant_friction(parser) -> None:
     )
 
 
-def load_scene(arguments) -> "Scene":
-    """The scene of the file that is given; else the reference brake."""
+def load_given(path: Path | None, structures: bool = False) -> Any:
+    """The scene, or also a structure, in the file that is given; else the reference brake."""
     from .._mechanism.scene import Scene, brake_scene
+    from .._mechanism.structure import load
 
-    return brake_scene() if arguments.scene is None else Scene.load(arguments.scene)
-
-
-def low_and_high(option: str, text: str | None) -> tuple[float | None, ...] | None:
-    """LOW:HIGH as two numbers, None where one is absent; LOW alone is LOW:."""
-    if text is None:
-        return None
-    low, _, high = text.partition(":")
-    return tuple(number(option, end) if end else None for end in (low, high))
+    if path is None:
+        return brake_scene()
+    return load(path) if structures else Scene.load(path)
 
 
 def pairs_of(option: str, texts: list[str], form: str) -> dict[str, str]:

@@ -199,13 +199,8 @@ def contact_load(
     """
     require_kind("surface", surface, Surface)
     require_kind("material", material, Material)
-    mu_m = number("mu_m", mu_m, at_least=0, at_most=MU_M_MAX)
-    return load_of_area(surface, material, number("A_r", A_r, above=0), mu_m)
-
-
-def load_of_area(surface: Surface, material: Material, A_r: Numbers, mu_m: Numbers) -> Numbers:
-    """As `contact_load`, without checks."""
-    D, k_mu = surface.D, friction_correction(mu_m)
+    A_r = number("A_r", A_r, above=0)
+    D, k_mu = surface.D, friction_correction(number("mu_m", mu_m, at_least=0, at_most=MU_M_MAX))
     log_a_e = log_critical_area(surface, material, k_mu)
     t = jnp.log((3 - D) / (D - 1) * A_r) - log_a_e
     elastic = t > 0

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from .._base.parts import Record
+from .._base.table import table
 from .._surface.surface import Surface
 from .band import HIGHEST, LOWEST, PER_RESOLUTION, chosen_band, given_band
 from .fit import PowerLaw
@@ -60,8 +61,6 @@ class Identification(Record):
         return Surface(self.D, self.G, self.gamma)
 
     def __repr__(self) -> str:
-        from .._base.table import table
-
         other, (low, high) = self.structure_function, self.band
         rows = {
             "D": f"{self.D:.4f} +- {self.D_standard_error:.4f}",

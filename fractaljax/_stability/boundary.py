@@ -28,7 +28,7 @@ from .._mechanism.quantities import (
 )
 from .._mechanism.scene import Scene, require_kind
 from .critical_friction import critical_frequency, hopf_test_function
-from .stability import growth_rate_of_linearised
+from .quartic import rightmost_root
 
 _BATCH = 512  # points evaluated at once
 _LINES_MAX = 2000  # of the lattice, whose points grow with the square
@@ -209,7 +209,7 @@ class _Plane(eqx.Module):
         load, slope = scene.normal_load, self.friction_slope
         lin = linearise(scene.oscillator, friction, K_n, K_t, slope, load)
         damping = jnp.stack([lin.c_1, lin.c_2]) / jnp.sqrt(lin.a + lin.b)
-        growth = growth_rate_of_linearised(lin)
+        growth = rightmost_root(lin).real
         return _Point(hopf_test_function(lin), critical_frequency(lin), growth, damping, *law)
 
 

@@ -141,12 +141,7 @@ def growth_rate(scene: Scene | Structure, friction_slope: bool = True) -> Float[
         s = solve(*assembled(scene, friction_slope).matrices).s
         # An argmax: sorting would double the time to compile.
         return s.real[jnp.argmax(s.real)]
-    return growth_rate_of_linearised(linearised(scene, friction_slope))
-
-
-def growth_rate_of_linearised(lin: Linearised) -> Float[Array, ""]:
-    """Largest real part of the roots of a characteristic polynomial [1/s], a scalar."""
-    return quartic.rightmost_root(lin).real
+    return quartic.rightmost_root(linearised(scene, friction_slope)).real
 
 
 @functools.partial(jax.jit, static_argnames="friction_slope")

@@ -4,10 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from .._base.ranges import is_logarithmic
-from .._mechanism.quantities import label
+from .._base.ranges import within
 from .._stability.boundary import Boundary, BranchEnd
-from .axes import Axes, given_or_new, legend_above
+from .axes import Axes, given_or_new, legend_above, over_quantity
 
 
 def boundary(result: Boundary, ax: Axes | None = None) -> Axes:
@@ -18,9 +17,7 @@ def boundary(result: Boundary, ax: Axes | None = None) -> Axes:
 
     ax = given_or_new(ax)
     for which, (name, low, high) in (("x", result.x), ("y", result.y)):
-        scale = "log" if is_logarithmic(low, high) else "linear"
-        ax.set(**{f"{which}scale": scale, f"{which}label": label(result.scene, name)})
-        ax.set(**{f"{which}lim": (low, high)})
+        over_quantity(ax, which, result.scene, name, within(low, high, np.array([0, 0.5, 1])))
     if not result.branches:
         words = "it squeals" if result.squeals else "stable"
         ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", va="center")

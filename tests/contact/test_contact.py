@@ -228,7 +228,7 @@ def loads(x, A_r):
     def log_P(move):
         D, G, A = x[0] + move[0], x[1] * jnp.exp(move[1]), A_r * jnp.exp(move[2])
         surface = substitute(BRAKE.surface, {"D": D, "G": G, "gamma": x[2]})
-        return jnp.log(fractal.load_of_area(surface, material, A, x[9]))
+        return jnp.log(fj.contact_load(surface, material, A, mu_m=x[9]))
 
     still = jnp.zeros(3, x.dtype)
     return jnp.exp(log_P(still)), jax.jacfwd(log_P)(still), jax.jacrev(log_P)(still)
