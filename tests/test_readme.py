@@ -16,7 +16,7 @@ def blocks(page, language):
     return re.findall(rf"```{language}\n(.*?)```", (ROOT / page).read_text(), flags=re.DOTALL)
 
 
-@pytest.mark.parametrize("page", [README, GUIDE])
+@pytest.mark.parametrize("page", [README, pytest.param(GUIDE, marks=pytest.mark.slow)])
 def test_examples_print_what_is_printed(page, capsys, tmp_path, monkeypatch):
     """The output shown is printed digit for digit, and the picture of the guide is drawn."""
     monkeypatch.chdir(tmp_path)

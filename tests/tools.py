@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import matplotlib.image
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 import fractaljax as fj
 from fractaljax.__main__ import main
@@ -60,6 +61,13 @@ def both_modes(function, x, has_aux=False) -> tuple[Any, ...]:
     rows = jnp.eye(value.size, dtype=value.dtype).reshape(-1, *value.shape)
     (reverse,) = jax.vmap(jax.linear_transpose(linear, x))(rows)
     return value, forward, reverse.reshape(*value.shape, x.size), *aux
+
+
+def both_gradients(function, x) -> list[Any]:
+    """Gradients of a scalar function by a pytree of numbers, in forward and in reverse mode."""
+    row, unravel = ravel_pytree(x)
+    _, *slopes = both_modes(lambda row: function(unravel(row)), row)
+    return [unravel(slope) for slope in slopes]
 
 
 def labels(ax) -> list[str]:

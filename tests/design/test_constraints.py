@@ -18,7 +18,7 @@ from fractaljax._design.constraints import (
     Roughness,
 )
 from fractaljax._surface.roughness import root_mean_square_height
-from tools import reference_scene, state_matrix
+from tools import both_modes, reference_scene, state_matrix
 
 ALL = {
     "K_n >= 4e+08 N/m": NormalStiffness(4e8),
@@ -44,7 +44,7 @@ def everything(scene):
         return jnp.stack([constraint(moved) for constraint in ALL.values()])
 
     x = jnp.stack([scene.contact.surface.D, jnp.log(scene.contact.surface.G)])
-    return values(x), jax.jacfwd(values)(x), jax.jacrev(values)(x)
+    return both_modes(values, x)
 
 
 def test_names():

@@ -427,6 +427,7 @@ def test_tolerance_within_an_envelope(scene, enveloped):
     assert best.squeal_probability == pytest.approx(float(jnp.mean(growth > 0)), abs=2e-4)
 
 
+@pytest.mark.slow
 def test_seed_is_that_of_the_samples(scene):
     """Another seed gives the same surface, and another draw; the same gives the same."""
     runs = [

@@ -70,6 +70,7 @@ def test_members_meet_every_requirement_and_trade(front):
         assert float(fineness(scene)) == pytest.approx(front.second[i], rel=1e-9)
 
 
+@pytest.mark.slow
 def test_picture(front):
     """Every member, with the names of the objectives at the axes."""
     ax = draw(front)
