@@ -52,6 +52,7 @@ def test_links_lead_somewhere(page):
         assert "://" in target or ((ROOT / page).parent / target).is_file(), target
 
 
+@pytest.mark.slow
 def test_pictures_are_those_the_command_writes(tmp_path, capsys):
     """The committed pictures are what `fractaljax design` draws, up to the rendering of type."""
     assert main(["design", "--quiet", "--out", str(tmp_path)]) == 0

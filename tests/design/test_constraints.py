@@ -76,6 +76,7 @@ def test_values_and_signs(scene):
     np.testing.assert_array_equal(np.asarray(values) <= 0, met)
 
 
+@pytest.mark.slow
 def test_derivatives(scene):
     """Both modes against differences."""
     _, forward, reverse = everything(scene)
@@ -91,6 +92,7 @@ def test_derivatives(scene):
         np.testing.assert_allclose((pair[0] - pair[1]) / (2 * step), forward[:, i], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_fully_plastic_joints_know_the_way_back(scene):
     """Not met, finite, larger the deeper, and continuous at the critical area."""
     wanting = [0, 1, 2]

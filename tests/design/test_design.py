@@ -195,6 +195,7 @@ def test_all_plastic_bounds_are_infeasible(scene):
     assert fj.growth_rate(best.scene) < -math.pi
 
 
+@pytest.mark.slow
 def test_objective_replaces_distance(scene):
     """With the growth rate as objective no grid point that meets the rest does better."""
     best = fj.design(scene, objective=fj.growth_rate, progress=False)

@@ -59,6 +59,7 @@ def test_eps_decides_what_is_found():
         fj.limit_cycle(reference_scene(), regularisation=COARSE)
 
 
+@SLOW
 @pytest.mark.parametrize("eps", [COARSE, 2e-3, MIDDLE, 1e-3])
 def test_error_is_the_largest_difference(eps):
     """From the exact law's cycle, of period and both amplitudes. One return is one period."""
@@ -69,6 +70,7 @@ def test_error_is_the_largest_difference(eps):
     np.testing.assert_allclose(found.regularisation_error, largest, rtol=1e-9)
 
 
+@SLOW
 @pytest.mark.parametrize("eps", [COARSE, MIDDLE])
 def test_orbit(eps):
     """The motion through one period returns to `state`, and everything told of it is its own."""
@@ -96,6 +98,7 @@ def test_orbit(eps):
         found.switches()
 
 
+@SLOW
 def test_multipliers():
     """One is 1, the others attract; their product is the divergence's integral (Liouville)."""
     found, system = cycle(COARSE), stick_slip(reference_scene())
@@ -111,6 +114,7 @@ def test_multipliers():
     np.testing.assert_allclose(np.prod(values).real, expected, rtol=1e-3)
 
 
+@SLOW
 def test_no_motion():
     """Where steady sliding attracts there is no cycle of either law."""
     found = fj.limit_cycle(motionless_scene(), regularisation=COARSE, throw=False)
@@ -119,6 +123,7 @@ def test_no_motion():
         assert np.isnan(value).all()
 
 
+@SLOW
 def test_amplitude_near_slope_far():
     """Where values are 0.3 percent off, the derivative by K_n is off by more than ten."""
     assert abs(difference() / SLOPE - 1) > 0.1

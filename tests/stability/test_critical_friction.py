@@ -89,7 +89,7 @@ def test_closed_form_is_the_root_of_the_hurwitz_determinant():
     K_n, m, omega = log_uniform(rng, 5, 11, n), log_uniform(rng, -1, 1, n), (2, 5, (2, n))
     omega = log_uniform(rng, *omega)
     columns = K_n, K_n * rng.uniform(0.01, 1, n), m, *omega, *log_uniform(rng, -5, 0, (2, n))
-    found = jax.vmap(of_numbers)([jnp.asarray(x) for x in columns])
+    found = jax.jit(jax.vmap(of_numbers))([jnp.asarray(x) for x in columns])
     for value, *x in zip(found, *columns, strict=True):
         wanted = exact(*x)
         # a - b may have lost digits to rounding.
