@@ -16,10 +16,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from fractaljax._dynamics.stick_slip import scaled_start, sliding_equilibrium, stick_slip
 
 import fractaljax as fj
 from fractaljax._dynamics import transient
-from fractaljax._dynamics.stick_slip import scaled_start, sliding_equilibrium, stick_slip
 
 from .page import draw, png, spread, subplots, table, verdict
 from .timing import compiled, devices, ended, ratio, seconds, started, taking_turns, versions

@@ -20,13 +20,13 @@ def pytest_configure(config):
     # Most of a run is compilation: workers, subprocesses and later runs share what is compiled.
     from fractaljax._cli.compiled import FIRST_QUIET_JAX
 
-    if jax.__version_info__ < FIRST_QUIET_JAX:
-        return
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(config.cache.mkdir("jax"))
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-    jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
+    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(config.cache.mkdir("jax"))
+    jax.config.update("jax_compilation_cache_dir", folder)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    # Of older ones, which print notes when they load a program, only pytest sees standard error.
+    if jax.__version_info__ >= FIRST_QUIET_JAX:
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -34,10 +34,7 @@ def numbers(pattern, text):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "pattern"),
-    [
-        pytest.param("float32", MEASURED, marks=pytest.mark.slow),
-        ("figures_7_to_10", NUMBER),
-    ],
+    [("float32", MEASURED), ("figures_7_to_10", NUMBER)],
 )
 def test_page_has_the_text_that_its_script_generates(name, pattern):
     committed, now = (pattern.sub("#", page) for page in pages(name))
@@ -52,6 +49,7 @@ def test_float32_page_has_the_numbers_that_are_measured_now():
     np.testing.assert_array_less(np.abs(np.log(committed) - np.log(now)), np.log(3))
 
 
+@pytest.mark.slow
 def test_figures_page_has_the_numbers_that_are_found_now():
     committed, now = (numbers(NUMBER, page) for page in pages("figures_7_to_10"))
     assert len(now) > 100

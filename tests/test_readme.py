@@ -16,7 +16,7 @@ def blocks(page, language):
     return re.findall(rf"```{language}\n(.*?)```", (ROOT / page).read_text(), flags=re.DOTALL)
 
 
-@pytest.mark.parametrize("page", [README, GUIDE])
+@pytest.mark.parametrize("page", [README, pytest.param(GUIDE, marks=pytest.mark.slow)])
 def test_examples_print_what_is_printed(page, capsys, tmp_path, monkeypatch):
     """The output shown is printed digit for digit, and the picture of the guide is drawn."""
     monkeypatch.chdir(tmp_path)
@@ -52,6 +52,7 @@ def test_links_lead_somewhere(page):
         assert "://" in target or ((ROOT / page).parent / target).is_file(), target
 
 
+@pytest.mark.slow
 def test_pictures_are_those_the_command_writes(tmp_path, capsys):
     """The committed pictures are what `fractaljax design` draws, up to the rendering of type."""
     assert main(["design", "--quiet", "--out", str(tmp_path)]) == 0

@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import matplotlib.image
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 import fractaljax as fj
 from fractaljax.__main__ import main
@@ -47,6 +49,25 @@ def motionless_scene() -> fj.Scene:
 def reference_cycle() -> fj.LimitCycle:
     """The limit cycle of the reference scene, computed once."""
     return fj.limit_cycle(reference_scene())
+
+
+def both_modes(function, x, has_aux=False) -> tuple[Any, ...]:
+    """Value, forward and reverse Jacobian (value's shape, n) at x (n,), and aux: from one trace.
+
+    `jax.jacfwd` beside `jax.jacrev` would trace and compile the same function twice.
+    """
+    value, linear, *aux = jax.linearize(function, x, has_aux=has_aux)
+    forward = jax.vmap(linear, out_axes=-1)(jnp.eye(x.size, dtype=x.dtype))
+    rows = jnp.eye(value.size, dtype=value.dtype).reshape(-1, *value.shape)
+    (reverse,) = jax.vmap(jax.linear_transpose(linear, x))(rows)
+    return value, forward, reverse.reshape(*value.shape, x.size), *aux
+
+
+def both_gradients(function, x) -> list[Any]:
+    """Gradients of a scalar function by a pytree of numbers, in forward and in reverse mode."""
+    row, unravel = ravel_pytree(x)
+    _, *slopes = both_modes(lambda row: function(unravel(row)), row)
+    return [unravel(slope) for slope in slopes]
 
 
 def labels(ax) -> list[str]:

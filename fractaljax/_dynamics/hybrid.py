@@ -7,6 +7,7 @@ of a joint and, where the joint has a tangential spring, along its normal. The c
 or 2 (open, both faces of a joint together). Components are the first axis; lanes may follow.
 """
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -87,12 +88,14 @@ class HybridSystem(eqx.Module):
 
     def _each(self, function, *arrays) -> Array:
         """function(law, *rows) of each face, with the law of its joint."""
-        rows = [None] * sum(map(len, self.faces))
-        for law, faces in zip(self.laws, self.faces, strict=True):
-            own = slice(faces[0], faces[-1] + 1)
-            for i, row in zip(faces, function(law, *(x[own] for x in arrays)), strict=True):
-                rows[i] = row
-        return jnp.stack(rows)
+        joints = zip(self.laws, self.faces, strict=True)
+        one = (
+            jax.vmap(functools.partial(function, law))(
+                *(x[faces[0] : faces[-1] + 1] for x in arrays)
+            )
+            for law, faces in joints
+        )
+        return jnp.concatenate(list(one))
 
     def limits(self, loads) -> Array:
         """The largest friction force of each face in stick (f, ...)."""

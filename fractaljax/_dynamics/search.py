@@ -60,6 +60,7 @@ class Attractor(eqx.Module):
     status: Int[Array, "..."]
     period_returns: Int[Array, "..."]  # in one period
     error: Float[Array, "..."]  # of the periodic orbit, relative
+    returns: Float[Array, "..."]  # of the run
 
 
 class _Run(eqx.Module):
@@ -393,7 +394,7 @@ def _find(
         return _Run(y, s, run.guard, steps), known, rounds + 1
 
     _, known, _ = jax.lax.while_loop(running, body, (run, known, 0))
-    return Attractor(known.orbit, known.status, known.period_returns, known.error)
+    return Attractor(known.orbit, known.status, known.period_returns, known.error, known.returns)
 
 
 def find(

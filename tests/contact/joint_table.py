@@ -10,6 +10,7 @@ import numpy as np
 
 import fractaljax as fj
 from fractaljax._base.parts import substitute
+from tools import both_modes
 
 INPUTS = ("D", "G", "gamma", "E", "nu", "sigma_y", "H", "P", "mu_s", "mu_m")
 TABLED = ("D", "G", "P")  # inputs with derivatives in the table: by D, ln G, ln P
@@ -43,12 +44,15 @@ def _state(x):
 @jax.jit
 @jax.vmap
 def _everything(x):
-    def numbers(move):
-        state = vars(_state(jnp.where(ABSOLUTE, x + move, x * jnp.exp(move))))
-        return {name: value for name, value in state.items() if name != "regime"}
+    state = _state(x)
+    names = [name for name in vars(state) if name != "regime"]
 
-    still = jnp.zeros_like(x)
-    return _state(x), jax.jacfwd(numbers)(still), jax.jacrev(numbers)(still)
+    def numbers(move):
+        moved = vars(_state(jnp.where(ABSOLUTE, x + move, x * jnp.exp(move))))
+        return jnp.stack([moved[name] for name in names])
+
+    _, *slopes = both_modes(numbers, jnp.zeros_like(x))
+    return state, *(dict(zip(names, slope, strict=True)) for slope in slopes)
 
 
 def everything(x, dtype: Any = np.float64):

@@ -30,7 +30,7 @@ from benchmarks.exact_joint import exact_joint
 from fractaljax._base.parts import substitute
 from fractaljax._contact import fractal, load_balance
 from reference import make_contact
-from tools import primitives
+from tools import both_modes, primitives
 
 EPS = float(np.finfo(float).eps)
 EPS32 = float(np.finfo(np.float32).eps)
@@ -230,8 +230,8 @@ def loads(x, A_r):
         surface = substitute(BRAKE.surface, {"D": D, "G": G, "gamma": x[2]})
         return jnp.log(fj.contact_load(surface, material, A, mu_m=x[9]))
 
-    still = jnp.zeros(3, x.dtype)
-    return jnp.exp(log_P(still)), jax.jacfwd(log_P)(still), jax.jacrev(log_P)(still)
+    found, *slopes = both_modes(log_P, jnp.zeros(3, x.dtype))
+    return jnp.exp(found), *slopes
 
 
 def test_load_of_every_area():
@@ -282,7 +282,7 @@ def lost(x):
     return EPS * (100 + 50 / (x[:, 0] - 2))
 
 
-@pytest.mark.parametrize("seeds", [range(2), pytest.param(range(2, 90), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seeds", [range(2), pytest.param(range(2, 20), marks=pytest.mark.slow)])
 def test_wide_domain(seeds):
     for seed in seeds:
         x = wide_joints(seed)

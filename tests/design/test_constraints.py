@@ -18,7 +18,7 @@ from fractaljax._design.constraints import (
     Roughness,
 )
 from fractaljax._surface.roughness import root_mean_square_height
-from tools import reference_scene, state_matrix
+from tools import both_modes, reference_scene, state_matrix
 
 ALL = {
     "K_n >= 4e+08 N/m": NormalStiffness(4e8),
@@ -44,7 +44,7 @@ def everything(scene):
         return jnp.stack([constraint(moved) for constraint in ALL.values()])
 
     x = jnp.stack([scene.contact.surface.D, jnp.log(scene.contact.surface.G)])
-    return values(x), jax.jacfwd(values)(x), jax.jacrev(values)(x)
+    return both_modes(values, x)
 
 
 def test_names():
@@ -76,6 +76,7 @@ def test_values_and_signs(scene):
     np.testing.assert_array_equal(np.asarray(values) <= 0, met)
 
 
+@pytest.mark.slow
 def test_derivatives(scene):
     """Both modes against differences."""
     _, forward, reverse = everything(scene)
@@ -91,6 +92,7 @@ def test_derivatives(scene):
         np.testing.assert_allclose((pair[0] - pair[1]) / (2 * step), forward[:, i], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_fully_plastic_joints_know_the_way_back(scene):
     """Not met, finite, larger the deeper, and continuous at the critical area."""
     wanting = [0, 1, 2]

@@ -107,6 +107,7 @@ def test_a_structure_has_files_beside_it(tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_single_precision_stays_single(tmp_path):
     """The scene is read in the precision it had."""
     single = jax.tree.map(lambda x: x.astype(jnp.float32), fj.brake_scene())

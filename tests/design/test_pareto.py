@@ -70,6 +70,7 @@ def test_members_meet_every_requirement_and_trade(front):
         assert float(fineness(scene)) == pytest.approx(front.second[i], rel=1e-9)
 
 
+@pytest.mark.slow
 def test_picture(front):
     """Every member, with the names of the objectives at the axes."""
     ax = draw(front)
@@ -83,7 +84,9 @@ def test_picture(front):
         ({"points": 2}, "points must be a whole number of at least 3, got 2"),
         ({"envelope": {"P": (1.0, 2.0)}}, "pareto does not take envelope"),
         ({"bounds": {"D": (2.5, 2.3)}}, "bounds on D must be (lower, upper)"),
-        ({"K_n_min": 1e14}, "no design meets every requirement"),
+        pytest.param(
+            {"K_n_min": 1e14}, "no design meets every requirement", marks=pytest.mark.slow
+        ),
     ],
 )
 def test_refusals(options, message):

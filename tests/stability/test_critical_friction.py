@@ -15,7 +15,7 @@ from fractaljax._mechanism.quantities import sliding_friction, with_friction_tim
 from fractaljax._stability.critical_friction import critical_frequency, hopf_test_function
 from fractaljax._stability.linearise import linearised
 from quartics import log_uniform, many_rightmost, stacked
-from tools import reference_scene
+from tools import both_gradients, both_modes, reference_scene
 
 BRAKE = fj.brake_scene()
 slow = pytest.mark.slow
@@ -89,7 +89,7 @@ def test_closed_form_is_the_root_of_the_hurwitz_determinant():
     K_n, m, omega = log_uniform(rng, 5, 11, n), log_uniform(rng, -1, 1, n), (2, 5, (2, n))
     omega = log_uniform(rng, *omega)
     columns = K_n, K_n * rng.uniform(0.01, 1, n), m, *omega, *log_uniform(rng, -5, 0, (2, n))
-    found = jax.vmap(of_numbers)([jnp.asarray(x) for x in columns])
+    found = jax.jit(jax.vmap(of_numbers))([jnp.asarray(x) for x in columns])
     for value, *x in zip(found, *columns, strict=True):
         wanted = exact(*x)
         # a - b may have lost digits to rounding.
@@ -104,8 +104,7 @@ def test_gradients_of_the_closed_form():
         h = x * mp.mpf(10) ** -15
         ends = [exact(*at[:i], x + sign * h, *at[i + 1 :]) for sign in (1, -1)]
         wanted.append(float((ends[0] - ends[1]) / (2 * h)))
-    for mode in (jax.jacfwd, jax.jacrev):
-        found = mode(of_numbers)([jnp.asarray(x) for x in at])
+    for found in jax.jit(lambda x: both_gradients(of_numbers, x))(list(at)):
         np.testing.assert_allclose(found, wanted, rtol=1e-11)
     assert float(gradient(fixed()).friction.mu_s) == 0  # the scene's own friction does not matter
 
@@ -159,38 +158,38 @@ def leaf(scene, quantity):
     return scene.contact.surface.D if quantity == "D" else scene.oscillator.V
 
 
-@functools.partial(jax.jit, static_argnums=2)
 def critical(scene, x, quantity):
-    scene = eqx.tree_at(lambda s: leaf(s, quantity), scene, x)
-    return fj.critical_friction(scene)
+    return fj.critical_friction(eqx.tree_at(lambda s: leaf(s, quantity), scene, x))
 
 
-slope_forward = jax.jit(jax.jacfwd(critical, 1), static_argnums=2)
-slope_reverse = jax.jit(jax.grad(critical, 1), static_argnums=2)
+@functools.partial(jax.jit, static_argnums=2)
+def value_and_slopes(scene, x, quantity):
+    """The critical friction, and its derivative in forward and in reverse mode."""
+    found = both_modes(lambda x: critical(scene, x[0], quantity), jnp.asarray(x)[None])
+    return jnp.stack([jnp.ravel(number)[0] for number in found])
+
+
 bend = jax.jit(jax.jacfwd(jax.grad(critical, 1), 1), static_argnums=2)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", ["slope", pytest.param("driven", marks=slow), pytest.param("fractal", marks=slow)]
-)
+@pytest.mark.parametrize("name", QUICK)
 def test_gradients_of_the_first_root(name):
     """Both modes and the second derivative against differences of the root."""
     scene, quantity = SCENES[name], "D" if name == "fractal" else "V"
     at = float(leaf(scene, quantity))
     h = (2e-4 if name == "fractal" else 2e-3) * at
 
-    def by_differences(f):  # sixth order
-        ends = [[float(f(scene, at + k * h, quantity)) for k in (i, -i)] for i in (1, 2, 3)]
-        d = [(up - down) / (2 * k * h) for k, (up, down) in enumerate(ends, start=1)]
-        return 1.5 * d[0] - 0.6 * d[1] + 0.1 * d[2]
-
-    reverse = float(slope_reverse(scene, at, quantity))
-    assert reverse == pytest.approx(by_differences(critical), rel=1e-5)
-    assert float(slope_forward(scene, at, quantity)) == pytest.approx(reverse, rel=1e-12)
+    d = []
+    for k in (1, 2, 3):  # sixth order
+        up, down = (np.asarray(value_and_slopes(scene, at + x, quantity)) for x in (k * h, -k * h))
+        d.append((up - down) / (2 * k * h))
+    difference, _, bent = 1.5 * d[0] - 0.6 * d[1] + 0.1 * d[2]
+    _, forward, reverse = np.asarray(value_and_slopes(scene, at, quantity))
+    assert reverse == pytest.approx(difference, rel=1e-5)
+    assert forward == pytest.approx(reverse, rel=1e-12)
     if name == "driven":  # second derivatives compile slowly
-        found = float(bend(scene, at, quantity))
-        assert found == pytest.approx(by_differences(slope_reverse), rel=1e-4)
+        assert float(bend(scene, at, quantity)) == pytest.approx(bent, rel=1e-4)
 
 
 # --- corner cases -------------------------------------------------------------------------

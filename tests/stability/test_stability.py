@@ -16,7 +16,7 @@ import pytest
 import fractaljax as fj
 from quartics import coefficients, in_units, quartic_roots
 from structures import two_joints
-from tools import primitives, reference_scene
+from tools import both_gradients, primitives, reference_scene
 
 BRAKE = fj.brake_scene()
 OSCILLATOR = BRAKE.oscillator
@@ -103,7 +103,9 @@ def of_numbers(scene, changes):
     return fj.growth_rate(scene.replace(**changes))
 
 
-GRADIENTS = [jax.jit(mode(of_numbers, argnums=1)) for mode in (jax.jacfwd, jax.jacrev)]
+@jax.jit
+def gradients(scene, changes):
+    return both_gradients(lambda changes: of_numbers(scene, changes), changes)
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -118,8 +120,7 @@ def test_growth_rate_and_its_gradients(name):
     exact = chain(x)
     growth = float(fj.growth_rate(scene))
     assert abs(growth - exact.real) <= 1e-12 * abs(exact)
-    for gradient in GRADIENTS:
-        found = gradient(scene, {key: float(value) for key, value in x.items()})
+    for found in gradients(scene, {key: float(value) for key, value in x.items()}):
         for key, slope in exact_slopes(x).items():
             assert abs(float(found[key]) - slope.real) <= 1e-9 * abs(slope), key
 
@@ -133,16 +134,16 @@ def changed(x):
     return BRAKE.replace(G=jnp.exp(x["log G"]), **others)
 
 
-THROUGH_CONTACT = [
-    jax.jit(mode(lambda x: fj.growth_rate(changed(x)))) for mode in (jax.jacfwd, jax.jacrev)
-]
+@jax.jit
+def through_contact(x):
+    return both_gradients(lambda x: fj.growth_rate(changed(x)), x)
 
 
 def test_gradients_through_the_contact_law():
     """d lambda = lambda_K dK + lambda_x dx, with lambda_K exact and dK by differences."""
     stiffness = jax.jit(lambda x: jnp.stack(fj.stiffness(changed(x))))
     slopes = exact_slopes(numbers_of(BRAKE))
-    found = [gradient(KNOWN) for gradient in THROUGH_CONTACT]
+    found = through_contact(KNOWN)
     for name, x in KNOWN.items():
         h, d = 1e-3 if name == "D" else 6e-4 * abs(x), []
         for k in (1, 2, 3):  # sixth order
@@ -156,8 +157,7 @@ def test_gradients_through_the_contact_law():
 
 def test_fully_plastic_joint_has_no_gradient():
     """No elastic contact, no stiffness: D and G change nothing, exactly."""
-    for gradient in THROUGH_CONTACT:
-        found = gradient(KNOWN | {"log G": float(np.log(1.342e-8))})
+    for found in through_contact(KNOWN | {"log G": float(np.log(1.342e-8))}):
         assert float(found["D"]) == float(found["log G"]) == 0
 
 

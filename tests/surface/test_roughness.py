@@ -13,6 +13,7 @@ from scipy.special import j0
 
 import fractaljax as fj
 from fractaljax._surface.roughness import root_mean_square_height, roughness
+from tools import both_modes
 
 L, N, KEYS, GAMMA, G = 1e-3, 48, 150, 1.5, 1e-10
 
@@ -36,7 +37,7 @@ def everything(x, L_s):
         found = roughness(fj.Surface(*x[:3]), x[3], L_s)
         return jnp.stack([found.Sq, found.Sdq])
 
-    return both(x), jax.jacfwd(both)(x), jax.jacrev(both)(x)
+    return both_modes(both, x)
 
 
 @pytest.mark.parametrize(
