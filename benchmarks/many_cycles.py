@@ -16,10 +16,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from fractaljax._dynamics.stick_slip import scaled_start, sliding_equilibrium, stick_slip
 
 import fractaljax as fj
-from fractaljax._dynamics import transient
+from fractaljax._dynamics import search
+from fractaljax._dynamics.hybrid import hybrid_system, scaled_start
 
 from .page import draw, png, spread, subplots, table, verdict
 from .timing import compiled, devices, ended, ratio, seconds, started, taking_turns, versions
@@ -83,13 +83,16 @@ def lanes(K_n: jax.Array) -> Row:
 
     def one(K):
         scene = reference(K)
-        system = stick_slip(scene)
+        system = hybrid_system(scene)
         growth = fj.growth_rate(scene) / system.omega
-        start, still = scaled_start(scene, system, None), sliding_equilibrium(scene, system)
-        return transient.find(system, start, still, growth, jnp.asarray(5000.0), 40).returns
+        start, tolerances = scaled_start(system, None), (jnp.asarray(0.25), jnp.asarray(1e-9))
+        most = jnp.asarray(5000.0)
+        return search.find(
+            system, start, system.equilibrium(), growth, most, *tolerances, 64
+        ).returns
 
     returns = np.asarray(jax.jit(jax.vmap(one))(K_n))
-    groups = dict.fromkeys((transient._TOGETHER, len(returns)))
+    groups = dict.fromkeys((64, len(returns)))
     return {
         "turns": {"mean": float(returns.mean()), "most": float(returns.max())},
         "busy": {str(n): busy(returns, n) for n in groups},

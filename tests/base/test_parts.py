@@ -185,7 +185,10 @@ def test_repr_shows_numbers():
 def test_every_quantity_says_what_it_is():
     for part in [SURFACE, MATERIAL, *PARTS]:
         for field in dataclasses.fields(part):
-            if not isinstance(getattr(part, field.name), Part):
+            value = getattr(part, field.name)
+            if isinstance(value, bool):
+                assert field.metadata["note"], field.name
+            elif not isinstance(value, Part):
                 assert field.metadata["unit"] and field.metadata["meaning"], field.name
     scales = {
         field.name

@@ -415,12 +415,6 @@ def test_a_free_body_has_no_pressed_equilibrium():
         structure_table(free)
 
 
-def test_motion_with_preload_is_refused():
-    scene, _ = problem("scene")
-    with pytest.raises(ValueError, match="preload has no motion yet"):
-        fj.simulate(scene, [0.0, 0.0, 0.0, 0.0], 1e-3)
-
-
 def test_float32():
     for name in ("scene", "three kinds"):
         x, _ = problem(name)

@@ -1,0 +1,134 @@
+"""Limit cycles of mechanisms with several joints, lift-off and lever arms, against the table.
+
+The table is that of the independent event-driven solver (tests/hybrid_truth.py).
+"""
+
+import copy
+import functools
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fractaljax as fj
+from mechanisms import PROBLEMS
+from tools import both_modes
+
+TABLE = json.loads((Path(__file__).parents[1] / "reference" / "mechanisms.json").read_text())
+ROWS = {row["name"]: row for row in TABLE["rows"]}
+LAWS = {
+    "coulomb": fj.Coulomb,
+    "stribeck": fj.Stribeck,
+    "exponential": fj.ExponentialStribeck,
+    "hyperbolic": fj.HyperbolicStribeck,
+}
+QUICK = ("papangelo_2017", "lift_off")
+NAMES = [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in PROBLEMS]
+DIFFERENTIATED = ("lift_off", "second_face_lift_off", "stick_together", "four_dof")
+
+
+def structure(problem) -> fj.Structure:
+    """A problem of the table; a joint of the source's form says that it is not preloaded."""
+    joints = []
+    for joint in problem["joints"]:
+        law, numbers = joint["friction"]
+        contact = fj.FixedContact(joint.get("K_n", 0.0), joint.get("K_t", 0.0), joint.get("P"))
+        normal = joint.get("normal")
+        preload = joint.get("preload", normal is not None)
+        directions = joint["tangential"], normal
+        joints.append(fj.Joint(contact, LAWS[law](**numbers), *directions, joint["V"], preload))
+    matrices = (jnp.stack([jnp.stack(row) for row in problem[name]]) for name in "MCK")
+    return fj.Structure(*matrices, joints, F=jnp.asarray(problem["F"]))
+
+
+def changed(problem, places, values):
+    """The problem with numbers changed at dotted places, as `by` names them."""
+    problem = copy.deepcopy(problem)
+    for place, value in zip(places, values, strict=True):
+        *path, last = (int(key) if key.isdigit() else key for key in place.split("."))
+        table = problem
+        for key in path:
+            table = table[key]
+            table = table[1] if isinstance(table, tuple) else table  # (law, numbers)
+        table[last] = value
+    return problem
+
+
+@functools.cache
+def cycle(name):
+    return fj.limit_cycle(structure(PROBLEMS[name]), PROBLEMS[name]["start"], throw=False)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_cycle(name):
+    """Period, amplitudes, shares, forces, state and multipliers."""
+    row, found = ROWS[name], cycle(name)
+    assert found.result == fj.CycleResult.converged
+    assert found.returns == row["maxima"] and float(found.error) < 1e-9
+    close = functools.partial(np.testing.assert_allclose, rtol=1e-8)
+    close(found.period, row["period"])
+    largest = max(row["amplitude"])
+    close(found.amplitude, row["amplitude"], atol=1e-9 * largest)
+    for velocity in ("velocity_min", "velocity_max"):
+        close(getattr(found, velocity), row[velocity], atol=1e-9 * max(row["velocity_max"]))
+    for share in ("stick_fraction", "open_fraction"):
+        close(getattr(found, share), row[share], atol=1e-9)
+    forces = np.array(row["normal_force"])
+    close(found.normal_force, forces, atol=1e-8 * abs(forces).max())
+    truth = np.sort(abs(np.array([complex(*z) for z in row["multipliers"]])))
+    np.testing.assert_allclose(np.sort(abs(np.asarray(found.multipliers))), truth, atol=1e-6)
+    if row["maxima"] == 1:
+        n = len(row["amplitude"])
+        scale = np.repeat([largest, max(row["velocity_max"])], n)
+        np.testing.assert_allclose(found.state / scale, row["state"] / scale, atol=1e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", DIFFERENTIATED)
+def test_derivatives(name):
+    """Of period, amplitudes and shares by the numbers in `by`, forward and reverse."""
+    problem, row = PROBLEMS[name], ROWS[name]
+    places = problem["by"]
+
+    def outputs(values):
+        found = fj.limit_cycle(
+            structure(changed(problem, places, values)), problem["start"], throw=False
+        )
+        shares = found.stick_fraction, found.open_fraction
+        return jnp.concatenate([found.period[None], found.amplitude, *shares])
+
+    values = jnp.array([_at(problem, place) for place in places])
+    expected = [row["derivatives"][place] for place in places]
+    truth, error = np.moveaxis(
+        [
+            [of["period"], *of["amplitude"], *of["stick_fraction"], *of["open_fraction"]]
+            for of in expected
+        ],
+        2,
+        0,
+    )
+    _, *slopes = jax.jit(lambda values: both_modes(outputs, values))(values)
+    for slope in slopes:
+        off = abs(np.asarray(slope).T - truth)
+        assert (off < 10 * error + 1e-6 * (abs(truth) + 1e-2)).all(), (places, off)
+
+
+def _at(problem, place) -> float:
+    found = problem
+    for key in place.split("."):
+        found = found[int(key)] if key.isdigit() else found[key]
+        found = found[1] if isinstance(found, tuple) else found
+    return found
+
+
+def test_a_joint_without_speed_is_named():
+    """Constant friction has no V of its own, but the motion has."""
+    contact = fj.FixedContact(1.0, 0.0, 1.0)
+    joint = fj.Joint(contact, fj.Coulomb(0.3), 0)
+    still = fj.Structure(np.eye(1), None, np.eye(1), {"pad": joint})
+    for call in (fj.limit_cycle, lambda x: fj.simulate(x, [0.0, 0.0], 1.0)):
+        with pytest.raises(ValueError, match="joint pad: V must be given"):
+            call(still)
