@@ -127,7 +127,7 @@ class HybridSystem(eqx.Module):
     def held(self, accelerations, held) -> Array:
         """Forces (f, ...) on the faces `held` that cancel their accelerations t.x'' (f, ...)."""
         wanted = jnp.where(held, -accelerations, 0)
-        if self.B is None:
+        if self.T is None or self.B is None:
             return wanted
         W = self._leaf(jnp.sum(self.T[:, :, None] * self.B[None], axis=1), held.ndim - 1)
         own = jnp.eye(len(W), dtype=W.dtype).reshape(len(W), len(W), *(1,) * (held.ndim - 1))
@@ -195,7 +195,7 @@ class HybridSystem(eqx.Module):
         rates = self._each(
             lambda law, w, load: self.speed * law.slope(self.speed * w) * load, w, loads
         )
-        if self.B is not None:
+        if self.T is not None and self.B is not None:
             own = jnp.sum(self.T * jnp.swapaxes(self.B, 0, 1), axis=1)
             rates = rates * self._leaf(own, y.ndim - 1)
         return jnp.max(jnp.abs(rates), axis=0)
@@ -308,11 +308,9 @@ def degrees_of_freedom(mechanism: Mechanism) -> int:
     return 2
 
 
-def hybrid_system(mechanism: Mechanism) -> HybridSystem:
+def hybrid_system(mechanism: Any) -> HybridSystem:
     """The scaled system of a scene or a structure."""
-    if isinstance(mechanism, Scene):
-        return _of_scene(mechanism)
-    return _of_structure(mechanism)
+    return _of_structure(mechanism) if isinstance(mechanism, Structure) else _of_scene(mechanism)
 
 
 def _of_scene(scene: Scene) -> HybridSystem:

@@ -162,7 +162,8 @@ def regularised_cycle(
     loads, changes = states[:, :n] @ system.L.T + system.P[None], rates[:, :n] @ system.L.T
     below = [share_below_zero(times, loads[:, f[0]], changes[:, f[0]]) for f in system.faces]
     below, opens = jnp.stack(below), np.array(system.opens)
-    forces = jnp.stack([(low, high) for low, high in extremes(times, loads, changes).T])
+    forces = extremes(times, loads, changes).T[np.array([f[0] for f in system.faces])]
+    forces = jnp.where(opens[:, None], jnp.maximum(forces, 0), forces) * system.force_unit
 
     def end(y):
         # Tangents are less accurate than states at the same tolerance.

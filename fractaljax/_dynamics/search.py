@@ -113,16 +113,13 @@ def _returns(steps: Segments, y, count: int) -> _Returns:
     return _Returns(at, states[:, at + 1], jnp.cumsum(steps.duration)[at], at >= 0)
 
 
-def _quintic(y, middle, end, d_0, d_m, d_1, x):
-    """The quintic with these values and slopes at 0, 1/2 and 1, at x; elementwise."""
+def _quintic(y, d, x):
+    """The quintic with values y (3, ...) and slopes d (3, ...) at 0, 1/2 and 1, at x."""
     u, v, w = x, x - 0.5, x - 1
     # Lagrange weights squared, each with the correction of its own slope.
     at_0, at_m, at_1 = 4 * (v * w) ** 2, 16 * (u * w) ** 2, 4 * (u * v) ** 2
-    return (
-        at_0 * (y + u * (d_0 + 6 * y))
-        + at_m * (middle + v * d_m)
-        + at_1 * (end + w * (d_1 - 6 * end))
-    )
+    first, last = y[0] + u * (d[0] + 6 * y[0]), y[2] + w * (d[2] - 6 * y[2])
+    return at_0 * first + at_m * (y[1] + v * d[1]) + at_1 * last
 
 
 def admissible(system: HybridSystem, segments: Segments, middle) -> Array:
@@ -138,14 +135,14 @@ def admissible(system: HybridSystem, segments: Segments, middle) -> Array:
     # Half a segment each: the cubic through a guard's ends and a point between says where it is
     # lowest. There the guard itself is evaluated.
     places = jnp.arange(7) / 6
-    inside = jax.vmap(lambda x: _quintic(*at, *d, x))(places)
+    inside = jax.vmap(lambda x: _quintic(at, d, x))(places)
     g = guards(inside)
     cubics = (Cubic.at_thirds(g[:4]), Cubic.at_thirds(g[3:]))
     lowest = []
     for k, cubic in enumerate(cubics):
         theta, _ = cubic.minimum()
         theta = jnp.take_along_axis(theta, jnp.argmin(cubic(theta), axis=0)[None], axis=0)[0]
-        lowest.append(_quintic(*at, *d, (k + theta)[None] / 2))
+        lowest.append(_quintic(at, d, (k + theta)[None] / 2))
     g = jnp.concatenate([g, guards(jnp.stack(lowest))])
     # The quintic is this good in a segment of the default length.
     holds = jnp.all(g > -1e-8 * scale) & jnp.all(h > -1e-10)
@@ -326,7 +323,8 @@ def _assess(
     ended = (returns >= max_returns) | (idle > options.patience)
     over = jnp.where(ended, over, RUNNING)
     # A return that the record does not hold is never seen to repeat.
-    over = jnp.where((returns >= options.settling) & ~seen.exists[1], TOO_LONG, over)
+    full = jnp.all(steps.used) & (returns >= options.settling)
+    over = jnp.where(full & ~seen.exists[1], TOO_LONG, over)
     status = jnp.where(status == RUNNING, jnp.where(ok, CONVERGED, over), status)
     progress = _Progress(
         status=status,

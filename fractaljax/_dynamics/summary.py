@@ -8,7 +8,12 @@ from .._stability.stability import stability
 from .._stability.summary import friction_remark, verdict
 from .cycle import CycleResult, LimitCycle
 
-_CONTACT_STATES = {"+": "slips, dx/dt < V", "-": "slips, dx/dt > V", "stick": "sticks"}
+_CONTACT_STATES = {
+    "+": "slips, dx/dt < V",
+    "-": "slips, dx/dt > V",
+    "stick": "sticks",
+    "open": "open",
+}
 
 
 def cycle_table(scene: Scene, cycle: LimitCycle) -> str:
@@ -20,7 +25,11 @@ def cycle_table(scene: Scene, cycle: LimitCycle) -> str:
         "period [ms]": f"{cycle.period * 1e3:.6g}",
         "frequency [Hz]": f"{cycle.frequency:.6g}",
         "returns in a period": f"{cycle.returns}",
-        "contact pulls": f"{cycle.tension_fraction:.2%} of the period",
+        **(
+            {"joint is open": f"{cycle.open_fraction[0]:.2%} of the period"}
+            if scene.preload
+            else {"contact pulls": f"{cycle.tension_fraction:.2%} of the period"}
+        ),
         "estimated error": f"{cycle.error:.1e}",
     }
     regularised = cycle.regularisation_error != 0

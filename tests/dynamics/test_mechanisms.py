@@ -7,6 +7,7 @@ import copy
 import functools
 import json
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +20,7 @@ from tools import both_modes
 
 TABLE = json.loads((Path(__file__).parents[1] / "reference" / "mechanisms.json").read_text())
 ROWS = {row["name"]: row for row in TABLE["rows"]}
-LAWS = {
+LAWS: dict[str, Any] = {
     "coulomb": fj.Coulomb,
     "stribeck": fj.Stribeck,
     "exponential": fj.ExponentialStribeck,
@@ -38,8 +39,8 @@ def structure(problem) -> fj.Structure:
         contact = fj.FixedContact(joint.get("K_n", 0.0), joint.get("K_t", 0.0), joint.get("P"))
         normal = joint.get("normal")
         preload = joint.get("preload", normal is not None)
-        directions = joint["tangential"], normal
-        joints.append(fj.Joint(contact, LAWS[law](**numbers), *directions, joint["V"], preload))
+        law = LAWS[law](**numbers)
+        joints.append(fj.Joint(contact, law, joint["tangential"], normal, joint["V"], preload))
     matrices = (jnp.stack([jnp.stack(row) for row in problem[name]]) for name in "MCK")
     return fj.Structure(*matrices, joints, F=jnp.asarray(problem["F"]))
 
@@ -102,14 +103,11 @@ def test_derivatives(name):
 
     values = jnp.array([_at(problem, place) for place in places])
     expected = [row["derivatives"][place] for place in places]
-    truth, error = np.moveaxis(
-        [
-            [of["period"], *of["amplitude"], *of["stick_fraction"], *of["open_fraction"]]
-            for of in expected
-        ],
-        2,
-        0,
-    )
+    shown = [
+        [of["period"], *of["amplitude"], *of["stick_fraction"], *of["open_fraction"]]
+        for of in expected
+    ]
+    truth, error = np.array(shown).transpose(2, 0, 1)
     _, *slopes = jax.jit(lambda values: both_modes(outputs, values))(values)
     for slope in slopes:
         off = abs(np.asarray(slope).T - truth)
