@@ -28,7 +28,7 @@ LAWS: dict[str, Any] = {
 }
 QUICK = ("papangelo_2017", "lift_off")
 NAMES = [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in PROBLEMS]
-DIFFERENTIATED = ("lift_off", "second_face_lift_off", "stick_together", "four_dof")
+DIFFERENTIATED = ("lift_off", "stick_together", "four_dof")
 
 
 def structure(problem) -> fj.Structure:
@@ -40,9 +40,13 @@ def structure(problem) -> fj.Structure:
         normal = joint.get("normal")
         preload = joint.get("preload", normal is not None)
         law = LAWS[law](**numbers)
-        joints.append(fj.Joint(contact, law, joint["tangential"], normal, joint["V"], preload))
-    matrices = (jnp.stack([jnp.stack(row) for row in problem[name]]) for name in "MCK")
-    return fj.Structure(*matrices, joints, F=jnp.asarray(problem["F"]))
+        # Backwards along t is forwards along -t.
+        V, t = joint["V"], np.array(joint["tangential"])
+        if not isinstance(V, jax.Array) and V < 0:
+            V, t = -V, -t
+        joints.append(fj.Joint(contact, law, t, normal, V, preload))
+    M, C, K = (jnp.stack([jnp.stack(row) for row in problem[name]]) for name in "MCK")
+    return fj.Structure(M, C, K, joints, F=jnp.asarray(problem["F"]))
 
 
 def changed(problem, places, values):
@@ -95,9 +99,9 @@ def test_derivatives(name):
     places = problem["by"]
 
     def outputs(values):
-        found = fj.limit_cycle(
-            structure(changed(problem, places, values)), problem["start"], throw=False
-        )
+        x = structure(changed(problem, places, values))
+        # As many as the search takes by itself outside of a compiled program.
+        found = fj.limit_cycle(x, problem["start"], segments=512, throw=False)
         shares = found.stick_fraction, found.open_fraction
         return jnp.concatenate([found.period[None], found.amplitude, *shares])
 
