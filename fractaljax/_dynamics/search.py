@@ -49,7 +49,7 @@ class SearchOptions:
     small: float = 1e-2  # size below which any decay without switches does
     extrapolated: float = 0.02  # growth in a return, without switches, that is extrapolated
     divergence: float = 1e6  # size at which a motion diverges: with a small V, many V are ordinary
-    settling: int = 8  # returns after which the record must hold at least two
+    settling: int = 8  # rounds without growth after which the record must hold two returns
     patience: int = 512  # rounds without a maximum
 
 
@@ -227,6 +227,8 @@ class _Progress(eqx.Module):
     tried: Float[Array, "..."]  # gap at the last attempt
     returns: Float[Array, "..."]
     idle: Int[Array, "..."]  # rounds without a return
+    size: Float[Array, "..."]  # distance from the equilibrium at the last return
+    calm: Int[Array, "..."]  # rounds with a return in which it did not grow
 
 
 def _assess(
@@ -323,8 +325,10 @@ def _assess(
     ended = (returns >= max_returns) | (idle > options.patience)
     over = jnp.where(ended, over, RUNNING)
     # A return that the record does not hold is never seen to repeat.
-    full = jnp.all(steps.used) & (returns >= options.settling)
-    over = jnp.where(full & ~seen.exists[1], TOO_LONG, over)
+    grows = away[0] > 1.01 * known.size
+    calm = jnp.where(idle > 0, known.calm, jnp.where(grows, 0, known.calm + 1))
+    too_long = jnp.all(steps.used) & ~seen.exists[1] & (calm >= options.settling)
+    over = jnp.where(too_long, TOO_LONG, over)
     status = jnp.where(status == RUNNING, jnp.where(ok, CONVERGED, over), status)
     progress = _Progress(
         status=status,
@@ -337,6 +341,8 @@ def _assess(
         tried=jnp.where(ready, gap, known.tried),
         returns=returns,
         idle=idle,
+        size=jnp.where(idle > 0, known.size, away[0]),
+        calm=calm,
     )
     progress = jax.tree.map(lambda new, old: jnp.where(active, new, old), progress, known)
     # Steps from before an extrapolation are not of this motion.
@@ -360,7 +366,9 @@ def _find(
         s=jnp.ones((len(s), length, *shape), start.dtype),
         guard=jnp.full((length, *shape), UNUSED),
     )
-    known = _Progress(none + RUNNING, empty, none, zero, far, none, zero, far, zero, none)
+    known = _Progress(
+        none + RUNNING, empty, none, zero, far, none, zero, far, zero, none, zero, none
+    )
     assess = functools.partial(_assess, options=options, length=length)
 
     def running(carry):
