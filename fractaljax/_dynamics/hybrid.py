@@ -116,13 +116,18 @@ class HybridSystem(eqx.Module):
         free = self._leaf(self.F, x.ndim - 1) - self._times(self.K, x) - self._times(self.C, u)
         return free + self._acceleration(friction)
 
+    def _friction(self, y, signs) -> Array:
+        """The friction forces of the faces (f, ...) with these signs of sliding."""
+        w, loads = self.sliding(y[self.n :]), self.loads(y[: self.n])
+
+        def force(law, w, load, sign):
+            return law.branch(self.speed * w, sign) * load
+
+        return self._each(force, w, loads, signs)
+
     def _slipping(self, y, s) -> Array:
         """The friction forces of slipping faces (f, ...), 0 elsewhere."""
-        w, loads = self.sliding(y[self.n :]), self.loads(y[: self.n])
-        force = self._each(
-            lambda law, w, load, s: law.branch(self.speed * w, s) * load, w, loads, s
-        )
-        return jnp.where(jnp.abs(s) == 1, force, 0)
+        return jnp.where(jnp.abs(s) == 1, self._friction(y, s), 0)
 
     def held(self, accelerations, held) -> Array:
         """Forces (f, ...) on the faces `held` that cancel their accelerations t.x'' (f, ...)."""
@@ -147,10 +152,7 @@ class HybridSystem(eqx.Module):
 
     def regularised_field(self, y, signs) -> Array:
         """dy/dt where friction has `signs` (f, ...) between -1 and 1, by a smoothed sign."""
-        w, loads = self.sliding(y[self.n :]), self.loads(y[: self.n])
-        force = self._each(
-            lambda law, w, load, sign: law.branch(self.speed * w, sign) * load, w, loads, signs
-        )
+        force, loads = self._friction(y, signs), self.loads(y[: self.n])
         opens = np.repeat(self.opens, [len(faces) for faces in self.faces])
         first = jnp.stack([loads[faces[0]] for faces in self.faces for _ in faces])
         opens = opens.reshape(-1, *(1,) * (y.ndim - 1)) & (first < 0)
@@ -210,7 +212,6 @@ class HybridSystem(eqx.Module):
         number_of = jnp.arange(f).reshape(f, *(1,) * (s.ndim - 1))
         guard = jnp.broadcast_to(jnp.asarray(guard), s.shape[1:])
         ended = (guard[None] - 1) // 2 == number_of
-        ended = ended & (guard[None] > 0)
         lower = guard[None] == 1 + 2 * number_of
         reversed_s = jnp.where(ended & (s != 0), -s, s)
         rate = self.along(self.field(y, reversed_s)[self.n :])

@@ -42,12 +42,17 @@ class Maps(eqx.Module):
     b: Float[Array, "2n N"]  # of the end by its duration
     c: Float[Array, "2n N"]  # of the guard by the state it ends in; 0 where none ends it
 
+    @classmethod
+    def zeros(cls, y: Float[Array, "2n N"]) -> "Maps":
+        """Of the shapes that belong to the states y."""
+        return cls(jnp.zeros((len(y), *y.shape), y.dtype), jnp.zeros_like(y), jnp.zeros_like(y))
 
-def _tableau(name: str):
+
+def _tableau():
     # Imported late: a question of stability does not wait for diffrax.
     import diffrax
 
-    return getattr(diffrax, name).tableau
+    return diffrax.Dopri8.tableau
 
 
 def flow(system: HybridSystem, y, duration, s, written_out=False, error=False) -> Any:
@@ -58,7 +63,7 @@ def flow(system: HybridSystem, y, duration, s, written_out=False, error=False) -
     field = functools.partial(_field, system, s)
     duration = jnp.asarray(duration)[None]
     options = {"written_out": written_out, "error": error}
-    return runge_kutta(_tableau("Dopri8"), field, y, duration, **options)
+    return runge_kutta(_tableau(), field, y, duration, **options)
 
 
 def _field(system: HybridSystem, s, y) -> Array:
@@ -77,9 +82,7 @@ def chosen_guard(system: HybridSystem, y, s, guard) -> Array:
     return jnp.sum(jnp.where(chosen, guards, 0), axis=0)
 
 
-def maps(
-    system: HybridSystem, segments: Segments, tableau="Dopri8", written_out=False
-) -> tuple[Array, Maps]:
+def maps(system: HybridSystem, segments: Segments, written_out=False) -> tuple[Array, Maps]:
     """The ends of the segments and their derivatives."""
     y, s = segments.y, segments.s
 
@@ -92,7 +95,7 @@ def maps(
     units = jnp.broadcast_to(jnp.eye(len(y), dtype=y.dtype)[:, :, None], (len(y), *y.shape))
     columns = jnp.concatenate([y[:, None], units], axis=1)
     duration = segments.duration[None, None]
-    ends = runge_kutta(_tableau(tableau), field, columns, duration, written_out=written_out)
+    ends = runge_kutta(_tableau(), field, columns, duration, written_out=written_out)
     ends, A = ends[:, 0], ends[:, 1:]
     target = next_start(y)
     _, pull = jax.vjp(lambda end: chosen_guard(system, end, s, segments.guard), target)
@@ -230,9 +233,7 @@ def solve_periodic_orbit(system: HybridSystem, segments: Segments) -> PeriodicOr
         new = Segments(y, duration, segments.s, segments.guard)
         return new, local, jacobian, change, count + 1
 
-    n, N = y.shape
-    nothing = Maps(*(jnp.zeros((*shape, N), y.dtype) for shape in ((n, n), (n,), (n,))))
-    start = segments, nothing, jnp.eye(n, dtype=y.dtype), big, 0
+    start = segments, Maps.zeros(y), jnp.eye(len(y), dtype=y.dtype), big, 0
     segments, local, jacobian, change, _ = jax.lax.while_loop(running, body, start)
     return PeriodicOrbit(segments, change <= 10 * tolerance, local, jacobian)
 

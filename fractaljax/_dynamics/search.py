@@ -83,7 +83,6 @@ class _Returns(eqx.Module):
 
 def _advance(system: HybridSystem, run: _Run, h, options: SearchOptions) -> _Run:
     record = run.steps.shape[1]
-    kept = options.round_steps % record
 
     def body(k, carry):
         y, s, guard, steps = carry
@@ -93,12 +92,12 @@ def _advance(system: HybridSystem, run: _Run, h, options: SearchOptions) -> _Run
         steps = jax.lax.dynamic_update_index_in_dim(steps, one, place, 1)
         return y_new, s_new, guard, steps
 
-    steps = jnp.roll(run.steps, -kept, axis=1)
+    steps = jnp.roll(run.steps, -options.round_steps, axis=1)
     carry = run.y, run.s, run.guard, steps
     return _Run(*jax.lax.fori_loop(0, options.round_steps, body, carry))
 
 
-def _segments(system: HybridSystem, run: _Run) -> Segments:
+def _segments(run: _Run) -> Segments:
     """The last steps of one run as segments."""
     n, f = len(run.y), len(run.s)
     y, s, duration, guard = jnp.split(run.steps, [n, n + f, n + f + 1])
@@ -196,15 +195,15 @@ def _candidate(system, steps: Segments, y, first, last, returns, h, rtol, *, len
         steps = Segments(steps.y, jnp.where(used == UNUSED, 0, steps.duration), steps.s, used)
         return steps, found, error, middle, tries + 1
 
-    n, N = len(y), length
+    first_segments = jax.tree.map(lambda x: x[..., :length], steps)
     nothing = PeriodicOrbit(
-        segments=jax.tree.map(lambda x: x[..., :length], steps),
+        segments=first_segments,
         converged=jnp.array(False),
-        local=Maps(*(jnp.zeros((*shape, N), y.dtype) for shape in ((n, n), (n,), (n,)))),
-        return_jacobian=jnp.eye(n, dtype=y.dtype),
+        local=Maps.zeros(first_segments.y),
+        return_jacobian=jnp.eye(len(y), dtype=y.dtype),
     )
     infinite = jnp.asarray(jnp.inf, y.dtype)
-    carry = steps, nothing, infinite, jnp.zeros((n, N), y.dtype), 0
+    carry = steps, nothing, infinite, jnp.zeros_like(first_segments.y), 0
     _, found, error, middle, _ = jax.lax.while_loop(going, solve, carry)
     orbit = found.segments
     near = jnp.max(jnp.abs(orbit.y[:, 0] - y)) < 0.2 * (1 + jnp.max(jnp.abs(y)))
@@ -246,7 +245,7 @@ def _assess(
     length: int,
 ):
     """One scene after a round: its run, perhaps extrapolated, and what is known of it."""
-    steps = _segments(system, run)
+    steps = _segments(run)
     seen = _returns(steps, run.y, options.longest + 1)
     active = known.status == RUNNING
     tiny = jnp.finfo(run.y.dtype).tiny
