@@ -81,6 +81,23 @@ PROBLEMS: dict[str, dict[str, Any]] = {
         "start": [0.4, 1.6, 0.0, 0.0],
         "by": ["joints.0.P", "joints.0.V", "joints.0.K_n"],
     },
+    # The switch of one face releases the other, which stuck; eight maxima of t.x in a period.
+    "released": {
+        "M": [[0.598, -0.015], [-0.015, 0.73]],
+        "C": [[0.083, 0.0], [0.0, 0.106]],
+        "K": [[1.896, 1.109], [1.109, 1.259]],
+        "F": [0.0, 0.0],
+        "joints": [
+            {
+                "tangential": [1.01, 0.618],
+                "normal": [0.0, 1.0],
+                "V": 0.913, "P": 1.963, "K_n": 5.117, "K_t": 2.71,
+                "friction": ("hyperbolic", {"mu_s": 0.864, "delta": 0.382}),
+            },
+        ],
+        "start": [0.883, 0.58, 0.0, 0.0],
+        "by": ["joints.0.P", "joints.0.V"],
+    },
     # Two maxima of x1 in a period, lift-off between them.
     "two_maxima": {
         "M": [

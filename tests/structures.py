@@ -7,6 +7,8 @@ as roots of the determinant.
 
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 
@@ -164,3 +166,29 @@ def slope_of(change, start: complex, scale: float, friction_slope: bool = True) 
         h = mp.mpf(scale) * mp.mpf(10) ** -12
         ends = [eigenvalue_near(change(sign * h), friction_slope, start) for sign in (1, -1)]
         return float((ends[0].real - ends[1].real) / (2 * h))
+
+
+LAWS: dict[str, Any] = {
+    "coulomb": fj.Coulomb,
+    "stribeck": fj.Stribeck,
+    "exponential": fj.ExponentialStribeck,
+    "hyperbolic": fj.HyperbolicStribeck,
+}
+
+
+def of_problem(problem) -> fj.Structure:
+    """A problem of mechanisms.py; a joint of the source's form says that it is not preloaded."""
+    joints = []
+    for joint in problem["joints"]:
+        law, numbers = joint["friction"]
+        contact = fj.FixedContact(joint.get("K_n", 0.0), joint.get("K_t", 0.0), joint.get("P"))
+        normal = joint.get("normal")
+        preload = joint.get("preload", normal is not None)
+        law = LAWS[law](**numbers)
+        # Backwards along t is forwards along -t.
+        V, t = joint["V"], np.array(joint["tangential"])
+        if not isinstance(V, jax.Array) and V < 0:
+            V, t = -V, -t
+        joints.append(fj.Joint(contact, law, t, normal, V, preload))
+    M, C, K = (jnp.stack([jnp.stack(row) for row in problem[name]]) for name in "MCK")
+    return fj.Structure(M, C, K, joints, F=jnp.asarray(problem["F"]))

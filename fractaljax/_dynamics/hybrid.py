@@ -215,10 +215,11 @@ class HybridSystem(eqx.Module):
         lower = guard[None] == 1 + 2 * number_of
         reversed_s = jnp.where(ended & (s != 0), -s, s)
         rate = self.along(self.field(y, reversed_s)[self.n :])
-        after_slip = jnp.where(s * rate > 0, -s, 0)
+        reverses = (s * rate > 0) | (self.loads(y[: self.n]) < 0)
+        after_slip = jnp.where(reverses, -s, 0)
         after = jnp.where(s == 0, jnp.where(lower, 1, -1), after_slip)
         new = jnp.where(ended, after.astype(s.dtype), s)
-        exact = ended | (new == 0)
+        exact = ended | (s == 0) | (new == 0)
         k, x, u = 1 + 2 * f, y[: self.n], y[self.n :]
         for faces, opens in zip(self.faces, self.opens, strict=True):
             if opens:
@@ -237,8 +238,37 @@ class HybridSystem(eqx.Module):
         if self.B is None:
             u = jnp.where(exact, self._leaf(self.V, u.ndim - 1), u)
         else:
-            u = u + self._acceleration(self.held(-self.sliding(u), exact))
-        return jnp.concatenate([x, u]), new
+            u = u + self._acceleration(self.held(-self.sliding(u), exact & (new != OPEN)))
+        y = jnp.concatenate([x, u])
+        if self.B is None or f == 1:
+            return y, new
+        # The forces on faces that stick jump with the others' friction, perhaps beyond limits.
+        free = ended & (s != 0) | (new == 0)
+        switched = jnp.any(guard > 0)
+        return y, jax.lax.cond(switched, lambda: self._consistent(y, new, free), lambda: new)
+
+    def _consistent(self, y, s, free) -> Array:
+        """s with other signs of the faces `free` (f, ...), whose w is 0, where it contradicts y.
+
+        A force beyond its limits starts a slip; a slip that its own acceleration reverses sticks.
+        The largest contradiction goes first, as in the pivoting of a complementarity problem.
+        """
+        limits = self.limits(self.loads(y[: self.n]))
+        number = jnp.arange(len(s)).reshape(-1, *(1,) * (s.ndim - 1))
+        # To rounding, a face at its limit does either.
+        slack = 64 * jnp.finfo(y.dtype).eps
+
+        def pivot(_, s):
+            rate = self.along(self._driven(y, self._slipping(y, s), s))
+            force = self.held(rate, s == 0)
+            rate = rate + self.along(self._acceleration(force))
+            excess = jnp.where(s == 0, jnp.abs(force) * (1 - slack) - limits, s * rate - slack)
+            worst = jnp.argmax(jnp.where(free, excess, -1), axis=0)[None] == number
+            slips = jnp.where(force > limits, 1, -1)
+            changed = jnp.where(s == 0, slips, 0).astype(s.dtype)
+            return jnp.where(worst & free & (excess > 0), changed, s)
+
+        return jax.lax.fori_loop(0, 2 * len(s), pivot, s)
 
     def _without_load(self, x, tangential, normal, where) -> Array:
         """x moved along the normal of a joint to where its normal force is 0."""
@@ -257,10 +287,7 @@ class HybridSystem(eqx.Module):
             for i in faces if opens else ():
                 s = s.at[i].set(jnp.where(loads[faces[0]] < 0, OPEN, s[i]))
         # At the belt's velocity: the side whose own field leaves it, forward if both do.
-        limits = self.limits(loads)
-        force = self.held(self.along(self._driven(y, self._slipping(y, s), s)), s == 0)
-        leaving = jnp.where(force > limits, 1, jnp.where(force < -limits, -1, 0))
-        return jnp.where(s == 0, leaving, s).astype(y.dtype)
+        return self._consistent(y, s.astype(y.dtype), s == 0)
 
     def equilibrium(self) -> Float[Array, " 2n"]:
         """The closed, forward-slipping equilibrium (Eq. 40) as a state."""

@@ -7,7 +7,6 @@ import copy
 import functools
 import json
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,16 +15,11 @@ import pytest
 
 import fractaljax as fj
 from mechanisms import PROBLEMS
+from structures import of_problem
 from tools import both_modes
 
 TABLE = json.loads((Path(__file__).parents[1] / "reference" / "mechanisms.json").read_text())
 ROWS = {row["name"]: row for row in TABLE["rows"]}
-LAWS: dict[str, Any] = {
-    "coulomb": fj.Coulomb,
-    "stribeck": fj.Stribeck,
-    "exponential": fj.ExponentialStribeck,
-    "hyperbolic": fj.HyperbolicStribeck,
-}
 QUICK = ("papangelo_2017", "lift_off")
 # A joint slides forwards (V > 0). Backwards, with a second face along n, it is another joint.
 BACKWARDS = {
@@ -39,24 +33,6 @@ NAMES = [
     if name not in BACKWARDS
 ]
 DIFFERENTIATED = ("lift_off", "stick_together", "four_dof")
-
-
-def structure(problem) -> fj.Structure:
-    """A problem of the table; a joint of the source's form says that it is not preloaded."""
-    joints = []
-    for joint in problem["joints"]:
-        law, numbers = joint["friction"]
-        contact = fj.FixedContact(joint.get("K_n", 0.0), joint.get("K_t", 0.0), joint.get("P"))
-        normal = joint.get("normal")
-        preload = joint.get("preload", normal is not None)
-        law = LAWS[law](**numbers)
-        # Backwards along t is forwards along -t.
-        V, t = joint["V"], np.array(joint["tangential"])
-        if not isinstance(V, jax.Array) and V < 0:
-            V, t = -V, -t
-        joints.append(fj.Joint(contact, law, t, normal, V, preload))
-    M, C, K = (jnp.stack([jnp.stack(row) for row in problem[name]]) for name in "MCK")
-    return fj.Structure(M, C, K, joints, F=jnp.asarray(problem["F"]))
 
 
 def changed(problem, places, values):
@@ -74,7 +50,7 @@ def changed(problem, places, values):
 
 @functools.cache
 def cycle(name):
-    return fj.limit_cycle(structure(PROBLEMS[name]), PROBLEMS[name]["start"], throw=False)
+    return fj.limit_cycle(of_problem(PROBLEMS[name]), PROBLEMS[name]["start"], throw=False)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -109,7 +85,7 @@ def test_derivatives(name):
     places = problem["by"]
 
     def outputs(values):
-        x = structure(changed(problem, places, values))
+        x = of_problem(changed(problem, places, values))
         # As many as the search takes by itself outside of a compiled program.
         found = fj.limit_cycle(x, problem["start"], segments=512, throw=False)
         shares = found.stick_fraction, found.open_fraction
