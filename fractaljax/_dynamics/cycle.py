@@ -27,7 +27,7 @@ class CycleResult(eqx.Enumeration):
     unstable = "a limit cycle was found, but it repels: nearby motions leave it"
     equilibrium = "the motion dies out: the sliding equilibrium attracts it"
     diverged = "the motion grows beyond all bounds"
-    too_long = "one return takes more steps than are kept: ask for more segments"
+    too_long = "a period takes more steps than are kept: ask for more segments"
     not_periodic = "the motion does not repeat within 16 returns (a longer period, or none)"
     too_stiff = (
         "the regularised law takes more than max_steps steps: allow more, choose a solver such as "

@@ -50,7 +50,8 @@ class SearchOptions:
     extrapolated: float = 0.02  # growth in a return, without switches, that is extrapolated
     divergence: float = 1e6  # size at which a motion diverges: with a small V, many V are ordinary
     settling: int = 8  # rounds without growth after which the record must hold two returns
-    patience: int = 512  # rounds without a maximum
+    patience: int = 512  # rounds without a maximum, or for a record that holds few
+    record: int = 2048  # steps that are kept, at least; a period takes fewer
 
 
 class Attractor(eqx.Module):
@@ -64,7 +65,7 @@ class Attractor(eqx.Module):
 
 
 class _Run(eqx.Module):
-    """A coarse run with its last steps, oldest first, all in one array."""
+    """A coarse run with its last steps, in a ring of rounds, all in one array."""
 
     y: Float[Array, "2n ..."]
     s: Float[Array, "f ..."]
@@ -81,35 +82,35 @@ class _Returns(eqx.Module):
     exists: Array
 
 
-def _advance(system: HybridSystem, run: _Run, h, options: SearchOptions) -> _Run:
+def _advance(system: HybridSystem, run: _Run, rounds, h, options: SearchOptions) -> _Run:
     record = run.steps.shape[1]
+    place = rounds * options.round_steps % record
 
     def body(k, carry):
         y, s, guard, steps = carry
         y_new, s_new, dt, guard = step(system, y, s, guard, h)
         one = jnp.concatenate([y, s, dt[None], guard.astype(y.dtype)[None]])
-        place = record - options.round_steps + k
-        steps = jax.lax.dynamic_update_index_in_dim(steps, one, place, 1)
+        steps = jax.lax.dynamic_update_index_in_dim(steps, one, place + k, 1)
         return y_new, s_new, guard, steps
 
-    steps = jnp.roll(run.steps, -options.round_steps, axis=1)
-    carry = run.y, run.s, run.guard, steps
+    carry = run.y, run.s, run.guard, run.steps
     return _Run(*jax.lax.fori_loop(0, options.round_steps, body, carry))
 
 
-def _segments(run: _Run) -> Segments:
-    """The last steps of one run as segments."""
+def _segments(run: _Run, order) -> Segments:
+    """The last steps of one run as segments, in that order."""
     n, f = len(run.y), len(run.s)
-    y, s, duration, guard = jnp.split(run.steps, [n, n + f, n + f + 1])
+    y, s, duration, guard = jnp.split(run.steps[:, order], [n, n + f, n + f + 1])
     return Segments(y, duration[0], s, guard[0].astype(int))
 
 
-def _returns(steps: Segments, y, count: int) -> _Returns:
-    record = steps.duration.shape[0]
-    at = jnp.where(steps.guard == SECTION, jnp.arange(record), -1)
+def _returns(run: _Run, order, guard, count: int) -> _Returns:
+    at = jnp.where(guard == SECTION, jnp.arange(len(order)), -1)
     at, _ = jax.lax.top_k(at, count)
-    states = jnp.concatenate([steps.y, y[:, None]], axis=1)
-    return _Returns(at, states[:, at + 1], jnp.cumsum(steps.duration)[at], at >= 0)
+    # A step ends where the next one starts.
+    following = run.steps[: len(run.y), order[(at + 1) % len(order)]]
+    y = jnp.where((at == len(order) - 1)[None], run.y[:, None], following)
+    return _Returns(at, y, jnp.cumsum(run.steps[-2, order])[at], at >= 0)
 
 
 def _quintic(y, d, x):
@@ -245,19 +246,22 @@ def _assess(
     length: int,
 ):
     """One scene after a round: its run, perhaps extrapolated, and what is known of it."""
-    steps = _segments(run)
-    seen = _returns(steps, run.y, options.longest + 1)
+    record = run.steps.shape[1]
+    oldest = (rounds + 1) * options.round_steps
+    order = (oldest + jnp.arange(record)) % record
+    guard = run.steps[-1, order].astype(int)
+    seen = _returns(run, order, guard, options.longest + 1)
     active = known.status == RUNNING
     tiny = jnp.finfo(run.y.dtype).tiny
-    new = jnp.arange(len(steps.guard)) >= len(steps.guard) - options.round_steps
-    returns = known.returns + jnp.sum(new & (steps.guard == SECTION))
-    idle = jnp.where(seen.at[0] >= len(steps.guard) - options.round_steps, 0, known.idle + 1)
+    new = jnp.arange(record) >= record - options.round_steps
+    returns = known.returns + jnp.sum(new & (guard == SECTION))
+    idle = jnp.where(seen.at[0] >= record - options.round_steps, 0, known.idle + 1)
 
     # --- near the equilibrium ---
     away = jnp.sqrt(jnp.sum((seen.y - equilibrium[:, None]) ** 2, axis=0))
     size = jnp.sqrt(jnp.sum((run.y - equilibrium) ** 2)) + tiny
     diverged = ~(size < options.divergence * (1 + jnp.max(jnp.abs(equilibrium))))
-    last_switch = jnp.max(jnp.where(steps.guard > 0, jnp.arange(len(steps.guard)), -1))
+    last_switch = jnp.max(jnp.where(guard > 0, jnp.arange(record), -1))
     smooth = seen.exists[3] & (seen.at[3] > last_switch)
     log = jnp.log(away[:3] + tiny)
     rate, before = log[0] - log[1], log[1] - log[2]
@@ -301,6 +305,7 @@ def _assess(
 
     def solve():
         first, last = seen.at[period_returns], seen.at[0]
+        steps = _segments(run, order)
         return *_candidate(
             system, steps, seen.y[:, 0], first, last, period_returns, h, rtol, length=length
         ), period_returns
@@ -323,10 +328,12 @@ def _assess(
     over = jnp.where((widest < 0.02) | (smooth & (growth < 0)), EXHAUSTED, NOT_PERIODIC)
     ended = (returns >= max_returns) | (idle > options.patience)
     over = jnp.where(ended, over, RUNNING)
-    # A return that the record does not hold is never seen to repeat.
+    # A period that the record does not hold is never seen to repeat.
     grows = away[0] > 1.01 * known.size
     calm = jnp.where(idle > 0, known.calm, jnp.where(grows, 0, known.calm + 1))
-    too_long = jnp.all(steps.used) & ~seen.exists[1] & (calm >= options.settling)
+    short = ~seen.exists[1] & (calm >= options.settling)
+    short = short | (~seen.exists[options.longest] & (rounds >= options.patience))
+    too_long = jnp.all(guard != UNUSED) & short
     over = jnp.where(too_long, TOO_LONG, over)
     status = jnp.where(status == RUNNING, jnp.where(ok, CONVERGED, over), status)
     progress = _Progress(
@@ -345,7 +352,7 @@ def _assess(
     )
     progress = jax.tree.map(lambda new, old: jnp.where(active, new, old), progress, known)
     # Steps from before an extrapolation are not of this motion.
-    forgotten = steps.guard.shape[0] * extrapolates
+    forgotten = record * extrapolates
     return y_on, forgotten, progress
 
 
@@ -354,7 +361,7 @@ def _find(
 ) -> Attractor:
     shape, n = start.shape[1:], len(start)
     s = system.contact_state(start)
-    record = max(4 * length, 4 * options.round_steps)
+    record = max(32 * length, options.record)
     blank = jnp.zeros((n + len(s) + 2, record, *shape), start.dtype).at[-1].set(UNUSED)
     run = _Run(y=start, s=s, guard=jnp.full(shape, NONE), steps=blank)
     none, far = jnp.zeros(shape, int), jnp.full(shape, jnp.inf, start.dtype)
@@ -377,7 +384,8 @@ def _find(
         run, known, rounds = carry
         # A run that takes long to settle may be near the boundary of two basins.
         finer = sum(rounds >= after for after in options.finer_after)
-        run = _advance(system, run, (options.step / 2.0**finer).astype(start.dtype), options)
+        h_run = (options.step / 2.0**finer).astype(start.dtype)
+        run = _advance(system, run, rounds, h_run, options)
         arguments = system, run, known, equilibrium, growth, max_returns, h, rtol
 
         def one(arguments):
