@@ -212,6 +212,7 @@ class _Point(eqx.Module):
     frequency: jax.Array
     growth_rate: jax.Array
     damping: Float[Array, "2"]  # over sqrt(a + b); of a structure the two least damping ratios
+    open: jax.Array  # whether a preloaded joint is
     regimes: tuple[Regime, ...]  # of the fractal joints
     mu_m: tuple[jax.Array, ...]  # of the fractal joints, for which Eq. 19 corrects
 
@@ -244,8 +245,7 @@ class _Plane(eqx.Module):
         if isinstance(scene, Structure):
             attached = assembled(scene, self.friction_slope, refuse=False)
             pair = critical_pair(*attached.matrices, self.rigid)
-            pair = pair._replace(test=jnp.where(attached.open, jnp.nan, pair.test))
-            return _Point(*pair, regimes, lowest)
+            return _Point(*pair, attached.open, regimes, lowest)
         friction = scene.friction
         if states:
             K_n, K_t = states[0].K_n, states[0].K_t
@@ -255,7 +255,8 @@ class _Plane(eqx.Module):
         lin = linearise(scene.oscillator, friction, K_n, K_t, slope, load)
         damping = jnp.stack([lin.c_1, lin.c_2]) / jnp.sqrt(lin.a + lin.b)
         growth, frequency = rightmost_root(lin).real, critical_frequency(lin)
-        return _Point(hopf_test_function(lin), frequency, growth, damping, regimes, lowest)
+        test = hopf_test_function(lin)
+        return _Point(test, frequency, growth, damping, jnp.isnan(test), regimes, lowest)
 
 
 @functools.partial(jax.jit, static_argnums=1)
@@ -278,16 +279,16 @@ def _at(plane: _Plane, u):
 
 @jax.jit
 def _tests(plane: _Plane, us):
-    """Test function (k,) and gradient (k, 2) at points (k, 2)."""
+    """Test function (k,), gradient (k, 2) and open joints (k,) at points (k, 2)."""
     gradients, points = jax.vmap(_at, (None, 0))(plane, us)
-    return points.test, gradients
+    return points.test, gradients, points.open
 
 
 class _Field:
     """The test function for NumPy: at many points, or at one with all that is known there."""
 
     def __init__(self, plane: _Plane):
-        self.plane, self.dtype = plane, plane.low.dtype
+        self.plane, self.dtype, self.entered = plane, plane.low.dtype, False
         eps = float(jnp.finfo(self.dtype).eps)
         self.rounding, self.undamped = 10 * eps, max(_UNDAMPED, (10 * eps) ** 2)
         if plane.rigid is not None:
@@ -303,19 +304,25 @@ class _Field:
         return np.asarray(point.test, float)[None], np.asarray(gradient, float)[None]
 
     def values(self, us):
-        """Test function (k,) and gradient (k, 2) at any number of points."""
+        """Test function (k,) and gradient (k, 2) at any number of points, first of the lattice."""
 
         def program(us):
             return _tests(self.plane, jnp.asarray(us, self.dtype))
 
-        tests, gradients = (np.asarray(x, float) for x in in_batches(program, _BATCH, us))
-        if np.isnan(tests).any():
-            place = zip(self.plane.names, self.quantities(us[np.isnan(tests)][0]), strict=True)
+        tests, gradients, lifted = map(np.asarray, in_batches(program, _BATCH, us))
+        lost = np.isnan(tests)
+        if not self.entered:
+            # Beyond a static divergence the force has the other sign: it passed through infinity.
+            # On it rounding decides.
+            lost |= lifted & (tests >= 0)
+            self.entered = True
+        if lost.any():
+            place = zip(self.plane.names, self.quantities(us[lost][0]), strict=True)
             where = ", ".join(f"{name} = {value:.6g}" for name, value in place)
             loaded = any(x.normal_load is not None for x in joints_of(self.plane.scene).values())
             may = "; the joint may be open there" if loaded else ""
             raise ValueError(f"stability cannot be computed at {where}{may}")
-        return tests, gradients
+        return tests.astype(float), gradients.astype(float)
 
     def damped(self, u) -> bool:
         """Whether all modes are; else the test function can be 0 without a Hopf point."""

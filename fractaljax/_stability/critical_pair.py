@@ -66,6 +66,8 @@ def critical_pair(
     test = jnp.where(alone, -s[i].real * jnp.abs(fixed[i]), _test(sigma, delta, undamped))
     apart = _quotient(delta.imag, 2 * -sigma.real, undamped)
     imaginary = jnp.where(alone, fixed[i].imag, sigma.imag + apart)
+    real = (fixed[j] == fixed[i].conj()) | ((fixed[i].imag == 0) & (fixed[j].imag == 0))
+    imaginary = jnp.where(real & ~alone, 0, imaginary)
     ratios = -fixed.real / jnp.where(fixed == 0, 1, jnp.abs(fixed))
     ratios = jnp.where(chosen.counted & (fixed.imag >= 0), ratios, jnp.inf)
     first = jnp.argmin(ratios)
@@ -96,8 +98,9 @@ def _choice(s: Complex[Array, " k"], rigid, conservative) -> _Choice:
     apart = jnp.where(counted[None] & (place[None] != place[:, None]), apart, jnp.inf)
     partner = jnp.argmin(apart, axis=1)
     sigma, delta = (s + s[partner]) / 2, ((s - s[partner]) / 2) ** 2
-    undamped = jnp.abs(sigma.real) <= _UNDAMPED * jnp.finfo(size.dtype).eps * size
-    undamped |= conservative
+    eps = jnp.finfo(size.dtype).eps
+    # Exactly 0 where C = 0, but for neighbours of which one grows alone.
+    undamped = jnp.abs(sigma.real) <= jnp.where(conservative, eps**0.5, _UNDAMPED * eps) * size
     alone = (s.imag > 0) & (s[partner] == s.conj()) & ~undamped
     test = jnp.where(alone, -s.real * size, _test(sigma, delta, undamped))
     test = jnp.where(counted & (s.imag >= 0), test, jnp.inf)

@@ -127,14 +127,21 @@ def test_without_a_number(name):
 
 @slow
 def test_one_is_the_same_as_many():
-    for name in ("hoffmann", "damping", "belt"):
+    for name in ("hoffmann", "divergence", "belt"):
         single = fj.critical_friction(two_masses(row(name)))
         assert float(single) == pytest.approx(float(found(name)[0]), rel=1e-12)
 
 
 # --- many degrees of freedom, and all kinds of joints -------------------------------------
 
-ONSETS = {"one joint": (0.05, 2.0), "lever arms": (0.05, 2.0), "three kinds": (0.05, 2.0)}
+
+def more_damped(name):
+    """Problems that are stable at some friction."""
+    x, oracle = problem(name)
+    more = Oracle(oracle.M, 10 * oracle.C, oracle.K, oracle.F, oracle.joints)
+    return x.replace(C=10 * x.C), more
+
+
 SCALED = ("mu", "mu_s", "mu_m", "mu_d", "viscous")
 
 
@@ -160,16 +167,13 @@ def root(oracle, factor, omega, **changes):
 
 
 @slow
-@pytest.mark.parametrize("name", ["one joint", "lever arms", "three kinds"])
+@pytest.mark.parametrize("name", ["lever arms", "three kinds"])
 def test_the_first_root_in_many_digits(name):
     """No growth below it, the root of a determinant, and its derivatives in both modes."""
-    x, oracle = problem(name)
-    x = x.replace(C=10 * x.C)
-    oracle = Oracle(oracle.M, 10 * oracle.C, oracle.K, oracle.F, oracle.joints)
+    x, oracle = more_damped(name)
     joint = x.joint_names[-1]
     quantities = ["0.K_n", "0.V", f"{len(x.joints) - 1}.P"]
     at = jnp.array([oracle.numbers[each] for each in quantities])
-    own = float(x.joints[-1].coefficient())
 
     def factor(values):
         moved = x.replace(**{f"j{each}": v for each, v in zip(quantities, values, strict=True)})
@@ -182,7 +186,6 @@ def test_the_first_root_in_many_digits(name):
     omega = 2 * np.pi * float(critical.frequency)
     wanted = root(oracle, float(value), omega)
     assert float(value) == pytest.approx(float(wanted), rel=1e-11)
-    assert float(fj.critical_friction(x, joint=joint)) == pytest.approx(own * float(value))
     below = jax.vmap(lambda f: fj.growth_rate(with_friction_times(x, f)))
     growths = below(jnp.linspace(0.001, 1 - 1e-6, 300) * value)
     assert (growths < 0).all()
@@ -229,6 +232,100 @@ def test_a_beam_of_twenty_degrees_of_freedom():
     rate = jax.jit(lambda mu: fj.growth_rate(x.replace(**{"tip.mu": mu, "middle.mu": mu / 2})))
     growths = [float(rate(mu * share)) for share in (0.25, 0.5, 0.75, 1 - 1e-7, 1 + 1e-7)]
     assert max(growths[:-1]) < 0 < growths[-1]
+
+
+# --- boundaries ---------------------------------------------------------------------------
+
+WINDOWS = {
+    "flutter": (("K_n", 0.5, 3.0), ("mu", 0.2, 3.0)),
+    "divergence": (("K_n", 0.5, 3.0), ("mu", 1.0, 30.0)),
+}
+
+
+@functools.cache
+def boundary(name):
+    # Both axes linear: one program for all.
+    window = WINDOWS["divergence" if "divergence" in name else "flutter"]
+    return fj.hopf_boundary(two_masses(row(name)), *window, lines=9)
+
+
+@slow
+@pytest.mark.parametrize("name", ["damping", "hoffmann", "divergence", "divergence, damped"])
+def test_boundaries_in_closed_form(name):
+    """Flutter and divergence over a stiffness and friction, with frequency."""
+    (branch,) = boundary(name).branches
+    diverges = "divergence" in name
+    assert len(branch.x) > 30 and branch.divergence == diverges
+    assert ("static divergence" in repr(boundary(name))) == diverges
+    numbers = [float(number) for number in row(name)]
+    for K_n, mu, frequency in list(zip(branch.x, branch.y, branch.frequency, strict=True))[::5]:
+        numbers[6] = K_n
+        assert mu == pytest.approx(float(exact(*numbers)), rel=1e-9)
+        here = two_masses(jnp.array(numbers)).replace(mu=mu)
+        # With preload a divergence has no equilibrium; without slope that counts for nothing else.
+        here = fj.stability(here.replace(**{"joint_1.preload": False}))
+        assert frequency == pytest.approx(float(here.frequency), abs=1e-6)
+        assert abs(float(here.growth_rate)) < 1e-6
+    for end in (branch.start, branch.end):
+        assert bool(end == fj.BranchEnd.window)
+
+
+def two_minimal_models():
+    """Hoffmann's model twice, the second of twice the frequency, each with a joint and damping."""
+    K, C = np.zeros((2, 4, 4))
+    K[:2, :2], K[2:, 2:] = [[2, 1], [1, 2 - 4 / 3]], np.array([[2, 1], [1, 2 - 4 / 3]]) * 4
+    C[:2, :2], C[2:, 2:] = np.diag([0.02, 0.03]), np.diag([0.1, 0.02])
+    joints = {
+        "left": fj.Joint(fj.FixedContact(4 / 3, 0.0, 1.0), fj.Coulomb(0.1), 0, 1, preload=True),
+        "right": fj.Joint(fj.FixedContact(16 / 3, 0.0, 1.0), fj.Coulomb(0.2), 2, 3, preload=True),
+    }
+    return fj.Structure(np.eye(4), C, K, joints)
+
+
+@slow
+def test_a_corner_between_two_modes():
+    """Two models that know nothing of each other: two straight branches that end at one place."""
+    x = two_minimal_models()
+    found = fj.hopf_boundary(x, ("left.mu", 0.3, 1.2), ("right.mu", 0.3, 1.2), lines=7)
+    left = float(exact(2, 1, 1, 2 - 4 / 3, 0.02, 0.03, 4 / 3, 0))
+    right = float(exact(8, 4, 4, 8 - 16 / 3, 0.1, 0.02, 16 / 3, 0))
+    assert len(found.branches) == 2 and found.untraced == 0 and not found.squeals
+    for branch in found.branches:
+        upright = np.ptp(branch.x) < 1e-9
+        along, across, wanted, other = (
+            (branch.y, branch.x, left, right) if upright else (branch.x, branch.y, right, left)
+        )
+        np.testing.assert_allclose(across, wanted, rtol=1e-9)
+        assert (along.min(), along.max()) == pytest.approx((0.3, other), abs=1e-5)
+        assert {end_name(branch.start), end_name(branch.end)} == {"window", "corner"}
+    assert "at a corner, where a second mode loses its damping" in repr(found)
+
+
+def end_name(end):
+    return next(name for name in ("window", "corner") if bool(end == getattr(fj.BranchEnd, name)))
+
+
+@slow
+def test_boundary_of_preloaded_joints_of_all_kinds():
+    """Squeal to the right of each point and not to the left, by the matrices of the oracle."""
+    x, oracle = more_damped("three kinds")
+    factor = fj.critical_friction(x, joint="j2") / x.joints[2].coefficient()
+    x = with_friction_times(x, factor)  # a point of the boundary
+    window = ("j0.P", 200.0, 1500.0), ("j1.V", 0.05, 0.6)
+    found = fj.hopf_boundary(x, *window, lines=7)
+    assert found.branches
+    for branch in found.branches:
+        steps = np.diff(np.stack([branch.x, branch.y]) / [[1300.0], [0.55]])
+        for i in range(1, len(branch.x) - 1, max(1, len(branch.x) // 5)):
+            along = steps[:, i] / np.linalg.norm(steps[:, i])
+            right = np.array([along[1], -along[0]]) * [1300.0, 0.55] * 1e-4
+            growths = []
+            for sign in (1, -1):
+                numbers = scaled(oracle, mp.mpf(float(factor)))
+                P, V = np.array([branch.x[i], branch.y[i]]) + sign * right
+                numbers |= {"0.P": mp.mpf(P), "1.V": mp.mpf(V)}
+                growths.append(max(s.real for s in oracle.eigenvalues(numbers=numbers)))
+            assert growths[1] < 0 < growths[0]
 
 
 # --- refusals -----------------------------------------------------------------------------
