@@ -129,8 +129,8 @@ def hopf_boundary(
 
     Of a structure the boundary is flutter or static divergence (`Branch.divergence`). A branch ends
     at a corner, where a second mode loses its damping too; the next branch begins there. Points lie
-    on it within 1e-10 of the window. Each takes the eigenvalues once: choose fewer `lines` for many
-    degrees of freedom.
+    on it within 1e-10 of the window, or eps over the damping ratio. Each takes the eigenvalues
+    once: choose fewer `lines` for many degrees of freedom.
 
     Not differentiable, and not for use under `jit`; see `critical_friction` for that.
 
@@ -166,7 +166,7 @@ def hopf_boundary(
         low=np.zeros(2),
         high=np.ones(2),
         valid=field.damped,
-        tolerance=max(1e-12 if rigid is None else 1e-10, field.rounding),
+        tolerance=field.tolerance,
     )
     found, squeals, untraced = trace(curves, field.values, lines)
     return Boundary(
@@ -290,9 +290,9 @@ class _Field:
     def __init__(self, plane: _Plane):
         self.plane, self.dtype, self.entered = plane, plane.low.dtype, False
         eps = float(jnp.finfo(self.dtype).eps)
-        self.rounding, self.undamped = 10 * eps, max(_UNDAMPED, (10 * eps) ** 2)
-        if plane.rigid is not None:
-            self.undamped = _COALESCED * eps**0.5
+        self.tolerance, self.undamped = max(1e-12, 10 * eps), max(_UNDAMPED, (10 * eps) ** 2)
+        if plane.rigid is not None:  # eigenvalues know light damping to eps of the frequency
+            self.tolerance, self.undamped = max(1e-10, 1e4 * eps), _COALESCED * eps**0.5
         # A point is asked for its zero, for its damping and for what the result shows.
         self._at = functools.lru_cache(8)(lambda u: _at(plane, jnp.asarray(u, self.dtype)))
 

@@ -1,6 +1,7 @@
 """Margin, sweeps, designs and fronts of a structure with preload, beside matrices made by NumPy."""
 
 import functools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,7 +34,7 @@ def by_hand(values):
     """State of the pad's contact, and all eigenvalues."""
     v = GIVEN | values
     surface = fj.Surface(v["pad.D"], v["pad.G"], float(BRAKE.contact.surface.gamma))
-    state = fj.contact_state(surface, BRAKE.contact.material, v["pad.P"], mu_s=0.4, mu_m=0.25)
+    state: Any = fj.contact_state(surface, BRAKE.contact.material, v["pad.P"], mu_s=0.4, mu_m=0.25)
     K_n, K_t, u = float(state.K_n), float(state.K_t), v["pad.V"] / 0.5
     mu, slope = 0.4 + 0.075 * (u**3 - 3 * u), 0.075 * (3 * u**2 - 3) / 0.5
     e = np.eye(4)[2]
@@ -62,7 +63,8 @@ def test_sweep_and_margin():
     def measure(x):
         return {"growth": fj.growth_rate(x), "margin": fj.margin(x, 20.0)}
 
-    found = fj.sweep(measure, structure(), progress=False, **{"pad.P": Ps, "pad.V": Vs})
+    axes: dict[str, Any] = {"pad.P": Ps, "pad.V": Vs}
+    found = fj.sweep(measure, structure(), progress=False, **axes)
     assert found.values["margin"].min() < 0 < found.values["margin"].max()
     for i, P in enumerate(Ps):
         for j, V in enumerate(Vs):
@@ -88,7 +90,7 @@ def test_designs(names):
     """What it asks holds by hand, and of 300 other designs none that meets it is nearer."""
     target, K_n_min = -80.0, 8e7
     assert growth_by_hand({}) > target
-    best = fj.design(
+    best: Any = fj.design(
         structure(),
         bounds={name: BOUNDS[name] for name in names},
         target=target,
@@ -103,7 +105,7 @@ def test_designs(names):
         return met and float(state.slip_ratio) <= 0.9 + slack
 
     x = best.scene
-    values = {name: float(fj_value(x, name)) for name in names}
+    values = {name: float(of_pad(x, name)) for name in names}
     assert not best.violated and meets(values, 1e-5)
     assert best.value == pytest.approx(distance(values, names), rel=1e-6)
     assert best.growth_rate == pytest.approx(growth_by_hand(values), abs=1e-6)
@@ -120,7 +122,7 @@ def test_designs(names):
             assert not meets(other)
 
 
-def fj_value(x, name):
+def of_pad(x, name):
     pad = x.joints[0]
     surface = pad.contact.surface
     return {"D": surface.D, "G": surface.G, "P": pad.contact.P, "V": pad.V}[name.split(".")[1]]
@@ -143,7 +145,7 @@ def test_front():
     assert len(front.first) >= 4 and (np.diff(front.first) > 0).all()
     members = []
     for i in range(len(front.first)):
-        values = {name: float(fj_value(front.scene(i), name)) for name in names}
+        values = {name: float(of_pad(front.scene(i), name)) for name in names}
         assert front.first[i] == pytest.approx(growth_by_hand(values), abs=1e-6)
         assert front.second[i] == pytest.approx(-values["pad.P"] / 1e3)
         members.append((front.first[i], front.second[i]))
