@@ -56,6 +56,7 @@ def growth_by_hand(values):
     return float(by_hand(values)[1].real.max())
 
 
+@slow
 def test_sweep_and_margin():
     """Over the load and the velocity of a joint: growth rate and least damping ratio."""
     Ps, Vs = np.array([600.0, 1500.0]), np.array([0.2, 0.37, 0.47])

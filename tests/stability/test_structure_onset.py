@@ -38,7 +38,7 @@ PAIRS: dict[str, dict[str, float]] = {
     "light damping": HOFFMANN | dict(c1=1e-6, c2=7e-6, k11=2.1),
     "damping": HOFFMANN | dict(c1=0.05, c2=0.3, K_t=0.1),
     "divergence": DIVERGING,
-    "divergence, damped": DIVERGING | dict(c1=0.1, c2=2.0),
+    "divergence, damped": DIVERGING | dict(c1=0.1, c2=0.3),
     "belt": BELT,
     "belt, undamped": BELT | dict(c1=0, c2=0),
     "one direction undamped": BELT | dict(c2=0),
@@ -264,7 +264,9 @@ def test_boundaries_in_closed_form(name):
         here = two_masses(jnp.array(numbers)).replace(mu=mu)
         # With preload a divergence has no equilibrium; without slope that counts for nothing else.
         here = fj.stability(here.replace(**{"joint_1.preload": False}))
-        assert frequency == pytest.approx(float(here.frequency), abs=1e-6)
+        # Without damping all modes are on the boundary, and any may come first.
+        listed = np.asarray(here.frequencies) if name == "divergence" else [here.frequency]
+        assert np.abs(np.asarray(listed) - frequency).min() < 1e-6
         assert abs(float(here.growth_rate)) < 1e-6
     for end in (branch.start, branch.end):
         assert bool(end == fj.BranchEnd.window)
