@@ -22,6 +22,7 @@ from .._base.parts import brief, flag, require_scalar, scalar, substitute
 from .._contact.fixed import FixedContact
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import (
+    joints_of,
     known_quantities,
     moved_by,
     own_quantities,
@@ -99,7 +100,7 @@ class DesignProblem(eqx.Module):
         x = self.moved(u, condition, shift)
         states = {
             name: part.contact.state(part.friction.mu_s, part.friction.mu_m)
-            for name, part in parts_with_contacts(x).items()
+            for name, part in joints_of(x).items()
             if part.contact.fractal
         }
         growth = growth_rate(_with_stiffness(x, states), self.friction_slope)
@@ -235,25 +236,18 @@ def _evaluate(problem: DesignProblem, us, conditions):
 # --- scenes and structures alike -------------------------------------------------------------
 
 
-def parts_with_contacts(x: Mechanism) -> dict[str, Any]:
-    """The joints of a structure by name; a scene, with contact and friction itself, as ""."""
-    if isinstance(x, Structure):
-        return dict(zip(x.joint_names, x.joints, strict=True))
-    return {"": x}
-
-
 def _dot(name: str) -> str:
     return f"{name}." if name else ""
 
 
 def _slips(x, name) -> bool:
     """Whether a contact has a tangential law, which slips."""
-    return parts_with_contacts(x)[name].contact.stiffness_ratio is None
+    return joints_of(x)[name].contact.stiffness_ratio is None
 
 
 def _with_stiffness(x, states):
     """`x` with contacts of known stiffness where their states (by name) are known already."""
-    parts, zero = parts_with_contacts(x), FixedContact(0.0, 0.0, 1.0)
+    parts, zero = joints_of(x), FixedContact(0.0, 0.0, 1.0)
     for name, state in states.items():
         P = parts[name].contact.P  # of a preloaded joint
         known = substitute(zero, {"K_n": state.K_n, "K_t": state.K_t, "P": P})
@@ -267,7 +261,7 @@ def _moved_contacts(x, names) -> tuple[str, ...]:
     """The fractal contacts whose stiffness these quantities move."""
     moved = {each for name in names for each in moved_by(x, name)}
     found = []
-    for name, part in parts_with_contacts(x).items():
+    for name, part in joints_of(x).items():
         own = {*own_quantities(part.contact), *own_quantities(part.friction)}
         if part.contact.fractal and moved & {_dot(name) + each for each in own}:
             found.append(name)

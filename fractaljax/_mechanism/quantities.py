@@ -29,6 +29,13 @@ _CHECKED_AT_ONCE = 1 << 16  # points of a grid
 STIFFNESS_RATIO, FREQUENCY_RATIO, FRICTION = "K_t/K_n", "omega_1/omega_2", "mu"
 
 
+def joints_of(x: Mechanism) -> dict[str, Any]:
+    """The joints of a structure by name; a scene, with contact and friction itself, as ""."""
+    if isinstance(x, Structure):
+        return dict(zip(x.joint_names, x.joints, strict=True))
+    return {"": x}
+
+
 class Quantity(NamedTuple):
     """A number of a scene."""
 
@@ -241,9 +248,12 @@ def sliding_friction(scene: Scene) -> Array:
     return friction.mu(scene.oscillator.V)
 
 
-def with_friction_times(scene: Scene, factor: ArrayLike) -> Scene:
-    """The friction law as a whole times `factor`; not checked."""
-    return eqx.tree_at(lambda x: x.friction, scene, scene.friction.times(factor))
+def with_friction_times(x: Any, factor: ArrayLike) -> Any:
+    """A scene or structure with each friction law as a whole times `factor`; not checked."""
+    if isinstance(x, Structure):
+        joints = tuple(with_friction_times(joint, factor) for joint in x.joints)
+        return eqx.tree_at(lambda s: s.joints, x, joints)
+    return eqx.tree_at(lambda part: part.friction, x, x.friction.times(factor))
 
 
 def _friction_times(scene, factor):

@@ -1,10 +1,11 @@
-"""The stability boundary as a curve in two quantities of a scene.
+"""The stability boundary as a curve in two quantities of a scene or a structure.
 
 Both axes are scaled to [0, 1]. The boundary is where the Hopf test function is 0, which is smooth
 on the scale of the stiffness however light the damping. `_continuation.py` follows it.
 """
 
 import functools
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,26 +14,35 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.batches import in_batches
-from .._base.parts import Record, flag, require_scalar, scalar, whole
+from .._base.parts import Record, brief, flag, require_scalar, scalar, whole
 from .._base.ranges import is_logarithmic
 from .._contact.contact import Regime
 from .._continuation import Continuation, Curve, CurveEnd, trace
+from .._mechanism.mechanism import Mechanism
 from .._mechanism.oscillator import linearise
 from .._mechanism.quantities import (
+    joints_of,
     own_quantities,
     require_independent,
     require_inside,
     require_known,
     substituted,
+    with_friction_times,
     with_optional,
 )
-from .._mechanism.scene import Scene, require_kind
+from .._mechanism.scene import Scene
+from .._mechanism.structure import Structure, require_single
 from .critical_friction import critical_frequency, hopf_test_function
+from .critical_pair import critical_pair
+from .linearise import assembled, with_equilibrium
+from .quadratic import solve
 from .quartic import rightmost_root
 
 _BATCH = 512  # points evaluated at once
 _LINES_MAX = 2000  # of the lattice, whose points grow with the square
 _UNDAMPED = 1e-12  # negative damping over sqrt(a + b) that may be rounding
+_COALESCED = 1e2  # times sqrt(eps): negative damping ratio that may be rounding, in a structure
+_LOST = 1e-5  # damping of two modes at once, where the boundary has a corner
 _MU_M_STEP = 0.3  # where Eq. 19 is discontinuous
 
 Window = tuple[str, float, float]
@@ -45,6 +55,7 @@ class BranchEnd(eqx.Enumeration):
     closed = "where it began"
     regime = "where the regime of the joint changes"
     undamped = "where both directions have lost their damping"
+    corner = "at a corner, where a second mode loses its damping"
     friction_correction = "at mu_m = 0.3, where Eq. 19 has a step"
     lost = "where it could not be followed"
 
@@ -54,7 +65,7 @@ class Branch(Record):
 
     x: Float[np.ndarray, " k"]
     y: Float[np.ndarray, " k"]
-    frequency: Float[np.ndarray, " k"]  # of the imaginary pair of eigenvalues [Hz]
+    frequency: Float[np.ndarray, " k"]  # of the imaginary pair of eigenvalues [Hz]; 0: divergence
     growth_rate: Float[np.ndarray, " k"]  # [1/s], 0 up to rounding
     start: BranchEnd
     end: BranchEnd
@@ -64,11 +75,16 @@ class Branch(Record):
         """Whether it is a loop; its last point is then its first."""
         return bool(self.end == BranchEnd.closed)
 
+    @property
+    def divergence(self) -> bool:
+        """Whether a real eigenvalue is 0 on it, not a pair imaginary: static instability."""
+        return not self.frequency.any()
+
 
 class Boundary(Record):
     """Where the growth rate is 0 in a window of two quantities, as `hopf_boundary` returns it."""
 
-    scene: Scene
+    scene: Mechanism
     x: Window  # name and range
     y: Window
     branches: tuple[Branch, ...]
@@ -82,7 +98,8 @@ class Boundary(Record):
         rows = [f"stability boundary, {x}, {y}: {len(self.branches)} branch{plural}"]
         for branch in self.branches:
             ends = f"begins {BranchEnd[branch.start]}, ends {BranchEnd[branch.end]}"
-            rows.append(f"  {len(branch.x)} points, {'a loop' if branch.closed else ends}")
+            kind = "static divergence, " if branch.divergence else ""
+            rows.append(f"  {len(branch.x)} points, {kind}{'a loop' if branch.closed else ends}")
         if not self.branches and not self.untraced:
             side = "it squeals" if self.squeals else "stable against small disturbances"
             rows.append(f"  none found: {side}")
@@ -92,31 +109,42 @@ class Boundary(Record):
 
 
 def hopf_boundary(
-    scene: Scene,
+    scene: Scene | Structure,
     x: Window,
     y: Window,
     *,
     friction_slope: bool = True,
     lines: int = 49,
 ) -> Boundary:
-    """Trace where the growth rate is 0 in the window of two quantities of a scene.
+    """Trace where the growth rate is 0 in the window of two quantities of a scene or structure.
 
-    `x` and `y` are (name, low, high): any quantity of the scene, or "K_t/K_n" at the scene's K_n
-    (the given stiffness ratio of a fractal contact), "omega_1/omega_2" at the scene's omega_2, and
-    "mu", the friction at the belt velocity, which scales the friction law as a whole. A range over
-    a decade or more is logarithmic. Every point lies on the boundary within 1e-12 of the window, or
-    what the rounding of the scene allows. Branches are found where they cross one of `lines` lines
-    each way, or dip between two of them; a loop within a cell can be missed. Where both directions
-    lose all their damping at once, along a whole line, the Hopf test function does not change sign
-    smoothly: such crossings are counted as `untraced`.
+    `x` and `y` are (name, low, high): any quantity, of a structure also "left.D"; of a scene also
+    "K_t/K_n" at the scene's K_n (the given stiffness ratio of a fractal contact), "omega_1/omega_2"
+    at the scene's omega_2, and "mu", the friction at the belt velocity, which scales the friction
+    law as a whole. A range over a decade or more is logarithmic. Every point lies on the boundary
+    within 1e-12 of the window, or what the rounding of the scene allows. Branches are found where
+    they cross one of `lines` lines each way, or dip between two of them; a loop within a cell can
+    be missed. Where both directions lose all their damping at once, along a whole line, the Hopf
+    test function does not change sign smoothly: such crossings are counted as `untraced`.
+
+    Of a structure the boundary is flutter or static divergence (`Branch.divergence`). A branch ends
+    at a corner, where a second mode loses its damping too; the next branch begins there. Points lie
+    on it within 1e-10 of the window, or eps over the damping ratio. Each takes the eigenvalues
+    once: choose fewer `lines` for many degrees of freedom.
 
     Not differentiable, and not for use under `jit`; see `critical_friction` for that.
 
     **Raises:** `ValueError` for a name that is no quantity of the scene, two names that set the
-    same one, a range that is empty, inverted or outside the domain, or a scene that holds arrays.
+    same one, a range that is empty, inverted or outside the domain, a scene that holds arrays, and
+    where stability cannot be computed in the window: a preloaded joint is open, or there is no
+    equilibrium.
     """
-    require_kind("scene", scene, Scene)
-    require_scalar(scene)
+    if isinstance(scene, Structure):
+        require_single(scene)
+    elif isinstance(scene, Scene):
+        require_scalar(scene)
+    else:
+        raise TypeError(f"scene must be a Scene or a Structure, got {brief(scene)}")
     friction_slope = flag("friction_slope", friction_slope)
     lines = whole("lines", lines, 2, _LINES_MAX)
     windows = [_window(scene, which, window) for which, window in (("x", x), ("y", y))]
@@ -126,15 +154,19 @@ def hopf_boundary(
     logarithmic = tuple(is_logarithmic(*window[1:]) for window in windows)
     ends = np.array([window[1:] for window in windows])
     ends[list(logarithmic)] = np.log(ends[list(logarithmic)])
-    low, high = jnp.asarray(ends.T, scene.oscillator.m.dtype)
+    low, high = jnp.asarray(ends.T, jax.tree.leaves(scene)[0].dtype)
     scene = with_optional(scene, names)
-    field = _Field(_Plane(scene, low, high, names, logarithmic, friction_slope))
+    rigid = None
+    if isinstance(scene, Structure):
+        with_equilibrium(scene, friction_slope)
+        rigid = _rigid(scene, friction_slope)
+    field = _Field(_Plane(scene, low, high, rigid, names, logarithmic, friction_slope))
     curves = Continuation(
         field.equations,
         low=np.zeros(2),
         high=np.ones(2),
         valid=field.damped,
-        tolerance=max(1e-12, field.rounding),
+        tolerance=field.tolerance,
     )
     found, squeals, untraced = trace(curves, field.values, lines)
     return Boundary(
@@ -179,17 +211,19 @@ class _Point(eqx.Module):
     test: jax.Array
     frequency: jax.Array
     growth_rate: jax.Array
-    damping: Float[Array, "2"]  # over sqrt(a + b)
-    regime: Regime | None  # of a fractal joint
-    mu_m: jax.Array | None  # of a fractal joint, for which Eq. 19 corrects
+    damping: Float[Array, "2"]  # over sqrt(a + b); of a structure the two least damping ratios
+    open: jax.Array  # whether a preloaded joint is
+    regimes: tuple[Regime, ...]  # of the fractal joints
+    mu_m: tuple[jax.Array, ...]  # of the fractal joints, for which Eq. 19 corrects
 
 
 class _Plane(eqx.Module):
-    """A scene over the unit square: two of its quantities, each scaled to its range."""
+    """A scene or structure over the unit square: two of its quantities, scaled to their ranges."""
 
-    scene: Scene
+    scene: Any
     low: Float[Array, "2"]  # of each quantity, or of its logarithm
     high: Float[Array, "2"]
+    rigid: Any  # how many eigenvalues of a structure are those of rigid-body modes
     names: tuple[str, str] = eqx.field(static=True)
     logarithmic: tuple[bool, ...] = eqx.field(static=True)
     friction_slope: bool = eqx.field(static=True)
@@ -200,17 +234,36 @@ class _Plane(eqx.Module):
 
     def at(self, u) -> _Point:
         scene = substituted(self.scene, dict(zip(self.names, self.quantities(u), strict=True)))
-        contact, friction = scene.contact, scene.friction
-        if contact.fractal:
-            state = contact.state(friction.mu_s, friction.mu_m)
-            K_n, K_t, law = state.K_n, state.K_t, (state.regime, friction.mu_m)
+        fractal = [joint for joint in joints_of(scene).values() if joint.contact.fractal]
+        laws = [joint.friction for joint in fractal]
+        states = [
+            joint.contact.state(law.mu_s, law.mu_m)
+            for joint, law in zip(fractal, laws, strict=True)
+        ]
+        regimes = tuple(state.regime for state in states)
+        lowest = tuple(law.mu_m for law in laws)
+        if isinstance(scene, Structure):
+            attached = assembled(scene, self.friction_slope, refuse=False)
+            pair = critical_pair(*attached.matrices, self.rigid)
+            return _Point(*pair, attached.open, regimes, lowest)
+        friction = scene.friction
+        if states:
+            K_n, K_t = states[0].K_n, states[0].K_t
         else:
-            (K_n, K_t), law = contact.stiffness(friction.mu_s, friction.mu_m), (None, None)
+            K_n, K_t = scene.contact.stiffness(friction.mu_s, friction.mu_m)
         load, slope = scene.normal_load, self.friction_slope
         lin = linearise(scene.oscillator, friction, K_n, K_t, slope, load)
         damping = jnp.stack([lin.c_1, lin.c_2]) / jnp.sqrt(lin.a + lin.b)
-        growth = rightmost_root(lin).real
-        return _Point(hopf_test_function(lin), critical_frequency(lin), growth, damping, *law)
+        growth, frequency = rightmost_root(lin).real, critical_frequency(lin)
+        test = hopf_test_function(lin)
+        return _Point(test, frequency, growth, damping, jnp.isnan(test), regimes, lowest)
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _rigid(structure: Structure, friction_slope: bool):
+    """How many eigenvalues are those of rigid-body modes, at little friction."""
+    x = with_friction_times(structure, 1e-3)
+    return (solve(*assembled(x, friction_slope).matrices).s == 0).sum()
 
 
 @jax.jit
@@ -226,17 +279,20 @@ def _at(plane: _Plane, u):
 
 @jax.jit
 def _tests(plane: _Plane, us):
-    """Test function (k,) and gradient (k, 2) at points (k, 2)."""
+    """Test function (k,), gradient (k, 2) and open joints (k,) at points (k, 2)."""
     gradients, points = jax.vmap(_at, (None, 0))(plane, us)
-    return points.test, gradients
+    return points.test, gradients, points.open
 
 
 class _Field:
     """The test function for NumPy: at many points, or at one with all that is known there."""
 
     def __init__(self, plane: _Plane):
-        self.plane, self.dtype = plane, plane.low.dtype
-        self.rounding = 10 * float(jnp.finfo(self.dtype).eps)
+        self.plane, self.dtype, self.entered = plane, plane.low.dtype, False
+        eps = float(jnp.finfo(self.dtype).eps)
+        self.tolerance, self.undamped = max(1e-12, 10 * eps), max(_UNDAMPED, (10 * eps) ** 2)
+        if plane.rigid is not None:  # eigenvalues know light damping to eps of the frequency
+            self.tolerance, self.undamped = max(1e-10, 1e4 * eps), _COALESCED * eps**0.5
         # A point is asked for its zero, for its damping and for what the result shows.
         self._at = functools.lru_cache(8)(lambda u: _at(plane, jnp.asarray(u, self.dtype)))
 
@@ -248,22 +304,29 @@ class _Field:
         return np.asarray(point.test, float)[None], np.asarray(gradient, float)[None]
 
     def values(self, us):
-        """Test function (k,) and gradient (k, 2) at any number of points."""
+        """Test function (k,) and gradient (k, 2) at any number of points, first of the lattice."""
 
         def program(us):
             return _tests(self.plane, jnp.asarray(us, self.dtype))
 
-        tests, gradients = (np.asarray(x, float) for x in in_batches(program, _BATCH, us))
-        if np.isnan(tests).any():
-            place = zip(self.plane.names, self.quantities(us[np.isnan(tests)][0]), strict=True)
+        tests, gradients, lifted = map(np.asarray, in_batches(program, _BATCH, us))
+        lost = np.isnan(tests)
+        if not self.entered:
+            # Beyond a static divergence the force has the other sign: it passed through infinity.
+            # On it rounding decides.
+            lost |= lifted & (tests >= 0)
+            self.entered = True
+        if lost.any():
+            place = zip(self.plane.names, self.quantities(us[lost][0]), strict=True)
             where = ", ".join(f"{name} = {value:.6g}" for name, value in place)
-            may = "; the joint may be open there" if self.plane.scene.preload else ""
+            loaded = any(x.normal_load is not None for x in joints_of(self.plane.scene).values())
+            may = "; the joint may be open there" if loaded else ""
             raise ValueError(f"stability cannot be computed at {where}{may}")
-        return tests, gradients
+        return tests.astype(float), gradients.astype(float)
 
     def damped(self, u) -> bool:
-        """Whether both directions are; else the test function can be 0 without a Hopf point."""
-        return bool(np.asarray(self.at(u).damping).min() >= -max(_UNDAMPED, self.rounding**2))
+        """Whether all modes are; else the test function can be 0 without a Hopf point."""
+        return bool(np.asarray(self.at(u).damping).min() >= -self.undamped)
 
     def quantities(self, u) -> list[float]:
         return [float(x) for x in self.plane.quantities(jnp.asarray(u, self.dtype))]
@@ -273,15 +336,16 @@ class _Field:
         if end in (CurveEnd.edge, CurveEnd.closed):
             return BranchEnd.window if end is CurveEnd.edge else BranchEnd.closed
         here = self.at(u)
-        if np.abs(here.damping).max() < 1e-5:
-            return BranchEnd.undamped
-        if here.mu_m is not None and abs(float(here.mu_m) - _MU_M_STEP) < 1e-6:
+        if np.abs(here.damping).max() < _LOST:
+            return BranchEnd.undamped if self.plane.rigid is None else BranchEnd.corner
+        if any(abs(float(mu_m) - _MU_M_STEP) < 1e-6 for mu_m in here.mu_m):
             return BranchEnd.friction_correction
         ahead = (u - before) / np.linalg.norm(u - before)
         for reach in 10.0 ** np.arange(-7, -2):
             for direction in (ahead, ahead[::-1], -ahead[::-1]):
                 beside = self.at(np.clip(u + reach * direction, 0, 1))
-                if here.regime is not None and not bool(beside.regime == here.regime):
+                pairs = zip(here.regimes, beside.regimes, strict=True)
+                if not all(bool(one == other) for one, other in pairs):
                     return BranchEnd.regime
         return BranchEnd.lost
 

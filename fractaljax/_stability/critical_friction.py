@@ -4,16 +4,20 @@
 proportional to mu^2, reaches g_c = c_1 c_2/(c_1 + c_2)^2 [(a - b)^2 + (c_1 + c_2)(c_1 b + c_2 a)]:
 a Hopf bifurcation. Where only g depends on friction that is a closed form. The slope of the
 friction law changes the damping as well, and a fractal joint its stiffness. Then the first root
-along friction is bracketed and polished, and differentiated implicitly.
+along friction is bracketed and polished, and differentiated implicitly. A structure takes that way
+with the test function of `critical_pair.py`.
 """
 
 import functools
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from .._base.parts import flag, require_scalar
+from .._base.parts import brief, concrete, flag, require_scalar
 from .._base.singular import positive_sqrt, safe_divide
 from .._contact.contact import MU_M_MAX
 from .._mechanism.oscillator import (
@@ -22,12 +26,16 @@ from .._mechanism.oscillator import (
     linearise,
     static_normal_force,
 )
-from .._mechanism.quantities import sliding_friction, with_friction_times
-from .._mechanism.scene import Scene, require_kind, stiffness
-from .linearise import linearised
+from .._mechanism.quantities import joints_of, sliding_friction, with_friction_times
+from .._mechanism.scene import Scene, stiffness
+from .._mechanism.structure import Joint, Structure
+from .critical_pair import critical_pair, least_test
+from .linearise import assembled, linearised
+from .quadratic import solve
 
 _FACTORS = 512  # of the friction law, among which the first root is bracketed
-_BISECTIONS = 50
+_AT_ONCE = 8  # of them, and so many points that divide the bracket further
+_REFINED = 12  # times, to 9^-12 of it
 
 
 def critical_coupling(lin: Linearised) -> Float[Array, ""]:
@@ -61,30 +69,84 @@ def critical_frequency(lin: Linearised) -> Float[Array, ""]:
     return positive_sqrt(safe_divide(a_1, a_3, (lin.a + lin.b) / 2)) / (2 * jnp.pi)
 
 
-@functools.partial(jax.jit, static_argnames="friction_slope")
-def critical_friction(scene: Scene, friction_slope: bool = True) -> Float[Array, ""]:
-    """Friction coefficient mu(V) at which the scene starts to squeal [-], a scalar.
+def critical_friction(
+    scene: Scene | Structure, friction_slope: bool = True, joint: str | None = None
+) -> Float[Array, ""]:
+    """Friction coefficient mu(V) at which the scene or structure starts to squeal [-], a scalar.
 
     With a `FixedContact` and friction that has no slope, or `friction_slope=False`, the closed
     form mu_c = m sqrt(g_c/(K_n K_t)), infinite where K_n or K_t is 0. Otherwise the friction law
     as a whole is multiplied by a factor, so that mu_s, mu_m and its slope grow together, and the
     contact follows as in `stiffness`: K_t of a fractal joint depends on mu_s, its critical area on
-    mu_m. The first friction that squeals is searched from 1/500 to 500 times that of the scene, up
-    to the limit of Eq. 19 (mu_m <= 0.9): 0 if the least squeals already, infinite if none does,
+    mu_m. The first friction that squeals is searched from 1/1000 to 1000 times that of the scene,
+    up to the limit of Eq. 19 (mu_m <= 0.9): 0 if the least squeals already, infinite if none does,
     NaN where it cannot be computed, and where a preloaded joint opens first. To hold the stiffness,
     `scene.replace(contact=FixedContact(*stiffness(scene)))`, with its P if it is preloaded.
 
+    Of a structure one factor scales the friction of all joints, and the equilibrium follows.
+    Returned is mu at the sliding velocity of `joint`, which all joints share unless it is named;
+    those of the others are in the same proportion as before. Squeal begins by flutter or by static
+    divergence (a real eigenvalue). The factor is the root of the Hopf test function of n degrees
+    of freedom (`critical_pair.py`) between two of 512 factors f, evenly spaced in f/(1 + f): an
+    interval of squeal narrower than that can be missed. Each takes the eigenvalues once.
+
     The derivative is that of the root, and 0 where it is 0 or infinite.
 
-    **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`.
+    **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`; for a structure without
+    joints, a `joint` that it does not have, or none where friction differs between them.
     """
-    require_kind("scene", scene, Scene)
+    sloping = flag("friction_slope", friction_slope)
+    if isinstance(scene, Structure):
+        coefficient = _coefficient(scene, joint)
+        factor = _factor_of_structure(scene, sloping)
+        return jnp.where(factor == jnp.inf, jnp.inf, coefficient * _finite(factor))
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene must be a Scene or a Structure, got {brief(scene)}")
+    if joint is not None:
+        raise ValueError(f"joint names one of a structure, got {brief(joint)} for a scene")
+    return _of_scene(scene, sloping)
+
+
+def _finite(factor):
+    return jnp.where(factor == jnp.inf, 1, factor)
+
+
+def _coefficient(structure: Structure, name: str | None) -> Array:
+    """mu at the sliding velocity of a joint, by name or that of all."""
+    known = ", ".join(structure.joint_names)
+    if not structure.joints:
+        raise ValueError("critical_friction needs a joint, and the structure has none")
+    if name is not None:
+        if name not in structure.joint_names:
+            raise ValueError(f"the structure has no joint {brief(name)}; it has {known}")
+        return _sliding(structure.joints[structure.joint_names.index(name)])
+    first, *others = map(_sliding, structure.joints)
+    wanted = f"joint must be given, for friction differs between the joints: {known}"
+    for other in others:
+        values = concrete(first), concrete(other)
+        if values[0] is None or values[1] is None:
+            first = eqx.error_if(first, first != other, wanted)
+        elif values[0] != values[1]:
+            raise ValueError(wanted)
+    return first
+
+
+_sliding = jax.jit(Joint.coefficient)
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _factor_of_structure(structure, friction_slope):
+    # Beyond a static divergence there is an equilibrium again: it is looked for before.
+    least = assembled(with_friction_times(structure, 1e-3), friction_slope)
+    return _first_factor(structure, friction_slope)[0] + 0 * least.C[0, 0]
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _of_scene(scene: Scene, friction_slope: bool) -> Float[Array, ""]:
     require_scalar(scene)
-    sloping = flag("friction_slope", friction_slope) and scene.friction.velocity_dependent
-    if sloping or scene.contact.fractal:
-        factor = _first_factor(scene, friction_slope)
-        none = factor == jnp.inf
-        return jnp.where(none, jnp.inf, sliding_friction(scene) * jnp.where(none, 1, factor))
+    if scene.contact.fractal or (friction_slope and scene.friction.velocity_dependent):
+        factor, _ = _first_factor(scene, friction_slope)
+        return jnp.where(factor == jnp.inf, jnp.inf, sliding_friction(scene) * _finite(factor))
     K_n, K_t = stiffness(scene)
     m = scene.oscillator.m
     lin = linearise(scene.oscillator, scene.friction, K_n, K_t, friction_slope=False)
@@ -100,54 +162,117 @@ def critical_friction(scene: Scene, friction_slope: bool = True) -> Float[Array,
     return jnp.where(N > 0, found, jnp.nan)
 
 
-def _test(scene, factor, friction_slope):
-    """The Hopf test function with the friction law times a factor."""
-    return hopf_test_function(linearised(with_friction_times(scene, factor), friction_slope))
+class _Found(NamedTuple):
+    """The search for the first factor of the friction that squeals: at `high`, not at `low`."""
+
+    low: jax.Array
+    high: jax.Array  # infinite before it is bracketed
+    value: jax.Array  # at `high`: not below 0 if a joint opens first, perhaps NaN
+    least: jax.Array  # whether the least factor squeals
+    rounds: jax.Array
+    refined: jax.Array  # rounds since it is bracketed
+    rigid: jax.Array | None  # eigenvalues of rigid-body modes, of a structure
 
 
-def _test_and_slope(scene, factor, friction_slope):
-    """The test function, and its derivative by the factor."""
-    return jax.jvp(lambda x: _test(scene, x, friction_slope), (factor,), (jnp.ones_like(factor),))
+def _test(x, factor, friction_slope, rigid):
+    """The Hopf test function with each friction law times a factor."""
+    if isinstance(x, Structure):
+        attached = assembled(with_friction_times(x, factor), friction_slope, refuse=False)
+        return critical_pair(*attached.matrices, rigid).test
+    return hopf_test_function(linearised(with_friction_times(x, factor), friction_slope))
+
+
+def _signs(x, factors, friction_slope, rigid):
+    """Numbers (k,) of its sign at factors (k,), whether a joint is open (k,), and `rigid`.
+
+    A number is 0 where rounding decides the sign. Rigid-body modes are those at the first factor,
+    the least; later ones mean divergence.
+    """
+    if not isinstance(x, Structure):
+        values = jax.vmap(lambda f: _test(x, f, friction_slope, None))(factors)
+        return values, jnp.isnan(values), None
+
+    def solved(factor):
+        attached = assembled(with_friction_times(x, factor), friction_slope, refuse=False)
+        return solve(*attached.matrices), attached
+
+    modes, attached = jax.vmap(solved)(factors)
+    rigid = jnp.where(rigid < 0, (modes.s[0] == 0).sum(), rigid)
+    values = jax.vmap(least_test, (0, 0, None))(modes, attached.C, rigid)
+    return values, jax.vmap(lambda found: found.open)(attached), rigid
+
+
+def _lattice(x):
+    """The factors (_FACTORS,) among which the first root is bracketed."""
+    dtype = jax.tree.leaves(x)[0].dtype
+    share = (jnp.arange(_FACTORS, dtype=dtype) + 0.5) / _FACTORS
+    factors = share / (1 - share)
+    for part in joints_of(x).values():
+        if part.contact.fractal:
+            lowest = part.friction.mu_m
+            most = safe_divide(MU_M_MAX, lowest, jnp.full_like(lowest, jnp.inf))
+            factors = jnp.minimum(factors, most)
+    return factors
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
-def _first_factor(scene, friction_slope):
-    """The least factor of the friction law that squeals; 0 if any does, infinite if none."""
-    x = (jnp.arange(_FACTORS, dtype=scene.oscillator.m.dtype) + 0.5) / _FACTORS
-    factors = x / (1 - x)
-    if scene.contact.fractal:
-        lowest = scene.friction.mu_m
-        factors = jnp.minimum(
-            factors, safe_divide(MU_M_MAX, lowest, jnp.full_like(lowest, jnp.inf))
+def _first_factor(x: Any, friction_slope: bool):
+    """The least factor of the friction that squeals; 0 if any does, infinite if none.
+
+    And the number of rigid-body eigenvalues of a structure.
+    """
+    groups = _lattice(x).reshape(-1, _AT_ONCE)
+    inner = (jnp.arange(_AT_ONCE, dtype=groups.dtype) + 1) / (_AT_ONCE + 1)
+
+    def onward(at):
+        bracketed = at.high < jnp.inf
+        return jnp.where(bracketed, at.refined < _REFINED, at.rounds < len(groups))
+
+    def search(at):
+        bracketed = at.high < jnp.inf
+        between = at.low + inner * (jnp.where(bracketed, at.high, at.low) - at.low)
+        factors = jnp.where(bracketed, between, groups[jnp.minimum(at.rounds, len(groups) - 1)])
+        values, lifted, rigid = _signs(x, factors, friction_slope, at.rigid)
+        squeals = ~(values >= 0) | lifted  # NaN does not count as stable
+        first, some = jnp.argmax(squeals), squeals.any()
+        last = jnp.where(some, factors[first - 1], factors[-1])
+        return _Found(
+            low=jnp.where(some & (first == 0), at.low, last),
+            high=jnp.where(some, factors[first], at.high),
+            value=jnp.where(some, values[first], at.value),
+            least=at.least | (some & (first == 0) & (at.rounds == 0)),
+            rounds=at.rounds + 1,
+            refined=at.refined + bracketed,
+            rigid=rigid,
         )
-    values = jax.vmap(lambda factor: _test(scene, factor, friction_slope))(factors)
-    # NaN does not count as stable: it makes the root NaN if it comes first.
-    squeals = ~(values >= 0)
-    first = jnp.argmax(squeals)
 
-    def bisect(_, ends):
-        low, high = ends
-        middle = (low + high) / 2
-        inside = ~(_test(scene, middle, friction_slope) >= 0)
-        return jnp.where(inside, low, middle), jnp.where(inside, middle, high)
-
-    ends = factors[jnp.maximum(first - 1, 0)], factors[first]
-    _, factor = jax.lax.fori_loop(0, _BISECTIONS, bisect, ends)
-    value, slope = _test_and_slope(scene, factor, friction_slope)
+    zero, number = jnp.zeros((), groups.dtype), jnp.zeros((), int)
+    rigid = number - 1 if isinstance(x, Structure) else None
+    start = _Found(zero, zero + jnp.inf, zero - 1, zero > 0, number, number, rigid)
+    found = jax.lax.while_loop(onward, search, start)
+    bracketed = found.high < jnp.inf
+    factor = jnp.where(bracketed, found.high, 1)
+    value, slope = jax.jvp(
+        lambda f: _test(x, f, friction_slope, found.rigid), (factor,), (jnp.ones_like(factor),)
+    )
     step = safe_divide(value, slope, jnp.zeros_like(value))
     # At the step of Eq. 19 the sign can change without a root.
     factor = factor - jnp.where(jnp.abs(step) < 1e-6 * factor, step, 0)
-    root = jnp.where(squeals[0], 0, jnp.where(squeals[first], factor, jnp.inf))
-    return jnp.where(jnp.isnan(values[first]), jnp.nan, root)
+    root = jnp.where(found.least, 0, jnp.where(bracketed, factor, jnp.inf))
+    return jnp.where(found.value < 0, root, jnp.nan), found.rigid
 
 
 @_first_factor.defjvp
 def _first_factor_jvp(friction_slope, primals, tangents):
     # The implicit function, in operations that can be differentiated again.
-    (scene,), (dscene,) = primals, tangents
-    factor = _first_factor(scene, friction_slope)
+    (x,), (dx,) = primals, tangents
+    factor, rigid = _first_factor(x, friction_slope)
     inside = (factor > 0) & (factor < jnp.inf)
     at = jnp.where(inside, factor, 1)
-    _, change = jax.jvp(lambda s: _test(s, at, friction_slope), (scene,), (dscene,))
-    _, slope = _test_and_slope(scene, at, friction_slope)
-    return factor, -jnp.where(inside, safe_divide(change, slope, jnp.zeros_like(slope)), 0)
+    test = lambda x, f: _test(x, f, friction_slope, rigid)  # noqa: E731
+    _, linear = jax.linearize(test, x, at)
+    change = linear(dx, jnp.zeros_like(at))
+    slope = linear(jax.tree.map(jnp.zeros_like, dx), jnp.ones_like(at))
+    moved = -jnp.where(inside, safe_divide(change, slope, jnp.zeros_like(slope)), 0)
+    none = None if rigid is None else np.zeros(rigid.shape, jax.dtypes.float0)
+    return (factor, rigid), (moved, none)

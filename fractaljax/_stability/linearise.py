@@ -49,6 +49,11 @@ class Assembled(NamedTuple):
     normal_force: jax.Array | None  # (m,) [N], as `Stability` has it
 
     @property
+    def open(self) -> jax.Array:
+        """Whether a preloaded joint is."""
+        return jnp.zeros((), bool) if self.normal_force is None else (self.normal_force <= 0).any()
+
+    @property
     def matrices(self) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array | None]:
         """What `solve` takes."""
         return self.M, self.C, self.K, self.C_error
@@ -87,8 +92,12 @@ class _Attached(NamedTuple):
         return self.n is not None and (self.P is not None or self.slope is not None)
 
 
-def assembled(structure: Structure, friction_slope: bool) -> Assembled:
-    """As `assemble`, with a bound on the rounding error of C, and the normal forces."""
+def assembled(structure: Structure, friction_slope: bool, refuse: bool = True) -> Assembled:
+    """As `assemble`, with a bound on the rounding error of C, and the normal forces.
+
+    Without `refuse` there are numbers where a joint is open as well, and no error where the
+    equilibrium is lost to rounding: near a static divergence.
+    """
     require_single(structure)
     sloping = flag("friction_slope", friction_slope)
     C, K = structure.C, structure.K
@@ -120,7 +129,7 @@ def assembled(structure: Structure, friction_slope: bool) -> Assembled:
     if places:
         directions = jnp.stack([d for i in places for d in (joints[i].t, joints[i].n)])
         why = NO_PRESSED_EQUILIBRIUM if loaded else NO_EQUILIBRIUM
-        along, errors = _equilibrium(F, K, directions, why)
+        along, errors = _equilibrium(F, K, directions, why if refuse else None)
         displaced = {
             i: (along[2 * k : 2 * k + 2], errors[2 * k : 2 * k + 2]) for k, i in enumerate(places)
         }
@@ -144,15 +153,30 @@ def assembled(structure: Structure, friction_slope: bool) -> Assembled:
     )
     if not loaded:
         return Assembled(structure.M, C, K, error, None)
-    forces = jnp.stack(forces)
-    C, K = (jnp.where((forces <= 0).any(), jnp.nan, X) for X in (C, K))
-    return Assembled(structure.M, C, K, error, forces)
+    found = Assembled(structure.M, C, K, error, jnp.stack(forces))
+    if not refuse:
+        return found
+    C, K = (jnp.where(found.open, jnp.nan, X) for X in (C, K))
+    return found._replace(C=C, K=K)
 
 
-def _equilibrium(F, K, directions, otherwise: str) -> tuple[jax.Array, jax.Array]:
+def with_equilibrium(structure: Structure, friction_slope: bool) -> Assembled:
+    """As `assembled`, outside compiled programs.
+
+    **Raises:** `ValueError` in a line if the structure has no equilibrium.
+    """
+    try:
+        return assembled(structure, friction_slope)
+    except RuntimeError:  # a message of many lines from inside a compiled program
+        loaded = any(joint.normal_load is not None for joint in structure.joints)
+        raise ValueError(NO_PRESSED_EQUILIBRIUM if loaded else NO_EQUILIBRIUM) from None
+
+
+def _equilibrium(F, K, directions, otherwise: str | None) -> tuple[jax.Array, jax.Array]:
     """Eq. 40: d.x_0 [m] along each of the `directions` (k, n), and a bound on its rounding error.
 
-    x_0 (n,) solves K x_0 = F, the joints being in K and their friction under preload in F.
+    x_0 (n,) solves K x_0 = F, the joints being in K and their friction under preload in F. The
+    error where there is none says `otherwise`, if that is given.
     """
     x_0 = jnp.linalg.solve(K, F)
     along = directions @ x_0
@@ -163,4 +187,6 @@ def _equilibrium(F, K, directions, otherwise: str) -> tuple[jax.Array, jax.Array
     errors = _ROUNDING * eps * (jnp.abs(K) @ x_0) @ through
     supported = eps * jnp.abs(K).max() * x_0.max() <= 0.01 * jnp.abs(F).max()
     supported |= errors.max() <= 0.01 * size.max()
-    return eqx.error_if(along, ~supported, otherwise), errors
+    if otherwise is not None:
+        along = eqx.error_if(along, ~supported, otherwise)
+    return along, errors

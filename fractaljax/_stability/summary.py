@@ -13,7 +13,7 @@ from .._mechanism.scene import Scene, stiffness
 from .._mechanism.structure import Joint, Structure
 from .._surface.roughness import roughness
 from .critical_friction import critical_friction
-from .linearise import NO_EQUILIBRIUM, NO_PRESSED_EQUILIBRIUM, Assembled, assembled
+from .linearise import Assembled, with_equilibrium
 from .stability import Stability, require_computable, stability
 
 ABSENT = "-"
@@ -130,11 +130,7 @@ def structure_table(structure: Structure, friction_slope: bool = True) -> str:
     **Raises:** `ValueError` as `assemble`, if the structure has no equilibrium under F or a joint
     is open there, and if its numbers leave the range of floating-point numbers.
     """
-    try:
-        attached = assembled(structure, friction_slope)
-    except RuntimeError:  # a message of many lines from inside a compiled program
-        loaded = any(joint.normal_load is not None for joint in structure.joints)
-        raise ValueError(NO_PRESSED_EQUILIBRIUM if loaded else NO_EQUILIBRIUM) from None
+    attached = with_equilibrium(structure, friction_slope)
     for name, force in zip(structure.joint_names, _forces(attached), strict=False):
         if force <= 0:
             raise ValueError(

@@ -1,0 +1,154 @@
+"""The Hopf test function of n degrees of freedom, smooth where two modes coalesce.
+
+Let sigma +- sqrt(delta) be the eigenvalues of two modes with decay rates u_1 and u_2, and
+p = -Re sigma. Then
+
+    T = p^2 - Re delta - (Im delta/(2 p))^2 = u_1 u_2 (p^2 + y^2)/p^2,   y = Im sqrt(delta),
+
+is 0 exactly where one of them is imaginary. As (g_c - g) of two directions it varies on the scale
+of the stiffness however light the damping, and is analytic through coalescence. Every mode has it
+with its nearest neighbour; the least of them decides. Near coalescence sigma and delta are means
+over a circle around both eigenvalues, which lose no digits there:
+
+    sum_i f(s_i) = 1/(2 pi i) oint f(z) tr[Q^-1(z) Q'(z)] dz,   Q(z) = z^2 M + z C + K.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float, Int
+
+from .quadratic import Modes, solve
+
+_NODES = 32  # on the circle
+_SEPARATED = 16.0  # times closer than any other mode: the error is 4^-_NODES
+_UNDAMPED = 1e3  # times eps: p over the frequency that may be rounding
+
+
+class CriticalPair(NamedTuple):
+    """The mode that decides, and what a boundary shows of it."""
+
+    test: Float[Array, ""]  # T [1/s^2], below 0 exactly where a mode grows
+    frequency: Float[Array, ""]  # [Hz], where T = 0
+    growth_rate: Float[Array, ""]  # [1/s]
+    damping: Float[Array, "2"]  # the two least damping ratios
+
+
+class _Choice(NamedTuple):
+    """T of every mode with its nearest neighbour."""
+
+    test: Float[Array, " k"]  # infinite for rigid-body modes and second ones of conjugate pairs
+    counted: jax.Array  # (k,) all but rigid-body modes
+    partner: Int[Array, " k"]
+    alone: jax.Array  # (k,) whether the neighbour is the conjugate: T = u |s|
+    undamped: jax.Array  # (k,) whether p is 0
+
+
+def critical_pair(
+    M: Float[Array, "n n"],
+    C: Float[Array, "n n"],
+    K: Float[Array, "n n"],
+    C_error: Float[Array, "n n"] | None,
+    rigid: Int[Array, ""],
+) -> CriticalPair:
+    """T of the mode where it is least, the `rigid` eigenvalues of least modulus left out.
+
+    Those of rigid-body modes are 0 at any friction; another one that is 0 means divergence.
+    """
+    s = solve(M, C, K, C_error).s
+    fixed = jax.lax.stop_gradient(s)
+    chosen = _choice(fixed, rigid, ~(C != 0).any())
+    i = jnp.argmin(chosen.test)
+    j, alone, undamped = (x[i] for x in (chosen.partner, chosen.alone, chosen.undamped))
+    sigma, delta = _mean_and_spread(M, C, K, s, i, j)
+    test = jnp.where(alone, -s[i].real * jnp.abs(fixed[i]), _test(sigma, delta, undamped))
+    apart = _quotient(delta.imag, 2 * -sigma.real, undamped)
+    imaginary = jnp.where(alone, fixed[i].imag, sigma.imag + apart)
+    real = (fixed[j] == fixed[i].conj()) | ((fixed[i].imag == 0) & (fixed[j].imag == 0))
+    imaginary = jnp.where(real & ~alone, 0, imaginary)
+    ratios = -fixed.real / jnp.where(fixed == 0, 1, jnp.abs(fixed))
+    ratios = jnp.where(chosen.counted & (fixed.imag >= 0), ratios, jnp.inf)
+    first = jnp.argmin(ratios)
+    second = jnp.where(jnp.arange(len(s)) == first, jnp.inf, ratios).min()
+    return CriticalPair(
+        test=jnp.where(jnp.isnan(fixed).any(), jnp.nan, test),
+        frequency=jnp.abs(imaginary) / (2 * jnp.pi),
+        growth_rate=jnp.where(chosen.counted, fixed.real, -jnp.inf).max(),
+        damping=jnp.stack([ratios[first], second]),
+    )
+
+
+def least_test(modes: Modes, C: Float[Array, "n n"], rigid: Int[Array, ""]) -> Float[Array, ""]:
+    """T [1/s^2] as `critical_pair` has it, without derivatives; 0 for what rounding may decide."""
+    test = _choice(modes.s, rigid, ~(C != 0).any()).test
+    unresolved = jnp.abs(modes.s.real) <= modes.error
+    test = jnp.where(unresolved, jnp.maximum(test, 0), test).min()
+    return jnp.where(jnp.isnan(modes.s).any(), jnp.nan, test)
+
+
+def _choice(s: Complex[Array, " k"], rigid, conservative) -> _Choice:
+    place, size = jnp.arange(len(s)), jnp.abs(s)
+    smaller = (size[None] < size[:, None]) | (
+        (size[None] == size[:, None]) & (place[None] < place[:, None])
+    )
+    counted = smaller.sum(axis=1) >= rigid
+    apart = jnp.abs(s[:, None] - s[None])
+    apart = jnp.where(counted[None] & (place[None] != place[:, None]), apart, jnp.inf)
+    partner = jnp.argmin(apart, axis=1)
+    sigma, delta = (s + s[partner]) / 2, ((s - s[partner]) / 2) ** 2
+    eps = jnp.finfo(size.dtype).eps
+    # Exactly 0 where C = 0, but for neighbours of which one grows alone.
+    undamped = jnp.abs(sigma.real) <= jnp.where(conservative, eps**0.5, _UNDAMPED * eps) * size
+    alone = (s.imag > 0) & (s[partner] == s.conj()) & ~undamped
+    test = jnp.where(alone, -s.real * size, _test(sigma, delta, undamped))
+    test = jnp.where(counted & (s.imag >= 0), test, jnp.inf)
+    return _Choice(test, counted, partner, alone, undamped)
+
+
+def _test(sigma, delta, undamped):
+    """T, and -|T| where p < 0: both modes grow."""
+    p = -sigma.real
+    ratio = _quotient(delta.imag, 2 * p, undamped)
+    # Without damping T is that of equal damping, which vanishes where the modes coalesce.
+    test = jnp.where(undamped, 0, p**2) - delta.real - ratio**2
+    return jnp.where((p < 0) & ~undamped, -jnp.abs(test), test)
+
+
+def _quotient(x, y, none):
+    return jnp.where(none, 0, x / jnp.where(none, 1, y))
+
+
+def _mean_and_spread(M, C, K, s, i, j):
+    """sigma and delta of the modes i and j."""
+    fixed = jax.lax.stop_gradient(s)
+    place, middle = jnp.arange(len(s)), (fixed[i] + fixed[j]) / 2
+    half = jnp.abs(fixed[i] - fixed[j]) / 2
+    others = jnp.where((place == i) | (place == j), jnp.inf, jnp.abs(fixed - middle)).min()
+    others = jnp.minimum(others, _SEPARATED * (jnp.abs(middle) + half))
+    coalescing = _SEPARATED * half <= others
+    # Around the first alone where the second is as far as others; `solve` has s = 0 exactly.
+    nearest = jnp.where(place == i, jnp.inf, jnp.abs(fixed - fixed[i])).min()
+    least = jnp.sqrt(jnp.finfo(half.dtype).eps) * jnp.abs(fixed).max()
+    radius = jnp.maximum(jnp.where(coalescing, others, nearest) / 4, least)
+    first, second = _moments(M, C, K, jnp.where(coalescing, middle, fixed[i]), radius)
+    alone = fixed[i] + first
+    sigma = jnp.where(coalescing, middle + first / 2, (alone + s[j]) / 2)
+    spread = jnp.where(coalescing, second / 2 - first**2 / 4, ((alone - s[j]) / 2) ** 2)
+    return sigma, spread
+
+
+def _moments(M, C, K, centre, radius):
+    """Sums of z and of z^2 of the eigenvalues in a circle, z being relative to its centre."""
+    unit = jax.lax.stop_gradient(1 / jnp.sqrt(jnp.diagonal(M)))
+    M, C, K = (X * unit[:, None] * unit[None] for X in (M, C, K))
+    step = radius * jnp.asarray(
+        np.exp(2j * np.pi * (np.arange(_NODES) + 0.5) / _NODES), centre.dtype
+    )
+
+    def traced(z):
+        return jnp.trace(jnp.linalg.solve(z**2 * M + z * C + K, 2 * z * M + C))
+
+    trace = jax.vmap(traced)(centre + step)
+    return tuple((trace * step**k).mean() for k in (2, 3))
