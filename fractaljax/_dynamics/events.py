@@ -111,7 +111,7 @@ def step(system: HybridSystem, y, s, last, h):
     Returns the state and contact state after it, its length, and the number of the guard that
     ended it or `NONE`. States inside the step are those of the cubic through its ends.
     """
-    h = h / jnp.maximum(1, 2 * system.stiffness(y))
+    h = h / jnp.maximum(1, 2 * system.stiffness(y, s))
     step = h[None]
     f_0 = system.field(y, s)
     f_b = system.field(y + step / 2 * f_0, s)

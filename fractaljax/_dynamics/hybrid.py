@@ -186,8 +186,8 @@ class HybridSystem(eqx.Module):
                 rows.append(jnp.where(state == OPEN, -load, load)[None])
         return jnp.concatenate(rows)
 
-    def stiffness(self, y) -> Array:
-        """The largest rate (...) at which friction alone changes sliding velocities.
+    def stiffness(self, y, s) -> Array:
+        """The largest rate (...) at which friction alone changes velocities of slipping faces.
 
         Far from equilibrium it exceeds every other rate. Zero for laws without slope.
         """
@@ -200,7 +200,7 @@ class HybridSystem(eqx.Module):
         if self.T is not None and self.B is not None:
             own = jnp.sum(self.T * jnp.swapaxes(self.B, 0, 1), axis=1)
             rates = rates * self._leaf(own, y.ndim - 1)
-        return jnp.max(jnp.abs(rates), axis=0)
+        return jnp.max(jnp.where(jnp.abs(s) == 1, jnp.abs(rates), 0), axis=0)
 
     def switch(self, y, s, guard) -> tuple[Array, Array]:
         """State and contact state after the guard of that number has reached zero.

@@ -156,7 +156,7 @@ def remesh(system: HybridSystem, steps: Segments, h, length: int) -> Segments:
 
     They are no longer than h, if so few suffice, and shorter where friction is stiff.
     """
-    weight = jnp.maximum(1, 2 * system.stiffness(steps.y)) * steps.duration
+    weight = jnp.maximum(1, 2 * system.stiffness(steps.y, steps.s)) * steps.duration
     weight = jnp.where(steps.used, weight, 0)
     ends_phase = steps.used & (steps.guard != NONE)
     phase = jnp.cumsum(ends_phase) - ends_phase
