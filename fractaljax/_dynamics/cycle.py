@@ -128,7 +128,7 @@ class LimitCycle(Record):
         share = jnp.arange(n) / n
         y = self._orbit.at(system, share * self.period * system.omega)
         y = jnp.where(jnp.isfinite(self.period), y, jnp.nan)
-        return share * self.period, (y * system.units[:, None]).T
+        return share * self.period, (system.own(y) * system.units[:, None]).T
 
     def spectrum(self, n: int = 512) -> tuple[Float[Array, " n/2"], Float[Array, "n/2 2"]]:
         """Harmonics: frequencies [Hz] and peak amplitudes [m] of x1 and x2.
