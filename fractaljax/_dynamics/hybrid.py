@@ -163,6 +163,10 @@ class HybridSystem(eqx.Module):
         w, loads = self.sliding(y[self.n :]), self.loads(y[: self.n])
 
         def force(law, w, load, sign):
+            if law.velocity_dependent:
+                # A coarse step may overshoot far beyond w = 0, where a law means nothing.
+                side = jnp.sign(sign)
+                w = side * jnp.maximum(side * w, -1)
             return law.branch(self.speed * w, sign) * load
 
         return self._each(force, w, loads, signs)
