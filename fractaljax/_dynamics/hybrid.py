@@ -68,8 +68,13 @@ class HybridSystem(eqx.Module):
         return self.n - 1 if self.excited else None
 
     def excitation_frequency(self, lanes: int = 0) -> Array:
-        """Of z'' = -Omega^2 z, the last degree of freedom of an excited system."""
+        """Omega of z'' = -Omega^2 z, the last degree of freedom of an excited system."""
         return self._leaf(jnp.sqrt(self.K[-1, -1]), lanes)
+
+    @property
+    def excitation_period(self) -> Array:
+        """2 pi/Omega."""
+        return 2 * jnp.pi / self.excitation_frequency()
 
     @property
     def largest_force(self) -> Array:
@@ -198,11 +203,15 @@ class HybridSystem(eqx.Module):
 
     def regularised_field(self, y, signs) -> Array:
         """dy/dt where friction has `signs` (f, ...) between -1 and 1, by a smoothed sign."""
-        force, loads = self._friction(y, signs), self.loads(y[: self.n])
+        force, opens = self._friction(y, signs), self.open_faces(y)
+        return jnp.concatenate([y[self.n :], self._driven(y, force, jnp.where(opens, OPEN, 1))])
+
+    def open_faces(self, y) -> Array:
+        """The faces (f, ...) of joints that can open and whose normal force would pull."""
+        loads = self.loads(y[: self.n])
         opens = np.repeat(self.opens, [len(faces) for faces in self.faces])
         first = jnp.stack([loads[faces[0]] for faces in self.faces for _ in faces])
-        opens = opens.reshape(-1, *(1,) * (y.ndim - 1)) & (first < 0)
-        return jnp.concatenate([y[self.n :], self._driven(y, force, jnp.where(opens, OPEN, 1))])
+        return opens.reshape(-1, *(1,) * (y.ndim - 1)) & (first < 0)
 
     def section(self, y) -> Array:
         """t.u of the first face, which falls through 0 at a return to the Poincare section.

@@ -281,5 +281,6 @@ def limit_cycle(
 
         eps = number("regularisation", regularisation, above=0)
         steps = whole("max_steps", max_steps, 1)
-        cycle = regularised_cycle(mechanism, start, eps, cycle, solver, tolerance, steps)
+        arguments = mechanism, start, excitation, eps
+        cycle = regularised_cycle(*arguments, cycle, solver, tolerance, steps)
     return raise_unless(CycleResult.converged, cycle) if throw else cycle

@@ -19,7 +19,7 @@ from .._base.parts import Record, brief, concrete, number, raise_unless, scalar,
 from .._mechanism.mechanism import Mechanism
 from .events import Cubic, guards_and_rates, without_start
 from .excitation import Excitation, excited_system
-from .hybrid import NONE, HybridSystem, check_rtol, degrees_of_freedom, start_state
+from .hybrid import NONE, OPEN, HybridSystem, check_rtol, degrees_of_freedom, start_state
 from .orbit import chosen_guard, flow
 
 if TYPE_CHECKING:
@@ -355,9 +355,13 @@ def _regularised(
         times, states = nodes(solution)
         last, times = states[-1], t0 + times / system.omega
     else:
-        times, states, last = saveat, solution.ys[:-1], solution.ys[-1]
-        states = jnp.where(jnp.isfinite(states), states, jnp.nan)
+        # What was not reached is infinite.
+        last = jnp.where(jnp.isfinite(solution.ys), solution.ys, 0)
+        times, states = saveat, jnp.where(jnp.isfinite(solution.ys), solution.ys, jnp.nan)[:-1]
     sliding = system.speed * jax.vmap(lambda y: system.sliding(y[system.n :]))(states)
+    contact_states = jnp.where(jnp.abs(sliding) < eps, 0, jnp.sign(sliding))
+    if any(system.opens):
+        contact_states = jnp.where(system.open_faces(states.T).T, OPEN, contact_states)
     far = jnp.max(jnp.abs(last)) > _bound(system, y)
     reached = solution.result == RESULTS.successful
     result = SimulationResult.where(
@@ -367,7 +371,7 @@ def _regularised(
     return Trajectory(
         times=times,
         states=(system.own(states.T) * system.units[:, None]).T,
-        contact_states=jnp.where(jnp.abs(sliding) < eps, 0, jnp.sign(sliding)),
+        contact_states=contact_states,
         result=result,
         _system=system if saveat is None else None,
         _solution=solution if saveat is None else None,
