@@ -130,7 +130,8 @@ class Mechanism:
     def scaled(self) -> "Mechanism":
         """The same in units of 1/omega, V and V/omega."""
         s, V = self.omega, self.units[-1]
-        force = None if self.force is None else lambda t: self.force(t / s) / (V * s)
+        given = self.force
+        force = None if given is None else lambda t: given(t / s) / (V * s)
         joints = tuple(
             replace(
                 j,
@@ -717,7 +718,8 @@ def forced_cycle(mechanism, start, T, settle=200, rtol=1e-12) -> Cycle:
         "cycle",
         T / mechanism.omega,
         ends[:n, 1] - ends[:n, 0],
-        *(ends[n:].T),
+        ends[n:, 0],
+        ends[n:, 1],
         stick,
         open_fraction=opened,
         state=z * mechanism.units,

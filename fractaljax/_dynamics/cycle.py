@@ -100,9 +100,10 @@ class LimitCycle(Record):
     open_fraction: Float[Array, " m"]  # of the period open, one value a joint
     tension_fraction: Float[Array, "..."]  # of the period with K_n n.x < 0: the contact pulls
     normal_force: Float[Array, "m 2"]  # smallest and largest of each joint [N]
-    state: Float[Array, " 2n"]  # [x, v] on the cycle, at the section: a maximum of t.x [m, m/s]
+    # [x, v] [m, m/s] on the cycle, at the section: a maximum of t.x, or the time 0 of an excitation
+    state: Float[Array, " 2n"]
     error: Float[Array, ""]  # estimated relative error of period and states
-    returns: Int[Array, ""]  # of the Poincare map (maxima of x1) in one period
+    returns: Int[Array, ""]  # of the Poincare map in one period
     regularisation_error: Float[Array, ""]  # largest relative difference from the exact law
     result: CycleResult
     _monodromy: Float[Array, "2n 2n"] = eqx.field(repr=False)
@@ -110,8 +111,8 @@ class LimitCycle(Record):
     _orbit: Any = eqx.field(repr=False)  # Orbit, or regularised.SmoothOrbit
 
     @property
-    def multipliers(self) -> Complex[Array, "4"]:
-        """The Floquet multipliers, largest modulus first; one of them is 1."""
+    def multipliers(self) -> Complex[Array, " 2n"]:
+        """The Floquet multipliers, largest modulus first; one is 1 where nothing excites."""
         # Computed only when asked for: eigenvalues have no second derivative in JAX.
         values = jnp.linalg.eigvals(self._monodromy)
         order = jnp.argsort(-jnp.abs(jax.lax.stop_gradient(values)), axis=-1)

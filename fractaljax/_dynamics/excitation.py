@@ -49,10 +49,13 @@ class Excitation(Record):
             if not amplitude:
                 raise ValueError("amplitude must hold at least one degree of freedom, got {}")
             self.dofs = tuple(int(d) if isinstance(d, np.integer) else d for d in amplitude)
-            amplitude = [number(f"amplitude at {d}", a) for d, a in amplitude.items()]
-        self.amplitude = number("amplitude", _stacked(amplitude))
+            self.amplitude = jnp.stack(
+                [number(f"amplitude at {d}", a) for d, a in amplitude.items()]
+            )
+        else:
+            self.amplitude = _numbers("amplitude", amplitude)
         self.frequency = number("frequency", frequency, above=0)
-        self.phase = number("phase", _stacked(phase))
+        self.phase = _numbers("phase", phase)
 
     def parts(self, mechanism: Mechanism) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """The forces (n,) [N] that multiply cos(Omega t) and sin(Omega t).
@@ -81,13 +84,11 @@ class Excitation(Record):
         return cosine, sine
 
 
-def _stacked(values: Any) -> Any:
-    """Several numbers, perhaps traced, as an array; anything else as it is."""
-    return (
-        jnp.stack([number("amplitude", v) for v in values])
-        if isinstance(values, (list, tuple))
-        else values
-    )
+def _numbers(name: str, values: Any) -> Numbers:
+    """One number, or several, some perhaps traced, as an array."""
+    if isinstance(values, (list, tuple)) and values:
+        return jnp.stack([number(name, value) for value in values])
+    return number(name, values)
 
 
 def _index(mechanism: Mechanism, dof: Dof) -> int:
@@ -99,7 +100,7 @@ def _index(mechanism: Mechanism, dof: Dof) -> int:
     return known.index(dof)
 
 
-def excited_system(mechanism: Mechanism, excitation: Excitation | None) -> HybridSystem:
+def excited_system(mechanism: Any, excitation: Excitation | None) -> HybridSystem:
     """The scaled system of a scene or a structure, with the excitation if there is one.
 
     Its last degree of freedom is z, of order one and without unit. Its unit of time is the

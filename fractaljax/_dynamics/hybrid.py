@@ -209,7 +209,7 @@ class HybridSystem(eqx.Module):
     def open_faces(self, y) -> Array:
         """The faces (f, ...) of joints that can open and whose normal force would pull."""
         loads = self.loads(y[: self.n])
-        opens = np.repeat(self.opens, [len(faces) for faces in self.faces])
+        opens = jnp.asarray(np.repeat(self.opens, [len(faces) for faces in self.faces]))
         first = jnp.stack([loads[faces[0]] for faces in self.faces for _ in faces])
         return opens.reshape(-1, *(1,) * (y.ndim - 1)) & (first < 0)
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, ScalarLike
 
-from .._base.parts import concrete, number, raise_unless, whole
+from .._base.parts import concrete, number, raise_unless, require_kind, whole
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.scene import Scene
 from .._stability.stability import growth_rate
@@ -233,6 +233,8 @@ def limit_cycle(
 ) -> LimitCycle:
     """The limit cycle that the motion from `start` ends in, by the exact law of dry friction.
 
+    With an excitation: the periodic motion under it.
+
     A coarse run from `start` is compared at its returns to a section: the maxima of t.x, the
     tangential displacement of the first joint (of x1 in a scene). Where they repeat, Newton's
     method solves for the periodic orbit, and every derivative is the implicit one of its
@@ -246,6 +248,10 @@ def limit_cycle(
     - `start`: (2n,), [x, v] in m and m/s; by default the sliding equilibrium, displaced by V/omega
       along t, where omega^2 is the sum of the squared eigenfrequencies of a scene, and of a
       structure the root of the sum of their fourth powers.
+    - `excitation`: a harmonic force. The returns are then its periods, at each of which its time is
+      0 again: the section is stroboscopic, `state` is that at the time 0, `period` is `returns`
+      periods of the excitation (above 1 the motion is subharmonic), and none of the 2n
+      `multipliers` is 1 by itself. `start` is the state at the time 0.
     - `regularisation`: eps [m/s], to replace sgn v by tanh(v/eps). The cycle is then compared
       with the exact law's from the same start: `regularisation_error` is the largest relative
       difference of period and amplitudes, and the result `depends_on_eps` where it is above
@@ -266,6 +272,8 @@ def limit_cycle(
     """
     n = degrees_of_freedom(mechanism)
     start = None if start is None else start_state(start, n)
+    if excitation is not None:
+        require_kind("excitation", excitation, Excitation)
     given = mechanism, start, excitation
     tolerance = check_rtol(rtol, jnp.result_type(*jax.tree.leaves(given)))
     returns = jnp.asarray(whole("max_returns", max_returns, 1), float)

@@ -58,7 +58,7 @@ class Trajectory(Record):
         return self.states[-1]
 
     def at(self, times: ArrayLike | Sequence[float]) -> Float[Array, "k 2n"]:
-        """States at `times` (k,) [s] from the start to the end of the simulation.
+        """States at `times` (k,) [s] from `t0` to the end of the simulation.
 
         **Raises:** `ValueError` for times of another shape or outside, and for a simulation with
         `saveat`; `RuntimeError` inside a compiled program.
@@ -93,9 +93,7 @@ class Trajectory(Record):
         # The end is known up to rounding: t1 itself is inside.
         rounding = 8 * jnp.finfo(last.dtype).eps * jnp.maximum(jnp.abs(first), jnp.abs(last))
         outside = (times < first) | (times > last + rounding)
-        known = concrete(first)
-        since = "the start" if known is None or known != 0 else "0"
-        wanted = f"times must be from {since} to the end of the simulation"
+        wanted = "times must be from t0 to the end of the simulation"
         found, given = concrete(outside), concrete(times)
         if found is None or given is None:
             return eqx.error_if(times, outside, wanted)
