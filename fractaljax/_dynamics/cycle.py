@@ -119,25 +119,35 @@ class LimitCycle(Record):
         return jnp.take_along_axis(values, order, axis=-1)
 
     @property
+    def of_scene(self) -> bool:
+        """Whether `stick_fraction` is of the two directions of a scene, not of joints."""
+        return self.stick_fraction.shape[-1] != len(self._system.faces)
+
+    @property
     def frequency(self) -> Float[Array, ""]:
         """1/period [Hz]."""
         return 1 / self.period
 
-    def orbit(self, n: int = 512) -> tuple[Float[Array, " n"], Float[Array, "n 4"]]:
-        """Times [s] and states [m, m/s], evenly spaced over one period from `state`."""
+    def orbit(self, n: int = 512) -> tuple[Float[Array, " n"], Float[Array, "n 2dofs"]]:
+        """Times [s] and states [x, v] [m, m/s], evenly spaced over one period from `state`."""
         system = self._system
         share = jnp.arange(n) / n
         y = self._orbit.at(system, share * self.period * system.omega)
         y = jnp.where(jnp.isfinite(self.period), y, jnp.nan)
         return share * self.period, (system.own(y) * system.units[:, None]).T
 
-    def spectrum(self, n: int = 512) -> tuple[Float[Array, " n/2"], Float[Array, "n/2 2"]]:
-        """Harmonics: frequencies [Hz] and peak amplitudes [m] of x1 and x2.
+    def spectrum(self, n: int = 512) -> tuple[Float[Array, " n/2"], Float[Array, "n/2 dofs"]]:
+        """Harmonics: frequencies [Hz] and peak amplitudes [m] of the degrees of freedom.
 
         The Fourier coefficients of n samples of the orbit, without the mean.
         """
+        return self.harmonics(jnp.eye(len(self.amplitude), dtype=self.amplitude.dtype), n)
+
+    def harmonics(self, rows, n: int = 512) -> tuple[Float[Array, " n/2"], Float[Array, "n/2 k"]]:
+        """As `spectrum`, of the displacements rows @ x, rows (k, dofs)."""
         _, states = self.orbit(n)
-        lines = jnp.abs(jnp.fft.rfft(states[:, :2], axis=0)) / n * 2
+        x = states[:, : states.shape[1] // 2] @ jnp.asarray(rows, states.dtype).T
+        lines = jnp.abs(jnp.fft.rfft(x, axis=0)) / n * 2
         harmonics = jnp.arange(1, n // 2 + 1)
         return harmonics / self.period, lines[1 : n // 2 + 1]
 

@@ -86,9 +86,8 @@ class Excitation(Record):
 
 def _numbers(name: str, values: Any) -> Numbers:
     """One number, or several, some perhaps traced, as an array."""
-    if isinstance(values, (list, tuple)) and values:
-        return jnp.stack([number(name, value) for value in values])
-    return number(name, values)
+    several = isinstance(values, (list, tuple)) and len(values) > 0
+    return jnp.stack([number(name, v) for v in values]) if several else number(name, values)
 
 
 def _index(mechanism: Mechanism, dof: Dof) -> int:

@@ -151,7 +151,7 @@ def test_friction_beyond_its_law(capsys, tmp_path):
         (["cycle", "--rtol", "nan"], "rtol must be above 0 and at most 0.1, got nan"),
         (["cycle", "--max-returns", 0], "max_returns must be a whole number of at least 1, got 0"),
         (["cycle", "--max-returns", 1.5], "invalid int value: '1.5'"),
-        (["cycle", "--start", 1, 2, 3], "--start: expected 4 arguments"),
+        (["cycle", "--start", 1, 2, 3], "start must have shape (4,), got (3,)"),
         (["cycle", "--start", 0, 0, "nan", 0], "start must be finite, got nan"),
         (["cycle", "--rtol", 1, "--rtol", 2], "argument --rtol: given more than once"),
         (["cycle", "--constant-friction"], "unrecognized arguments: --constant-friction"),
