@@ -706,10 +706,11 @@ def forced_cycle(mechanism, start, T, settle=200, rtol=1e-12) -> Cycle:
         gap = trip[-1].end - z
         if abs(gap).max() < 1e-13 * max(1, abs(z).max()) or best < 1e-9 <= 2 * abs(gap).max():
             break
-        best, flow = abs(gap).max(), monodromy(core, trip, rtol)
-        z = z + np.linalg.solve(np.eye(2 * n) - flow, gap)
+        best = abs(gap).max()
+        z = z + np.linalg.solve(np.eye(2 * n) - monodromy(core, trip, rtol), gap)
     else:
         return Cycle("not periodic")
+    flow = monodromy(core, trip, rtol)
     rows = np.hstack([np.zeros((2 * n, 1)), np.eye(2 * n)])
     ends = np.array([spread(trip, row) for row in rows]) * mechanism.units[:, None]
     stick, _, opened = shares(core, trip) / T

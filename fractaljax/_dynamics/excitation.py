@@ -86,8 +86,9 @@ class Excitation(Record):
 
 def _numbers(name: str, values: Any) -> Numbers:
     """One number, or several, some perhaps traced, as an array."""
-    several = isinstance(values, (list, tuple)) and len(values) > 0
-    return jnp.stack([number(name, v) for v in values]) if several else number(name, values)
+    if isinstance(values, (list, tuple)):
+        values = jnp.stack([number(name, value) for value in values] or [jnp.zeros(0)])
+    return number(name, values)
 
 
 def _index(mechanism: Mechanism, dof: Dof) -> int:

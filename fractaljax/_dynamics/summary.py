@@ -20,20 +20,14 @@ _CONTACT_STATES = {
 
 def cycle_table(mechanism: Scene | Structure, cycle: LimitCycle) -> str:
     """The result of the search for one limit cycle, its numbers and its switches."""
-    scene = mechanism if isinstance(mechanism, Scene) else None
     found = {"result": str(CycleResult[cycle.result])} | verdict(stability(mechanism))
     if not jnp.isfinite(cycle.period):
         return table([""], [found])
-    pulls = {}
-    if scene is not None and scene.preload:
-        pulls = {"joint is open": f"{cycle.open_fraction[0]:.2%} of the period"}
-    elif scene is not None:
-        pulls = {"contact pulls": f"{cycle.tension_fraction:.2%} of the period"}
     whole = found | {
         "period [ms]": f"{cycle.period * 1e3:.6g}",
         "frequency [Hz]": f"{cycle.frequency:.6g}",
         "returns in a period": f"{cycle.returns}",
-        **pulls,
+        **({} if isinstance(mechanism, Structure) else _pulls(mechanism, cycle)),
         "estimated error": f"{cycle.error:.1e}",
     }
     regularised = cycle.regularisation_error != 0
@@ -53,7 +47,7 @@ def cycle_table(mechanism: Scene | Structure, cycle: LimitCycle) -> str:
         }
         for i in range(len(cycle.amplitude))
     ]
-    if scene is None:
+    if isinstance(mechanism, Structure):
         names = mechanism.names or [f"x{i}" for i in range(1, mechanism.n + 1)]
         most = sorted(range(mechanism.n), key=lambda i: -cycle.amplitude[i])[:_MOST]
         tables = [
@@ -62,6 +56,7 @@ def cycle_table(mechanism: Scene | Structure, cycle: LimitCycle) -> str:
             table([names[i] for i in most], [directions[i] for i in most]),
         ]
         return "\n\n".join(tables)
+    scene = mechanism
     for direction, share in zip(directions, cycle.stick_fraction, strict=True):
         direction["sticks"] = f"{share:.2%} of the period"
     tables = [table([""], [whole]), table(["x1, along the belt", "x2, normal to it"], directions)]
@@ -71,6 +66,12 @@ def cycle_table(mechanism: Scene | Structure, cycle: LimitCycle) -> str:
     relative = scene.oscillator.V - jnp.stack([cycle.velocity_min, cycle.velocity_max])
     tables += friction_remark(scene, jnp.abs(relative).max())
     return "\n\n".join(tables)
+
+
+def _pulls(scene: Scene, cycle: LimitCycle) -> dict[str, str]:
+    if scene.preload:
+        return {"joint is open": f"{cycle.open_fraction[0]:.2%} of the period"}
+    return {"contact pulls": f"{cycle.tension_fraction:.2%} of the period"}
 
 
 def _joint_columns(cycle: LimitCycle) -> list[dict[str, str]]:
