@@ -148,6 +148,11 @@ def regularised_cycle(
     """
     system = excited_system(mechanism, excitation)
     options = {"solver": solver, "max_steps": max_steps}
+    looser, error = 10 * rtol, rtol
+    if any(system.opens):
+        # The field has a kink where a joint opens, which makes the gap rougher still.
+        looser = error = 100 * rtol
+        rtol = max(rtol / 100, 4096 * float(jnp.finfo(system.F.dtype).eps))
     frozen = jax.lax.stop_gradient((system, eps, scaled_start(system, start)))
     guess, returns, followed = _settle(*frozen, solver, rtol, max_steps)
 
@@ -161,7 +166,7 @@ def regularised_cycle(
         return system.own(solve(system, eps, full, period, rtol=rtol, **options).ys[0]) - y
 
     # Looser than the integration, whose adaptive steps make the gap rough.
-    newton = optimistix.Newton(rtol=10 * rtol, atol=10 * rtol)
+    newton = optimistix.Newton(rtol=looser, atol=looser)
     function, unknown = gap, guess
     if system.excited:
         function, unknown = excited_gap, system.own(guess[0])
@@ -202,12 +207,17 @@ def regularised_cycle(
     numbers = jnp.stack([period / system.omega, *(high - low)[: len(low) // 2]])
     difference = jnp.abs(numbers / jnp.stack([exact.period, *exact.amplitude]) - 1)
     difference = jax.lax.stop_gradient(jnp.max(difference))
-    error = jnp.asarray(rtol, y.dtype)
+    error = jnp.asarray(error, y.dtype)
     unstable = repels(*jax.lax.stop_gradient((monodromy, rates[0])), error)
     status = CycleResult.where(unstable, CycleResult.unstable, CycleResult.converged)
     status = CycleResult.where(difference <= _TOLERANCE, status, CycleResult.depends_on_eps)
+    # The tangential spring of a joint that opens lets go, and the tangents do not see the jump.
+    held = [jnp.any(system.L[faces[-1]] != 0) & (len(faces) > 1) for faces in system.faces]
+    jumps = jnp.any(opens & jnp.stack(held) & (below > 0))
     lost = CycleResult.where(followed, CycleResult.not_periodic, CycleResult.too_stiff)
     status = CycleResult.where(found, status, lost)
+    status = CycleResult.where(jumps & followed, CycleResult.jumps, status)
+    found = found & ~jumps
 
     def only(value):
         return jnp.where(found, value, jnp.nan)
