@@ -235,6 +235,19 @@ def test_orbit_with_lift_off():
 
 
 @SLOW
+def test_orbit_of_a_scene():
+    """Entrained by a force along the belt: the event-driven motion closes after its period."""
+    scene, f = reference_scene(), 3092.0
+    given = fj.Excitation({"x1": 400.0}, f)
+    found = fj.limit_cycle(scene, excitation=given, segments=512)
+    np.testing.assert_allclose(found.period * f, 1, rtol=1e-12)
+    again = fj.simulate(scene, found.state, float(found.period), excitation=given)
+    scale = np.array([1e-6, 1e-6, 0.1, 0.1])
+    np.testing.assert_allclose(again.end / scale, found.state / scale, rtol=0, atol=1e-8)
+    assert len(again.switches()) >= 2 and (abs(found.multipliers) < 1).all()
+
+
+@SLOW
 def test_linear_orbit():
     """Where nothing switches it is the linear response, also close to resonance."""
     for f, a in ((0.1, 0.5), (0.16, 0.05), (0.7, 2.0)):

@@ -101,7 +101,8 @@ def test_long_motion_with_an_implicit_solver():
 def test_motion(name):
     """Two joints, and one that opens."""
     problem, times = PROBLEMS[name], np.linspace(0, 20.0, 9)
-    found = fj.simulate(structure(problem), problem["start"], 20.0, regularisation=0.02)
+    options = {"regularisation": 0.02, "rtol": 1e-11, "max_steps": 20_000}
+    found = fj.simulate(structure(problem), problem["start"], 20.0, **options)
     truth = integrate(problem, 0.02, problem["start"], 20.0)
     np.testing.assert_allclose(found.at(times), truth.sol(times).T, rtol=0, atol=1e-6)
     if name == LIFT:
