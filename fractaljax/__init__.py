@@ -26,6 +26,7 @@ from ._design.pareto import Front as Front, pareto as pareto
 from ._design.tolerance import Tolerance as Tolerance, squeal_probability as squeal_probability
 from ._dynamics.attractors import attractors as attractors
 from ._dynamics.cycle import CycleResult as CycleResult, LimitCycle as LimitCycle
+from ._dynamics.excitation import Excitation as Excitation
 from ._dynamics.limit_cycle import limit_cycle as limit_cycle
 from ._dynamics.simulate import (
     SimulationResult as SimulationResult,

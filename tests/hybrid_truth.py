@@ -2,7 +2,7 @@
 
 It uses nothing of the package. The motion obeys
 
-    M x'' + C x' + K x = F + sum_j [(P_j - N_j) n_j + mu_j(|w_j|) sgn(w_j) N_j t_j],
+    M x'' + C x' + K x = F + f(t) + sum_j [(P_j - N_j) n_j + mu_j(|w_j|) sgn(w_j) N_j t_j],
     w_j = V_j - t_j.x',   N_j = max(0, P_j + K_n n_j.x)
 
 and is cut into phases of one mode: every face slips forward (1), slips backward (-1), sticks (0) or
@@ -92,6 +92,7 @@ class Mechanism:
     K: np.ndarray
     F: np.ndarray
     joints: tuple[Joint, ...]
+    force: Callable | None = None  # f of the times (...), (..., n)
 
     @classmethod
     def of(cls, problem: dict) -> "Mechanism":
@@ -129,6 +130,8 @@ class Mechanism:
     def scaled(self) -> "Mechanism":
         """The same in units of 1/omega, V and V/omega."""
         s, V = self.omega, self.units[-1]
+        given = self.force
+        force = None if given is None else lambda t: given(t / s) / (V * s)
         joints = tuple(
             replace(
                 j,
@@ -140,7 +143,7 @@ class Mechanism:
             )
             for j in self.joints
         )
-        return Mechanism(self.M, self.C / s, self.K / s**2, self.F / (V * s), joints)
+        return Mechanism(self.M, self.C / s, self.K / s**2, self.F / (V * s), joints, force)
 
     @cached_property
     def faces(self) -> tuple[Face, ...]:
@@ -185,7 +188,7 @@ class Field:
 
     def __init__(self, mechanism: Mechanism, mode: tuple[int, ...]):
         self.n = n = len(mechanism.M)
-        faces, self.mode = mechanism.faces, mode
+        faces, self.mode, self.force = mechanism.faces, mode, mechanism.force
         self.f, self.K, self.C = mechanism.F.copy(), mechanism.K.copy(), mechanism.C
         inverse = np.linalg.inv(mechanism.M)
         events, rows, by = [], [], []
@@ -229,22 +232,24 @@ class Field:
                     by.append(-side * self.multipliers[self.stuck.index(i)])
         self.events, self.rows, self.by = events, np.array(rows), np.array(by)
 
-    def forces(self, z) -> np.ndarray:
-        """All but inertia and the multipliers, at states z (..., 2n)."""
+    def forces(self, z, t) -> np.ndarray:
+        """All but inertia and the multipliers, at states z (..., 2n) and times t (...)."""
         x, v = z[..., : self.n], z[..., self.n :]
         out = self.f - x @ self.K.T - v @ self.C.T
+        if self.force is not None:
+            out = out + self.force(np.asarray(t))
         if self.laws:
             speeds = (self.signs * (self.V - v @ self.D.T)).T
             mu = np.array([law(w) for law, w in zip(self.laws, speeds, strict=True)]).T
             out = out + (self.signs * mu * (self.load + x @ self.slope.T)) @ self.D
         return out
 
-    def rates(self, _t, z) -> np.ndarray:
-        return np.concatenate([z[self.n :], self.inverse @ self.forces(z)])
+    def rates(self, t, z) -> np.ndarray:
+        return np.concatenate([z[self.n :], self.inverse @ self.forces(z, t)])
 
-    def values(self, z) -> np.ndarray:
-        """The guards at states z (..., 2n)."""
-        return self.rows[:, 0] + z @ self.rows[:, 1:].T + self.forces(z) @ self.by.T
+    def values(self, z, t) -> np.ndarray:
+        """The guards at states z (..., 2n) and times t (...)."""
+        return self.rows[:, 0] + z @ self.rows[:, 1:].T + self.forces(z, t) @ self.by.T
 
     def slopes(self, z) -> np.ndarray:
         """Jacobian of the forces."""
@@ -267,7 +272,7 @@ class Field:
         return self.rows[:, 1:] + self.by @ self.slopes(z)
 
 
-def choose(mechanism, z, mode, options, decided=()) -> tuple[int, ...]:
+def choose(mechanism, z, t, mode, options, decided=()) -> tuple[int, ...]:
     """The first mode that agrees with the state; options: signs by face, the likely one first.
 
     A sliding velocity of zero must grow to the side on which the face slips, unless it is decided;
@@ -280,7 +285,7 @@ def choose(mechanism, z, mode, options, decided=()) -> tuple[int, ...]:
         for i, (_, s) in zip(options, picks, strict=True):
             trial[i] = s
         field_ = mechanism.field(tuple(trial))
-        forces = field_.forces(z)
+        forces = field_.forces(z, t)
         acceleration, margin = field_.inverse @ forces, np.inf
         for i, f in enumerate(mechanism.faces):
             if trial[i] == 0:
@@ -299,7 +304,7 @@ def choose(mechanism, z, mode, options, decided=()) -> tuple[int, ...]:
     return found
 
 
-def first_mode(mechanism, z) -> tuple[int, ...]:
+def first_mode(mechanism, z, t) -> tuple[int, ...]:
     """The mode in which a motion begins."""
     n, w, mode, options = len(mechanism.M), mechanism.sliding(z), [], {}
     for i, f in enumerate(mechanism.faces):
@@ -311,10 +316,10 @@ def first_mode(mechanism, z) -> tuple[int, ...]:
         mode.append(int(np.sign(w[i])) if abs(w[i]) > SAME else 0)
         if mode[-1] == 0:
             options[i] = (0, 1, -1)
-    return choose(mechanism, z, tuple(mode), options)
+    return choose(mechanism, z, t, tuple(mode), options)
 
 
-def next_mode(mechanism, z, mode, event) -> tuple[tuple[int, ...], dict]:
+def next_mode(mechanism, z, t, mode, event) -> tuple[tuple[int, ...], dict]:
     """The mode after an event, and the order of the zero of each guard that it leaves at zero."""
     kind, at = event[:2]
     trial, decided = list(mode), ()
@@ -333,7 +338,7 @@ def next_mode(mechanism, z, mode, event) -> tuple[tuple[int, ...], dict]:
                 options.pop(i, None)
                 trial[i] = OPEN if kind == "open" else int(np.sign(w[i]))
         zeros["close" if kind == "open" else "open", at] = 1
-    after = choose(mechanism, z, tuple(trial), options, decided)
+    after = choose(mechanism, z, t, tuple(trial), options, decided)
     for i in options:
         if after[i]:
             alone = decided == (i,) and sum(a != b for a, b in zip(mode, after, strict=True)) == 1
@@ -374,14 +379,23 @@ def falls(c) -> Any:
     return None
 
 
-def land(field_, guard, z, h, rtol):
+def rate_of(field_, row, by, z, t):
+    """The rate of guards row.[1, z] + by.forces(z, t) along the motion."""
+    found = (row[..., 1:] + by @ field_.slopes(z)) @ field_.rates(t, z)
+    if field_.force is not None:
+        found = found + by @ (field_.force(t + 1e-5) - field_.force(t - 1e-5)) / 2e-5
+    return found
+
+
+def land(field_, guard, z, t, h, rtol):
     """The step from z to the zero of a guard near h, integrated instead of interpolated."""
     end, (row, by) = z, guard
     for _ in range(4 if h > 0 else 0):
-        end = solve_ivp(field_.rates, (0, h), z, "DOP853", rtol=rtol, atol=rtol, first_step=h)
+        span, step = (t, t + h), t + h - t
+        end = solve_ivp(field_.rates, span, z, "DOP853", rtol=rtol, atol=rtol, first_step=step)
         end = end.y[:, -1]
-        value = row[0] + row[1:] @ end + by @ field_.forces(end)
-        shift = value / ((row[1:] + by @ field_.slopes(end)) @ field_.rates(0, end))
+        value = row[0] + row[1:] @ end + by @ field_.forces(end, t + h)
+        shift = value / rate_of(field_, row, by, end, t + h)
         if not 1e-16 < abs(shift) < min(1e-4, h):  # there, or grazing
             break
         h -= shift
@@ -402,12 +416,12 @@ class Phase:
     steps: list = field(repr=False, default_factory=list)  # (start, end, used end, dense)
 
 
-def phases(mechanism, z, rtol, t1=np.inf, maxima=False) -> Iterator[Phase]:
+def phases(mechanism, z, rtol, t1=np.inf, maxima=False, t0=0.0) -> Iterator[Phase]:
     """The phases of a scaled mechanism; with `maxima`, cut where t.x of joint 1 is largest too."""
-    z, t, longest, idle = np.array(z, float), 0.0, 3.2 * rtol**0.125, 0
+    z, t, longest, idle = np.array(z, float), t0, 3.2 * rtol**0.125, 0
     n, faces = len(mechanism.M), mechanism.faces
     top = np.concatenate([np.zeros(n + 1), mechanism.joints[0].t])
-    mode = first_mode(mechanism, z)
+    mode = first_mode(mechanism, z, t)
     stuck = [i for i, s in enumerate(mode) if s == 0]
     z = put(mechanism, z, [faces[i].d for i in stuck], [faces[i].V for i in stuck])
     w = mechanism.sliding(z)
@@ -424,9 +438,8 @@ def phases(mechanism, z, rtol, t1=np.inf, maxima=False) -> Iterator[Phase]:
         if maxima:
             rows, by = np.vstack([rows, top]), np.vstack([by, np.zeros(n)])
         orders = np.array([known.get(event, 0) for event in events])
-        rate = field_.rates(0, z)
-        value = rows[:, 0] + rows[:, 1:] @ z + by @ field_.forces(z)
-        slope = (rows[:, 1:] + by @ field_.slopes(z)) @ rate
+        value = rows[:, 0] + rows[:, 1:] @ z + by @ field_.forces(z, t)
+        slope = rate_of(field_, rows, by, z, t)
         solver = DOP853(field_.rates, t, z, t1, max_step=longest, rtol=rtol, atol=rtol)
         start, t0, steps, pieces, hit = z, t, [], [], None
         while hit is None and solver.status == "running":
@@ -437,7 +450,7 @@ def phases(mechanism, z, rtol, t1=np.inf, maxima=False) -> Iterator[Phase]:
             pieces.append(solver.dense_output())
             h = solver.t - t
             Z = pieces[-1](t + h * NODES).T
-            g = rows[:, 0] + Z @ rows[:, 1:].T + field_.forces(Z) @ by.T
+            g = rows[:, 0] + Z @ rows[:, 1:].T + field_.forces(Z, t + h * NODES) @ by.T
             if not steps:  # zeros that are known at the start are divided out
                 tau = NODES[:, None]
                 g -= np.where(orders > 0, value, 0) + np.where(orders > 1, slope * h * tau, 0)
@@ -458,7 +471,7 @@ def phases(mechanism, z, rtol, t1=np.inf, maxima=False) -> Iterator[Phase]:
             if found:
                 place, k = min(found)
                 hit = events[k]
-                used, end = land(field_, (rows[k], by[k]), z, place * h, rtol)
+                used, end = land(field_, (rows[k], by[k]), z, t, place * h, rtol)
             steps.append((t, t + h, t + used, pieces[-1]))
             z, t = np.array(end), t + used
         fixed = [(faces[i].d, faces[i].V) for i in field_.stuck]
@@ -474,13 +487,13 @@ def phases(mechanism, z, rtol, t1=np.inf, maxima=False) -> Iterator[Phase]:
         idle = idle + 1 if t == t0 else 0
         if idle > 20:
             raise Impossible(f"no time passes in {mode} at {z}")
-        mode, known = next_mode(mechanism, z, mode, hit)
+        mode, known = next_mode(mechanism, z, t, mode, hit)
 
 
-def simulate(mechanism, start, t1, rtol=1e-12) -> list[Phase]:
-    """The motion from [x, x'] until the time t1, phase by phase."""
+def simulate(mechanism, start, t1, rtol=1e-12, t0=0.0) -> list[Phase]:
+    """The motion from [x, x'] at t0 until the time t1, phase by phase."""
     s, units, found = mechanism.omega, mechanism.units, []
-    for p in phases(mechanism.scaled, np.asarray(start) / units, rtol, t1 * s):
+    for p in phases(mechanism.scaled, np.asarray(start) / units, rtol, t1 * s, t0=t0 * s):
 
         def dense(t, inner=p.dense):
             return (inner(np.asarray(t) * s).T * units).T
@@ -497,9 +510,9 @@ def monodromy(mechanism, trip, rtol=1e-12) -> np.ndarray:
     for p, after in zip(trip, [*trip[1:], None], strict=True):
         field_ = mechanism.field(p.mode)
 
-        def rates(_t, y, field_=field_):
+        def rates(t, y, field_=field_):
             z, Y = y[:size], y[size:].reshape(size, size)
-            return np.concatenate([field_.rates(0, z), (field_.jacobian(z) @ Y).ravel()])
+            return np.concatenate([field_.rates(t, z), (field_.jacobian(z) @ Y).ravel()])
 
         if p.t1 > p.t0:
             y = np.concatenate([p.start, flow.ravel()])
@@ -507,8 +520,10 @@ def monodromy(mechanism, trip, rtol=1e-12) -> np.ndarray:
             flow = y[size:].reshape(size, size)
         if after is not None and after.mode != p.mode:
             z, g = p.end, field_.gradients(p.end)[field_.events.index(p.event)]
-            before, behind = field_.rates(0, z), mechanism.field(after.mode).rates(0, z)
-            flow = flow + np.outer(behind - before, g @ flow) / (g @ before)
+            before, behind = field_.rates(p.t1, z), mechanism.field(after.mode).rates(p.t1, z)
+            k = field_.events.index(p.event)
+            speed = rate_of(field_, field_.rows[k], field_.by[k], z, p.t1)
+            flow = flow + np.outer(behind - before, g @ flow) / speed
     return flow
 
 
@@ -602,7 +617,8 @@ def measure(mechanism, z, T, rtol=1e-12) -> Cycle:
         visits.append((p.mode, joined + p.t1 - p.t0))
         field_ = core.field(p.mode)
         for k, (t, end, used, dense) in enumerate(p.steps):
-            C = FIT @ field_.values(dense(t + (end - t) * NODES).T)
+            times = t + (end - t) * NODES
+            C = FIT @ field_.values(dense(times).T, times)
             for c in C.T:
                 if abs(c[1]) < 4 * sum(abs(c[2:])) or k == 0:
                     inside = [x for x in extrema(c) if 1e-3 < x < (used - t) / (end - t) - 1e-3]
@@ -675,3 +691,39 @@ def cycle(mechanism, start, rtol=1e-12, coarse=1e-8, most=3000, returns=24) -> C
     except Diverged:
         return Cycle("diverged")
     return Cycle("not periodic")
+
+
+def forced_cycle(mechanism, start, T, settle=200, rtol=1e-12) -> Cycle:
+    """The stable motion with the given period T under f(t), from `start` at t = 0.
+
+    `state` is that at t = 0, and the shares and extremes are those of one period.
+    """
+    core, n, T = mechanism.scaled, len(mechanism.M), T * mechanism.omega
+    *_, last = phases(core, np.asarray(start) / mechanism.units, 1e-8, settle * T)
+    z, best = last.end, np.inf
+    for _ in range(12):
+        trip = list(phases(core, z, rtol, T))
+        gap = trip[-1].end - z
+        if abs(gap).max() < 1e-13 * max(1, abs(z).max()) or best < 1e-9 <= 2 * abs(gap).max():
+            break
+        best = abs(gap).max()
+        z = z + np.linalg.solve(np.eye(2 * n) - monodromy(core, trip, rtol), gap)
+    else:
+        return Cycle("not periodic")
+    flow = monodromy(core, trip, rtol)
+    rows = np.hstack([np.zeros((2 * n, 1)), np.eye(2 * n)])
+    ends = np.array([spread(trip, row) for row in rows]) * mechanism.units[:, None]
+    stick, _, opened = shares(core, trip) / T
+    multipliers = np.array(sorted(np.linalg.eigvals(flow), key=abs, reverse=True))
+    return Cycle(
+        "cycle",
+        T / mechanism.omega,
+        ends[:n, 1] - ends[:n, 0],
+        ends[n:, 0],
+        ends[n:, 1],
+        stick,
+        open_fraction=opened,
+        state=z * mechanism.units,
+        multipliers=multipliers,
+        itinerary=[(p.mode, (p.t1 - p.t0) / mechanism.omega) for p in trip],
+    )

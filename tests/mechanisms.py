@@ -7,6 +7,7 @@ cycle is reached; "by" names quantities for derivatives. Numbers of the cycles a
 reference/mechanisms.json, made by reference/make_mechanisms.py.
 """
 
+import copy
 from typing import Any
 
 
@@ -459,3 +460,16 @@ PROBLEMS: dict[str, dict[str, Any]] = {
         "by": ["joints.0.P", "joints.0.V", "C.0.0"],
     },
 }  # fmt: skip
+
+
+def changed(problem, places, values):
+    """The problem with numbers changed at dotted places, as `by` names them."""
+    problem = copy.deepcopy(problem)
+    for place, value in zip(places, values, strict=True):
+        *path, last = (int(key) if key.isdigit() else key for key in place.split("."))
+        table = problem
+        for key in path:
+            table = table[key]
+            table = table[1] if isinstance(table, tuple) else table  # (law, numbers)
+        table[last] = value
+    return problem

@@ -44,9 +44,10 @@ def add_cycle(commands) -> None:
     parser.add_argument(
         "--start",
         type=float,
-        nargs=4,
-        metavar=("X1", "X2", "V1", "V2"),
-        help="where the motion starts [m, m, m/s, m/s]; else near the sliding equilibrium",
+        nargs="+",
+        metavar=("X1", "X2"),
+        help="where the motion starts: displacements [m], then velocities [m/s], of every degree of"
+        " freedom (a scene has two); else near the sliding equilibrium",
     )
     parser.add_argument("--rtol", type=float, help="of period and states; default 1e-9")
     parser.add_argument(
@@ -56,14 +57,19 @@ def add_cycle(commands) -> None:
 
 
 def _cycle(arguments) -> int:
-    """Find the limit cycle that the motion ends in; write cycle.png and cycle.csv."""
+    """Find the limit cycle that the motion ends in; write cycle.png and cycle.csv.
+
+    Of a scene, or of a structure (a file with a table of that name).
+    """
     from .. import plot
     from .._dynamics.limit_cycle import CycleResult, limit_cycle
     from .._dynamics.summary import cycle_table
+    from .._mechanism.scene import Scene
     from .._stability.stability import require_computable
 
-    scene = load_given(arguments.scene)
-    require_computable(scene)
+    scene = load_given(arguments.scene, structures=True)
+    if isinstance(scene, Scene):
+        require_computable(scene)
     options = {name: getattr(arguments, name) for name in ("start", "rtol", "max_returns")}
     options = {name: value for name, value in options.items() if value is not None}
     with output(arguments.out) as write:
@@ -81,7 +87,8 @@ def _cycle(arguments) -> int:
 
 def _orbit_text(cycle) -> str:
     t, states = cycle.orbit(_SAMPLES)
-    titles = ["time [s]", "x1 [m]", "x2 [m]", "v1 [m/s]", "v2 [m/s]"]
+    dofs = range(1, 1 + len(cycle.amplitude))
+    titles = ["time [s]", *(f"x{i} [m]" for i in dofs), *(f"v{i} [m/s]" for i in dofs)]
     rows = zip(t.tolist(), states.tolist(), strict=True)
     return csv_text(titles, ([time, *state] for time, state in rows))
 

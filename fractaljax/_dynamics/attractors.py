@@ -1,6 +1,7 @@
 """The distinct attractors of a mechanism, found from many starts."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 from .._base.parts import number
 from .._mechanism.mechanism import Mechanism
 from .cycle import CycleResult, LimitCycle
+from .excitation import Excitation
 from .hybrid import degrees_of_freedom, hybrid_system
 from .limit_cycle import limit_cycle
 
@@ -18,6 +20,7 @@ def attractors(
     mechanism: Mechanism,
     starts: ArrayLike | Sequence[Sequence[float]] | None = None,
     *,
+    excitation: Excitation | None = None,
     rtol: float | None = None,
     max_returns: int = 5000,
 ) -> list[LimitCycle]:
@@ -25,7 +28,7 @@ def attractors(
 
     Two cycles are the same if their periods and amplitudes agree to 1e-6. `starts` is (k, 2n),
     [x, v] in m and m/s; by default 32 spread about the equilibrium, up to velocities of 2 V. The
-    list is in the order of the starts. `rtol` and `max_returns` are those of `limit_cycle`.
+    list is in the order of the starts. The options are those of `limit_cycle`.
 
     **Raises:** `ValueError` for starts of another shape, and what `limit_cycle` raises.
     """
@@ -35,8 +38,9 @@ def attractors(
     starts = number("starts", jnp.asarray(starts, dtype=float))
     if starts.ndim != 2 or starts.shape[1] != 2 * n:
         raise ValueError(f"starts must have shape (k, {2 * n}), got {starts.shape}")
+    options: dict[str, Any] = {"excitation": excitation, "rtol": rtol, "throw": False}
     cycles = jax.vmap(
-        lambda start: limit_cycle(mechanism, start, rtol=rtol, max_returns=max_returns, throw=False)
+        lambda start: limit_cycle(mechanism, start, max_returns=max_returns, **options)
     )(starts)
     distinct: list[LimitCycle] = []
     for i in range(len(starts)):
@@ -45,7 +49,7 @@ def attractors(
             continue
         if bool(cycle.result == CycleResult.inaccurate):
             # On its own it gets the segments it needs. It may then equal a known one.
-            cycle = limit_cycle(mechanism, cycle.state, rtol=rtol, throw=False)
+            cycle = limit_cycle(mechanism, cycle.state, **options)
             if any(_same(cycle, other) for other in distinct):
                 continue
         distinct.append(cycle)

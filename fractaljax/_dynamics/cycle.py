@@ -33,6 +33,7 @@ class CycleResult(eqx.Enumeration):
         "the regularised law takes more than max_steps steps: allow more, choose a solver such as "
         "diffrax.Kvaerno5, or leave the regularisation out"
     )
+    jumps = "a joint with K_t opens, where the regularised law jumps: leave the regularisation out"
     exhausted = (
         "the motion nearly repeats, but has not settled within max_returns: allow more of them"
     )
@@ -100,9 +101,10 @@ class LimitCycle(Record):
     open_fraction: Float[Array, " m"]  # of the period open, one value a joint
     tension_fraction: Float[Array, "..."]  # of the period with K_n n.x < 0: the contact pulls
     normal_force: Float[Array, "m 2"]  # smallest and largest of each joint [N]
-    state: Float[Array, " 2n"]  # [x, v] on the cycle, at the section: a maximum of t.x [m, m/s]
+    # [x, v] [m, m/s] on the cycle, at the section: a maximum of t.x, or the time 0 of an excitation
+    state: Float[Array, " 2n"]
     error: Float[Array, ""]  # estimated relative error of period and states
-    returns: Int[Array, ""]  # of the Poincare map (maxima of x1) in one period
+    returns: Int[Array, ""]  # of the Poincare map in one period
     regularisation_error: Float[Array, ""]  # largest relative difference from the exact law
     result: CycleResult
     _monodromy: Float[Array, "2n 2n"] = eqx.field(repr=False)
@@ -110,33 +112,43 @@ class LimitCycle(Record):
     _orbit: Any = eqx.field(repr=False)  # Orbit, or regularised.SmoothOrbit
 
     @property
-    def multipliers(self) -> Complex[Array, "4"]:
-        """The Floquet multipliers, largest modulus first; one of them is 1."""
+    def multipliers(self) -> Complex[Array, " 2n"]:
+        """The Floquet multipliers, largest modulus first; one is 1 where nothing excites."""
         # Computed only when asked for: eigenvalues have no second derivative in JAX.
         values = jnp.linalg.eigvals(self._monodromy)
         order = jnp.argsort(-jnp.abs(jax.lax.stop_gradient(values)), axis=-1)
         return jnp.take_along_axis(values, order, axis=-1)
 
     @property
+    def of_scene(self) -> bool:
+        """Whether `stick_fraction` is of the two directions of a scene, not of joints."""
+        return self.stick_fraction.shape[-1] != len(self._system.faces)
+
+    @property
     def frequency(self) -> Float[Array, ""]:
         """1/period [Hz]."""
         return 1 / self.period
 
-    def orbit(self, n: int = 512) -> tuple[Float[Array, " n"], Float[Array, "n 4"]]:
-        """Times [s] and states [m, m/s], evenly spaced over one period from `state`."""
+    def orbit(self, n: int = 512) -> tuple[Float[Array, " n"], Float[Array, "n 2dofs"]]:
+        """Times [s] and states [x, v] [m, m/s], evenly spaced over one period from `state`."""
         system = self._system
         share = jnp.arange(n) / n
         y = self._orbit.at(system, share * self.period * system.omega)
         y = jnp.where(jnp.isfinite(self.period), y, jnp.nan)
-        return share * self.period, (y * system.units[:, None]).T
+        return share * self.period, (system.own(y) * system.units[:, None]).T
 
-    def spectrum(self, n: int = 512) -> tuple[Float[Array, " n/2"], Float[Array, "n/2 2"]]:
-        """Harmonics: frequencies [Hz] and peak amplitudes [m] of x1 and x2.
+    def spectrum(self, n: int = 512) -> tuple[Float[Array, " n/2"], Float[Array, "n/2 dofs"]]:
+        """Harmonics: frequencies [Hz] and peak amplitudes [m] of the degrees of freedom.
 
         The Fourier coefficients of n samples of the orbit, without the mean.
         """
+        return self.harmonics(jnp.eye(len(self.amplitude), dtype=self.amplitude.dtype), n)
+
+    def harmonics(self, rows, n: int = 512) -> tuple[Float[Array, " n/2"], Float[Array, "n/2 k"]]:
+        """As `spectrum`, of the displacements rows @ x, rows (k, dofs)."""
         _, states = self.orbit(n)
-        lines = jnp.abs(jnp.fft.rfft(states[:, :2], axis=0)) / n * 2
+        x = states[:, : states.shape[1] // 2] @ jnp.asarray(rows, states.dtype).T
+        lines = jnp.abs(jnp.fft.rfft(x, axis=0)) / n * 2
         harmonics = jnp.arange(1, n // 2 + 1)
         return harmonics / self.period, lines[1 : n // 2 + 1]
 

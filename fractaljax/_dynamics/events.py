@@ -144,7 +144,7 @@ def step(system: HybridSystem, y, s, last, h):
     guard = jnp.where(hit, jnp.argmin(roots, axis=0), NONE)
     end = jnp.where(hit[None], between(jnp.where(hit, theta, 1)[None]), y_1)
     y_end, s_end = system.switch(end, s, guard)
-    return y_end, s_end, jnp.where(hit, theta, 1) * h, guard
+    return system.with_unit_excitation(y_end), s_end, jnp.where(hit, theta, 1) * h, guard
 
 
 def guards_and_rates(system: HybridSystem, y, s, h, f) -> tuple[Array, Array]:

@@ -25,7 +25,8 @@ from .._mechanism.structure import Structure, require_single
 
 OPEN = 2
 # Guards, by number: the section of the Poincare map, two for each face, one for each joint that
-# can open. The section is where t.u of the first face falls through 0: a maximum of t.x.
+# can open. The section is where t.u of the first face falls through 0, a maximum of t.x; of an
+# excited system it is the maximum of the excitation, once in each of its periods.
 SECTION, NONE, UNUSED = 0, -1, -2
 _FEW = 4  # degrees of freedom up to which products are written out, which compile into one loop
 
@@ -47,11 +48,57 @@ class HybridSystem(eqx.Module):
     V: Float[Array, " f"]
     faces: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # of each joint
     opens: tuple[bool, ...] = eqx.field(static=True)  # whether a joint can open
+    # Whether the last degree of freedom is the phase of an excitation: excitation.py.
+    excited: bool = eqx.field(static=True, default=False)
 
     @property
     def n(self) -> int:
-        """The number of degrees of freedom."""
+        """The number of degrees of freedom, with that of an excitation."""
         return self.F.shape[0]
+
+    def own(self, y) -> Array:
+        """The mechanism's part (2n, ...) of states, without that of an excitation."""
+        if not self.excited:
+            return y
+        return jnp.concatenate([y[: self.n - 1], y[self.n : -1]])
+
+    @property
+    def constant(self) -> int | None:
+        """The component of a state that no motion changes at the section: z of an excitation."""
+        return self.n - 1 if self.excited else None
+
+    def excitation_frequency(self, lanes: int = 0) -> Array:
+        """Omega of z'' = -Omega^2 z, the last degree of freedom of an excited system."""
+        return self._leaf(jnp.sqrt(self.K[-1, -1]), lanes)
+
+    @property
+    def excitation_period(self) -> Array:
+        """2 pi/Omega."""
+        return 2 * jnp.pi / self.excitation_frequency()
+
+    @property
+    def largest_force(self) -> Array:
+        """The largest acceleration by the constant and the harmonic forces."""
+        constant = jnp.max(jnp.abs(self.F))
+        return constant + jnp.max(jnp.abs(self.K[:-1, -1])) if self.excited else constant
+
+    def with_excitation(self, y, t) -> Array:
+        """States (2n, ...) of the mechanism at the times t (...), with z = cos(Omega t)."""
+        if not self.excited:
+            return y
+        Omega = self.excitation_frequency()
+        t = jnp.broadcast_to(t, y.shape[1:])
+        z, rate = jnp.cos(Omega * t)[None], (-Omega * jnp.sin(Omega * t))[None]
+        x, u = jnp.split(y, 2)
+        return jnp.concatenate([x, z, u, rate])
+
+    def with_unit_excitation(self, y) -> Array:
+        """States with z^2 + (z'/Omega)^2 = 1 again, which a coarse method lets decay."""
+        if not self.excited:
+            return y
+        z, rate = y[self.n - 1], y[-1]
+        size = jnp.sqrt(z**2 + (rate / self.excitation_frequency(z.ndim)) ** 2)
+        return y.at[self.n - 1].divide(size).at[-1].divide(size)
 
     def _leaf(self, leaf, lanes: int) -> Array:
         """A leaf with an axis of length one for each lane that the system does not have."""
@@ -121,6 +168,10 @@ class HybridSystem(eqx.Module):
         w, loads = self.sliding(y[self.n :]), self.loads(y[: self.n])
 
         def force(law, w, load, sign):
+            if law.velocity_dependent:
+                # A coarse step may overshoot far beyond w = 0, where a law means nothing.
+                side = jnp.sign(sign)
+                w = side * jnp.maximum(side * w, -1)
             return law.branch(self.speed * w, sign) * load
 
         return self._each(force, w, loads, signs)
@@ -152,15 +203,22 @@ class HybridSystem(eqx.Module):
 
     def regularised_field(self, y, signs) -> Array:
         """dy/dt where friction has `signs` (f, ...) between -1 and 1, by a smoothed sign."""
-        force, loads = self._friction(y, signs), self.loads(y[: self.n])
-        opens = np.repeat(self.opens, [len(faces) for faces in self.faces])
-        first = jnp.stack([loads[faces[0]] for faces in self.faces for _ in faces])
-        opens = opens.reshape(-1, *(1,) * (y.ndim - 1)) & (first < 0)
+        force, opens = self._friction(y, signs), self.open_faces(y)
         return jnp.concatenate([y[self.n :], self._driven(y, force, jnp.where(opens, OPEN, 1))])
 
+    def open_faces(self, y) -> Array:
+        """The faces (f, ...) of joints that can open and whose normal force would pull."""
+        loads = self.loads(y[: self.n])
+        opens = jnp.asarray(np.repeat(self.opens, [len(faces) for faces in self.faces]))
+        first = jnp.stack([loads[faces[0]] for faces in self.faces for _ in faces])
+        return opens.reshape(-1, *(1,) * (y.ndim - 1)) & (first < 0)
+
     def section(self, y) -> Array:
-        """t.u of the first face, which falls through 0 at a return to the Poincare section."""
-        return self.along(y[self.n :])[0]
+        """t.u of the first face, which falls through 0 at a return to the Poincare section.
+
+        Of an excited system z', so that the section is stroboscopic.
+        """
+        return y[-1] if self.excited else self.along(y[self.n :])[0]
 
     def guards(self, y, s) -> Array:
         """Functions (k, ...) that are positive while contact state s lasts, and the section.
@@ -305,9 +363,9 @@ class HybridSystem(eqx.Module):
 
     @property
     def units(self) -> Float[Array, " 2n"]:
-        """Units [m, ..., m/s, ...] of a scaled state."""
-        length = self.speed / self.omega
-        return jnp.concatenate([jnp.full(self.n, length), jnp.full(self.n, self.speed)])
+        """Units [m, ..., m/s, ...] of a scaled state of the mechanism."""
+        n, length = self.n - self.excited, self.speed / self.omega
+        return jnp.concatenate([jnp.full(n, length), jnp.full(n, self.speed)])
 
 
 def _solve(W, b) -> Array:
@@ -435,15 +493,15 @@ def start_state(start: ArrayLike | Sequence[float], n: int) -> Float[Array, " 2n
 def scaled_start(system: HybridSystem, start: Array | None) -> Float[Array, " 2n"]:
     """The start in scaled units, constant: by default the equilibrium with one displacement.
 
-    It is V/omega along the tangential direction of the first joint.
+    It is V/omega along the tangential direction of the first joint. An excitation begins at t = 0.
     """
     if start is None:
         y = system.equilibrium()
         away = system.section_direction
-        y = y.at[: system.n].add(away / jnp.sum(away**2))
+        y = system.own(y.at[: system.n].add(away / jnp.sum(away**2)))
     else:
         y = start / system.units
-    return jax.lax.stop_gradient(y)
+    return jax.lax.stop_gradient(system.with_excitation(y, 0.0))
 
 
 def check_rtol(rtol: Any, dtype: DTypeLike) -> float:

@@ -9,20 +9,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, ScalarLike
 
-from .._base.parts import concrete, number, raise_unless, whole
+from .._base.parts import concrete, number, raise_unless, require_kind, whole
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.scene import Scene
 from .._stability.stability import growth_rate
 from . import search
 from .cycle import CycleResult, LimitCycle, Orbit, repels
 from .events import Cubic, first_root
+from .excitation import Excitation, excited_system
 from .hybrid import (
     NONE,
     OPEN,
     HybridSystem,
     check_rtol,
     degrees_of_freedom,
-    hybrid_system,
     scaled_start,
     start_state,
 )
@@ -128,11 +128,13 @@ def _monodromy(system: HybridSystem, segments: Segments, local: Maps) -> Float[A
 
 @functools.partial(jax.jit, static_argnames=("segments", "rtol"))
 def _limit_cycle(
-    mechanism: Mechanism, start, max_returns, *, segments: int, rtol: float
+    mechanism: Mechanism, start, excitation, max_returns, *, segments: int, rtol: float
 ) -> LimitCycle:
-    system = hybrid_system(mechanism)
+    system = excited_system(mechanism, excitation)
+    # An excited motion does not end in equilibrium.
+    growth = jnp.ones_like(system.omega) if system.excited else growth_rate(mechanism)
     frozen, equilibrium, growth = jax.lax.stop_gradient(
-        (system, system.equilibrium(), growth_rate(mechanism) / system.omega)
+        (system, system.equilibrium(), growth / system.omega)
     )
     y = scaled_start(system, start)
     h = jnp.asarray(0.25 * (rtol / 1e-9) ** 0.125, y.dtype)
@@ -163,11 +165,12 @@ def _limit_cycle(
         return jnp.where(exists, value, jnp.nan)
 
     period = only(period)
-    n, scale = system.n, system.units
+    n, scale = system.n - system.excited, system.units
     # The loads of the tangential faces are the normal forces of the joints.
     tangential = np.array([faces[0] for faces in system.faces])
     rows = jnp.concatenate([system.L[tangential], jnp.zeros_like(system.L[tangential])], axis=1)
-    everything = jnp.concatenate([jnp.eye(2 * n, dtype=rows.dtype), rows])
+    own = system.own(jnp.eye(2 * system.n, dtype=rows.dtype))
+    everything = jnp.concatenate([own, rows])
     low, high = _extremes(system, closed, everything)
     offset = system.P[tangential][None]
     forces = (jnp.stack([low, high])[:, 2 * n :] + offset) * system.force_unit
@@ -196,12 +199,12 @@ def _limit_cycle(
         open_fraction=only(share(closed.s == OPEN))[tangential],
         tension_fraction=only(pulls[0] if isinstance(mechanism, Scene) else jnp.stack(pulls)),
         normal_force=only(forces.T),
-        state=only(y[:, 0] * scale),
+        state=only(system.own(y[:, 0]) * scale),
         error=only(error),
         returns=found.period_returns,
         regularisation_error=only(jnp.zeros_like(error)),
         result=status,
-        _monodromy=only(monodromy),
+        _monodromy=only(system.own(system.own(monodromy).T).T),
         _system=system,
         _orbit=Orbit(closed),
     )
@@ -219,6 +222,7 @@ def limit_cycle(
     mechanism: Mechanism,
     start: ArrayLike | Sequence[float] | None = None,
     *,
+    excitation: Excitation | None = None,
     regularisation: ScalarLike | None = None,
     solver: "AbstractSolver | None" = None,
     rtol: float | None = None,
@@ -228,6 +232,8 @@ def limit_cycle(
     throw: bool = True,
 ) -> LimitCycle:
     """The limit cycle that the motion from `start` ends in, by the exact law of dry friction.
+
+    With an excitation: the periodic motion under it.
 
     A coarse run from `start` is compared at its returns to a section: the maxima of t.x, the
     tangential displacement of the first joint (of x1 in a scene). Where they repeat, Newton's
@@ -242,6 +248,10 @@ def limit_cycle(
     - `start`: (2n,), [x, v] in m and m/s; by default the sliding equilibrium, displaced by V/omega
       along t, where omega^2 is the sum of the squared eigenfrequencies of a scene, and of a
       structure the root of the sum of their fourth powers.
+    - `excitation`: a harmonic force. The returns are then its periods, at each of which its time is
+      0 again: the section is stroboscopic, `state` is that at the time 0, `period` is `returns`
+      periods of the excitation (above 1 the motion is subharmonic), and none of the 2n
+      `multipliers` is 1 by itself. `start` is the state at the time 0.
     - `regularisation`: eps [m/s], to replace sgn v by tanh(v/eps). The cycle is then compared
       with the exact law's from the same start: `regularisation_error` is the largest relative
       difference of period and amplitudes, and the result `depends_on_eps` where it is above
@@ -262,19 +272,23 @@ def limit_cycle(
     """
     n = degrees_of_freedom(mechanism)
     start = None if start is None else start_state(start, n)
-    given = mechanism if start is None else (mechanism, start)
+    if excitation is not None:
+        require_kind("excitation", excitation, Excitation)
+    given = mechanism, start, excitation
     tolerance = check_rtol(rtol, jnp.result_type(*jax.tree.leaves(given)))
     returns = jnp.asarray(whole("max_returns", max_returns, 1), float)
     count = _SEGMENTS if segments is None else whole("segments", segments, 16)
-    cycle = _limit_cycle(mechanism, start, returns, segments=count, rtol=tolerance)
+    arguments = mechanism, start, excitation, returns
+    cycle = _limit_cycle(*arguments, segments=count, rtol=tolerance)
     while segments is None and count < _MOST_SEGMENTS and _needs_more_segments(cycle):
         # A long period, or one of many returns.
         count *= 8
-        cycle = _limit_cycle(mechanism, start, returns, segments=count, rtol=tolerance)
+        cycle = _limit_cycle(*arguments, segments=count, rtol=tolerance)
     if regularisation is not None:
         from .regularised import regularised_cycle
 
         eps = number("regularisation", regularisation, above=0)
         steps = whole("max_steps", max_steps, 1)
-        cycle = regularised_cycle(mechanism, start, eps, cycle, solver, tolerance, steps)
+        arguments = mechanism, start, excitation, eps
+        cycle = regularised_cycle(*arguments, cycle, solver, tolerance, steps)
     return raise_unless(CycleResult.converged, cycle) if throw else cycle

@@ -108,12 +108,13 @@ def _in_phase(phase, values) -> Array:
     return jax.ops.segment_sum(values, phase, len(phase))[phase]
 
 
-def corrections(local: Maps, segments: Segments, gap, guard):
+def corrections(local: Maps, segments: Segments, gap, guard, constant: int | None = None):
     """Changes of states and durations that close the gaps and bring the guards to zero.
 
     They solve dy_next = A dy + b dt + gap on every segment of the chain, with the same dt in a
-    phase, and c dy_next = -guard at its end. Returns them and the product of all maps (2n, 2n),
-    the Jacobian of the return map.
+    phase, and c dy_next = -guard at its end. Of the first state the component `constant`, which
+    repeats whatever it is, does not change. Returns them and the product of all maps (2n, 2n), the
+    Jacobian of the return map.
     """
     ends = segments.used & (segments.guard != NONE)
     phase = jnp.cumsum(ends) - ends
@@ -139,7 +140,10 @@ def corrections(local: Maps, segments: Segments, gap, guard):
     (jacobian, shift, _), (r, d) = jax.lax.scan(chain, (eye, zero, zero), (*lanes, ends))
     # Without segments the equations would be singular.
     jacobian = jnp.where(jnp.any(ends), jacobian, 0)
-    first = jnp.linalg.solve(eye - jacobian, shift)
+    matrix = eye - jacobian
+    if constant is not None:
+        matrix, shift = matrix.at[constant].set(eye[constant]), shift.at[constant].set(0)
+    first = jnp.linalg.solve(matrix, shift)
     durations = share * _in_phase(phase, jnp.where(ends, r @ first + d, 0))
 
     def along(dy, segment):
@@ -213,6 +217,9 @@ class PeriodicOrbit(eqx.Module):
 def solve_periodic_orbit(system: HybridSystem, segments: Segments) -> PeriodicOrbit:
     """The periodic orbit near those segments."""
     y = segments.y
+    if system.excited:
+        y = y.at[:, 0].set(system.with_excitation(system.own(y[:, 0]), 0.0))
+        segments = eqx.tree_at(lambda segments: segments.y, segments, y)
     eps, big = jnp.finfo(y.dtype).eps, jnp.asarray(jnp.finfo(y.dtype).max, y.dtype)
     tolerance = 1e3 * eps * (1 + jnp.max(jnp.abs(y)))
 
@@ -225,7 +232,8 @@ def solve_periodic_orbit(system: HybridSystem, segments: Segments) -> PeriodicOr
         ends, local = maps(system, segments, written_out=True)
         target = next_start(segments.y)
         guard = chosen_guard(system, target, segments.s, segments.guard)
-        dy, dt, jacobian = corrections(local, segments, ends - target, guard)
+        gap = ends - target
+        dy, dt, jacobian = corrections(local, segments, gap, guard, system.constant)
         change = jnp.maximum(jnp.max(jnp.abs(dy)), jnp.max(jnp.abs(dt)))
         # Far from the orbit a full step may leave the region of convergence.
         share = jnp.minimum(1, 1 / change)
@@ -248,7 +256,8 @@ def estimated_error(system: HybridSystem, orbit: PeriodicOrbit) -> tuple[Array, 
         return y, y
 
     end, (middle, _) = jax.lax.scan(half, y, length=2)
-    dy, dt, _ = corrections(orbit.local, segments, end - next_start(y), jnp.zeros_like(h))
+    gap, guard = end - next_start(y), jnp.zeros_like(h)
+    dy, dt, _ = corrections(orbit.local, segments, gap, guard, system.constant)
     period = jnp.sum(h)
     error = jnp.maximum(jnp.abs(jnp.sum(dt)) / period, jnp.max(jnp.abs(dy)) / jnp.max(jnp.abs(y)))
     return error, middle
@@ -277,7 +286,7 @@ def _orbit_jvp(primals, tangents):
     _, local = maps(system, Segments(y, duration, s, guard))
 
     def solution(gap, off):
-        return corrections(local, segments, gap, off)[:2]
+        return corrections(local, segments, gap, off, system.constant)[:2]
 
     # Linear, hence its own derivative. Older versions of JAX transpose a scan only as a jvp.
     nothing = jax.tree.map(jnp.zeros_like, (gap, off))

@@ -1,7 +1,7 @@
 """The regularised friction law, tanh(v/eps) in place of sgn v, by diffrax and optimistix.
 
-Its motion is smooth, so its limit cycle solves y(T) = y, u1 = 0. But it is the cycle of another
-mechanism, and nothing in it tells how far that is from the exact law's.
+Its motion is smooth, so its limit cycle solves y(T) = y, u1 = 0; with an excitation T is known. But
+it is the cycle of another mechanism, and nothing in it tells how far that is from the exact one.
 """
 
 import functools
@@ -19,7 +19,8 @@ from .._mechanism.mechanism import Mechanism
 from .._mechanism.structure import Structure
 from .cycle import CycleResult, LimitCycle, repels
 from .events import Cubic
-from .hybrid import HybridSystem, hybrid_system, scaled_start
+from .excitation import excited_system
+from .hybrid import HybridSystem, scaled_start
 
 _SETTLING = 64  # slowest periods of the transient
 _LONGEST = 4  # most returns in one period
@@ -70,6 +71,7 @@ def _settle(system: HybridSystem, eps, y, solver, rtol, max_steps):
     Also whether each was reached within `max_steps` steps.
     """
     K = jnp.diag(system.K) if system.K.ndim == 1 else system.K
+    K = K[:-1, :-1] if system.excited else K
     flexibility = jnp.max(jnp.sum(jnp.abs(jnp.linalg.inv(K)), axis=1))
     slowest = 2 * jnp.pi * jnp.sqrt(flexibility)
     away = system.section_direction
@@ -85,8 +87,17 @@ def _settle(system: HybridSystem, eps, y, solver, rtol, max_steps):
         y = y.at[system.n :].add(-system.section(y) * away / jnp.sum(away**2))
         return y, (y, found.ts[0], found.result != diffrax.RESULTS.max_steps_reached)
 
-    steps = _SETTLING * max_steps
-    settled = run(y, _SETTLING * slowest, rtol=max(rtol, 1e-7), max_steps=steps)
+    def next_period(y, _):
+        found = run(y, system.excitation_period, rtol=rtol, max_steps=max_steps)
+        y = system.with_excitation(system.own(found.ys[0]), 0.0)
+        reached = found.result == diffrax.RESULTS.successful
+        return y, (y, system.excitation_period, reached)
+
+    steps, settling = _SETTLING * max_steps, _SETTLING * slowest
+    if system.excited:
+        settling = jnp.ceil(settling / system.excitation_period) * system.excitation_period
+        next_return = next_period
+    settled = run(y, settling, rtol=max(rtol, 1e-7), max_steps=steps)
     _, (ends, times, within) = jax.lax.scan(next_return, settled.ys[0], length=1 + _LONGEST)
     apart = jnp.max(jnp.abs(ends[1:] - ends[:1]), axis=1)
     returns = 1 + jnp.argmax(apart <= 2 * jnp.min(apart) + _SAME)
@@ -122,14 +133,26 @@ def share_below_zero(times, values, rates) -> Float[Array, ""]:
 
 @eqx.filter_jit
 def regularised_cycle(
-    mechanism: Mechanism, start, eps, exact: LimitCycle, solver, rtol: float, max_steps: int
+    mechanism: Mechanism,
+    start,
+    excitation,
+    eps,
+    exact: LimitCycle,
+    solver,
+    rtol: float,
+    max_steps: int,
 ) -> LimitCycle:
     """The limit cycle of the regularised law from a start (2n,), beside the `exact` law's.
 
     The arguments are those of `limit_cycle`, with eps in m/s.
     """
-    system = hybrid_system(mechanism)
+    system = excited_system(mechanism, excitation)
     options = {"solver": solver, "max_steps": max_steps}
+    looser, error = 10 * rtol, rtol
+    if any(system.opens):
+        # The field has a kink where a joint opens, which makes the gap rougher still.
+        looser = error = 100 * rtol
+        rtol = max(rtol / 100, 4096 * float(jnp.finfo(system.F.dtype).eps))
     frozen = jax.lax.stop_gradient((system, eps, scaled_start(system, start)))
     guess, returns, followed = _settle(*frozen, solver, rtol, max_steps)
 
@@ -137,10 +160,22 @@ def regularised_cycle(
         (y, period), (system, eps) = unknown, args
         return solve(system, eps, y, period, rtol=rtol, **options).ys[0] - y, system.section(y)
 
+    def excited_gap(y, args):
+        system, eps = args
+        full, period = system.with_excitation(y, 0.0), returns * system.excitation_period
+        return system.own(solve(system, eps, full, period, rtol=rtol, **options).ys[0]) - y
+
     # Looser than the integration, whose adaptive steps make the gap rough.
-    newton = optimistix.Newton(rtol=10 * rtol, atol=10 * rtol)
-    root = optimistix.root_find(gap, newton, guess, (system, eps), max_steps=16, throw=False)
-    y, period = root.value
+    newton = optimistix.Newton(rtol=looser, atol=looser)
+    function, unknown = gap, guess
+    if system.excited:
+        function, unknown = excited_gap, system.own(guess[0])
+    root = optimistix.root_find(function, newton, unknown, (system, eps), max_steps=16, throw=False)
+    if system.excited:
+        y = system.with_excitation(root.value, 0.0)
+        period = returns * system.excitation_period
+    else:
+        y, period = root.value
     near = jnp.max(jnp.abs(y - guess[0])) < 0.2 * (1 + jnp.max(jnp.abs(guess[0])))
     # An equilibrium is periodic as well, with any period.
     moves = jnp.max(jnp.abs(field(0.0, y, (system, eps)))) > 1e-4
@@ -149,10 +184,9 @@ def regularised_cycle(
     solution = solve(system, eps, y, period, rtol=rtol, saveat=DENSE, **options)
     times, states = nodes(solution)
     rates = jax.vmap(lambda y: field(0.0, y, (system, eps)))(states)
-    low, high = extremes(times, states, rates) * system.units[None]
-    n, shown = system.n, np.arange(system.n)
-    if isinstance(mechanism, Structure):
-        shown = np.array([faces[0] for faces in system.faces])
+    low, high = system.own(extremes(times, states, rates).T).T * system.units[None]
+    n, structure = system.n, isinstance(mechanism, Structure)
+    shown = np.array([faces[0] for faces in system.faces]) if structure else np.arange(2)
     w = jax.vmap(lambda y: system.sliding(y[n:]))(states)
     change = -jax.vmap(lambda rate: system.along(rate[n:]))(rates)
     width = eps / system.speed
@@ -170,15 +204,20 @@ def regularised_cycle(
         return solve(system, eps, y, period, rtol=rtol / 10, **options).ys[0]
 
     monodromy = jax.jacfwd(end)(y)
-    numbers = jnp.stack([period / system.omega, *(high - low)[:n]])
+    numbers = jnp.stack([period / system.omega, *(high - low)[: len(low) // 2]])
     difference = jnp.abs(numbers / jnp.stack([exact.period, *exact.amplitude]) - 1)
     difference = jax.lax.stop_gradient(jnp.max(difference))
-    error = jnp.asarray(rtol, y.dtype)
+    error = jnp.asarray(error, y.dtype)
     unstable = repels(*jax.lax.stop_gradient((monodromy, rates[0])), error)
     status = CycleResult.where(unstable, CycleResult.unstable, CycleResult.converged)
     status = CycleResult.where(difference <= _TOLERANCE, status, CycleResult.depends_on_eps)
+    # The tangential spring of a joint that opens lets go, and the tangents do not see the jump.
+    held = [jnp.any(system.L[faces[-1]] != 0) & (len(faces) > 1) for faces in system.faces]
+    jumps = jnp.any(opens & jnp.stack(held) & (below > 0))
     lost = CycleResult.where(followed, CycleResult.not_periodic, CycleResult.too_stiff)
     status = CycleResult.where(found, status, lost)
+    status = CycleResult.where(jumps & followed, CycleResult.jumps, status)
+    found = found & ~jumps
 
     def only(value):
         return jnp.where(found, value, jnp.nan)
@@ -186,18 +225,18 @@ def regularised_cycle(
     return LimitCycle(
         period=only(numbers[0]),
         amplitude=only(numbers[1:]),
-        velocity_min=only(low[n:]),
-        velocity_max=only(high[n:]),
+        velocity_min=only(low[len(low) // 2 :]),
+        velocity_max=only(high[len(low) // 2 :]),
         stick_fraction=only(jnp.stack(stuck)),
         open_fraction=only(jnp.where(opens, below, 0)),
-        tension_fraction=only(jnp.where(opens, 0, below)),
+        tension_fraction=only(jnp.where(opens, 0, below)[() if structure else 0]),
         normal_force=only(forces),
-        state=only(y * system.units),
+        state=only(system.own(y) * system.units),
         error=only(error),
         returns=returns,
         regularisation_error=only(difference),
         result=status,
-        _monodromy=only(monodromy),
+        _monodromy=only(system.own(system.own(monodromy).T).T),
         _system=system,
         _orbit=SmoothOrbit(solution),
     )

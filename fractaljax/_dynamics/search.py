@@ -266,7 +266,8 @@ def _assess(
     log = jnp.log(away[:3] + tiny)
     rate, before = log[0] - log[1], log[1] - log[2]
     duration = seen.time[0] - seen.time[1]
-    steady = smooth & (jnp.abs(rate - before) < 0.1 * jnp.abs(rate))
+    # An excited motion has no equilibrium.
+    steady = smooth & (jnp.abs(rate - before) < 0.1 * jnp.abs(rate)) & (not system.excited)
     linear = steady & (away[0] < options.linear) & (rate < 0.7 * growth * duration)
     decays = linear | (smooth & (away[0] < options.small) & (rate < 0))
     decays = (growth < 0) & (decays | (size < 1e-6))

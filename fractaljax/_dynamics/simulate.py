@@ -15,10 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, ScalarLike
 
-from .._base.parts import Record, concrete, number, raise_unless, scalar, whole
+from .._base.parts import Record, brief, concrete, number, raise_unless, scalar, whole
 from .._mechanism.mechanism import Mechanism
 from .events import Cubic, guards_and_rates, without_start
-from .hybrid import NONE, HybridSystem, check_rtol, degrees_of_freedom, hybrid_system, start_state
+from .excitation import Excitation, excited_system
+from .hybrid import NONE, OPEN, HybridSystem, check_rtol, degrees_of_freedom, start_state
 from .orbit import chosen_guard, flow
 
 if TYPE_CHECKING:
@@ -37,15 +38,18 @@ class SimulationResult(eqx.Enumeration):
 
 
 class Trajectory(Record):
-    """The motion of a scene, as `simulate` returns it; unused steps repeat the last state."""
+    """The motion of a mechanism, as `simulate` returns it; unused steps repeat the last state.
 
-    times: Float[Array, " n"]  # at the ends of the steps [s]
+    With `saveat` everything is at those times only; what was not reached is NaN.
+    """
+
+    times: Float[Array, " n"]  # at the ends of the steps, from t0 on [s]
     states: Float[Array, "n 2n"]  # [x, v] [m, m/s]
     contact_states: Float[
         Array, "n f"
     ]  # from each time on: +1, -1 slip forward, backward, 0 stick, 2 open
     result: SimulationResult
-    _system: HybridSystem = eqx.field(repr=False)
+    _system: HybridSystem | None = eqx.field(repr=False)  # None with `saveat`
     _solution: Any = eqx.field(repr=False)  # diffrax's, of the regularised law
 
     @property
@@ -54,29 +58,42 @@ class Trajectory(Record):
         return self.states[-1]
 
     def at(self, times: ArrayLike | Sequence[float]) -> Float[Array, "k 2n"]:
-        """States at `times` (k,) [s] from 0 to the end of the simulation.
+        """States at `times` (k,) [s] from `t0` to the end of the simulation.
 
-        **Raises:** `ValueError` for times of another shape or outside; `RuntimeError` inside a
-        compiled program.
+        **Raises:** `ValueError` for times of another shape or outside, and for a simulation with
+        `saveat`; `RuntimeError` inside a compiled program.
         """
-        times = self._inside(number("times", jnp.asarray(times)))
-        scale = self._system.units
+        if self._system is None:
+            raise ValueError("a simulation with saveat has no states between: leave saveat out")
+        return self._at(self._system, self._inside(number("times", jnp.asarray(times))))
+
+    def _at(self, system: HybridSystem, times) -> Array:
+        scale = system.units
         if self._solution is not None:
-            states = jax.vmap(self._solution.evaluate)(times * self._system.omega)
-            return states * scale[None]
+            y = jax.vmap(self._solution.evaluate, out_axes=1)(
+                (times - self.times[0]) * system.omega
+            )
+            return (system.own(y) * scale[:, None]).T
+        k = self._step(times)
+        after = (times - self.times[k]) * system.omega
+        start = (self.states[k] / scale[None]).T
+        start = system.with_excitation(start, self.times[k] * system.omega)
+        y = flow(system, start, after, self.contact_states[k].T)
+        return (system.own(y) * scale[:, None]).T
+
+    def _step(self, times) -> Int[Array, " k"]:
+        """The steps in which these times are."""
         known = jax.lax.stop_gradient((self.times, times))
-        k = jnp.clip(jnp.searchsorted(*known, side="right") - 1, 0, len(self.times) - 1)
-        after = (times - self.times[k]) * self._system.omega
-        start, s = (self.states[k] / scale[None]).T, self.contact_states[k].T
-        return (flow(self._system, start, after, s) * scale[:, None]).T
+        return jnp.clip(jnp.searchsorted(*known, side="right") - 1, 0, len(self.times) - 1)
 
     def _inside(self, times) -> Array:
         if times.ndim != 1:
             raise ValueError(f"times must have shape (k,), got {times.shape}")
-        last = self.times[-1]
+        first, last = self.times[0], self.times[-1]
         # The end is known up to rounding: t1 itself is inside.
-        outside = (times < 0) | (times > last * (1 + 8 * jnp.finfo(last.dtype).eps))
-        wanted = "times must be from 0 to the end of the simulation"
+        rounding = 8 * jnp.finfo(last.dtype).eps * jnp.maximum(jnp.abs(first), jnp.abs(last))
+        outside = (times < first) | (times > last + rounding)
+        wanted = "times must be from t0 to the end of the simulation"
         found, given = concrete(outside), concrete(times)
         if found is None or given is None:
             return eqx.error_if(times, outside, wanted)
@@ -89,7 +106,11 @@ class Trajectory(Record):
 
         The faces of a scene are its directions; those of a structure come joint by joint, along
         t and, where there is a normal, along n.
+
+        **Raises:** `ValueError` for a simulation with `saveat`.
         """
+        if self._system is None:
+            raise ValueError("a simulation with saveat does not hold its switches")
         states, times = np.asarray(self.contact_states), np.asarray(self.times)
         return [
             (float(times[k + 1]), int(i) + 1, int(states[k, i]), int(states[k + 1, i]))
@@ -123,7 +144,7 @@ def _event(system: HybridSystem, y, s, h, g_0, g_1, d_0, d_1):
     bend = derivative(rate)
 
     # In its contact state every guard starts above zero, up to rounding.
-    rounding = 16 * jnp.finfo(y.dtype).eps * (1 + jnp.max(jnp.abs(y)) + jnp.max(jnp.abs(system.F)))
+    rounding = 16 * jnp.finfo(y.dtype).eps * (1 + jnp.max(jnp.abs(y)) + system.largest_force)
     late = g_0 < -rounding
     g_0 = jnp.maximum(g_0, 0)
     d_0 = jnp.where((g_0 <= rounding) & (d_0 >= -rounding), jnp.maximum(d_0, 0), d_0)
@@ -228,9 +249,16 @@ class _Steps(eqx.Module):
     result: SimulationResult
 
 
+def _bound(system: HybridSystem, y) -> Array:
+    """The size beyond which a motion from y has diverged."""
+    bound = 1e3 * (1 + jnp.max(jnp.abs(y)))
+    # An excitation may be large beside the belt's velocity, and at resonance.
+    return bound + 1e5 * system.largest_force if system.excited else bound
+
+
 @functools.partial(jax.jit, static_argnames="max_steps")
 def _find_steps(system: HybridSystem, y, end, h, rtol, *, max_steps: int) -> _Steps:
-    limit = 1e3 * (1 + jnp.max(jnp.abs(y)))
+    limit = _bound(system, y)
 
     def running(carry):
         y, _, t, k, *_ = carry
@@ -259,7 +287,7 @@ def _find_steps(system: HybridSystem, y, end, h, rtol, *, max_steps: int) -> _St
 
 
 @jax.jit
-def _repeat(system: HybridSystem, y, end, steps: _Steps) -> Trajectory:
+def _repeat(system: HybridSystem, y, t0, end, steps: _Steps) -> Trajectory:
     """The steps once more, differentiably."""
     last = jnp.where(steps.result == SimulationResult.reached, steps.count - 1, -1)
 
@@ -280,9 +308,10 @@ def _repeat(system: HybridSystem, y, end, steps: _Steps) -> Trajectory:
     following = jnp.concatenate([steps.s[:, 1:], steps.s[:, -1:]], axis=1)
     moves = jnp.arange(len(steps.duration)), steps.duration, steps.s.T, following.T, steps.guard
     _, (states, times, after) = jax.lax.scan(body, (y, jnp.zeros_like(end)), moves)
+    states = jnp.concatenate([y[None], states]).T
     return Trajectory(
-        times=jnp.concatenate([jnp.zeros(1, y.dtype), times]) / system.omega,
-        states=jnp.concatenate([y[None], states]) * system.units[None],
+        times=t0 + jnp.concatenate([jnp.zeros(1, y.dtype), times]) / system.omega,
+        states=(system.own(states) * system.units[:, None]).T,
         contact_states=jnp.concatenate([steps.s[:, :1].T, after]),
         result=steps.result,
         _system=system,
@@ -290,29 +319,60 @@ def _repeat(system: HybridSystem, y, end, steps: _Steps) -> Trajectory:
     )
 
 
+@jax.jit
+def _sampled(trajectory: Trajectory, saveat) -> Trajectory:
+    """The motion at the times `saveat` alone."""
+    assert trajectory._system is not None
+    states = trajectory._at(trajectory._system, saveat)
+    contact_states = trajectory.contact_states[trajectory._step(saveat)]
+    reached = trajectory.result == SimulationResult.reached
+    missing = ((saveat > trajectory.times[-1]) & ~reached)[:, None]
+    return Trajectory(
+        times=saveat,
+        states=jnp.where(missing, jnp.nan, states),
+        contact_states=jnp.where(missing, jnp.nan, contact_states),
+        result=trajectory.result,
+        _system=None,
+        _solution=None,
+    )
+
+
 @eqx.filter_jit
-def _regularised(system: HybridSystem, y, end, eps, solver, rtol, max_steps: int) -> Trajectory:
-    from diffrax import RESULTS
+def _regularised(
+    system: HybridSystem, y, t0, end, saveat, eps, solver, rtol, max_steps: int
+) -> Trajectory:
+    from diffrax import RESULTS, SaveAt
 
     from .regularised import DENSE, nodes, solve
 
     options = {"solver": solver, "rtol": rtol, "max_steps": max_steps, "saveat": DENSE}
+    if saveat is not None:
+        options["saveat"] = SaveAt(ts=(saveat - t0) * system.omega, t1=True)
     solution = solve(system, eps, y, end, **options)
-    times, states = nodes(solution)
+    if saveat is None:
+        times, states = nodes(solution)
+        last, times = states[-1], t0 + times / system.omega
+    else:
+        # What was not reached is infinite.
+        last = jnp.where(jnp.isfinite(solution.ys), solution.ys, 0)
+        times, states = saveat, jnp.where(jnp.isfinite(solution.ys), solution.ys, jnp.nan)[:-1]
     sliding = system.speed * jax.vmap(lambda y: system.sliding(y[system.n :]))(states)
-    far = jnp.max(jnp.abs(states[-1])) > 1e3 * (1 + jnp.max(jnp.abs(y)))
+    contact_states = jnp.where(jnp.abs(sliding) < eps, 0, jnp.sign(sliding))
+    if any(system.opens):
+        contact_states = jnp.where(system.open_faces(states.T).T, OPEN, contact_states)
+    far = jnp.max(jnp.abs(last)) > _bound(system, y)
     reached = solution.result == RESULTS.successful
     result = SimulationResult.where(
         reached, SimulationResult.reached, SimulationResult.out_of_steps
     )
     result = SimulationResult.where(far, SimulationResult.diverged, result)
     return Trajectory(
-        times=times / system.omega,
-        states=states * system.units[None],
-        contact_states=jnp.where(jnp.abs(sliding) < eps, 0, jnp.sign(sliding)),
+        times=times,
+        states=(system.own(states.T) * system.units[:, None]).T,
+        contact_states=contact_states,
         result=result,
-        _system=system,
-        _solution=solution,
+        _system=system if saveat is None else None,
+        _solution=solution if saveat is None else None,
     )
 
 
@@ -321,23 +381,31 @@ def simulate(
     start: ArrayLike | Sequence[float],
     t1: ScalarLike,
     *,
+    excitation: Excitation | None = None,
+    t0: ScalarLike = 0.0,
+    saveat: ArrayLike | Sequence[float] | None = None,
     regularisation: ScalarLike | None = None,
     solver: "AbstractSolver | None" = None,
     rtol: float | None = None,
     max_steps: int = 4096,
     throw: bool = True,
 ) -> Trajectory:
-    """The motion from `start` over the time `t1`, by the exact law of dry friction.
+    """The motion from `start` at `t0` until `t1`, by the exact law of dry friction.
 
     Eighth-order steps of equal length, each cut where the contact state changes. Derivatives with
-    respect to the scene, `start` and `t1` are those of the motion with its switches.
+    respect to the mechanism, the excitation, `start`, `t0` and `t1` are those of the motion with
+    its switches.
 
     **Arguments:**
 
     - `mechanism`: a scene, or a structure of n degrees of freedom whose joints all have a V;
       `jax.vmap` takes many.
     - `start`: (2n,), [x, v] in m and m/s.
-    - `t1`: end time [s], above 0.
+    - `t1`: end time [s], above `t0`.
+    - `excitation`: a harmonic force, whose phase refers to the time 0.
+    - `t0`: start time [s].
+    - `saveat`: (k,), times [s] in order from `t0` to `t1`, at which alone states are returned. The
+      memory that the regularised law takes then does not grow with the steps.
     - `regularisation`: eps [m/s], to replace sgn v by tanh(v/eps); a contact state is then 0 where
       abs(v) < eps. The motion depends on eps: `limit_cycle` compares with the exact law.
     - `solver`: a diffrax solver for the regularised law, Tsit5 by default; an implicit one, such
@@ -351,14 +419,16 @@ def simulate(
     rtol that the precision cannot hold; `RuntimeError` if `throw`.
     """
     start = start_state(start, degrees_of_freedom(mechanism))
-    system = hybrid_system(mechanism)
-    t1 = scalar("t1", t1, above=0)
+    system = excited_system(mechanism, excitation)
+    t0, t1 = _times(t0, t1)
+    saveat = None if saveat is None else _checked(saveat, t0, t1)
     n = whole("max_steps", max_steps, 1)
-    y, end = start / system.units, t1 * system.omega
+    y, end = start / system.units, (t1 - t0) * system.omega
+    y = system.with_excitation(y, t0 * system.omega)
     rtol = check_rtol(rtol, y.dtype)
     if regularisation is not None:
         eps = number("regularisation", regularisation, above=0)
-        trajectory = _regularised(system, y, end, eps, solver, rtol, n)
+        trajectory = _regularised(system, y, t0, end, saveat, eps, solver, rtol, n)
     else:
         h = jnp.asarray(min(0.25 * (rtol / 1e-9) ** 0.125, 0.5), y.dtype)
         frozen = jax.lax.stop_gradient((system, y, end))
@@ -368,5 +438,31 @@ def simulate(
             used = min(n, 1 << max(int(steps.count) - 1, 15).bit_length())
             shorter = steps.duration[:used], steps.s[:, :used], steps.guard[:used]
             steps = eqx.tree_at(lambda x: (x.duration, x.s, x.guard), steps, shorter)
-        trajectory = _repeat(system, y, end, steps)
+        trajectory = _repeat(system, y, t0, end, steps)
+        trajectory = trajectory if saveat is None else _sampled(trajectory, saveat)
     return raise_unless(SimulationResult.reached, trajectory) if throw else trajectory
+
+
+def _times(t0, t1) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Both, the second above the first."""
+    t0 = scalar("t0", t0)
+    start = concrete(t0)
+    if start is not None:
+        return t0, scalar("t1", t1, above=float(start))
+    t1 = scalar("t1", t1)
+    return t0, eqx.error_if(t1, ~(t1 > t0), "t1 must be above t0")
+
+
+def _checked(saveat, t0, t1) -> Float[Array, " k"]:
+    """The times of `saveat`, if they are in order from t0 to t1."""
+    saveat = number("saveat", jnp.asarray(saveat))
+    if saveat.ndim != 1 or not len(saveat):
+        raise ValueError(f"saveat must have shape (k,) with k at least 1, got {saveat.shape}")
+    ends = jnp.concatenate([t0[None], saveat, t1[None]])
+    bad, wanted = jnp.any(ends[1:] < ends[:-1]), "saveat must be in order from t0 to t1"
+    found = concrete(bad)
+    if found is None:
+        return eqx.error_if(saveat, bad, wanted)
+    if found:
+        raise ValueError(f"{wanted}, got {brief(np.asarray(saveat))}")
+    return saveat

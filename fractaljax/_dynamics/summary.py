@@ -4,10 +4,12 @@ import jax.numpy as jnp
 
 from .._base.table import table
 from .._mechanism.scene import Scene
+from .._mechanism.structure import Structure
 from .._stability.stability import stability
 from .._stability.summary import friction_remark, verdict
 from .cycle import CycleResult, LimitCycle
 
+_MOST = 12  # degrees of freedom of a structure, and multipliers, that are listed
 _CONTACT_STATES = {
     "+": "slips, dx/dt < V",
     "-": "slips, dx/dt > V",
@@ -16,20 +18,16 @@ _CONTACT_STATES = {
 }
 
 
-def cycle_table(scene: Scene, cycle: LimitCycle) -> str:
+def cycle_table(mechanism: Scene | Structure, cycle: LimitCycle) -> str:
     """The result of the search for one limit cycle, its numbers and its switches."""
-    found = {"result": str(CycleResult[cycle.result])} | verdict(stability(scene))
+    found = {"result": str(CycleResult[cycle.result])} | verdict(stability(mechanism))
     if not jnp.isfinite(cycle.period):
         return table([""], [found])
     whole = found | {
         "period [ms]": f"{cycle.period * 1e3:.6g}",
         "frequency [Hz]": f"{cycle.frequency:.6g}",
         "returns in a period": f"{cycle.returns}",
-        **(
-            {"joint is open": f"{cycle.open_fraction[0]:.2%} of the period"}
-            if scene.preload
-            else {"contact pulls": f"{cycle.tension_fraction:.2%} of the period"}
-        ),
+        **({} if isinstance(mechanism, Structure) else _pulls(mechanism, cycle)),
         "estimated error": f"{cycle.error:.1e}",
     }
     regularised = cycle.regularisation_error != 0
@@ -39,17 +37,28 @@ def cycle_table(scene: Scene, cycle: LimitCycle) -> str:
     multipliers = (jnp.round(cycle.multipliers, 6) + 0).tolist()
     whole |= {
         f"Floquet multiplier {i}": f"{s.real:+.6f} {s.imag:+.6f}i  (modulus {abs(s):.6f})"
-        for i, s in enumerate(multipliers, start=1)
+        for i, s in enumerate(multipliers[:_MOST], start=1)
     }
     directions = [
         {
             "peak to peak [m]": f"{cycle.amplitude[i]:.6g}",
             "least dx/dt [m/s]": f"{cycle.velocity_min[i]:+.6g}",
             "largest dx/dt [m/s]": f"{cycle.velocity_max[i]:+.6g}",
-            "sticks": f"{cycle.stick_fraction[i]:.2%} of the period",
         }
-        for i in range(2)
+        for i in range(len(cycle.amplitude))
     ]
+    if isinstance(mechanism, Structure):
+        names = mechanism.names or [f"x{i}" for i in range(1, mechanism.n + 1)]
+        most = sorted(range(mechanism.n), key=lambda i: -cycle.amplitude[i])[:_MOST]
+        tables = [
+            table([""], [whole]),
+            table(list(mechanism.joint_names), _joint_columns(cycle)),
+            table([names[i] for i in most], [directions[i] for i in most]),
+        ]
+        return "\n\n".join(tables)
+    scene = mechanism
+    for direction, share in zip(directions, cycle.stick_fraction, strict=True):
+        direction["sticks"] = f"{share:.2%} of the period"
     tables = [table([""], [whole]), table(["x1, along the belt", "x2, normal to it"], directions)]
     switches = [] if regularised else cycle.switches()
     if switches:
@@ -57,6 +66,24 @@ def cycle_table(scene: Scene, cycle: LimitCycle) -> str:
     relative = scene.oscillator.V - jnp.stack([cycle.velocity_min, cycle.velocity_max])
     tables += friction_remark(scene, jnp.abs(relative).max())
     return "\n\n".join(tables)
+
+
+def _pulls(scene: Scene, cycle: LimitCycle) -> dict[str, str]:
+    if scene.preload:
+        return {"joint is open": f"{cycle.open_fraction[0]:.2%} of the period"}
+    return {"contact pulls": f"{cycle.tension_fraction:.2%} of the period"}
+
+
+def _joint_columns(cycle: LimitCycle) -> list[dict[str, str]]:
+    return [
+        {
+            "sticks": f"{cycle.stick_fraction[j]:.2%} of the period",
+            "is open": f"{cycle.open_fraction[j]:.2%} of the period",
+            "least normal force [N]": f"{cycle.normal_force[j, 0]:.6g}",
+            "largest normal force [N]": f"{cycle.normal_force[j, 1]:.6g}",
+        }
+        for j in range(len(cycle.normal_force))
+    ]
 
 
 def _switching(switches, period) -> str:

@@ -1,7 +1,7 @@
 """What the pictures share: figures, legends, lines, and axes with the name of a quantity."""
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
@@ -13,9 +13,10 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist as Artist
     from matplotlib.axes import Axes as Axes
 
+    from .._dynamics.hybrid import HybridSystem as HybridSystem
     from .figure import Figure as Figure
 else:
-    Artist = Axes = Figure = Any  # matplotlib is imported with the first picture
+    Artist = Axes = Figure = HybridSystem = Any  # matplotlib is imported with the first picture
 
 DIRECTIONS = "along the belt", "normal to the belt"
 
@@ -71,10 +72,39 @@ def geometric(values: Float[np.ndarray, " n"]) -> bool:
     return bool(low > 0 and np.median(values) < (np.sqrt(low * high) + (low + high) / 2) / 2)
 
 
-def component(direction: int, times: jax.Array, batch: int) -> int:
-    """The index of direction 1 or 2 of a motion, which must not be a batch of `batch` axes."""
-    if direction not in (1, 2):
-        raise ValueError(f"direction must be 1 or 2, got {direction!r}")
+class Coordinate(NamedTuple):
+    """What a picture shows of a motion: a displacement row @ x."""
+
+    row: Float[np.ndarray, " n"]
+    face: int | None  # that slides along it, from 0
+    symbol: str  # of the displacement
+    rate: str  # of its velocity
+    meaning: str  # ", " and words, or ""
+
+
+def coordinate(
+    system: HybridSystem, direction: int, joint: int | None, times: jax.Array, batch: int
+) -> Coordinate:
+    """A degree of freedom or t.x of a joint, both from 1, of a motion with `batch` axes.
+
+    **Raises:** `ValueError` for one that is not there, and for a batch of motions.
+    """
     if times.ndim != batch:
         raise ValueError("a picture shows one motion: index the batch first")
-    return direction - 1
+    n = system.n - system.excited
+    name, given, most = "direction", direction, n
+    if joint is not None:
+        name, given, most = "joint", joint, len(system.faces)
+    if given not in range(1, most + 1):
+        wanted = "1" if most == 1 else "1 or 2" if most == 2 else f"from 1 to {most}"
+        raise ValueError(f"{name} must be {wanted}, got {given!r}")
+    rows = np.eye(n) if system.T is None else np.asarray(system.T)[:, :n]
+    if joint is not None:
+        face = system.faces[joint - 1][0]
+        symbol, rate = f"t.x of joint {joint}", f"t.dx/dt of joint {joint}"
+        return Coordinate(rows[face], face, symbol, rate, "")
+    row, meaning = np.eye(n)[direction - 1], ""
+    face = next((k for k, other in enumerate(rows) if (other == row).all()), None)
+    if face is not None:
+        meaning = f", {DIRECTIONS[all(face != faces[0] for faces in system.faces)]}"
+    return Coordinate(row, face, f"x{direction}", f"dx{direction}/dt", meaning)

@@ -14,13 +14,15 @@ _TANGENTS = 6
 _TANGENT = 0.09  # half its length, as a share of the axis
 
 
-def cycles(results: Mapping[str, LimitCycle], *, direction: int = 1) -> Figure:
-    """Phase portrait and spectrum of one direction, a row for each cycle; returns the figure.
+def cycles(
+    results: Mapping[str, LimitCycle], *, direction: int = 1, joint: int | None = None
+) -> Figure:
+    """Phase portrait and spectrum of one displacement, a row for each cycle; returns the figure.
 
-    The keys name the rows, and all rows have the same axes.
+    The keys name the rows, and all rows have the same axes. The displacement is that of
+    `phase_portrait`.
 
-    **Raises:** `ValueError` for none, where there is no limit cycle, for a batch, or a direction
-    not 1 or 2.
+    **Raises:** `ValueError` for none, and as `phase_portrait`.
     """
     if not results:
         raise ValueError("there must be at least one limit cycle to draw")
@@ -30,8 +32,8 @@ def cycles(results: Mapping[str, LimitCycle], *, direction: int = 1) -> Figure:
     for part, (name, cycle) in zip(parts[:, 0], results.items(), strict=True):
         part.suptitle(name, x=0.01, ha="left", fontweight="bold", fontsize="medium")
         left, right = part.subplots(1, 2)
-        portraits.append(phase_portrait(cycle, left, direction=direction))
-        spectra.append(spectrum(cycle, right, direction=direction))
+        portraits.append(phase_portrait(cycle, left, direction=direction, joint=joint))
+        spectra.append(spectrum(cycle, right, direction=direction, joint=joint))
     for column in (portraits, spectra):
         for which in "xy":
             low, high = np.transpose([getattr(ax, f"get_{which}lim")() for ax in column])
@@ -52,7 +54,7 @@ def amplitudes(
     label: str,
     slopes: ArrayLike | None = None,
 ) -> Axes:
-    """Peak-to-peak amplitudes [um] of a batch of cycles over a quantity, both directions.
+    """Peak-to-peak amplitudes [um] of a batch of cycles over a quantity, of all directions.
 
     `over` (n,) are the values of the quantity, `label` its name with its unit, and `slopes` (n,)
     the derivative of the amplitude of direction 1 by it [m per unit], drawn as some tangents.
@@ -67,8 +69,9 @@ def amplitudes(
     ax = given_or_new(ax)
     amplitude = np.asarray(results.amplitude) * 1e6
     handles = []
-    for i, line in enumerate(("o-", "s-")):
-        handles += ax.plot(x, amplitude[:, i], line, ms=4, lw=1.3, label=f"direction {i + 1}")
+    for i, row in enumerate(amplitude.T):
+        line = ("o-", "s-", "^-", "d-")[i % 4]
+        handles += ax.plot(x, row, line, ms=4, lw=1.3, label=f"direction {i + 1}")
     if slopes is not None:
         slope = np.asarray(slopes, float) * 1e6
         if slope.shape != x.shape:

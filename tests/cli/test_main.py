@@ -68,6 +68,27 @@ def test_cycle(capsys):
     assert Path("fractaljax-cycle/cycle.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_cycle_of_a_structure(capsys):
+    """Its joints and degrees of freedom; the start has a number for each state."""
+    law = fj.ExponentialStribeck(1.0, 0.5, 0.5)
+    joint = fj.Joint(fj.FixedContact(0.0, 0.0, 1.0), law, "block", None, 1.0)
+    matrices = [[1.0]], [[0.1]], [[1.0]]
+    belt = fj.Structure(*matrices, {"pad": joint}, F=[0.0], names=["block"])
+    belt.save("belt.toml")
+    status, out, err = run(capsys, "cycle", "belt.toml", "--start", 1.5, 0)
+    cycle = fj.limit_cycle(belt, [1.5, 0.0])
+    assert (status, err) == (0, "")
+    assert out == f"{cycle_table(belt, cycle)}\nwritten to fractaljax-cycle: cycle.png, cycle.csv\n"
+    for words in ("pad", "block", "sticks", "15.66% of the period", "6431.38"):
+        assert words in out
+    with open("fractaljax-cycle/cycle.csv", newline="") as file:
+        titles, *rows = csv.reader(file)
+    assert titles == ["time [s]", "x1 [m]", "v1 [m/s]"]
+    np.testing.assert_array_equal(np.array(rows, float), np.column_stack(cycle.orbit(512)))
+    said = "fractaljax: start must have shape (2,), got (1,); use jax.vmap for many\n"
+    assert run(capsys, "cycle", "belt.toml", "--start", 1.5) == (2, "", said)
+
+
 def test_cycle_options(capsys, monkeypatch):
     """Options as given, none otherwise; an inaccurate cycle is one; other files stay."""
     asked = []
@@ -151,7 +172,7 @@ def test_friction_beyond_its_law(capsys, tmp_path):
         (["cycle", "--rtol", "nan"], "rtol must be above 0 and at most 0.1, got nan"),
         (["cycle", "--max-returns", 0], "max_returns must be a whole number of at least 1, got 0"),
         (["cycle", "--max-returns", 1.5], "invalid int value: '1.5'"),
-        (["cycle", "--start", 1, 2, 3], "--start: expected 4 arguments"),
+        (["cycle", "--start", 1, 2, 3], "start must have shape (4,), got (3,)"),
         (["cycle", "--start", 0, 0, "nan", 0], "start must be finite, got nan"),
         (["cycle", "--rtol", 1, "--rtol", 2], "argument --rtol: given more than once"),
         (["cycle", "--constant-friction"], "unrecognized arguments: --constant-friction"),

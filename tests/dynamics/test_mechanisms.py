@@ -3,7 +3,6 @@
 The table is that of the independent event-driven solver (tests/hybrid_truth.py).
 """
 
-import copy
 import functools
 import json
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
-from mechanisms import PROBLEMS
+from mechanisms import PROBLEMS, changed
 from structures import of_problem
 from tools import both_modes
 
@@ -33,19 +32,6 @@ NAMES = [
     if name not in BACKWARDS
 ]
 DIFFERENTIATED = ("lift_off", "stick_together", "four_dof")
-
-
-def changed(problem, places, values):
-    """The problem with numbers changed at dotted places, as `by` names them."""
-    problem = copy.deepcopy(problem)
-    for place, value in zip(places, values, strict=True):
-        *path, last = (int(key) if key.isdigit() else key for key in place.split("."))
-        table = problem
-        for key in path:
-            table = table[key]
-            table = table[1] if isinstance(table, tuple) else table  # (law, numbers)
-        table[last] = value
-    return problem
 
 
 @functools.cache

@@ -458,8 +458,8 @@ def test_refusals(bad, message):
 @pytest.mark.parametrize(
     ("times", "message"),
     [
-        ([0.0, 1.0], "^times must be from 0 to the end of the simulation, .*, got 1.0$"),
-        ([-1e-9], "^times must be from 0 to the end of the simulation, .*, got -1e-09$"),
+        ([0.0, 1.0], "^times must be from t0 to the end of the simulation, .*, got 1.0$"),
+        ([-1e-9], "^times must be from t0 to the end of the simulation, .*, got -1e-09$"),
         ([np.nan], "^times must be finite, got nan$"),
         (1e-6, r"^times must have shape \(k,\), got \(\)$"),
     ],
@@ -470,6 +470,6 @@ def test_times_outside(times, message):
     for motion_of in (found, smooth(0.03)):
         with pytest.raises(ValueError, match=message):
             motion_of.at(times)
-    with pytest.raises(RuntimeError, match="times must be from 0 to the end of the simulation"):
+    with pytest.raises(RuntimeError, match="times must be from t0 to the end of the simulation"):
         late = jax.jit(lambda times: found.at(times))
         jax.block_until_ready(late(jnp.array([1.0])))

@@ -17,6 +17,7 @@ import pytest
 from IPython.core.formatters import DisplayFormatter
 
 import fractaljax as fj
+from fractaljax.plot.axes import coordinate
 from fractaljax.plot.maps import vibration_modes
 from synthetic import DX, gaussian_map, gaussian_profile
 from tools import (
@@ -433,6 +434,50 @@ def test_spectrum_shows_the_harmonics():
     # A period of two returns has twice as many lines.
     twice = eqx.tree_at(lambda cycle: cycle.returns, cycle, jnp.array(2))
     assert drawn(plot.spectrum(twice), "harmonics")[0].shape == (2, 39)
+
+
+@functools.cache
+def belt_cycle():
+    """A structure of one degree of freedom, whose joint slides along it."""
+    law = fj.ExponentialStribeck(1.0, 0.5, 0.5)
+    joint = fj.Joint(fj.FixedContact(0.0, 0.0, 1.0), law, 0, None, 1.0)
+    belt = fj.Structure([[1.0]], [[0.1]], [[1.0]], [joint], F=[0.0])
+    return belt, fj.limit_cycle(belt, [1.5, 0.0], throw=False)
+
+
+def test_cycle_of_a_structure():
+    """A joint's t.x and a degree of freedom, scaled; a row for each joint."""
+    belt, cycle = belt_cycle()
+    (row,) = (figure := plot.cycle(cycle)).subfigs or [figure.axes]
+    assert [ax.get_xlabel() for ax in row] == ["t.x of joint 1 [µm]", "frequency [kHz]"]
+    assert row[0].get_ylabel() == "t.dx/dt of joint 1 [m/s]"
+    assert_whole(figure)
+    ((x, v),) = drawn(row[0], "limit cycle")
+    assert np.ptp(x) == pytest.approx(1e6 * float(cycle.amplitude[0]), rel=1e-3)
+    share = f"sticks, {cycle.stick_fraction[0]:.1%} of the period"
+    assert labels(row[0]) == ["limit cycle", "belt velocity 1 m/s", share]
+    along = plot.phase_portrait(cycle)
+    assert along.get_xlabel() == f"x1, {BELT}"
+    np.testing.assert_array_equal(drawn(along, "limit cycle")[0], [x, v])
+    _, lines = cycle.spectrum()
+    assert lines.shape == (256, 1) and cycle.orbit(8)[1].shape == (8, 2)
+    stems = drawn(plot.spectrum(cycle, joint=1), "harmonics")[0]
+    np.testing.assert_allclose(1e6 * lines[1:20, 0], stems[1], rtol=1e-12)
+    np.testing.assert_allclose(cycle.harmonics([[-2.0]])[1], 2 * lines, rtol=1e-12)
+    # A joint along minus two times the degree of freedom.
+    lever = eqx.tree_at(lambda system: system.T, cycle._system, jnp.array([[-2.0]]))
+    shown = [coordinate(lever, 1, joint, cycle.period, batch=0) for joint in (1, None)]
+    assert [(*c.row, c.face) for c in shown] == [(-2.0, 0), (1.0, None)]
+    moved = fj.simulate(belt, cycle.state, 10.0)
+    for ax in (plot.trajectory(moved, joint=1), plot.trajectory(moved)):
+        assert "sticks" in labels(ax)
+    for call, message in (
+        (lambda: plot.phase_portrait(cycle, joint=2), "joint must be 1, got 2"),
+        (lambda: plot.spectrum(cycle, direction=2), "direction must be 1, got 2"),
+        (lambda: plot.trajectory(moved, direction=0), "direction must be 1, got 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
 
 
 def test_cycles_have_common_axes():
