@@ -207,7 +207,7 @@ def balance(mechanism, trip):
         def power(t, p=p, field=field):
             z = p.dense(t)
             x, v = z[:n], z[n:]
-            forces = field.forces(z / mechanism.units)
+            forces = field.forces(z / mechanism.units, t)
             total = field.multipliers @ forces if field.stuck else []
             out = -v @ C @ v
             for i, (f, sign) in enumerate(zip(mechanism.faces, p.mode, strict=True)):

@@ -71,7 +71,7 @@ def test_transitions():
     compared = released = 0
     for z, mode, event, guard in cases:
         try:
-            after, _ = hybrid_truth.next_mode(TRUTH, z, mode, event)
+            after, _ = hybrid_truth.next_mode(TRUTH, z, 0.0, mode, event)
         except hybrid_truth.Impossible:
             continue
         s = np.where(np.array(mode) == hybrid_truth.OPEN, OPEN, mode).astype(float)
