@@ -353,7 +353,7 @@ class HybridSystem(eqx.Module):
         K = jnp.diag(self.K) if self.K.ndim == 1 else self.K
         B = jnp.eye(self.n, dtype=K.dtype) if self.B is None else self.B
         coupled = K - (B * mu[None]) @ self.L
-        x = jnp.linalg.solve(coupled, self.F + B @ (mu * self.P))
+        x = _solve(coupled, self.F + B @ (mu * self.P))
         return jnp.concatenate([x, jnp.zeros_like(x)])
 
     @property

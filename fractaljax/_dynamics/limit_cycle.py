@@ -120,10 +120,8 @@ def _monodromy(system: HybridSystem, segments: Segments, local: Maps) -> Float[A
     jump = jnp.where(switches[None], (after - before) / speed[None], 0)
     eye = jnp.eye(len(ends), dtype=ends.dtype)
     M = jnp.einsum("ijn,jkn->nik", eye[:, :, None] + jump[:, None] * local.c[None], local.A)
-    while len(M) > 1:
-        unpaired = M[len(M) & ~1 :]
-        M = jnp.concatenate([M[1::2] @ M[: len(M) & ~1 : 2], unpaired])
-    return M[0]
+    product, _ = jax.lax.scan(lambda product, M: (M @ product, None), eye, M)
+    return product
 
 
 @functools.partial(jax.jit, static_argnames=("segments", "rtol"))

@@ -42,11 +42,6 @@ class Maps(eqx.Module):
     b: Float[Array, "2n N"]  # of the end by its duration
     c: Float[Array, "2n N"]  # of the guard by the state it ends in; 0 where none ends it
 
-    @classmethod
-    def zeros(cls, y: Float[Array, "2n N"]) -> "Maps":
-        """Of the shapes that belong to the states y."""
-        return cls(jnp.zeros((len(y), *y.shape), y.dtype), jnp.zeros_like(y), jnp.zeros_like(y))
-
 
 def _tableau():
     # Imported late: a question of stability does not wait for diffrax.
@@ -55,15 +50,14 @@ def _tableau():
     return diffrax.Dopri8.tableau
 
 
-def flow(system: HybridSystem, y, duration, s, written_out=False, error=False) -> Any:
+def flow(system: HybridSystem, y, duration, s, error=False) -> Any:
     """The state (2n, ...) after `duration` (...) in contact state s (f, ...), by one step.
 
     With `error`, also an estimate (2n, ...) of its error.
     """
     field = functools.partial(_field, system, s)
     duration = jnp.asarray(duration)[None]
-    options = {"written_out": written_out, "error": error}
-    return runge_kutta(_tableau(), field, y, duration, **options)
+    return runge_kutta(_tableau(), field, y, duration, error=error)
 
 
 def _field(system: HybridSystem, s, y) -> Array:
@@ -82,7 +76,7 @@ def chosen_guard(system: HybridSystem, y, s, guard) -> Array:
     return jnp.sum(jnp.where(chosen, guards, 0), axis=0)
 
 
-def maps(system: HybridSystem, segments: Segments, written_out=False) -> tuple[Array, Maps]:
+def maps(system: HybridSystem, segments: Segments) -> tuple[Array, Maps]:
     """The ends of the segments and their derivatives."""
     y, s = segments.y, segments.s
 
@@ -95,7 +89,7 @@ def maps(system: HybridSystem, segments: Segments, written_out=False) -> tuple[A
     units = jnp.broadcast_to(jnp.eye(len(y), dtype=y.dtype)[:, :, None], (len(y), *y.shape))
     columns = jnp.concatenate([y[:, None], units], axis=1)
     duration = segments.duration[None, None]
-    ends = runge_kutta(_tableau(), field, columns, duration, written_out=written_out)
+    ends = runge_kutta(_tableau(), field, columns, duration)
     ends, A = ends[:, 0], ends[:, 1:]
     target = next_start(y)
     _, pull = jax.vjp(lambda end: chosen_guard(system, end, s, segments.guard), target)
@@ -162,45 +156,45 @@ def remesh(system: HybridSystem, steps: Segments, h, length: int) -> Segments:
     """
     weight = jnp.maximum(1, 2 * system.stiffness(steps.y, steps.s)) * steps.duration
     weight = jnp.where(steps.used, weight, 0)
-    ends_phase = steps.used & (steps.guard != NONE)
-    phase = jnp.cumsum(ends_phase) - ends_phase
+    ends_w, ends_t = jnp.cumsum(jnp.stack([weight, steps.duration]), axis=1)
+    # The first and last step of each phase, and its weight.
+    ended = jnp.cumsum(steps.used & (steps.guard != NONE))
     phases = jnp.arange(min(length, _PHASES))
-    own = (phase[None] == phases[:, None]) & steps.used[None]
-    size = jnp.sum(jnp.where(own, weight[None], 0), axis=1)
-    exists = jnp.any(own, axis=1)
+    exists = phases < ended[-1]
+    last_step = jnp.sum(ended[None] <= phases[:, None], axis=1)
+    last_step = jnp.where(exists, last_step, 0)
+    first_step = jnp.where(phases > 0, jnp.roll(last_step, 1) + 1, 0)
+    begin = (ends_w - weight)[first_step]
+    size = jnp.where(exists, ends_w[last_step] - begin, 0)
     h = jnp.maximum(h, jnp.sum(size) / jnp.maximum(length - jnp.sum(exists), 1))
     count = jnp.where(exists, jnp.ceil(jnp.maximum(size / h - 1e-6, 1)), 0)
     count = count.astype(int)
-    after = jnp.cumsum(count)
-    first_step = jnp.sum(phase[None] < phases[:, None], axis=1)
-    last_step = first_step + jnp.sum(own, axis=1) - 1
-    begin = jnp.cumsum(size) - size
+    until = jnp.cumsum(count)
 
     number = jnp.arange(length)
-    used = number < after[-1]
-    p = jnp.where(used, jnp.sum(after[None] <= number[:, None], axis=1), 0)
-    k_in_phase = number - (after - count)[p]
-    ends_w, ends_t = jnp.cumsum(weight), jnp.cumsum(steps.duration)
-
-    def at(k_in_phase):
-        """Old step, and time since its start, where a part of the phase begins."""
-        w = begin[p] + size[p] * k_in_phase / jnp.maximum(count[p], 1)
-        k = jnp.searchsorted(ends_w, w, side="right")
-        k = jnp.clip(k, first_step[p], last_step[p])
-        share = (w - (ends_w - weight)[k]) / jnp.where(weight[k] > 0, weight[k], 1)
-        return k, jnp.clip(share, 0, 1) * steps.duration[k]
-
-    k, start = at(k_in_phase)
-    k_end, end = at(k_in_phase + 1)
-    starts = ends_t - steps.duration
-    duration = jnp.where(used, starts[k_end] + end - starts[k] - start, 0)
-    moved = flow(system, steps.y[:, k], jnp.where(used, start, 0), steps.s[:, k])
-    last = last_step[jnp.sum(count > 0) - 1]
-    guard = jnp.where(k_in_phase + 1 == count[p], steps.guard[last_step[p]], NONE)
+    used = number < until[-1]
+    p = jnp.where(used, jnp.sum(until[None] <= number[:, None], axis=1), 0)
+    # Gathered together: each gather is compiled on its own.
+    count, before, low, high = jnp.stack([count, until - count, first_step, last_step])[:, p]
+    begin, size = jnp.stack([begin, size])[:, p][:, None]
+    place = number - before
+    # Both ends of each new segment: the old step they lie in, and the time since its start.
+    w = begin + size * jnp.stack([place, place + 1]) / jnp.maximum(count, 1)[None]
+    step = jnp.clip(jnp.searchsorted(ends_w, w, side="right"), low[None], high[None])
+    old = jnp.stack([ends_w - weight, weight, steps.duration, ends_t - steps.duration])
+    start_w, weight, duration, start_t = old[:, step]
+    share = (w - start_w) / jnp.where(weight > 0, weight, 1)
+    after = jnp.clip(share, 0, 1) * duration
+    duration = jnp.where(used, jnp.diff(start_t + after, axis=0)[0], 0)
+    states = jnp.concatenate([steps.y, steps.s])[:, step[0]]
+    y, s = states[: len(steps.y)], states[len(steps.y) :]
+    moved = flow(system, y, jnp.where(used, after[0], 0), s)
+    guard = jnp.where(place + 1 == count, steps.guard[high], NONE)
+    last = jnp.argmax(jnp.where(used, number, -1))
     return Segments(
         y=jnp.where(used[None], moved, moved[:, :1]),
         duration=duration,
-        s=jnp.where(used[None], steps.s[:, k], steps.s[:, last][:, None]),
+        s=jnp.where(used[None], s, s[:, last][:, None]),
         guard=jnp.where(used, guard, UNUSED),
     )
 
@@ -210,57 +204,64 @@ class PeriodicOrbit(eqx.Module):
 
     segments: Segments
     converged: Bool[Array, ""]
-    local: Maps
     return_jacobian: Float[Array, "2n 2n"]
+    error: Float[Array, ""]  # of period and states, relative, estimated by halving the steps
+    middle: Float[Array, "2n N"]  # states halfway through the segments
+
+    @classmethod
+    def none(cls, segments: Segments) -> "PeriodicOrbit":
+        """None yet; of the shapes that belong to those segments."""
+        y = segments.y
+        eye, far = jnp.eye(len(y), dtype=y.dtype), jnp.asarray(jnp.inf, y.dtype)
+        return cls(segments, jnp.array(False), eye, far, jnp.zeros_like(y))
 
 
 def solve_periodic_orbit(system: HybridSystem, segments: Segments) -> PeriodicOrbit:
     """The periodic orbit near those segments."""
-    y = segments.y
+    y, s = segments.y, segments.s
     if system.excited:
         y = y.at[:, 0].set(system.with_excitation(system.own(y[:, 0]), 0.0))
         segments = eqx.tree_at(lambda segments: segments.y, segments, y)
     eps, big = jnp.finfo(y.dtype).eps, jnp.asarray(jnp.finfo(y.dtype).max, y.dtype)
     tolerance = 1e3 * eps * (1 + jnp.max(jnp.abs(y)))
 
+    def settled(change, count):
+        limit = jnp.where(count < _ITERATIONS, tolerance, 10 * tolerance)
+        return change <= limit
+
     def running(carry):
-        *_, change, count = carry
-        return (count < _ITERATIONS) & ~(change <= tolerance) & (change < jnp.inf)
+        found, change, count = carry
+        going = (count < _ITERATIONS) | settled(change, count)
+        return going & ~found.converged & (change < jnp.inf)
 
     def body(carry):
-        segments, *_, count = carry
-        ends, local = maps(system, segments, written_out=True)
-        target = next_start(segments.y)
-        guard = chosen_guard(system, target, segments.s, segments.guard)
-        gap = ends - target
+        found, change, count = carry
+        segments, last = found.segments, settled(change, count)
+        y, h = segments.y, segments.duration
+        ends, local = maps(system, segments)
+        target = next_start(y)
+        guard = chosen_guard(system, target, s, segments.guard)
+
+        def halved():
+            end, starts = jax.lax.scan(lambda y, _: (flow(system, y, h / 2, s), y), y, length=2)
+            return end, starts[1]
+
+        # The last iteration is for the error: what half the steps would change.
+        ends, middle = jax.lax.cond(last, halved, lambda: (ends, found.middle))
+        gap, guard = ends - target, jnp.where(last, 0, guard)
         dy, dt, jacobian = corrections(local, segments, gap, guard, system.constant)
-        change = jnp.maximum(jnp.max(jnp.abs(dy)), jnp.max(jnp.abs(dt)))
+        period, size = jnp.sum(h), jnp.max(jnp.abs(y))
+        error = jnp.maximum(jnp.abs(jnp.sum(dt)) / period, jnp.max(jnp.abs(dy)) / size)
+        new = jnp.maximum(jnp.max(jnp.abs(dy)), jnp.max(jnp.abs(dt)))
         # Far from the orbit a full step may leave the region of convergence.
-        share = jnp.minimum(1, 1 / change)
-        y, duration = segments.y + share * dy, segments.duration + share * dt
-        new = Segments(y, duration, segments.s, segments.guard)
-        return new, local, jacobian, change, count + 1
+        share = jnp.where(last, 0, jnp.minimum(1, 1 / new))
+        moved = Segments(y + share * dy, h + share * dt, s, segments.guard)
+        error = jnp.where(last, error, found.error)
+        change = jnp.where(last, change, new)
+        return PeriodicOrbit(moved, last, jacobian, error, middle), change, count + 1
 
-    start = segments, Maps.zeros(y), jnp.eye(len(y), dtype=y.dtype), big, 0
-    segments, local, jacobian, change, _ = jax.lax.while_loop(running, body, start)
-    return PeriodicOrbit(segments, change <= 10 * tolerance, local, jacobian)
-
-
-def estimated_error(system: HybridSystem, orbit: PeriodicOrbit) -> tuple[Array, Array]:
-    """Relative error of period and states, estimated by halving the steps; and the midpoints."""
-    segments = orbit.segments
-    y, h, s = segments.y, segments.duration, segments.s
-
-    def half(y, _):
-        y = flow(system, y, h / 2, s)
-        return y, y
-
-    end, (middle, _) = jax.lax.scan(half, y, length=2)
-    gap, guard = end - next_start(y), jnp.zeros_like(h)
-    dy, dt, _ = corrections(orbit.local, segments, gap, guard, system.constant)
-    period = jnp.sum(h)
-    error = jnp.maximum(jnp.abs(jnp.sum(dt)) / period, jnp.max(jnp.abs(dy)) / jnp.max(jnp.abs(y)))
-    return error, middle
+    found, *_ = jax.lax.while_loop(running, body, (PeriodicOrbit.none(segments), big, 0))
+    return found
 
 
 @jax.custom_jvp

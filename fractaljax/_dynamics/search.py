@@ -20,10 +20,8 @@ from jaxtyping import Array, Float, Int
 from .events import Cubic, step
 from .hybrid import NONE, SECTION, UNUSED, HybridSystem
 from .orbit import (
-    Maps,
     PeriodicOrbit,
     Segments,
-    estimated_error,
     next_start,
     remesh,
     solve_periodic_orbit,
@@ -183,35 +181,26 @@ def _candidate(system, steps: Segments, y, first, last, returns, h, rtol, *, len
     steps = Segments(steps.y[:, order], duration, steps.s[:, order], guard)
 
     def going(carry):
-        _, found, error, _, tries = carry
-        return (tries == 0) | ((tries < _MESHES) & found.converged & ~(error <= rtol))
+        _, found, tries = carry
+        return (tries == 0) | ((tries < _MESHES) & found.converged & ~(found.error <= rtol))
 
     def solve(carry):
-        steps, *_, tries = carry
+        steps, _, tries = carry
         found = solve_periodic_orbit(system, remesh(system, steps, h * 0.8**tries, length))
-        error, middle = estimated_error(system, found)
         # The orbit's phases have other lengths than those of the steps: they are cut anew.
         steps = jax.tree.map(lambda x, new: x.at[..., :length].set(new), steps, found.segments)
         used = jnp.where(number < length, steps.guard, UNUSED)
         steps = Segments(steps.y, jnp.where(used == UNUSED, 0, steps.duration), steps.s, used)
-        return steps, found, error, middle, tries + 1
+        return steps, found, tries + 1
 
-    first_segments = jax.tree.map(lambda x: x[..., :length], steps)
-    nothing = PeriodicOrbit(
-        segments=first_segments,
-        converged=jnp.array(False),
-        local=Maps.zeros(first_segments.y),
-        return_jacobian=jnp.eye(len(y), dtype=y.dtype),
-    )
-    infinite = jnp.asarray(jnp.inf, y.dtype)
-    carry = steps, nothing, infinite, jnp.zeros_like(first_segments.y), 0
-    _, found, error, middle, _ = jax.lax.while_loop(going, solve, carry)
+    nothing = PeriodicOrbit.none(jax.tree.map(lambda x: x[..., :length], steps))
+    _, found, _ = jax.lax.while_loop(going, solve, (steps, nothing, 0))
     orbit = found.segments
     near = jnp.max(jnp.abs(orbit.y[:, 0] - y)) < 0.2 * (1 + jnp.max(jnp.abs(y)))
     moves = jnp.max(jnp.abs(orbit.y[system.n :])) > 1e-4
     ok = found.converged & near & moves & _attracts(found.return_jacobian)
-    ok = ok & admissible(system, orbit, middle) & ~_has_shorter_period(orbit, returns)
-    return orbit, error, ok
+    ok = ok & admissible(system, orbit, found.middle) & ~_has_shorter_period(orbit, returns)
+    return orbit, found.error, ok
 
 
 class _Progress(eqx.Module):
@@ -404,8 +393,7 @@ def _find(
         moved = forgotten > 0
         guards = jnp.where(moved[None], UNUSED, run.steps[-1])
         steps = run.steps.at[-1].set(guards)
-        s = jnp.where(moved[None], system.contact_state(y), run.s)
-        return _Run(y, s, run.guard, steps), known, rounds + 1
+        return _Run(y, run.s, run.guard, steps), known, rounds + 1
 
     _, known, _ = jax.lax.while_loop(running, body, (run, known, 0))
     return Attractor(known.orbit, known.status, known.period_returns, known.error, known.returns)
