@@ -208,12 +208,13 @@ def _limit_cycle(
     )
 
 
-def _needs_more_segments(cycle: LimitCycle) -> bool:
+def _needs_more_segments(cycle: LimitCycle, count: int) -> bool:
     """Known only of one cycle outside of a compiled program."""
     if concrete(cycle.period) is None or cycle.period.ndim:
         return False
-    finer = CycleResult.inaccurate, CycleResult.too_long
-    return any(bool(cycle.result == member) for member in finer)
+    # Eight times the default keeps 16,384 steps: a motion without a period shall not take longer.
+    too_long = bool(cycle.result == CycleResult.too_long) and count == _SEGMENTS
+    return too_long or bool(cycle.result == CycleResult.inaccurate)
 
 
 def limit_cycle(
@@ -278,7 +279,7 @@ def limit_cycle(
     count = _SEGMENTS if segments is None else whole("segments", segments, 16)
     arguments = mechanism, start, excitation, returns
     cycle = _limit_cycle(*arguments, segments=count, rtol=tolerance)
-    while segments is None and count < _MOST_SEGMENTS and _needs_more_segments(cycle):
+    while segments is None and count < _MOST_SEGMENTS and _needs_more_segments(cycle, count):
         # A long period, or one of many returns.
         count *= 8
         cycle = _limit_cycle(*arguments, segments=count, rtol=tolerance)

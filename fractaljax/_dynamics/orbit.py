@@ -19,6 +19,7 @@ from .runge_kutta import runge_kutta
 
 _ITERATIONS = 16
 _PHASES = 256  # most of one contact state in an orbit
+_BLOCK = 32  # of sums
 
 
 class Segments(eqx.Module):
@@ -97,6 +98,17 @@ def maps(system: HybridSystem, segments: Segments) -> tuple[Array, Maps]:
     return ends, Maps(A, system.field(ends, s), c)
 
 
+def cumulative(x) -> Array:
+    """The sums of x (..., k) up to each place, which compile faster than those of jnp.cumsum."""
+    k = x.shape[-1]
+    if k <= _BLOCK or k % _BLOCK:
+        at = jnp.arange(k)
+        return jnp.sum(jnp.where(at[None] <= at[:, None], x[..., None, :], 0), axis=-1)
+    inside = cumulative(x.reshape(*x.shape[:-1], k // _BLOCK, _BLOCK))
+    before = cumulative(inside[..., -1]) - inside[..., -1]
+    return (inside + before[..., None]).reshape(x.shape)
+
+
 def _in_phase(phase, values) -> Array:
     """The sum of `values` (N,) over the phase of each segment."""
     return jax.ops.segment_sum(values, phase, len(phase))[phase]
@@ -111,7 +123,7 @@ def corrections(local: Maps, segments: Segments, gap, guard, constant: int | Non
     Jacobian of the return map.
     """
     ends = segments.used & (segments.guard != NONE)
-    phase = jnp.cumsum(ends) - ends
+    phase = cumulative(ends) - ends
     share = jnp.where(segments.used, 1 / jnp.maximum(_in_phase(phase, segments.used * 1.0), 1), 0)
     share = share.astype(gap.dtype)
     b = local.b * share[None]
@@ -156,9 +168,9 @@ def remesh(system: HybridSystem, steps: Segments, h, length: int) -> Segments:
     """
     weight = jnp.maximum(1, 2 * system.stiffness(steps.y, steps.s)) * steps.duration
     weight = jnp.where(steps.used, weight, 0)
-    ends_w, ends_t = jnp.cumsum(jnp.stack([weight, steps.duration]), axis=1)
+    ends_w, ends_t = cumulative(jnp.stack([weight, steps.duration]))
     # The first and last step of each phase, and its weight.
-    ended = jnp.cumsum(steps.used & (steps.guard != NONE))
+    ended = cumulative(steps.used & (steps.guard != NONE))
     phases = jnp.arange(min(length, _PHASES))
     exists = phases < ended[-1]
     last_step = jnp.sum(ended[None] <= phases[:, None], axis=1)
@@ -169,7 +181,7 @@ def remesh(system: HybridSystem, steps: Segments, h, length: int) -> Segments:
     h = jnp.maximum(h, jnp.sum(size) / jnp.maximum(length - jnp.sum(exists), 1))
     count = jnp.where(exists, jnp.ceil(jnp.maximum(size / h - 1e-6, 1)), 0)
     count = count.astype(int)
-    until = jnp.cumsum(count)
+    until = cumulative(count)
 
     number = jnp.arange(length)
     used = number < until[-1]

@@ -22,6 +22,7 @@ from .hybrid import NONE, SECTION, UNUSED, HybridSystem
 from .orbit import (
     PeriodicOrbit,
     Segments,
+    cumulative,
     next_start,
     remesh,
     solve_periodic_orbit,
@@ -43,6 +44,7 @@ class SearchOptions:
     near: float = 0.15  # gap between returns below which an orbit is tried, relative
     accepted: float = 0.03  # distance from the orbit at which its multipliers decide, relative
     approaches: int = 3  # rounds in which the motion approaches an orbit that is not yet near
+    eager: int = 64  # rounds after which orbits are tried less often
     linear: float = 0.5  # size below which a decay at the linear rate ends in equilibrium
     small: float = 1e-2  # size below which any decay without switches does
     extrapolated: float = 0.02  # growth in a return, without switches, that is extrapolated
@@ -108,7 +110,7 @@ def _returns(run: _Run, order, guard, count: int) -> _Returns:
     # A step ends where the next one starts.
     following = run.steps[: len(run.y), order[(at + 1) % len(order)]]
     y = jnp.where((at == len(order) - 1)[None], run.y[:, None], following)
-    return _Returns(at, y, jnp.cumsum(run.steps[-2, order])[at], at >= 0)
+    return _Returns(at, y, cumulative(run.steps[-2, order])[at], at >= 0)
 
 
 def _quintic(y, d, x):
@@ -163,7 +165,7 @@ def _has_shorter_period(orbit: Segments, returns) -> Array:
     start = orbit.y[:, :1]
     away = jnp.max(jnp.abs(next_start(orbit.y) - start), axis=0)
     at_section = orbit.guard == SECTION
-    early = at_section & (jnp.cumsum(at_section) < returns)
+    early = at_section & (cumulative(at_section) < returns)
     return jnp.any(early & (away < 1e-5 * (1 + jnp.max(jnp.abs(start)))))
 
 
@@ -290,8 +292,10 @@ def _assess(
     period_returns = jnp.where(rounds % 2 == 0, 1, repeated)
     gap = jnp.where(period_returns == 1, apart[0], closest)
     ready = active & (status == RUNNING) & ~closer & ~extrapolates & (gap < options.near * scale)
-    # After a failure again, once the returns are closer together or some rounds later.
-    ready = ready & ((gap < 0.7 * known.tried) | (rounds % 8 < 2))
+    # After a failure again, once the returns are closer together or some rounds later; a motion
+    # without a period often comes near itself.
+    pause = jnp.where(rounds < options.eager, 8, 64)
+    ready = ready & ((gap < 0.7 * known.tried) | (rounds % pause < 2))
 
     def solve():
         first, last = seen.at[period_returns], seen.at[0]
