@@ -50,7 +50,7 @@ class SearchOptions:
     extrapolated: float = 0.02  # growth in a return, without switches, that is extrapolated
     divergence: float = 1e6  # size at which a motion diverges: with a small V, many V are ordinary
     settling: int = 8  # rounds without growth after which the record must hold two returns
-    patience: int = 512  # rounds without a maximum, or for a record that holds few
+    patience: int = 512  # rounds without a maximum
     record: int = 2048  # steps that are kept, at least; a period takes fewer
 
 
@@ -326,7 +326,7 @@ def _assess(
     grows = away[0] > 1.01 * known.size
     calm = jnp.where(idle > 0, known.calm, jnp.where(grows, 0, known.calm + 1))
     short = ~seen.exists[1] & (calm >= options.settling)
-    short = short | (~seen.exists[options.longest] & (rounds >= options.patience))
+    short = short | (ended & ~seen.exists[options.longest // 4])
     too_long = jnp.all(guard != UNUSED) & short
     over = jnp.where(too_long, TOO_LONG, over)
     status = jnp.where(status == RUNNING, jnp.where(ok, CONVERGED, over), status)

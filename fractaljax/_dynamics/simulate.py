@@ -425,6 +425,7 @@ def simulate(
     n = whole("max_steps", max_steps, 1)
     y, end = start / system.units, (t1 - t0) * system.omega
     y = system.with_excitation(y, t0 * system.omega)
+    t0, end = (jnp.asarray(t, y.dtype) for t in (t0, end))
     rtol = check_rtol(rtol, y.dtype)
     if regularisation is not None:
         eps = number("regularisation", regularisation, above=0)

@@ -335,14 +335,6 @@ def test_the_command_lists_the_joints(tmp_path, capsys):
     assert f"{fj.growth_rate(two_joints(4)):+.6g}" in shown
 
 
-def test_a_cycle_is_of_a_scene(tmp_path, capsys):
-    two_joints(4).save(tmp_path / "brake.toml")
-    out = tmp_path / "out"
-    status, _, error = run_command(capsys, "cycle", tmp_path / "brake.toml", "--out", out)
-    assert status == 2 and "has the unknown key 'structure'" in error
-    assert not out.exists()
-
-
 @pytest.mark.parametrize(
     ("C", "K", "said"),
     [
