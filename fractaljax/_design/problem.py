@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.batches import in_batches
-from .._base.parts import brief, flag, require_scalar, scalar, substitute
+from .._base.parts import brief, flag, scalar, substitute
 from .._contact.fixed import FixedContact
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import (
@@ -28,12 +28,13 @@ from .._mechanism.quantities import (
     own_quantities,
     replaced,
     require_independent,
+    require_one,
     substituted,
     value_of,
     with_optional,
 )
 from .._mechanism.scene import Scene
-from .._mechanism.structure import Structure, require_single
+from .._mechanism.structure import Structure
 from .._stability.stability import growth_rate
 from .constraints import Constraint, Plain
 from .envelope import Envelope
@@ -308,12 +309,7 @@ def state_problem(
     **_: Any,
 ) -> DesignProblem:
     """Check the arguments of `design` that state a problem, which that documents; no others."""
-    if isinstance(x, Scene):
-        require_scalar(x)
-    elif isinstance(x, Structure):
-        require_single(x)
-    else:
-        raise TypeError(f"x must be a Scene or a Structure, got {brief(x)}")
+    require_one("x", x)
     if objective is not None and not callable(objective):
         raise TypeError(f"objective must be a function of a scene, got {brief(objective)}")
     if not isinstance(constraints, (list, tuple)) or not all(map(callable, constraints)):

@@ -345,9 +345,7 @@ def _assess(
         calm=calm,
     )
     progress = jax.tree.map(lambda new, old: jnp.where(active, new, old), progress, known)
-    # Steps from before an extrapolation are not of this motion.
-    forgotten = record * extrapolates
-    return y_on, forgotten, progress
+    return y_on, extrapolates, progress
 
 
 def _find(
@@ -389,12 +387,12 @@ def _find(
         if shape:
             # Each scene on its own: it has its own number of iterations.
             first = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), arguments)
-            y, forgotten, known = jax.tree.map(
+            y, moved, known = jax.tree.map(
                 lambda x: jnp.moveaxis(x, 0, -1), jax.lax.map(one, first)
             )
         else:
-            y, forgotten, known = one(arguments)
-        moved = forgotten > 0
+            y, moved, known = one(arguments)
+        # Steps from before an extrapolation are not of this motion.
         guards = jnp.where(moved[None], UNUSED, run.steps[-1])
         steps = run.steps.at[-1].set(guards)
         return _Run(y, run.s, run.guard, steps), known, rounds + 1

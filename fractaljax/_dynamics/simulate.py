@@ -63,9 +63,16 @@ class Trajectory(Record):
         **Raises:** `ValueError` for times of another shape or outside, and for a simulation with
         `saveat`; `RuntimeError` inside a compiled program.
         """
+        return self._at(self._continuous(), self._inside(number("times", jnp.asarray(times))))
+
+    def _continuous(self) -> HybridSystem:
+        """The system that moves, whose states between the times are known.
+
+        **Raises:** `ValueError` for a simulation with `saveat`.
+        """
         if self._system is None:
             raise ValueError("a simulation with saveat has no states between: leave saveat out")
-        return self._at(self._system, self._inside(number("times", jnp.asarray(times))))
+        return self._system
 
     def _at(self, system: HybridSystem, times) -> Array:
         scale = system.units
@@ -322,8 +329,7 @@ def _repeat(system: HybridSystem, y, t0, end, steps: _Steps) -> Trajectory:
 @jax.jit
 def _sampled(trajectory: Trajectory, saveat) -> Trajectory:
     """The motion at the times `saveat` alone."""
-    assert trajectory._system is not None
-    states = trajectory._at(trajectory._system, saveat)
+    states = trajectory._at(trajectory._continuous(), saveat)
     contact_states = trajectory.contact_states[trajectory._step(saveat)]
     reached = trajectory.result == SimulationResult.reached
     missing = ((saveat > trajectory.times[-1]) & ~reached)[:, None]

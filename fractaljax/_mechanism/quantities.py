@@ -20,13 +20,31 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from .._base.parts import Part, number, quantities, quantity_name, substitute
+from .._base.parts import (
+    Part,
+    brief,
+    number,
+    quantities,
+    quantity_name,
+    require_scalar,
+    substitute,
+)
 from .mechanism import Mechanism
 from .scene import Scene, stiffness
-from .structure import Structure
+from .structure import Structure, require_single
 
 _CHECKED_AT_ONCE = 1 << 16  # points of a grid
 STIFFNESS_RATIO, FREQUENCY_RATIO, FRICTION = "K_t/K_n", "omega_1/omega_2", "mu"
+
+
+def require_one(name: str, x: Any) -> None:
+    """Refuse, as argument `name`, what is no mechanism, and one that holds a batch."""
+    if isinstance(x, Structure):
+        require_single(x)
+    elif isinstance(x, Scene):
+        require_scalar(x)
+    else:
+        raise TypeError(f"{name} must be a Scene or a Structure, got {brief(x)}")
 
 
 def joints_of(x: Mechanism) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.batches import in_batches
-from .._base.parts import Record, brief, flag, require_scalar, scalar, whole
+from .._base.parts import Record, flag, scalar, whole
 from .._base.ranges import is_logarithmic
 from .._contact.contact import Regime
 from .._continuation import Continuation, Curve, CurveEnd, trace
@@ -26,12 +26,13 @@ from .._mechanism.quantities import (
     require_independent,
     require_inside,
     require_known,
+    require_one,
     substituted,
     with_friction_times,
     with_optional,
 )
 from .._mechanism.scene import Scene
-from .._mechanism.structure import Structure, require_single
+from .._mechanism.structure import Structure
 from .critical_friction import critical_frequency, hopf_test_function
 from .critical_pair import critical_pair
 from .linearise import assembled, with_equilibrium
@@ -139,12 +140,7 @@ def hopf_boundary(
     where stability cannot be computed in the window: a preloaded joint is open, or there is no
     equilibrium.
     """
-    if isinstance(scene, Structure):
-        require_single(scene)
-    elif isinstance(scene, Scene):
-        require_scalar(scene)
-    else:
-        raise TypeError(f"scene must be a Scene or a Structure, got {brief(scene)}")
+    require_one("scene", scene)
     friction_slope = flag("friction_slope", friction_slope)
     lines = whole("lines", lines, 2, _LINES_MAX)
     windows = [_window(scene, which, window) for which, window in (("x", x), ("y", y))]

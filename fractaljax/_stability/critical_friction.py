@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._base.parts import brief, concrete, flag, require_scalar
+from .._base.parts import brief, concrete, flag
 from .._base.singular import positive_sqrt, safe_divide
 from .._contact.contact import MU_M_MAX
 from .._mechanism.oscillator import (
@@ -26,7 +26,7 @@ from .._mechanism.oscillator import (
     linearise,
     static_normal_force,
 )
-from .._mechanism.quantities import joints_of, sliding_friction, with_friction_times
+from .._mechanism.quantities import joints_of, require_one, sliding_friction, with_friction_times
 from .._mechanism.scene import Scene, stiffness
 from .._mechanism.structure import Joint, Structure
 from .critical_pair import critical_pair, least_test
@@ -95,13 +95,12 @@ def critical_friction(
     **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`; for a structure without
     joints, a `joint` that it does not have, or none where friction differs between them.
     """
+    require_one("scene", scene)
     sloping = flag("friction_slope", friction_slope)
     if isinstance(scene, Structure):
         coefficient = _coefficient(scene, joint)
         factor = _factor_of_structure(scene, sloping)
         return jnp.where(factor == jnp.inf, jnp.inf, coefficient * _finite(factor))
-    if not isinstance(scene, Scene):
-        raise TypeError(f"scene must be a Scene or a Structure, got {brief(scene)}")
     if joint is not None:
         raise ValueError(f"joint names one of a structure, got {brief(joint)} for a scene")
     return _of_scene(scene, sloping)
@@ -143,7 +142,6 @@ def _factor_of_structure(structure, friction_slope):
 
 @functools.partial(jax.jit, static_argnums=1)
 def _of_scene(scene: Scene, friction_slope: bool) -> Float[Array, ""]:
-    require_scalar(scene)
     if scene.contact.fractal or (friction_slope and scene.friction.velocity_dependent):
         factor, _ = _first_factor(scene, friction_slope)
         return jnp.where(factor == jnp.inf, jnp.inf, sliding_friction(scene) * _finite(factor))

@@ -19,9 +19,7 @@ def trajectory(
     **Raises:** `ValueError` for an unknown direction or joint, a batch, or a simulation with
     `saveat`.
     """
-    if result._system is None:
-        raise ValueError("a simulation with saveat has no states between: leave saveat out")
-    shown = coordinate(result._system, direction, joint, result.times, batch=1)
+    shown = coordinate(result._continuous(), direction, joint, result.times, batch=1)
     ax, times = given_or_new(ax), np.asarray(result.times)
     t = np.sort(np.concatenate([np.linspace(times[0], times[-1], _SAMPLES), times]))
     x = np.asarray(result.at(t))[:, : len(shown.row)] @ shown.row * 1e6
