@@ -25,6 +25,12 @@ from ._design.envelope import Envelope as Envelope
 from ._design.pareto import Front as Front, pareto as pareto
 from ._design.tolerance import Tolerance as Tolerance, squeal_probability as squeal_probability
 from ._dynamics.attractors import attractors as attractors
+from ._dynamics.branch import (
+    Branch as Branch,
+    BranchEnd as BranchEnd,
+    BranchEvent as BranchEvent,
+    continue_cycle as continue_cycle,
+)
 from ._dynamics.cycle import CycleResult as CycleResult, LimitCycle as LimitCycle
 from ._dynamics.excitation import Excitation as Excitation
 from ._dynamics.limit_cycle import limit_cycle as limit_cycle
@@ -49,8 +55,8 @@ from ._mechanism.scene import Scene as Scene, brake_scene as brake_scene, stiffn
 from ._mechanism.structure import Joint as Joint, Structure as Structure
 from ._stability.boundary import (
     Boundary as Boundary,
-    Branch as Branch,
-    BranchEnd as BranchEnd,
+    BoundaryBranch as BoundaryBranch,
+    BoundaryEnd as BoundaryEnd,
     hopf_boundary as hopf_boundary,
 )
 from ._stability.critical_friction import critical_friction as critical_friction

@@ -51,6 +51,7 @@ class Continuation:
     oriented: bool = True
     longest: float = 1 / 64  # steps
     shortest: float = 1e-7
+    settled: float = 0.0  # Newton step after which none is made to see whether it shrinks further
     most: int = 5000  # points each way
 
     def tangent(self, jacobian: np.ndarray) -> np.ndarray:
@@ -76,6 +77,8 @@ class Continuation:
             if rank < len(residual) or size > 4 * self.longest:
                 return None
             best, found = size, (u, jacobian)
+            if size <= self.settled:
+                break
             u = u.copy()
             u[free] += step
         return found if best <= self.tolerance and found and self.valid(found[0]) else None
@@ -91,25 +94,36 @@ class Continuation:
 
     def _follow(self, u, ahead, sign):
         """Points from u, starting in the direction `ahead`: `sign` times the tangent."""
-        points, length = [u], self.longest / 4
-        while len(points) < self.most:
-            step = self._step(u, ahead, length, sign)
-            if step is None:
-                length /= 2
-                if length < self.shortest:
-                    return points, CurveEnd.stuck
-                continue
-            reached, turned, angle, leaves = step
-            if len(points) > 2 and self._passes(points[0] - u, ahead, reached - u):
+        points = [u]
+        for reached, turned, leaves in self.steps(u, ahead, sign):
+            if len(points) > 2 and self.passes(points[0] - u, ahead, reached - u):
                 return [*points, points[0]], CurveEnd.closed
             if not (leaves and np.linalg.norm(reached - u) < self.shortest):
                 points.append(reached)
             if leaves:
                 return points, CurveEnd.edge
+            if len(points) >= self.most:
+                return points, CurveEnd.long
             u, ahead = reached, turned
+        return points, CurveEnd.stuck
+
+    def steps(self, u, ahead, sign=1):
+        """Each next point, the direction there, and whether it is on the edge, where the last is.
+
+        They end before the edge where Newton's method fails however short the step.
+        """
+        length, leaves = self.longest / 4, False
+        while not leaves:
+            step = self._step(u, ahead, length, sign)
+            if step is None:
+                length /= 2
+                if length < self.shortest:
+                    return
+                continue
+            u, ahead, angle, leaves = step
+            yield u, ahead, leaves
             if angle < _STRAIGHT:
                 length = min(1.5 * length, self.longest)
-        return points, CurveEnd.long
 
     def _step(self, u, ahead, length, sign):
         """The next point, its direction, the angle to it, whether on the edge; None if too long."""
@@ -145,7 +159,7 @@ class Continuation:
             if outside
         )
 
-    def _passes(self, start, ahead, step) -> bool:
+    def passes(self, start, ahead, step) -> bool:
         """Whether a step passes the start of the curve, both relative to where it begins."""
         along = start @ ahead
         aside = np.linalg.norm(start - along * ahead)

@@ -61,7 +61,7 @@ def _along(system: HybridSystem, y, s, t, row):
     return value(y), rate(y), derivative(rate)(y)
 
 
-def _extremes(system: HybridSystem, segments: Segments, rows) -> Float[Array, "2 r"]:
+def extreme_values(system: HybridSystem, segments: Segments, rows) -> Float[Array, "2 r"]:
     """Smallest and largest value along the orbit of linear functions rows @ y, rows (r, 2n)."""
     y, h, s = segments.y, segments.duration, segments.s
     ends, rows = next_start(y), jnp.concatenate([rows, -rows])
@@ -169,7 +169,7 @@ def _limit_cycle(
     rows = jnp.concatenate([system.L[tangential], jnp.zeros_like(system.L[tangential])], axis=1)
     own = system.own(jnp.eye(2 * system.n, dtype=rows.dtype))
     everything = jnp.concatenate([own, rows])
-    low, high = _extremes(system, closed, everything)
+    low, high = extreme_values(system, closed, everything)
     offset = system.P[tangential][None]
     forces = (jnp.stack([low, high])[:, 2 * n :] + offset) * system.force_unit
     forces = jnp.where(np.array(system.opens)[None], jnp.maximum(forces, 0), forces)

@@ -49,7 +49,7 @@ _MU_M_STEP = 0.3  # where Eq. 19 is discontinuous
 Window = tuple[str, float, float]
 
 
-class BranchEnd(eqx.Enumeration):
+class BoundaryEnd(eqx.Enumeration):
     """Why a branch of a stability boundary ends."""
 
     window = "at the edge of the window"
@@ -61,20 +61,20 @@ class BranchEnd(eqx.Enumeration):
     lost = "where it could not be followed"
 
 
-class Branch(Record):
+class BoundaryBranch(Record):
     """One connected piece of a stability boundary, with squeal on its right."""
 
     x: Float[np.ndarray, " k"]
     y: Float[np.ndarray, " k"]
     frequency: Float[np.ndarray, " k"]  # of the imaginary pair of eigenvalues [Hz]; 0: divergence
     growth_rate: Float[np.ndarray, " k"]  # [1/s], 0 up to rounding
-    start: BranchEnd
-    end: BranchEnd
+    start: BoundaryEnd
+    end: BoundaryEnd
 
     @property
     def closed(self) -> bool:
         """Whether it is a loop; its last point is then its first."""
-        return bool(self.end == BranchEnd.closed)
+        return bool(self.end == BoundaryEnd.closed)
 
     @property
     def divergence(self) -> bool:
@@ -88,7 +88,7 @@ class Boundary(Record):
     scene: Mechanism
     x: Window  # name and range
     y: Window
-    branches: tuple[Branch, ...]
+    branches: tuple[BoundaryBranch, ...]
     friction_slope: bool
     squeals: bool  # at the corner (low, low) of the window
     untraced: int  # crossings of the lattice that could not be followed
@@ -98,7 +98,7 @@ class Boundary(Record):
         plural = "" if len(self.branches) == 1 else "es"
         rows = [f"stability boundary, {x}, {y}: {len(self.branches)} branch{plural}"]
         for branch in self.branches:
-            ends = f"begins {BranchEnd[branch.start]}, ends {BranchEnd[branch.end]}"
+            ends = f"begins {BoundaryEnd[branch.start]}, ends {BoundaryEnd[branch.end]}"
             kind = "static divergence, " if branch.divergence else ""
             rows.append(f"  {len(branch.x)} points, {kind}{'a loop' if branch.closed else ends}")
         if not self.branches and not self.untraced:
@@ -128,10 +128,10 @@ def hopf_boundary(
     be missed. Where both directions lose all their damping at once, along a whole line, the Hopf
     test function does not change sign smoothly: such crossings are counted as `untraced`.
 
-    Of a structure the boundary is flutter or static divergence (`Branch.divergence`). A branch ends
-    at a corner, where a second mode loses its damping too; the next branch begins there. Points lie
-    on it within 1e-10 of the window, or eps over the damping ratio. Each takes the eigenvalues
-    once: choose fewer `lines` for many degrees of freedom.
+    Of a structure the boundary is flutter or static divergence (`BoundaryBranch.divergence`). A
+    branch ends at a corner, where a second mode loses its damping too; the next branch begins
+    there. Points lie on it within 1e-10 of the window, or eps over the damping ratio. Each takes
+    the eigenvalues once: choose fewer `lines` for many degrees of freedom.
 
     Not differentiable, and not for use under `jit`; see `critical_friction` for that.
 
@@ -327,33 +327,33 @@ class _Field:
     def quantities(self, u) -> list[float]:
         return [float(x) for x in self.plane.quantities(jnp.asarray(u, self.dtype))]
 
-    def why(self, end: CurveEnd, u, before) -> BranchEnd:
+    def why(self, end: CurveEnd, u, before) -> BoundaryEnd:
         """Why a branch ends at u, coming from the point `before`."""
         if end in (CurveEnd.edge, CurveEnd.closed):
-            return BranchEnd.window if end is CurveEnd.edge else BranchEnd.closed
+            return BoundaryEnd.window if end is CurveEnd.edge else BoundaryEnd.closed
         here = self.at(u)
         if np.abs(here.damping).max() < _LOST:
-            return BranchEnd.undamped if self.plane.rigid is None else BranchEnd.corner
+            return BoundaryEnd.undamped if self.plane.rigid is None else BoundaryEnd.corner
         if any(abs(float(mu_m) - _MU_M_STEP) < 1e-6 for mu_m in here.mu_m):
-            return BranchEnd.friction_correction
+            return BoundaryEnd.friction_correction
         ahead = (u - before) / np.linalg.norm(u - before)
         for reach in 10.0 ** np.arange(-7, -2):
             for direction in (ahead, ahead[::-1], -ahead[::-1]):
                 beside = self.at(np.clip(u + reach * direction, 0, 1))
                 pairs = zip(here.regimes, beside.regimes, strict=True)
                 if not all(bool(one == other) for one, other in pairs):
-                    return BranchEnd.regime
-        return BranchEnd.lost
+                    return BoundaryEnd.regime
+        return BoundaryEnd.lost
 
 
-def _branch(field: _Field, windows, curve: Curve) -> Branch:
+def _branch(field: _Field, windows, curve: Curve) -> BoundaryBranch:
     points = [field.at(u) for u in curve.points]
     places = np.array([field.quantities(u) for u in curve.points])
     # A point on the edge has the limit itself, not the exponential of its logarithm.
     for i, (_, low, high) in enumerate(windows):
         scaled = curve.points[:, i]
         places[:, i] = np.where(scaled == 0, low, np.where(scaled == 1, high, places[:, i]))
-    return Branch(
+    return BoundaryBranch(
         x=places[:, 0],
         y=places[:, 1],
         frequency=np.array([float(point.frequency) for point in points]),

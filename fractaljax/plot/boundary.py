@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from .._base.ranges import within
-from .._stability.boundary import Boundary, BranchEnd
+from .._stability.boundary import Boundary, BoundaryEnd
 from .axes import Axes, given_or_new, legend_above, over_quantity
 
 
@@ -30,7 +30,7 @@ def boundary(result: Boundary, ax: Axes | None = None) -> Axes:
         segments += list(np.stack([points[:-1], points[1:]], axis=1))
         frequencies.append((branch.frequency[:-1] + branch.frequency[1:]) / 2e3)
         for point, end in ((points[0], branch.start), (points[-1], branch.end)):
-            if not bool((end == BranchEnd.window) | (end == BranchEnd.closed)):
+            if not bool((end == BoundaryEnd.window) | (end == BoundaryEnd.closed)):
                 broken.append(point)
     lines = LineCollection(segments, array=np.concatenate(frequencies), cmap="viridis", lw=2.6)
     ax.add_collection(lines, autolim=False)

@@ -163,7 +163,7 @@ def test_both_sides_of_a_narrow_tongue_are_found():
 def test_it_ends_on_the_edges_of_the_window(name):
     found = boundary(name)
     for branch in found.branches:
-        assert branch.start == branch.end == fj.BranchEnd.window
+        assert branch.start == branch.end == fj.BoundaryEnd.window
         for i in (0, -1):
             assert branch.x[i] in found.x[1:] or branch.y[i] in found.y[1:]
 
@@ -171,7 +171,7 @@ def test_it_ends_on_the_edges_of_the_window(name):
 def test_a_loop_is_closed_and_has_folds():
     branch = only("loop")
     assert branch.closed
-    assert branch.start == branch.end == fj.BranchEnd.closed
+    assert branch.start == branch.end == fj.BoundaryEnd.closed
     assert (branch.x[0], branch.y[0]) == (branch.x[-1], branch.y[-1])
     assert len(set(zip(branch.x[1:], branch.y[1:], strict=True))) == len(branch.x) - 1
     angle = np.unwrap(np.arctan2(*np.diff(scaled(boundary("loop"), branch), axis=0).T[::-1]))
@@ -180,7 +180,7 @@ def test_a_loop_is_closed_and_has_folds():
 
 def test_it_says_where_all_damping_is_lost():
     """Both directions undamped by the slope of the law at one place: a corner."""
-    assert [end for end, _ in ends("all damping lost")].count(fj.BranchEnd.undamped) == 2
+    assert [end for end, _ in ends("all damping lost")].count(fj.BoundaryEnd.undamped) == 2
     assert boundary("all damping lost").untraced == 0
     legend = fj.plot.boundary(boundary("all damping lost")).get_legend()
     assert legend is not None
@@ -190,7 +190,7 @@ def test_it_says_where_all_damping_is_lost():
 @slow
 def test_it_says_where_the_regime_of_the_joint_changes():
     """Driven by the slope of the law beyond gross slip, by coupling before: a corner."""
-    corners = [x for end, x in ends("gross slip") if end == fj.BranchEnd.regime]
+    corners = [x for end, x in ends("gross slip") if end == fj.BoundaryEnd.regime]
     assert len(corners) == 2
     contact = BRAKE.contact
     before, after = (
@@ -205,7 +205,7 @@ def test_it_says_where_the_regime_of_the_joint_changes():
 def test_it_says_where_the_friction_correction_has_its_step():
     """A jump of 4e-4 in k_mu: the stiffness has two values there, and the boundary two ends."""
     name = "step of Eq. 19"
-    steps = [x for end, x in ends(name) if end == fj.BranchEnd.friction_correction]
+    steps = [x for end, x in ends(name) if end == fj.BoundaryEnd.friction_correction]
     assert len(steps) == 2
     at = 0.3 / 0.25 * float(sliding_friction(PROBLEMS[name][0]))
     assert max(abs(x - at) for x in steps) < 1e-6

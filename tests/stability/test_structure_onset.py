@@ -269,7 +269,7 @@ def test_boundaries_in_closed_form(name):
         assert np.abs(np.asarray(listed) - frequency).min() < 1e-6
         assert abs(float(here.growth_rate)) < 1e-6
     for end in (branch.start, branch.end):
-        assert bool(end == fj.BranchEnd.window)
+        assert bool(end == fj.BoundaryEnd.window)
 
 
 def two_minimal_models():
@@ -304,7 +304,7 @@ def test_a_corner_between_two_modes():
 
 
 def end_name(end):
-    return next(name for name in ("window", "corner") if bool(end == getattr(fj.BranchEnd, name)))
+    return next(name for name in ("window", "corner") if bool(end == getattr(fj.BoundaryEnd, name)))
 
 
 @slow

@@ -1,0 +1,461 @@
+"""Following a branch of cycles through folds and changes of itinerary.
+
+Within one itinerary the equations of `shooting.py` are smooth, and `_continuation.py` follows
+their solutions. An itinerary ends where the duration of a phase or, between switches, a guard
+falls to zero. There the branch goes on with the phase left out, or with one put in.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import scipy.optimize
+
+from .hybrid import OPEN, SECTION
+from .itinerary import Family, Phase, Shooting, multipliers_of
+from .shooting import after_switch, guards_at, measured, rate_at
+
+_STALE = 1.3  # growth of a phase after which it is cut anew
+_NEW = (1e-3, 1e-4, 1e-2)  # durations of a phase that appears, as a share of the period
+SMALL = 0.03  # size of a smooth orbit, in units of V/omega, below which a Hopf point is near
+_ROUNDING = 1e-9  # a guard this far below zero is kept to
+
+
+class BranchEnd(eqx.Enumeration):
+    """Why a branch of cycles ends."""
+
+    window = "at the edge of the window"
+    closed = "where it began"
+    hopf = "at a Hopf point, where the cycle vanishes"
+    jump = "where no cycle with another itinerary goes on: a motion jumps from here"
+    lost = "where it could not be followed"
+    long = "after the largest number of points"
+
+
+class Point(NamedTuple):
+    """One solution and what is shown of it."""
+
+    q: float
+    row: dict[str, Any]
+    itinerary: str
+
+
+class Follower:
+    """A branch of one mechanism in one quantity: its points and events so far."""
+
+    def __init__(self, family: Family, most: int):
+        self.family, self.most, self.n = family, most, family.n
+        self.x, self.window = family.x, family.window
+        self.points: list[Point] = []
+        self.events: list[dict[str, Any]] = []
+        self.home: tuple[Any, np.ndarray] | None = None  # phases and unknowns of the start
+
+    # --- what is recorded ---
+
+    def record(self, shooting: Shooting, z) -> None:
+        solution = shooting.solution(z)
+        given = self.x, self.window, solution.chain, solution.lifted, solution.u
+        extremes, units, second, error = map(np.asarray, measured(*given))
+        _, jacobian = shooting.equations(z)
+        n, h = self.n, solution.u[2 * self.n : 2 * self.n + shooting.m]
+        values = multipliers_of(shooting.monodromy(jacobian))
+        states = np.array([phase.s for phase in shooting.phases])
+        row = {
+            "period": float(h.sum() * second),
+            "amplitude": (extremes[1] - extremes[0])[:n],
+            "velocity_min": extremes[0, n:],
+            "velocity_max": extremes[1, n:],
+            "stick_fraction": h @ (states == 0) / h.sum(),
+            "open_fraction": h @ (states == OPEN) / h.sum(),
+            "stable": bool(np.abs(values[:-1]).max() < 1),
+            "multipliers": values,
+            "state": solution.u[: 2 * n] * units,
+            "error": float(error),
+        }
+        self.points.append(Point(float(z[-1]), row, shooting.itinerary()))
+
+    def note(self, kind, shooting: Shooting, z, before, after, condition=None) -> None:
+        """An event at the last recorded point; `condition` is what vanishes there."""
+        solution = shooting.solution(z)
+        self.events.append(
+            {
+                "kind": kind,
+                "index": len(self.points) - 1,
+                "before": before,
+                "after": after,
+                "data": (solution.chain, solution.lifted, jnp.asarray(solution.u)),
+                "condition": condition,
+            }
+        )
+
+    # --- following ---
+
+    def follow(self, shooting: Shooting, z, ahead) -> BranchEnd:
+        """Adds the points beyond z in the direction `ahead`, and says why they end."""
+        state: Any = shooting, z, ahead
+        origin = len(self.points)
+        while not isinstance(state, BranchEnd):
+            if len(self.points) - origin >= self.most:
+                return BranchEnd.long
+            state = self._stretch(*state, origin)
+        return state
+
+    def _stretch(self, shooting: Shooting, z, ahead, origin):
+        """Follows one itinerary on one mesh; returns where to go on, or why not."""
+        smooth = shooting.phases[0].guard == SECTION
+        for reached, turned, leaves in shooting.curves.steps(z, ahead):
+            if smooth and self._shrinks(shooting, reached):
+                return self._hopf(shooting, z)
+            if shooting.admissibility(reached) < -_ROUNDING:
+                return self._leaves_itinerary(shooting, z, reached)
+            if self._closes(shooting, z, ahead, reached):
+                return BranchEnd.closed
+            self._smooth_events(shooting, z, ahead, reached, turned)
+            self.record(shooting, reached)
+            if leaves:
+                return BranchEnd.window
+            if len(self.points) - origin >= self.most:
+                return BranchEnd.long
+            z, ahead = reached, turned
+            h = shooting.durations(z) * shooting.scale[2 * self.n : -1]
+            if (h > _STALE * shooting.length + 1e-2).any():
+                solution = shooting.solution(z)
+                times = np.concatenate([[0], np.cumsum(h)])
+                new = Shooting(self.family, solution, shooting.phases, times)
+                return self._onto(new, shooting, ahead)
+        if smooth and self._shrinks(shooting, z, 5):
+            return self._hopf(shooting, z)
+        return BranchEnd.lost
+
+    def turn_round(self) -> None:
+        """The points in the opposite order."""
+        self.points.reverse()
+        last = len(self.points) - 1
+        for event in self.events:
+            event["index"] = last - event["index"]
+            event["before"], event["after"] = event["after"], event["before"]
+
+    def _closes(self, shooting, z, ahead, reached) -> bool:
+        if self.home is None or self.home[0] != shooting.phases or len(self.points) < 4:
+            return False
+        start = shooting.scaled(self.home[1])
+        return shooting.curves.passes(start - z, ahead, reached - z)
+
+    def _onto(self, new: Shooting, old: Shooting, ahead):
+        """Where to go on with a new mesh of the same itinerary."""
+        found = new.curves.corrected(new.begin)
+        if found is None:
+            return BranchEnd.lost
+        direction = ahead * old.scale / new.scale
+        tangent = new.curves.tangent(found[1])
+        return new, found[0], tangent if tangent @ direction > 0 else -tangent
+
+    def _between(self, shooting, z, reached, share):
+        """The point of the curve near that share of the way, or None."""
+        found = shooting.curves.corrected(z + share * (reached - z))
+        return None if found is None else found[0]
+
+    def _root(self, shooting, z, reached, test: Callable) -> np.ndarray | None:
+        """The point between two at which a test function of z vanishes."""
+
+        def along(share):
+            at = self._between(shooting, z, reached, share)
+            return np.nan if at is None else test(at)
+
+        try:
+            share: Any = scipy.optimize.brentq(along, 0.0, 1.0, xtol=1e-13)
+        except (ValueError, RuntimeError):
+            return None
+        return self._between(shooting, z, reached, share)
+
+    def _smooth_events(self, shooting, z, ahead, reached, turned) -> None:
+        """Folds and changes of stability between two points of one itinerary."""
+
+        def tangent(at):
+            t = shooting.curves.tangent(shooting.equations(at)[1])
+            return t if t @ ahead > 0 else -t
+
+        if tangent(z)[-1] * turned[-1] < 0:
+            at = self._root(shooting, z, reached, lambda at: tangent(at)[-1])
+            if at is not None:
+                self._noted("fold", shooting, at, ("fold",))
+
+        def nontrivial(at):
+            return multipliers_of(shooting.monodromy(shooting.equations(at)[1]))[:-1]
+
+        def doubling(at):
+            return float(np.prod(nontrivial(at) + 1).real)
+
+        def rotating(at):
+            values = nontrivial(at)
+            turning = np.abs(values[np.abs(np.imag(values)) > 1e-9])
+            return float(turning.max() - 1) if len(turning) else -1.0
+
+        for kind, test in (("period doubling", doubling), ("Neimark-Sacker", rotating)):
+            if test(z) * test(reached) < 0:
+                at = self._root(shooting, z, reached, test)
+                if at is not None and abs(test(at)) < 1e-6:
+                    self._noted(kind, shooting, at, ("multiplier",))
+
+    def _noted(self, kind, shooting, at, condition) -> None:
+        self.record(shooting, at)
+        itinerary = shooting.itinerary()
+        self.note(kind, shooting, at, itinerary, itinerary, condition)
+
+    # --- the Hopf point ---
+
+    def _shrinks(self, shooting, z, factor=1.0) -> bool:
+        """Whether a smooth orbit is about to vanish, or has passed the point where it does."""
+        u = shooting.full(z)
+        y, _ = self.family.linearised(u[-1])
+        size = np.abs(u[: 2 * self.n] - y).max()
+        s = np.array(shooting.phases[0].s, float)
+        return (
+            size < factor * SMALL
+            or float(rate_at(self.x, self.window, u[-1], u[: 2 * self.n], s)) >= 0
+        )
+
+    def _hopf(self, shooting, z):
+        """The Hopf point near the small orbit z, and the end of the branch."""
+        q, period = z[-1], float(shooting.full(z)[2 * self.n : -1].sum())
+        found = self.family.hopf_near(q, 2 * np.pi / period)
+        if found is None:
+            return BranchEnd.lost
+        self.record_hopf(*found, shooting)
+        return BranchEnd.hopf
+
+    def record_hopf(self, q, frequency, shooting: Shooting) -> None:
+        y, A = self.family.linearised(q)
+        system = self.window.system(self.x, jnp.asarray(q))
+        period, n, units = 2 * np.pi / frequency, self.n, np.asarray(system.units)
+        values, flat = np.exp(np.linalg.eigvals(A) * period), np.zeros(len(system.P))
+        order = np.argsort(np.abs(values - 1))
+        # One of the pair on the unit circle is that of the orbit itself.
+        values = np.append(values[np.sort(order[1:])], 1.0)
+        state = y * units
+        row = {
+            "period": float(period / system.omega),
+            "amplitude": np.zeros(n),
+            "velocity_min": state[n:],
+            "velocity_max": state[n:],
+            "stick_fraction": flat,
+            "open_fraction": flat,
+            "stable": False,
+            "multipliers": values,
+            "state": state,
+            "error": 0.0,
+        }
+        itinerary = shooting.itinerary()
+        self.points.append(Point(q, row, itinerary))
+        u = np.concatenate([y, [period], [q]])
+        self.events.append(
+            {
+                "kind": "Hopf",
+                "index": len(self.points) - 1,
+                "before": itinerary,
+                "after": itinerary,
+                "data": (None, None, jnp.asarray(u)),
+                "condition": ("hopf",),
+            }
+        )
+
+    # --- changes of itinerary ---
+
+    def _leaves_itinerary(self, shooting: Shooting, z, reached):
+        """From an admissible z to where the orbit ceases to be, and on from there."""
+        low, high, inside = 0.0, 1.0, z
+        worst = shooting.admissibility(reached), reached
+        for _ in range(24):
+            middle = (low + high) / 2
+            at = self._between(shooting, z, reached, middle)
+            value = None if at is None else shooting.admissibility(at)
+            if value is not None and value > 0:
+                low, inside = middle, at
+            else:
+                high = middle
+                if value is not None:
+                    worst = value, at
+        outside = worst[1]
+        h = shooting.durations(outside)
+        candidates = (
+            self._vanishing(shooting, inside, int(np.argmin(h)))
+            if h.min() <= 0
+            else self._touching(shooting, inside, outside)
+        )
+        for candidate in candidates:
+            if candidate is not None:
+                return candidate
+        return BranchEnd.jump
+
+    def _times(self, shooting, z) -> np.ndarray:
+        h = shooting.durations(z) * shooting.scale[2 * self.n : -1]
+        return np.concatenate([[0], np.cumsum(h)])
+
+    def _vanishing(self, shooting: Shooting, z, p: int) -> Iterator[Any]:
+        """Ways on where phase p, nearly of no duration at z, is left out or changes places."""
+        phases, m = shooting.phases, shooting.m
+        old, new = phases[p - 1], phases[(p + 1) % m]
+        solution, times = shooting.solution(z), self._times(shooting, z)
+        if old.s == new.s:
+            # The chain begins where the next phase ends.
+            order = [(p + 2 + i) % m for i in range(m - 3)] if m > 2 else []
+            begin = times[(p + 1) % m + 1] if m > 2 else times[p]
+            if m > 2:
+                kept = [phases[i] for i in order] + [Phase(new.s, new.guard)]
+                edges = np.concatenate(
+                    [[begin], [_after(times[i + 1], begin, times) for i in order]]
+                )
+                edges = np.append(edges, begin + times[-1])
+            else:
+                kept, begin = [Phase(new.s, SECTION)], self.family.maximum(solution, times[-1])
+                edges = np.array([begin, begin + times[-1]])
+            yield self._merged(shooting, z, Shooting(self.family, solution, kept, edges))
+        # Otherwise the phase can be brought to no duration at all.
+        at = z.copy()
+        at[shooting.index(p)] = 0
+        found = shooting.curves.corrected(at, shooting.index(p))
+        if found is None:
+            return
+        at = found[0]
+        solution, times = shooting.solution(at), self._times(shooting, at)
+        condition = ("vanish", p)
+        faces = len(new.s)
+        if _face(old.guard, faces) != _face(phases[p].guard, faces):
+            changed = [i for i in range(faces) if phases[p].s[i] != new.s[i]]
+            s = tuple(new.s[i] if i in changed else old.s[i] for i in range(faces))
+            swapped = list(phases)
+            swapped[p - 1] = Phase(old.s, phases[p].guard)
+            swapped[p] = Phase(s, old.guard)
+            yield self._inserted(shooting, at, swapped, times, p, "order of switches", condition)
+        for guard in (old.guard, phases[p].guard):
+            kept = list(phases)
+            kept[p - 1] = Phase(old.s, guard)
+            del kept[p]
+            edges = np.delete(times, p) if p else times[1:]
+            yield self._direct(shooting, at, kept, edges, condition)
+
+    def _touching(self, shooting: Shooting, inside, outside) -> Iterator[Any]:
+        """Ways on where a guard touches zero between two switches, or at one."""
+        at = self._root(shooting, inside, outside, lambda z: shooting.lowest(z)[0])
+        at = inside if at is None else at
+        _, place = shooting.lowest(at)
+        solution, times = shooting.solution(at), self._times(shooting, at)
+        chain = solution.chain
+        k = int(place.segment)
+        p = int(chain.phase[k])
+        h = times[p + 1] - times[p]
+        since = float(chain.begin[k] + place.theta * chain.share[k]) * h
+        phase, moment = shooting.phases[p], times[p] + since
+        y = np.asarray(self.family.sampled(solution, np.array([moment]), 1)[0])[:, 0]
+        q, guard = solution.u[-1], int(place.guard)
+        s = np.array(phase.s, float)
+        face = (guard - 1) // 2
+        tried = []
+        if since <= 0 or since >= h:
+            tried = self._at_switch(phase, face, guard) if since <= 0 else []
+        else:
+            engine = np.asarray(after_switch(self.x, self.window, q, y, s, guard)).astype(int)
+            tried = [tuple(int(i) for i in engine)]
+            if face < len(s):
+                for other in (0, 1, -1):
+                    tried.append(tuple(other if i == face else j for i, j in enumerate(phase.s)))
+        condition = ("touch", place)
+        for state in dict.fromkeys(tried):
+            if state == phase.s:
+                continue
+            values = np.abs(guards_at(self.x, self.window, q, y, np.array(state, float)))
+            values = np.asarray(values).copy()
+            values[0] = np.inf
+            excursion = Phase(state, int(np.argmin(values)))
+            phases = list(shooting.phases)
+            if since <= 0:
+                phases.insert(p, excursion)
+                edges, new = np.insert(times, p, times[p]), p
+            elif len(phases) == 1:
+                phases = [excursion, Phase(phase.s, guard)]
+                edges, new = np.array([moment, moment, moment + times[-1]]), 0
+            else:
+                phases[p : p + 1] = [Phase(phase.s, guard), excursion, phase]
+                edges, new = np.insert(times, p + 1, [moment, moment]), p + 1
+            yield self._inserted(shooting, at, phases, edges, new, "grazing", condition)
+
+    def _at_switch(self, phase, face, guard):
+        """Contact states that may come before a phase whose guard is zero at its very start."""
+        if face >= len(phase.s):
+            return []
+        slip = 1 if guard == 1 + 2 * face else -1
+        state = slip if phase.s[face] == 0 else 0
+        return [tuple(state if i == face else j for i, j in enumerate(phase.s))]
+
+    def _merged(self, shooting, z, new: Shooting):
+        """On from where an excursion vanishes: located as the grazing of the orbit without it."""
+        found = new.curves.corrected(new.begin)
+        if found is None or np.linalg.norm(found[0] - new.begin) > 0.2:
+            return None
+        start, tangent = found[0], new.curves.tangent(found[1])
+
+        def ahead(length):
+            point = new.curves.corrected(start + length * tangent)
+            return None if point is None else point[0]
+
+        value = new.lowest(start)[0]
+        for length in np.outer(4.0 ** np.arange(-8, -1), [1, -1]).ravel():
+            at = ahead(length)
+            if at is not None and new.lowest(at)[0] * value < 0:
+                graze = self._root(new, start, at, lambda z: new.lowest(z)[0])
+                if graze is None:
+                    continue
+                direction = (at - start) * (1 if new.lowest(at)[0] > 0 else -1)
+                self._change("grazing", new, graze, shooting, new, ("touch", new.lowest(graze)[1]))
+                return new, graze, direction / np.linalg.norm(direction)
+        return None
+
+    def _inserted(self, shooting, at, phases, edges, index, kind, condition):
+        """On with a new phase of no duration at an event."""
+        solution = shooting.solution(at)
+        period = edges[-1] - edges[0]
+        for share in _NEW:
+            new = Shooting(self.family, solution, phases, edges)
+            begin = new.begin.copy()
+            begin[new.index(index)] = share * period / new.scale[new.index(index)]
+            found = new.curves.corrected(begin, new.index(index))
+            if found is None or np.linalg.norm(found[0] - new.begin) > 0.2:
+                continue
+            if new.admissibility(found[0]) <= 0:
+                continue
+            tangent = new.curves.tangent(found[1])
+            self._change(kind, shooting, at, shooting, new, condition)
+            self.record(new, found[0])
+            forward = tangent[new.index(index)] > 0
+            return new, found[0], tangent if forward else -tangent
+        return None
+
+    def _direct(self, shooting, at, phases, edges, condition):
+        """On without a phase that has vanished between two others."""
+        new = Shooting(self.family, shooting.solution(at), phases, edges)
+        found = new.curves.corrected(new.begin)
+        if found is None or np.linalg.norm(found[0] - new.begin) > 1e-3:
+            return None
+        tangent = new.curves.tangent(found[1])
+        for direction in (tangent, -tangent):
+            beside = new.curves.corrected(found[0] + 1e-4 * direction)
+            if beside is not None and new.admissibility(beside[0]) > 0:
+                self._change("grazing", shooting, at, shooting, new, condition)
+                return new, beside[0], direction
+        return None
+
+    def _change(self, kind, where, at, old, new, condition) -> None:
+        self.record(where, at)
+        self.note(kind, where, at, old.itinerary(), new.itinerary(), condition)
+
+
+def _after(time, begin, times) -> float:
+    """A time on a periodic orbit, as the first one after `begin`."""
+    return time if time > begin else time + times[-1]
+
+
+def _face(guard: int, faces: int) -> int:
+    """The face or, beyond those, the joint of a guard."""
+    return (guard - 1) // 2 if guard <= 2 * faces else guard - faces

@@ -1,0 +1,298 @@
+"""The equations of `shooting.py` for NumPy: itineraries, meshes and solutions on the host."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.optimize
+
+from .._continuation import Continuation
+from .._mechanism.mechanism import Mechanism
+from .cycle import LimitCycle
+from .hybrid import NONE, OPEN, SECTION, UNUSED, hybrid_system
+from .shooting import Chain, Lifted, Place, Window, condensed, linearised, lowest, resampled
+
+_SAMPLES = 512  # of an orbit, to see where friction is stiff
+_LENGTH = 0.25  # of segments at rtol 1e-9, in scaled time
+_SYMBOLS = {1: "+", -1: "-", 0: "0", OPEN: "o"}
+
+
+class Phase(NamedTuple):
+    s: tuple[int, ...]  # contact state
+    guard: int  # that ends it
+
+
+class Solution(NamedTuple):
+    """A periodic orbit on a chain of segments, in scaled units."""
+
+    phases: tuple[Phase, ...]
+    chain: Chain
+    lifted: Lifted
+    u: np.ndarray
+
+
+class Family:
+    """The cycles of one mechanism with one quantity free, and how finely they are cut."""
+
+    def __init__(self, x: Mechanism, window: Window, step: float, rtol: float):
+        self.x, self.window, self.step = x, window, step
+        self.template = hybrid_system(x)
+        self.n = self.template.n
+        self.h = _LENGTH * (rtol / 1e-9) ** 0.125
+        self.segments = 0  # so far: no fewer later, since another number is compiled anew
+
+    def sampled(self, orbit: Solution, times, places: int):
+        """States (2n, places) of an orbit at times, and the rates of friction there."""
+        period = orbit.u[2 * self.n : -1].sum()
+        wrapped = jnp.asarray(np.mod(times, period))
+        given = self.x, self.window, orbit.chain, orbit.lifted, orbit.u
+        return resampled(*given, wrapped, places=places)
+
+    def linearised(self, q) -> tuple[np.ndarray, np.ndarray]:
+        """The sliding equilibrium (2n,) and the Jacobian (2n, 2n) of the field there."""
+        y, A = linearised(self.x, self.window, jnp.asarray(q, float))
+        return np.asarray(y), np.asarray(A)
+
+    def eigenvalue(self, q, frequency) -> complex:
+        """The eigenvalue of the equilibrium nearest to that frequency, in scaled units."""
+        values = np.linalg.eigvals(self.linearised(q)[1])
+        return complex(values[np.argmin(np.abs(values - 1j * frequency))])
+
+    def hopf_near(self, q, frequency) -> tuple[float, float] | None:
+        """Quantity and frequency of the Hopf point near those."""
+        try:
+            at: Any = scipy.optimize.newton(
+                lambda q: self.eigenvalue(q, frequency).real, q, x1=q + 1e-4, tol=1e-15, maxiter=50
+            )
+        except RuntimeError:
+            return None
+        value = self.eigenvalue(at, frequency)
+        return (float(at), value.imag) if abs(value.real) < 1e-10 else None
+
+    def maximum(self, orbit: Solution, period) -> float:
+        """The time of the largest t.x, roughly."""
+        times = np.linspace(0, period, _SAMPLES, endpoint=False)
+        y, _ = self.sampled(orbit, times, _SAMPLES)
+        return float(times[np.argmax(np.asarray(self.template.along(y[: self.n]))[0])])
+
+
+class Shooting:
+    """The equations of one itinerary for NumPy: unknowns z are u without padding, scaled."""
+
+    def __init__(self, family: Family, old: Solution, phases, times):
+        """`phases` begin at `times` (m,) on an old orbit; the last one ends after those."""
+        self.family, self.phases = family, tuple(phases)
+        n, m = family.n, len(self.phases)
+        chain, moments, N = self._mesh(old, np.asarray(times, float))
+        y, _ = family.sampled(old, moments, N)
+        h = np.diff(times)
+        self.padded = bucket(m, 8)
+        u = np.concatenate([np.asarray(y[:, 0]), h, np.zeros(self.padded - m), old.u[-1:]])
+        self.chain, self.m, self.length = chain, m, h.copy()
+        blank = jnp.zeros((2 * n, len(u), N), y.dtype)
+        self.memory = [(u, Lifted(jnp.asarray(u), y, blank))]
+        self.known: dict[bytes, Any] = {}  # of the last points
+        size = 1 + float(np.abs(np.asarray(y)).max())
+        period = float(h.sum())
+        self.scale = np.concatenate([np.full(2 * n, size), np.full(m, period), [1.0]])
+        self.active = np.r_[np.arange(2 * n + m), len(u) - 1]
+        self.begin = self.scaled(u)
+        far = np.full(2 * n + m, np.inf)
+        self.curves = Continuation(
+            self.equations,
+            low=np.append(-far, 0.0),
+            high=np.append(far, 1.0),
+            valid=lambda z: bool(np.isfinite(z).all()),
+            tolerance=1e-9,
+            settled=1e-13,
+            oriented=False,
+            longest=family.step,
+            shortest=1e-8,
+        )
+        self.orders = self._orders()
+
+    def _mesh(self, old, times):
+        """The chain of segments, equal in each phase where friction counts, and their starts."""
+        starts, lengths = times[:-1], np.diff(times)
+        fine = np.linspace(0, 1, _SAMPLES, endpoint=False)
+        span = times[-1] - times[0]
+        _, stiff = self.family.sampled(old, times[0] + fine * span, _SAMPLES)
+        density = np.maximum(1, 2 * np.asarray(stiff))
+        total = np.concatenate([[0.0], np.cumsum(density) * span / _SAMPLES])
+        clock = np.linspace(0, span, _SAMPLES + 1)
+        weight = np.interp(times - times[0], clock, total)
+        counts = np.maximum(1, np.ceil(np.diff(weight) / self.family.h - 1e-6)).astype(int)
+        N = self.family.segments = max(self.family.segments, bucket(counts.sum(), 64))
+        s, guard, phase, begin, share, moments = [], [], [], [], [], []
+        for p, (start, length, count) in enumerate(zip(starts, lengths, counts, strict=True)):
+            inside = np.linspace(weight[p], weight[p + 1], count + 1)
+            edges = np.interp(inside, total, clock) - (start - times[0])
+            edges = edges / length if length > 0 else np.linspace(0, 1, count + 1)
+            edges[0], edges[-1] = 0, 1
+            s += [self.phases[p].s] * count
+            guard += [NONE] * (count - 1) + [self.phases[p].guard]
+            phase += [p] * count
+            begin += list(edges[:-1])
+            share += list(np.diff(edges))
+            moments += list(start + edges[:-1] * length)
+        rest = N - len(s)
+        dtype = old.lifted.y.dtype
+        chain = Chain(
+            s=jnp.asarray(np.array(s + [s[-1]] * rest).T, dtype),
+            guard=jnp.asarray(guard + [UNUSED] * rest),
+            phase=jnp.asarray(phase + [phase[-1]] * rest),
+            begin=jnp.asarray(begin + [1.0] * rest, dtype),
+            share=jnp.asarray(share + [0.0] * rest, dtype),
+            used=jnp.asarray(np.arange(bucket(len(lengths), 8)) < len(lengths), dtype),
+        )
+        return chain, np.array(moments + [times[0]] * rest), N
+
+    def _orders(self):
+        """Orders of the zeros of the guards (k, M) where a phase begins and where it ends."""
+        system = self.family.template
+        faces = len(self.phases[0].s)
+        count = 1 + 2 * faces + sum(system.opens)
+        before, after = np.zeros((count, self.padded), int), np.zeros((count, self.padded), int)
+        for p, phase in enumerate(self.phases):
+            last = self.phases[p - 1]
+            for i, (was, now) in enumerate(zip(last.s, phase.s, strict=True)):
+                if abs(now) == 1 and was == 0:
+                    # Released by its own limit w starts with its second derivative.
+                    before[1 + 2 * i, p] = 2 if (last.guard - 1) // 2 == i else 1
+                elif abs(now) == 1 and was == -now:
+                    before[1 + 2 * i, p] = 1
+            if last.guard > 2 * faces and last.s != phase.s:
+                before[last.guard, p] = 1
+            if phase.guard > 0:
+                after[phase.guard, p] = 1
+        return jnp.asarray(before), jnp.asarray(after)
+
+    # --- unknowns ---
+
+    def scaled(self, u) -> np.ndarray:
+        return u[self.active] / self.scale
+
+    def full(self, z) -> np.ndarray:
+        u = np.zeros(2 * self.family.n + self.padded + 1)
+        u[self.active] = z * self.scale
+        return u
+
+    def durations(self, z) -> np.ndarray:
+        return z[2 * self.family.n : -1]
+
+    def index(self, p: int) -> int:
+        """The coordinate that is the duration of phase p."""
+        return 2 * self.family.n + p
+
+    # --- equations ---
+
+    def near(self, u) -> Lifted:
+        distances = [np.abs(u - at).max() for at, _ in self.memory]
+        return self.memory[int(np.argmin(distances))][1]
+
+    def evaluated(self, z):
+        key = z.tobytes()
+        if key in self.known:
+            return self.known[key]
+        u = self.full(z)
+        x, window = self.family.x, self.family.window
+        residual, jacobian, lifted, gap = condensed(x, window, self.chain, self.near(u), u)
+        if float(gap) < 0.3:
+            self.memory = [*self.memory[-3:], (u, lifted)]
+        rows = np.arange(2 * self.family.n + self.m)
+        found = np.asarray(residual)[rows], np.asarray(jacobian)[np.ix_(rows, self.active)]
+        self.known = dict([*self.known.items()][-8:]) | {key: found}
+        return found
+
+    def equations(self, z):
+        residual, jacobian = self.evaluated(z)
+        return residual, jacobian * self.scale
+
+    def solution(self, z) -> Solution:
+        u = self.full(z)
+        return Solution(self.phases, self.chain, self.near(u), u)
+
+    def monodromy(self, jacobian) -> np.ndarray:
+        """The Jacobian (2n, 2n) of the return map, from that of the equations."""
+        k = 2 * self.family.n
+        jacobian = jacobian / self.scale
+        changes = np.linalg.solve(jacobian[k:, k:-1], jacobian[k:, :k])
+        return jacobian[:k, :k] + np.eye(k) - jacobian[:k, k:-1] @ changes
+
+    def lowest(self, z) -> tuple[float, Place]:
+        """The least reduced guard on the orbit, and where."""
+        u = self.full(z)
+        family = self.family
+        value, place = lowest(family.x, family.window, self.chain, self.near(u), u, *self.orders)
+        return float(value), jax.tree.map(lambda a: np.asarray(a)[()], place)
+
+    def admissibility(self, z) -> float:
+        """Above zero where every phase lasts and no guard is below zero."""
+        shortest = float(self.durations(z).min())
+        return shortest if shortest <= 0 else min(shortest, self.lowest(z)[0])
+
+    def itinerary(self) -> str:
+        return " ".join("".join(_SYMBOLS[i] for i in phase.s) for phase in self.phases)
+
+
+def bucket(count: int, least: int) -> int:
+    """The next `least` times a power of four: few shapes, hence few compilations."""
+    size = least
+    while size < count:
+        size *= 4
+    return size
+
+
+def multipliers_of(return_jacobian) -> np.ndarray:
+    """Floquet multipliers by size, and 1 last, from the Jacobian of the return map.
+
+    That has a zero in the place of the 1.
+    """
+    values = np.linalg.eigvals(return_jacobian).astype(complex)
+    order = np.argsort(-np.abs(values))
+    return np.append(values[order[:-1]], 1.0)
+
+
+def solution_of(cycle: LimitCycle, q: float) -> Solution:
+    """The orbit of a limit cycle as phases, in its own scaled units."""
+    segments = cycle._orbit.segments
+    guard = np.asarray(segments.guard)
+    used = guard != UNUSED
+    guard, s = guard[used], np.asarray(segments.s)[:, used].astype(int)
+    h, y = np.asarray(segments.duration)[used], np.asarray(segments.y)[:, used]
+    switches = bool((guard > 0).any())
+    ends = guard > 0 if switches else guard == SECTION
+    if switches:
+        # The chain begins after a switch.
+        first = int(np.flatnonzero(ends)[0]) + 1
+        guard, h, ends = (np.roll(a, -first) for a in (guard, h, ends))
+        s, y = np.roll(s, -first, axis=1), np.roll(y, -first, axis=1)
+    last = np.flatnonzero(ends)
+    if not switches:
+        last = last[-1:]
+    phase = np.searchsorted(last, np.arange(len(h)))
+    lengths = np.bincount(phase, h)
+    before = np.concatenate([[0], np.cumsum(h)[:-1]])
+    begin = before - np.concatenate([[0], np.cumsum(lengths)])[phase]
+    phases = tuple(Phase(tuple(int(i) for i in s[:, k]), int(guard[k])) for k in last)
+    M = bucket(len(lengths), 8)
+    N = bucket(len(h), 64)
+    inner = np.where(ends if switches else np.arange(len(h)) == last[-1], guard, NONE)
+    rest = N - len(h)
+
+    def padded(a, value):
+        return jnp.asarray(np.concatenate([a, np.full(rest, value)]).astype(np.asarray(a).dtype))
+
+    chain = Chain(
+        s=jnp.asarray(np.pad(s, ((0, 0), (0, rest)), mode="edge").astype(y.dtype)),
+        guard=padded(inner, UNUSED),
+        phase=padded(phase, phase[-1]),
+        begin=padded(begin / lengths[phase], 1.0),
+        share=padded(h / lengths[phase], 0.0),
+        used=jnp.asarray(np.arange(M) < len(lengths), y.dtype),
+    )
+    y = np.concatenate([y, np.repeat(y[:, :1], rest, axis=1)], axis=1)
+    u = np.concatenate([y[:, 0], lengths, np.zeros(M - len(lengths)), [q]])
+    blank = jnp.zeros((len(y), len(u), N), y.dtype)
+    return Solution(phases, chain, Lifted(jnp.asarray(u), jnp.asarray(y), blank), u)

@@ -1,0 +1,309 @@
+"""The equations of a periodic orbit of known itinerary, with one quantity of the mechanism free.
+
+The unknowns u are the first state (2n,), the duration of every phase (M,), and the quantity on its
+window, 0 to 1. The equations say that the chain closes and that each phase ends where its guard is
+zero. Their derivatives by the states between are eliminated by the affine maps of the segments.
+"""
+
+import functools
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from .._mechanism.mechanism import Mechanism
+from .._mechanism.quantities import substituted
+from .hybrid import NONE, UNUSED, HybridSystem, hybrid_system
+from .limit_cycle import extreme_values
+from .orbit import Segments, chosen_guard, flow, next_start
+from .runge_kutta import runge_kutta
+
+
+class Window(eqx.Module):
+    """The range of a quantity as 0 to 1, linear or logarithmic."""
+
+    low: Float[Array, ""]  # of the quantity or its logarithm
+    high: Float[Array, ""]
+    name: str = eqx.field(static=True)
+    logarithmic: bool = eqx.field(static=True)
+
+    def value(self, q) -> Any:
+        """The quantity at q."""
+        found = self.low + q * (self.high - self.low)
+        return jnp.exp(found) if self.logarithmic else found
+
+    def place(self, value) -> Any:
+        """The q of a value."""
+        found = jnp.log(value) if self.logarithmic else value
+        return (found - self.low) / (self.high - self.low)
+
+    def system(self, x: Mechanism, q) -> HybridSystem:
+        """The hybrid system of x with the quantity at q."""
+        return hybrid_system(substituted(x, {self.name: self.value(q)}))
+
+
+class Chain(eqx.Module):
+    """The itinerary: N segments in M phases, each of one contact state, padded."""
+
+    s: Float[Array, "f N"]  # contact state
+    guard: Int[Array, " N"]  # that ends the segment: a number, NONE within a phase, or UNUSED
+    phase: Int[Array, " N"]  # which phase it belongs to
+    begin: Float[Array, " N"]  # its start, as a share of the phase
+    share: Float[Array, " N"]  # its duration, as a share of the phase; 0 of padding
+    used: Float[Array, " M"]  # 1 of a phase, 0 of padding
+
+    @property
+    def ends(self) -> Array:
+        """Which segments end a phase."""
+        return (self.guard != NONE) & (self.guard != UNUSED)
+
+
+class Lifted(eqx.Module):
+    """States at the starts of the segments near a solution, as an affine function of u."""
+
+    u: Float[Array, " k"]
+    y: Float[Array, "2n N"]  # at u
+    D: Float[Array, "2n k N"]  # derivative by u
+
+    def at(self, u) -> Float[Array, "2n N"]:
+        """The states at another u."""
+        return self.y + jnp.einsum("ikn,k->in", self.D, u - self.u)
+
+
+def durations(chain: Chain, u, n: int) -> Float[Array, " N"]:
+    """The durations of the segments; n is the number of degrees of freedom."""
+    return u[2 * n : -1][chain.phase] * chain.share
+
+
+def _mix(system, rate, e):
+    return jax.tree.map(lambda a, d: a + e * d, system, rate)
+
+
+@jax.jit
+def condensed(x: Mechanism, window: Window, chain: Chain, lifted: Lifted, u):
+    """Residual (2n + M,) and Jacobian (2n + M, 2n + M + 1) at u, and the next `Lifted`.
+
+    Also the largest gap between segments. Of a phase that is padding the equation is h = 0.
+    """
+    system, rate = jax.jvp(lambda q: window.system(x, q), (u[-1],), (jnp.ones_like(u[-1]),))
+    y, s, n = lifted.at(u), chain.s, system.n
+    h = durations(chain, u, n)
+
+    def field(columns):
+        def both(y, e):
+            return _mix(system, rate, e).field(y, s)
+
+        along, slope = jax.linearize(both, columns[:, 0], jnp.zeros_like(u[-1]))
+        by = jnp.zeros(2 * n + 1, y.dtype).at[-1].set(1)
+        tangents = jax.vmap(slope, in_axes=(1, 0), out_axes=1)(columns[:, 1:], by)
+        return jnp.concatenate([along[:, None], tangents], axis=1)
+
+    units = jnp.eye(2 * n, 2 * n + 1, dtype=y.dtype)[:, :, None]
+    columns = jnp.concatenate([y[:, None], jnp.broadcast_to(units, (2 * n, 2 * n + 1, len(h)))], 1)
+    ends = runge_kutta(_tableau(), field, columns, h[None, None])
+    ends, A, Q = ends[:, 0], ends[:, 1:-1], ends[:, -1]
+    b = system.field(ends, s) * chain.share[None]
+    target = next_start(y)
+    g, pull = jax.vjp(lambda y: chosen_guard(system, y, s, chain.guard), target)
+    (c,) = pull(jnp.ones_like(h))
+    _, c_q = jax.jvp(
+        lambda e: chosen_guard(_mix(system, rate, e), target, s, chain.guard),
+        (jnp.zeros_like(u[-1]),),
+        (jnp.ones_like(u[-1]),),
+    )
+    D, d, D_end, d_end = _chained(chain, A, b, Q, ends - target, len(u))
+    row = jnp.einsum("in,ikn->nk", c, D_end).at[:, -1].add(c_q)
+    first = jnp.eye(2 * n, len(u), dtype=y.dtype)
+    padding = jnp.diag(1 - chain.used)
+    residual = jnp.concatenate(
+        [d_end[:, -1], _of_phases(chain, g + jnp.sum(c * d_end, 0)) + padding @ u[2 * n : -1]]
+    )
+    guards = _of_phases(chain, row.T).T.at[:, 2 * n : -1].add(padding)
+    jacobian = jnp.concatenate([D_end[..., -1] - first, guards])
+    return residual, jacobian, Lifted(u, y + d, D), jnp.max(jnp.abs(d))
+
+
+def _tableau():
+    # Imported late: a question of stability does not wait for diffrax.
+    import diffrax
+
+    return diffrax.Dopri8.tableau
+
+
+def _chained(chain: Chain, A, b, Q, gap, k: int):
+    """Derivatives by u (2n, k, N) and shifts (2n, N) of the starts of segments and of their ends.
+
+    A, b and Q are the derivatives of the ends by their starts, durations and the quantity.
+    """
+    phases = len(chain.used)
+    of_phase = jax.nn.one_hot(len(A) + chain.phase, k, dtype=A.dtype)
+    of_quantity = jnp.zeros(k, A.dtype).at[len(A) + phases].set(1)
+
+    def step(carry, segment):
+        D, d = carry
+        A, b, Q, gap, column = segment
+        end = A @ D + b[:, None] * column[None] + Q[:, None] * of_quantity[None]
+        return (end, A @ d + gap), (D, d, end, A @ d + gap)
+
+    start = jnp.eye(len(A), k, dtype=A.dtype), jnp.zeros(len(A), A.dtype)
+    lanes = tuple(jnp.moveaxis(x, -1, 0) for x in (A, b, Q, gap))
+    _, found = jax.lax.scan(step, start, (*lanes, of_phase))
+    return tuple(jnp.moveaxis(x, 0, -1) for x in found)
+
+
+def _of_phases(chain: Chain, values) -> Array:
+    """The values (..., N) at the ends of the phases (..., M); 0 of padding."""
+    place = jax.nn.one_hot(chain.phase, len(chain.used), dtype=values.dtype)
+    return jnp.where(chain.ends, values, 0) @ place
+
+
+class Place(eqx.Module):
+    """Where on an orbit a guard is looked at."""
+
+    guard: Int[Array, ""]
+    segment: Int[Array, ""]
+    theta: Float[Array, ""]  # share of the segment
+    before: Int[Array, ""]  # order of the guard's zero at the start of the phase
+    after: Int[Array, ""]  # and at its end
+
+
+_NODES = 5
+
+
+def reduced_guard(system: HybridSystem, chain: Chain, y, h, at: Place, theta) -> Array:
+    """The guard over (time since the start of its phase)^before (time to its end)^after.
+
+    So the zeros that a guard has where a phase begins and ends are not counted.
+    """
+    k = at.segment
+    state, s = y[:, k], chain.s[:, k]
+    phase = h[k] / chain.share[k]
+    since, left = chain.begin[k] * phase, (1 - chain.begin[k] - chain.share[k]) * phase
+
+    y = flow(system, state, theta * h[k], s)
+    values, rates = jax.jvp(lambda y: system.guards(y, s), (y,), (system.field(y, s),))
+    value, rate = values[at.guard], rates[at.guard]
+    time, rest = since + theta * h[k], left + (1 - theta) * h[k]
+    # At its own zero the guard's rate takes the place of the quotient.
+    at_start, at_end = (at.before > 0) & (time <= 0), (at.after > 0) & (rest <= 0)
+    plain = value / jnp.where(at_start | (at.before == 0), 1, time**at.before)
+    plain = plain / jnp.where(at_end | (at.after == 0), 1, rest)
+    at_start_value = rate / jnp.where(at.after > 0, rest, 1)
+    at_end_value = -rate / jnp.where(at.before > 0, jnp.where(at_end, time, 1) ** at.before, 1)
+    return jnp.where(at_start, at_start_value, jnp.where(at_end, at_end_value, plain))
+
+
+@jax.jit
+def lowest(x: Mechanism, window: Window, chain: Chain, lifted: Lifted, u, before, after):
+    """The least reduced guard anywhere on the orbit, and where it is.
+
+    `before` and `after` (k, M) are the orders of the zeros of the guards where phases begin and
+    end. Below zero the orbit does not keep to its itinerary.
+    """
+    system = window.system(x, u[-1])
+    y, n = lifted.at(u), system.n
+    h = durations(chain, u, n)
+    theta = jnp.arange(_NODES, dtype=y.dtype) / (_NODES - 1)
+
+    def samples(share):
+        states = flow(system, y, share * h, chain.s)
+        rate = system.field(states, chain.s)
+        return jax.jvp(lambda y: system.guards(y, chain.s), (states,), (rate,))
+
+    value, rate = jax.vmap(samples, out_axes=1)(theta)
+    phase = u[2 * n : -1][chain.phase]
+    time = (chain.begin[None] + theta[:, None] * chain.share[None]) * phase[None]
+    rest = phase[None] - time
+    p, q = before[:, chain.phase][:, None], after[:, chain.phase][:, None]
+    tiny = 1e-12
+    at_start, at_end = (p > 0) & (time <= tiny), (q > 0) & (rest <= tiny)
+    time, rest = jnp.where(time <= tiny, 1, time)[None], jnp.where(rest <= tiny, 1, rest)[None]
+    over = jnp.where(at_start, 1, time**p) * jnp.where(at_end, 1, rest**q)
+    reduced = jnp.where(at_start, rate, jnp.where(at_end, -rate, value)) / over
+    # After a stick ends, a slip begins with a zero of second order, whose sign the stick's decides.
+    counted = (chain.share[None] > 0) & ~(at_start & (p > 1))
+    counted = counted & (jnp.arange(len(value))[:, None, None] > 0)
+    reduced = jnp.where(counted, reduced, jnp.inf)
+    guard, node, segment = jnp.unravel_index(jnp.argmin(reduced), reduced.shape)
+    orders = before[guard, chain.phase[segment]], after[guard, chain.phase[segment]]
+    place = Place(guard, segment, theta[node], *orders)
+    fixed = (at_start | at_end)[guard, node, segment]
+
+    # Not beyond the phase.
+    first = jnp.maximum(-chain.begin[segment] / chain.share[segment], -0.3)
+    last = jnp.minimum((1 - chain.begin[segment]) / chain.share[segment], 1.3)
+
+    def vertex(theta, spacing):
+        """The minimum of the parabola through three points around the last one."""
+        theta = jnp.clip(theta, first + spacing, last - spacing)
+        around = theta + spacing * jnp.arange(-1, 2)
+        low, here, high = jax.vmap(lambda at: reduced_guard(system, chain, y, h, place, at))(around)
+        bend = low + high - 2 * here
+        moved = (low - high) / (2 * jnp.where(bend > 0, bend, 1))
+        moved = jnp.where(bend > 0, jnp.clip(moved, -1, 1), jnp.sign(low - high))
+        return theta + spacing * moved, None
+
+    spacings = jnp.array([1 / 4, 1 / 32, 1 / 256, 1 / 2048], y.dtype)
+    refined, _ = jax.lax.scan(vertex, place.theta, spacings)
+    refined = jnp.where(fixed, place.theta, refined)
+    value = reduced[guard, node, segment]
+    found = jnp.where(
+        fixed, value, jnp.minimum(value, reduced_guard(system, chain, y, h, place, refined))
+    )
+    theta = jnp.where(found < value, refined, place.theta)
+    return found, Place(guard, segment, theta, *orders)
+
+
+@functools.partial(jax.jit, static_argnames="places")
+def resampled(x, window: Window, chain: Chain, lifted: Lifted, u, times, *, places: int):
+    """States (2n, places) at times since the start of the orbit, and the rate of friction."""
+    system = window.system(x, u[-1])
+    h = durations(chain, u, system.n)
+    ends = jnp.cumsum(h)
+    last = jnp.max(jnp.where(chain.share > 0, jnp.arange(len(h)), 0))
+    k = jnp.minimum(jnp.searchsorted(ends, times, side="right"), last)
+    y = flow(system, lifted.at(u)[:, k], times - (ends - h)[k], chain.s[:, k])
+    return y, system.stiffness(y, chain.s[:, k])
+
+
+@jax.jit
+def measured(x, window: Window, chain: Chain, lifted: Lifted, u):
+    """Least and largest states (2, 2n) in SI units, their units, 1/omega, and the error."""
+    system = window.system(x, u[-1])
+    y, h = lifted.at(u), durations(chain, u, system.n)
+    segments = Segments(y, h, chain.s, chain.guard)
+    extremes = extreme_values(system, segments, jnp.eye(len(y), dtype=y.dtype))
+    half = flow(system, flow(system, y, h / 2, chain.s), h / 2, chain.s)
+    error = jnp.sum(jnp.max(jnp.abs(half - flow(system, y, h, chain.s)), axis=0))
+    units = system.units
+    return extremes * units[None], units, 1 / system.omega, error / jnp.max(jnp.abs(y))
+
+
+@jax.jit
+def linearised(x, window: Window, q):
+    """The sliding equilibrium (2n,) in scaled units, and the Jacobian (2n, 2n) of the field."""
+    system = window.system(x, q)
+    y = system.equilibrium()
+    slips = jnp.ones(len(system.P), y.dtype)
+    return y, jax.jacfwd(lambda y: system.field(y, slips))(y)
+
+
+@jax.jit
+def after_switch(x, window: Window, q, y, s, guard):
+    """The contact state after a guard of contact state s has reached zero at y."""
+    return window.system(x, q).switch(y, s, guard)[1]
+
+
+@jax.jit
+def guards_at(x, window: Window, q, y, s):
+    """The guards (k,) at one state."""
+    return window.system(x, q).guards(y, s)
+
+
+@jax.jit
+def rate_at(x, window: Window, q, y, s):
+    """The rate of the section's guard at one state: below 0 at a maximum of t.x."""
+    system = window.system(x, q)
+    return system.section(system.field(y, s))
