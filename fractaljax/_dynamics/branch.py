@@ -50,9 +50,9 @@ class Branch(Record):
     velocity_max: Float[np.ndarray, "k n"]  # [m/s]
     stick_fraction: Float[np.ndarray, "k m"]  # of the period, as in `limit_cycle`
     open_fraction: Float[np.ndarray, "k m"]
-    stable: Bool[np.ndarray, " k"]
+    stable: Bool[np.ndarray, " k"]  # whether small deviations from the cycle die out
     multipliers: Complex[np.ndarray, "k 2n"]  # the one that is 1 comes last
-    state: Float[np.ndarray, "k 2n"]  # [x, v] somewhere on the cycle [m, m/s]
+    state: Float[np.ndarray, "k 2n"]  # [x, v] where t.x of the first joint is largest [m, m/s]
     error: Float[np.ndarray, " k"]  # estimated, of the states, relative
     itinerary: tuple[str, ...] = eqx.field(static=True)
     events: tuple[BranchEvent, ...]
@@ -86,7 +86,7 @@ class Branch(Record):
         ]
         for event in self.events:
             change = "" if event.before == event.after else f"  {event.before} -> {event.after}"
-            rows.append(f"  {event.kind} at {self.name} = {float(event.value):.12g}{change}")
+            rows.append(f"  {event.kind} at {self.name} = {float(event.value):.9g}{change}")
         return "\n".join(rows)
 
 
@@ -204,10 +204,11 @@ def _from_hopf(follower: Follower, q: float):
         jnp.asarray(scanned)
     )
     values = np.linalg.eigvals(np.asarray(matrices))
-    values = np.where(np.imag(values) > 1e-9, values, -np.inf)
-    rightmost = values[np.arange(_SCANNED), np.argmax(np.real(values), axis=1)]
-    crossings = np.flatnonzero(np.diff(np.sign(rightmost.real)) != 0)
-    found = [follower.family.hopf_near(scanned[i], rightmost[i].imag) for i in crossings]
+    growth, frequency = np.real(values), np.imag(values)
+    last = np.argmax(np.where(frequency > 1e-9, growth, -np.inf), axis=1)
+    growth, frequency = (x[np.arange(_SCANNED), last] for x in (growth, frequency))
+    crossings = np.flatnonzero(np.diff(np.sign(growth)) != 0)
+    found = [follower.family.hopf_near(scanned[i], frequency[i]) for i in crossings]
     found = [point for point in found if point is not None and 0 <= point[0] <= 1]
     if not found:
         raise ValueError(f"there is no Hopf point of {follower.window.name} in the window")
@@ -272,6 +273,11 @@ def _branch(follower: Follower, x, name: str, start, end) -> Branch:
             )
         )
     rows = {key: np.array([point.row[key] for point in points]) for key in points[0].row}
+    # At a Hopf point a multiplier is 1: it is shown as the cycles beside it are.
+    for event in events:
+        if event.kind == "Hopf":
+            beside = event.index - 1 if event.index else 1
+            rows["stable"][event.index] = rows["stable"][beside]
     joints = [faces[0] for faces in follower.family.template.faces]
     if not isinstance(x, Scene):
         rows["stick_fraction"] = rows["stick_fraction"][:, joints]

@@ -17,7 +17,7 @@ from .hybrid import OPEN, SECTION
 from .itinerary import Family, Phase, Shooting, multipliers_of
 from .shooting import after_switch, guards_at, measured, rate_at
 
-_STALE = 1.3  # growth of a phase after which it is cut anew
+_FINER = 8  # attempts at a mesh that is fine enough
 _NEW = (1e-3, 1e-4, 1e-2)  # durations of a phase that appears, as a share of the period
 SMALL = 0.03  # size of a smooth orbit, in units of V/omega, below which a Hopf point is near
 _ROUNDING = 1e-9  # a guard this far below zero is kept to
@@ -57,21 +57,21 @@ class Follower:
     def record(self, shooting: Shooting, z) -> None:
         solution = shooting.solution(z)
         given = self.x, self.window, solution.chain, solution.lifted, solution.u
-        extremes, units, second, error = map(np.asarray, measured(*given))
+        (low, high, state), second, error = map(np.asarray, measured(*given))
         _, jacobian = shooting.equations(z)
         n, h = self.n, solution.u[2 * self.n : 2 * self.n + shooting.m]
         values = multipliers_of(shooting.monodromy(jacobian))
         states = np.array([phase.s for phase in shooting.phases])
         row = {
             "period": float(h.sum() * second),
-            "amplitude": (extremes[1] - extremes[0])[:n],
-            "velocity_min": extremes[0, n:],
-            "velocity_max": extremes[1, n:],
+            "amplitude": (high - low)[:n],
+            "velocity_min": low[n:],
+            "velocity_max": high[n:],
             "stick_fraction": h @ (states == 0) / h.sum(),
             "open_fraction": h @ (states == OPEN) / h.sum(),
             "stable": bool(np.abs(values[:-1]).max() < 1),
             "multipliers": values,
-            "state": solution.u[: 2 * n] * units,
+            "state": state,
             "error": float(error),
         }
         self.points.append(Point(float(z[-1]), row, shooting.itinerary()))
@@ -119,12 +119,9 @@ class Follower:
             if len(self.points) - origin >= self.most:
                 return BranchEnd.long
             z, ahead = reached, turned
-            h = shooting.durations(z) * shooting.scale[2 * self.n : -1]
-            if (h > _STALE * shooting.length + 1e-2).any():
-                solution = shooting.solution(z)
-                times = np.concatenate([[0], np.cumsum(h)])
-                new = Shooting(self.family, solution, shooting.phases, times)
-                return self._onto(new, shooting, ahead)
+            inaccurate = self.points[-1].row["error"] > self.family.rtol
+            if inaccurate or shooting.stale(z):
+                return self._remeshed(shooting, z, ahead)
         if smooth and self._shrinks(shooting, z, 5):
             return self._hopf(shooting, z)
         return BranchEnd.lost
@@ -143,11 +140,19 @@ class Follower:
         start = shooting.scaled(self.home[1])
         return shooting.curves.passes(start - z, ahead, reached - z)
 
-    def _onto(self, new: Shooting, old: Shooting, ahead):
-        """Where to go on with a new mesh of the same itinerary."""
-        found = new.curves.corrected(new.begin)
-        if found is None:
-            return BranchEnd.lost
+    def _remeshed(self, old: Shooting, z, ahead):
+        """Where to go on with a new mesh of the same itinerary, finer if that is not enough."""
+        times = self._times(old, z)
+        for _ in range(_FINER):
+            new = Shooting(self.family, old.solution(z), old.phases, times)
+            found = new.curves.corrected(new.begin)
+            if found is None:
+                return BranchEnd.lost
+            solution = new.solution(found[0])
+            given = self.x, self.window, solution.chain, solution.lifted, solution.u
+            if float(measured(*given)[2]) <= self.family.rtol / 2:
+                break
+            self.family.h *= 0.7
         direction = ahead * old.scale / new.scale
         tangent = new.curves.tangent(found[1])
         return new, found[0], tangent if tangent @ direction > 0 else -tangent
@@ -242,7 +247,7 @@ class Follower:
             "velocity_max": state[n:],
             "stick_fraction": flat,
             "open_fraction": flat,
-            "stable": False,
+            "stable": np.abs(values[:-1]).max() < 1 + 1e-9,
             "multipliers": values,
             "state": state,
             "error": 0.0,
@@ -312,6 +317,10 @@ class Follower:
                 kept, begin = [Phase(new.s, SECTION)], self.family.maximum(solution, times[-1])
                 edges = np.array([begin, begin + times[-1]])
             yield self._merged(shooting, z, Shooting(self.family, solution, kept, edges))
+        elif old.guard == phases[p].guard:
+            # A slip to and fro before a stick: without it the stick begins at its limit.
+            kept, edges = _without(phases, times, p, old.guard)
+            yield self._merged(shooting, z, Shooting(self.family, solution, kept, edges))
         # Otherwise the phase can be brought to no duration at all.
         at = z.copy()
         at[shooting.index(p)] = 0
@@ -330,10 +339,7 @@ class Follower:
             swapped[p] = Phase(s, old.guard)
             yield self._inserted(shooting, at, swapped, times, p, "order of switches", condition)
         for guard in (old.guard, phases[p].guard):
-            kept = list(phases)
-            kept[p - 1] = Phase(old.s, guard)
-            del kept[p]
-            edges = np.delete(times, p) if p else times[1:]
+            kept, edges = _without(phases, times, p, guard)
             yield self._direct(shooting, at, kept, edges, condition)
 
     def _touching(self, shooting: Shooting, inside, outside) -> Iterator[Any]:
@@ -449,6 +455,14 @@ class Follower:
     def _change(self, kind, where, at, old, new, condition) -> None:
         self.record(where, at)
         self.note(kind, where, at, old.itinerary(), new.itinerary(), condition)
+
+
+def _without(phases, times, p: int, guard: int):
+    """Phases and the times at which they begin without phase p, which has no duration."""
+    kept = list(phases)
+    kept[p - 1] = Phase(kept[p - 1].s, guard)
+    del kept[p]
+    return kept, np.delete(times, p)
 
 
 def _after(time, begin, times) -> float:

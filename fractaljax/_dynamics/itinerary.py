@@ -15,6 +15,7 @@ from .shooting import Chain, Lifted, Place, Window, condensed, linearised, lowes
 
 _SAMPLES = 512  # of an orbit, to see where friction is stiff
 _LENGTH = 0.25  # of segments at rtol 1e-9, in scaled time
+_STALE = 1.3  # growth of a phase after which it is cut anew
 _SYMBOLS = {1: "+", -1: "-", 0: "0", OPEN: "o"}
 
 
@@ -39,7 +40,7 @@ class Family:
         self.x, self.window, self.step = x, window, step
         self.template = hybrid_system(x)
         self.n = self.template.n
-        self.h = _LENGTH * (rtol / 1e-9) ** 0.125
+        self.h, self.rtol = _LENGTH * (rtol / 1e-9) ** 0.125, rtol
         self.segments = 0  # so far: no fewer later, since another number is compiled anew
 
     def sampled(self, orbit: Solution, times, places: int):
@@ -105,7 +106,7 @@ class Shooting:
             high=np.append(far, 1.0),
             valid=lambda z: bool(np.isfinite(z).all()),
             tolerance=1e-9,
-            settled=1e-13,
+            settled=1e-11,
             oriented=False,
             longest=family.step,
             shortest=1e-8,
@@ -180,6 +181,11 @@ class Shooting:
 
     def durations(self, z) -> np.ndarray:
         return z[2 * self.family.n : -1]
+
+    def stale(self, z) -> bool:
+        """Whether a phase has grown so much that it must be cut anew."""
+        h = self.durations(z) * self.scale[2 * self.family.n : -1]
+        return bool((h > _STALE * self.length + 1e-2).any())
 
     def index(self, p: int) -> int:
         """The coordinate that is the duration of phase p."""

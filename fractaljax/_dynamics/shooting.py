@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import substituted
+from .events import Cubic
 from .hybrid import NONE, UNUSED, HybridSystem, hybrid_system
 from .limit_cycle import extreme_values
 from .orbit import Segments, chosen_guard, flow, next_start
@@ -214,16 +215,16 @@ def lowest(x: Mechanism, window: Window, chain: Chain, lifted: Lifted, u, before
 
     value, rate = jax.vmap(samples, out_axes=1)(theta)
     phase = u[2 * n : -1][chain.phase]
-    time = (chain.begin[None] + theta[:, None] * chain.share[None]) * phase[None]
-    rest = phase[None] - time
+    time = ((chain.begin[None] + theta[:, None] * chain.share[None]) * phase[None])[None]
+    rest = phase[None, None] - time
     p, q = before[:, chain.phase][:, None], after[:, chain.phase][:, None]
     tiny = 1e-12
     at_start, at_end = (p > 0) & (time <= tiny), (q > 0) & (rest <= tiny)
-    time, rest = jnp.where(time <= tiny, 1, time)[None], jnp.where(rest <= tiny, 1, rest)[None]
+    time, rest = jnp.where(time <= tiny, 1, time), jnp.where(rest <= tiny, 1, rest)
     over = jnp.where(at_start, 1, time**p) * jnp.where(at_end, 1, rest**q)
     reduced = jnp.where(at_start, rate, jnp.where(at_end, -rate, value)) / over
     # After a stick ends, a slip begins with a zero of second order, whose sign the stick's decides.
-    counted = (chain.share[None] > 0) & ~(at_start & (p > 1))
+    counted = (chain.share[None, None] > 0) & ~(at_start & (p > 1))
     counted = counted & (jnp.arange(len(value))[:, None, None] > 0)
     reduced = jnp.where(counted, reduced, jnp.inf)
     guard, node, segment = jnp.unravel_index(jnp.argmin(reduced), reduced.shape)
@@ -270,15 +271,32 @@ def resampled(x, window: Window, chain: Chain, lifted: Lifted, u, times, *, plac
 
 @jax.jit
 def measured(x, window: Window, chain: Chain, lifted: Lifted, u):
-    """Least and largest states (2, 2n) in SI units, their units, 1/omega, and the error."""
+    """Least, largest and section's states (3, 2n) in SI units, 1/omega, and the error."""
     system = window.system(x, u[-1])
     y, h = lifted.at(u), durations(chain, u, system.n)
     segments = Segments(y, h, chain.s, chain.guard)
     extremes = extreme_values(system, segments, jnp.eye(len(y), dtype=y.dtype))
     half = flow(system, flow(system, y, h / 2, chain.s), h / 2, chain.s)
     error = jnp.sum(jnp.max(jnp.abs(half - flow(system, y, h, chain.s)), axis=0))
-    units = system.units
-    return extremes * units[None], units, 1 / system.omega, error / jnp.max(jnp.abs(y))
+    states = jnp.concatenate([extremes, at_section(system, segments)[None]])
+    return states * system.units[None], 1 / system.omega, error / jnp.max(jnp.abs(y))
+
+
+def at_section(system: HybridSystem, segments: Segments) -> Float[Array, " 2n"]:
+    """The state where t.x of the first face is largest."""
+    y, h, s = segments.y, segments.duration, segments.s
+    first, last = (system.along(x[: system.n])[0] for x in (y, next_start(y)))
+    rate, end_rate = h * system.section(y), h * system.section(next_start(y))
+    cubic = Cubic.through(-first, -last, -rate, -end_rate)
+    theta, _ = cubic.minimum()
+    k = jnp.argmin(cubic(theta))
+    y, s = y[:, k], s[:, k]
+
+    def newton(_, t):
+        at = flow(system, y, t, s)
+        return t - system.section(at) / system.section(system.field(at, s))
+
+    return flow(system, y, jax.lax.fori_loop(0, 4, newton, theta[k] * h[k]), s)
 
 
 @jax.jit

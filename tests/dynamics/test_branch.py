@@ -1,0 +1,254 @@
+"""Branches of limit cycles: against planar closed systems, the independent solver, differences."""
+
+import copy
+import functools
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq, minimize_scalar
+
+import fractaljax as fj
+import hybrid_truth
+from mechanisms import PROBLEMS, changed
+from structures import of_problem
+from tools import (
+    DOCS,
+    assert_same_picture,
+    both_modes,
+    labels,
+    load_script,
+    reference_scene,
+)
+
+BELT = PROBLEMS["papangelo_2017"]
+
+
+@functools.cache
+def cycle(name):
+    return fj.limit_cycle(of_problem(PROBLEMS[name]), PROBLEMS[name]["start"])
+
+
+@functools.cache
+def belt():
+    """The belt's cycles in its speed: stick-slip up to a grazing, then repelling slip."""
+    return fj.continue_cycle(of_problem(BELT), "V", (0.5, 2.5), cycle("papangelo_2017"))
+
+
+@functools.cache
+def branch(name, quantity, low, high):
+    return fj.continue_cycle(of_problem(PROBLEMS[name]), quantity, (low, high), cycle(name))
+
+
+# --- the one-mass belt, whose phase plane says where its cycles end ---
+
+
+def slip(v, start, time, **options):
+    """x'' + 0.1 x' + x = 0.5 + 0.5 exp(-2 (v - x')) from a start, by SciPy."""
+
+    def rate(_, y):
+        return [y[1], 0.5 + 0.5 * np.exp(-2 * (v - y[1])) - 0.1 * y[1] - y[0]]
+
+    options = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-14, "dense_output": True} | options
+    return solve_ivp(rate, (0, time), start, **options)
+
+
+def least_speed(v):
+    """Of the slip that begins where stick ends, the least sliding speed one turn later."""
+    motion = slip(v, [1 - 0.1 * v, v], 12).sol
+    times = np.linspace(3, 9, 601)
+    i = int(np.argmin(v - motion(times)[1]))
+    ends = {"bounds": times[[i - 1, i + 1]], "options": {"xatol": 1e-12}}
+    return minimize_scalar(lambda t: v - motion(t)[1], method="bounded", **ends).fun
+
+
+def test_belt():
+    """Grazing and Hopf point, from a cycle and from the Hopf point itself."""
+    graze = brentq(least_speed, 1.7, 1.95, xtol=1e-13)
+    again = fj.continue_cycle(of_problem(BELT), "V", (0.5, 2.5), "hopf")
+    for found in (belt(), again):
+        (at,), (hopf,) = found.grazings, found.hopf
+        np.testing.assert_allclose(at.value, graze, rtol=1e-9)
+        np.testing.assert_allclose(hopf.value, 0.5 * np.log(10), rtol=1e-9)
+        assert {at.before, at.after} == {"0 +", "+"} and len(found.events) == 2
+        assert float(found.error.max()) < 1e-9
+    assert bool(again.start == fj.BranchEnd.hopf) and bool(again.end == fj.BranchEnd.window)
+    stable = np.array([i < belt().grazings[0].index for i in range(len(belt().parameter))])
+    np.testing.assert_array_equal(belt().stable[stable], True)
+    np.testing.assert_array_equal(belt().stable[~stable][1:], False)
+    assert belt().amplitude[-1] == 0 and "grazing at V = 1.8366" in repr(belt())
+
+
+def test_repelling_cycles():
+    """Of the belt's slip cycles: each closes, and a deviation grows by its multiplier."""
+    found = belt()
+    inside = np.flatnonzero(~found.stable)[3:-3:9]
+    assert len(inside) > 2
+    for i in inside:
+        v, state, period = found.parameter[i], found.state[i], found.period[i]
+        end = slip(v, state, period).y[:, -1]
+        np.testing.assert_allclose(end, state, atol=1e-9)
+        # At the largest x the velocity is 0, and a deviation of x is one along the section.
+        size, away = 1e-5, []
+        for sign in (1, -1):
+            start = state + np.array([sign * size, 0])
+
+            def maximum(_, y):
+                return y[1]
+
+            maximum.direction = -1
+            stops = slip(v, start, 1.2 * period, events=maximum)
+            times, states = stops.t_events[0], stops.y_events[0]
+            away.append(states[np.argmin(abs(times - period)), 0] - state[0])
+        growth = (away[0] - away[1]) / (2 * size)
+        np.testing.assert_allclose(found.multipliers[i, 0].real, growth, rtol=1e-6)
+
+
+def value_of_event(kind, x, quantity, window, start):
+    """The first event of a kind as a function of the mechanism."""
+    return fj.continue_cycle(x, quantity, window, start).of_kind(kind)[0].value
+
+
+@pytest.mark.parametrize("kind", ["grazing", "Hopf"])
+def test_derivatives_of_the_belt(kind):
+    """In both modes against central differences."""
+
+    def value(p):
+        law = fj.ExponentialStribeck(p[3], p[4], p[5])
+        joint = fj.Joint(fj.FixedContact(1.0, 0.0, P=p[2]), law, [1.0], V=1.0)
+        x = fj.Structure([[1.0]], [[p[0]]], [[p[1]]], [joint])
+        return value_of_event(kind, x, "V", (0.9, 2.0), cycle("papangelo_2017"))
+
+    p = jnp.array([0.1, 1.0, 1.0, 1.0, 0.5, 0.5])
+    _, forward, backward = both_modes(value, p)
+    step = 1e-5
+    steps = [step * np.eye(6)[i] for i in range(6)]
+    truth = [(value(p + h) - value(p - h)) / (2 * step) for h in steps]
+    np.testing.assert_allclose(forward, truth, rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(backward, forward, rtol=1e-12, atol=1e-12)
+
+
+def test_picture(tmp_path):
+    """The committed one, with its words, and a degree of freedom that there is not."""
+    load_script(DOCS / "make_branch.py").draw(tmp_path / "branch.png", belt())
+    assert_same_picture(tmp_path / "branch.png", "branch.png")
+    ax = fj.plot.branch(belt())
+    assert labels(ax) == ["stable", "unstable", "grazing", "Hopf"]
+    assert ax.get_ylabel() == "peak-to-peak amplitude [m]"
+    with pytest.raises(ValueError, match="direction must be from 1 to 1, got 2"):
+        fj.plot.branch(belt(), direction=2)
+
+
+# --- any mechanism, against the independent solver ---
+
+
+def assert_truth(problem, quantity, found, i):
+    """Point i of a branch in a quantity of the first joint, against SciPy's events."""
+    problem = copy.deepcopy(problem)
+    problem["joints"][0][quantity] = float(found.parameter[i])
+    mechanism = hybrid_truth.Mechanism.of(problem)
+    z, T = found.state[i] / mechanism.units, found.period[i] * mechanism.omega
+    core = mechanism.scaled
+    trip = list(hybrid_truth.phases(core, z, 1e-12, T))
+    strength = max(1.0, float(np.abs(found.multipliers[i]).max()))
+    np.testing.assert_allclose(trip[-1].end, z, atol=1e-8 * strength * np.abs(z).max())
+    n = len(z) // 2
+    rows = np.hstack([np.zeros((n, 1)), np.eye(n, 2 * n)])
+    low, high = np.transpose([hybrid_truth.spread(trip, row) for row in rows])
+    largest = found.amplitude[i].max()
+    amplitude = (high - low) * mechanism.units[:n]
+    np.testing.assert_allclose(found.amplitude[i], amplitude, atol=1e-8 * strength * largest)
+    stick, _, opened = hybrid_truth.shares(core, trip) / T
+    np.testing.assert_allclose(found.stick_fraction[i], stick, atol=1e-7 * strength)
+    np.testing.assert_allclose(found.open_fraction[i], opened, atol=1e-7 * strength)
+
+
+@pytest.mark.parametrize(
+    ("name", "window", "kinds"),
+    [
+        ("leine_1998", (0.15, 1.2), ["grazing"]),
+        pytest.param(
+            "lift_off",
+            (0.3, 1.0),
+            ["grazing", "order of switches", "period doubling", "grazing", "fold"],
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
+def test_points(name, window, kinds):
+    """Cycles of every itinerary on the way, and the kinds of events between them."""
+    found = branch(name, "V", *window)
+    assert [event.kind for event in found.events][: len(kinds)] == kinds
+    assert float(found.error.max()) < 1e-8
+    edges = [0, *(event.index for event in found.events), len(found.parameter) - 1]
+    for before, after in itertools.pairwise(edges):
+        if after - before > 3:
+            assert_truth(PROBLEMS[name], "V", found, (before + after) // 2)
+
+
+def test_a_branch_meets_the_search():
+    """What `limit_cycle` finds beside a branch of stable cycles lies on it."""
+    found = branch("leine_1998", "V", 0.15, 1.2)
+    x = of_problem(PROBLEMS["leine_1998"])
+    for i in (5, len(found.parameter) // 2):
+        other = fj.limit_cycle(x.replace(V=found.parameter[i]), found.state[i])
+        np.testing.assert_allclose(found.period[i], other.period, rtol=1e-8)
+        np.testing.assert_allclose(found.amplitude[i], other.amplitude, rtol=1e-8)
+        np.testing.assert_allclose(found.stick_fraction[i], other.stick_fraction, rtol=1e-7)
+        np.testing.assert_allclose(found.velocity_max[i], other.velocity_max, rtol=1e-8)
+        sizes = (np.sort(np.abs(m)) for m in (found.multipliers[i], other.multipliers))
+        np.testing.assert_allclose(*sizes, atol=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["order of switches", "period doubling", "fold"])
+def test_derivatives_of_events(kind):
+    """Of the joint's P, against central differences of the branch itself."""
+    problem = PROBLEMS["lift_off"]
+    start = cycle("lift_off")
+
+    def value(p):
+        x = of_problem(changed(problem, ["joints.0.P"], [p]))
+        return value_of_event(kind, x, "V", (0.3, 1.0), start)
+
+    P, step = 1.96, 1e-5
+    slope, backward = jax.jvp(value, (jnp.array(P),), (jnp.ones(()),))[1], jax.grad(value)(P)
+    truth = (value(P + step) - value(P - step)) / (2 * step)
+    np.testing.assert_allclose(slope, truth, rtol=1e-5)
+    np.testing.assert_allclose(backward, slope, rtol=1e-10)
+
+
+@pytest.mark.slow
+def test_scene():
+    """The source's form: a scene's branch meets its limit cycles, of both directions."""
+    scene = reference_scene()
+    found = fj.continue_cycle(scene, "V", (0.1, 0.3))
+    assert found.stick_fraction.shape == (len(found.parameter), 2)
+    for i in (0, len(found.parameter) - 1):
+        other = fj.limit_cycle(scene.replace(V=found.parameter[i]), found.state[i])
+        np.testing.assert_allclose(found.amplitude[i], other.amplitude, rtol=1e-8)
+        np.testing.assert_allclose(found.stick_fraction[i], other.stick_fraction, atol=1e-8)
+
+
+def test_refusals():
+    x, start = of_problem(BELT), cycle("papangelo_2017")
+
+    def refuses(match, *arguments, error: type[Exception] = ValueError, **options):
+        with pytest.raises(error, match=match):
+            fj.continue_cycle(*arguments, **options)
+
+    refuses("no quantity 'speed'", x, "speed", (0.5, 2.0), start)
+    refuses("from a lower to a higher V", x, "V", (2.0, 0.5), start)
+    refuses("window must be", x, "V", 2.0, start)
+    refuses("must hold V = 1.0", x, "V", (1.5, 2.0), start)
+    refuses("V must be", x, "V", (-0.5, 2.0), start)
+    refuses("no Hopf point of V", x, "V", (0.5, 1.0), "hopf")
+    refuses('"hopf", got', x, "V", (0.5, 2.0), "fold")
+    refuses("a limit cycle of x itself", x.replace(P=2.0), "V", (0.5, 2.0), start)
+    refuses("start must be a LimitCycle", x, "V", (0.5, 2.0), [1.0], error=TypeError)
+    refuses("must be a Scene or a Structure", None, "V", (0.5, 2.0), error=TypeError)
+    with pytest.raises(TypeError, match="cannot be compiled"):
+        jax.jit(lambda x: fj.continue_cycle(x, "V", (0.5, 2.0), start).hopf[0].value)(x)
