@@ -5,6 +5,7 @@ their solutions. An itinerary ends where the duration of a phase or, between swi
 falls to zero. There the branch goes on with the phase left out, or with one put in.
 """
 
+import itertools
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ from .shooting import after_switch, guards_at, measured, rate_at
 _FINER = 8  # attempts at a mesh that is fine enough
 _NEW = (1e-3, 1e-4, 1e-2)  # durations of a phase that appears, as a share of the period
 SMALL = 0.03  # size of a smooth orbit, in units of V/omega, below which a Hopf point is near
+_SHORT = 1e-6  # duration of a phase that vanishes, as a share of the period
 _ROUNDING = 1e-9  # a guard this far below zero is kept to
 
 
@@ -283,11 +285,14 @@ class Follower:
                 if value is not None:
                     worst = value, at
         outside = worst[1]
-        h = shooting.durations(outside)
-        candidates = (
-            self._vanishing(shooting, inside, int(np.argmin(h)))
-            if h.min() <= 0
-            else self._touching(shooting, inside, outside)
+        p = int(np.argmin(shooting.durations(inside)))
+        # A phase this short is about to vanish, though rounding may touch one of its guards first.
+        vanishes = shooting.durations(inside)[p] < _SHORT
+        if shooting.durations(outside).min() <= 0:
+            vanishes, p = True, int(np.argmin(shooting.durations(outside)))
+        candidates = itertools.chain(
+            self._vanishing(shooting, inside, p) if vanishes else (),
+            self._touching(shooting, inside, outside),
         )
         for candidate in candidates:
             if candidate is not None:
@@ -344,8 +349,11 @@ class Follower:
 
     def _touching(self, shooting: Shooting, inside, outside) -> Iterator[Any]:
         """Ways on where a guard touches zero between two switches, or at one."""
-        at = self._root(shooting, inside, outside, lambda z: shooting.lowest(z)[0])
-        at = inside if at is None else at
+        at = None
+        if shooting.durations(outside).min() > 0:
+            at = self._root(shooting, inside, outside, lambda z: shooting.lowest(z)[0])
+        if at is None:
+            return
         _, place = shooting.lowest(at)
         solution, times = shooting.solution(at), self._times(shooting, at)
         chain = solution.chain
@@ -415,7 +423,8 @@ class Follower:
                     continue
                 direction = (at - start) * (1 if new.lowest(at)[0] > 0 else -1)
                 self._change("grazing", new, graze, shooting, new, ("touch", new.lowest(graze)[1]))
-                return new, graze, direction / np.linalg.norm(direction)
+                tangent = new.curves.tangent(new.equations(graze)[1])
+                return new, graze, tangent if tangent @ direction > 0 else -tangent
         return None
 
     def _inserted(self, shooting, at, phases, edges, index, kind, condition):
