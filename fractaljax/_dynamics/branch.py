@@ -124,7 +124,7 @@ def continue_cycle(
 
     **Raises:** `ValueError` for an unknown name, a window that is empty, outside the domain or
     does not hold the start, a cycle that is excited, regularised or none, and where there is no
-    Hopf point; `TypeError` under `jit` or `vmap`.
+    Hopf point; `TypeError` under `jit` or `vmap`, and for single precision.
     """
     require_one("x", x)
     degrees_of_freedom(x)
@@ -141,7 +141,10 @@ def continue_cycle(
     scale = is_logarithmic(low, high)
     ends = jnp.log(jnp.array([low, high])) if scale else jnp.array([low, high])
     interval = Window(ends[0], ends[1], name, scale)
-    tolerance = check_rtol(rtol, jnp.result_type(*jax.tree.leaves(frozen)))
+    dtype = jnp.result_type(*jax.tree.leaves(frozen))
+    if dtype != jnp.float64:
+        raise TypeError(f"continue_cycle needs double precision, got numbers in {dtype}")
+    tolerance = check_rtol(rtol, dtype)
     follower = Follower(Family(frozen, interval, step, tolerance), points)
     if isinstance(start, str):
         if start != "hopf":

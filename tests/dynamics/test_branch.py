@@ -3,6 +3,7 @@
 import copy
 import functools
 import itertools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +22,6 @@ from tools import (
     both_modes,
     labels,
     load_script,
-    reference_scene,
 )
 
 BELT = PROBLEMS["papangelo_2017"]
@@ -61,13 +61,14 @@ def least_speed(v):
     motion = slip(v, [1 - 0.1 * v, v], 12).sol
     times = np.linspace(3, 9, 601)
     i = int(np.argmin(v - motion(times)[1]))
-    ends = {"bounds": times[[i - 1, i + 1]], "options": {"xatol": 1e-12}}
-    return minimize_scalar(lambda t: v - motion(t)[1], method="bounded", **ends).fun
+    ends: Any = {"bounds": times[[i - 1, i + 1]], "options": {"xatol": 1e-12}}
+    least: Any = minimize_scalar(lambda t: v - motion(t)[1], method="bounded", **ends)
+    return least.fun
 
 
 def test_belt():
     """Grazing and Hopf point, from a cycle and from the Hopf point itself."""
-    graze = brentq(least_speed, 1.7, 1.95, xtol=1e-13)
+    graze: Any = brentq(least_speed, 1.7, 1.95, xtol=1e-13)
     again = fj.continue_cycle(of_problem(BELT), "V", (0.5, 2.5), "hopf")
     for found in (belt(), again):
         (at,), (hopf,) = found.grazings, found.hopf
@@ -112,6 +113,7 @@ def value_of_event(kind, x, quantity, window, start):
     return fj.continue_cycle(x, quantity, window, start).of_kind(kind)[0].value
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["grazing", "Hopf"])
 def test_derivatives_of_the_belt(kind):
     """In both modes against central differences."""
@@ -199,8 +201,8 @@ def test_a_branch_meets_the_search():
         np.testing.assert_allclose(found.amplitude[i], other.amplitude, rtol=1e-8)
         np.testing.assert_allclose(found.stick_fraction[i], other.stick_fraction, rtol=1e-7)
         np.testing.assert_allclose(found.velocity_max[i], other.velocity_max, rtol=1e-8)
-        sizes = (np.sort(np.abs(m)) for m in (found.multipliers[i], other.multipliers))
-        np.testing.assert_allclose(*sizes, atol=1e-7)
+        sizes = [np.sort(np.abs(m)) for m in (found.multipliers[i], other.multipliers)]
+        np.testing.assert_allclose(sizes[0], sizes[1], atol=1e-7)
 
 
 @pytest.mark.slow
@@ -221,16 +223,49 @@ def test_derivatives_of_events(kind):
     np.testing.assert_allclose(backward, slope, rtol=1e-10)
 
 
+BRAKE = fj.brake_scene()
+
+
+@functools.cache
+def squeal():
+    """The reference brake's squeal over friction, to where it meets the equilibrium."""
+    return fj.continue_cycle(BRAKE, "mu", (0.25, 0.4))
+
+
 @pytest.mark.slow
 def test_scene():
-    """The source's form: a scene's branch meets its limit cycles, of both directions."""
-    scene = reference_scene()
-    found = fj.continue_cycle(scene, "V", (0.1, 0.3))
+    """From the brake's squeal through two folds to the Hopf point, which is critical friction."""
+    found = squeal()
+    critical = fj.critical_friction(BRAKE)
+    np.testing.assert_allclose(found.hopf[0].value, critical, rtol=1e-9)
+    assert len(found.folds) == 2 and bool(found.start == fj.BranchEnd.hopf)
     assert found.stick_fraction.shape == (len(found.parameter), 2)
-    for i in (0, len(found.parameter) - 1):
-        other = fj.limit_cycle(scene.replace(V=found.parameter[i]), found.state[i])
+    stable = np.flatnonzero(found.stable)
+    for i in stable[[2, len(stable) // 2, -1]]:
+        scene = BRAKE.replace(mu=found.parameter[i])
+        other = fj.limit_cycle(scene, found.state[i])
         np.testing.assert_allclose(found.amplitude[i], other.amplitude, rtol=1e-8)
+        np.testing.assert_allclose(found.period[i], other.period, rtol=1e-8)
         np.testing.assert_allclose(found.stick_fraction[i], other.stick_fraction, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_a_fold_moves_with_the_surface():
+    """Its derivatives by D and ln G, against the folds of other surfaces."""
+    start = fj.limit_cycle(BRAKE)
+
+    def fold(p):
+        scene = BRAKE.replace(D=p[0], G=jnp.exp(p[1]))
+        folds = fj.continue_cycle(scene, "mu", (0.33, 0.4), start, points=150).folds
+        return max((event.value for event in folds), key=float)
+
+    p = jnp.array([2.4, jnp.log(1.342e-10)])
+    _, forward, backward = both_modes(fold, p)
+    for i, size in enumerate((1e-6, 1e-5)):
+        h = size * np.eye(2)[i]
+        truth = (fold(p + h) - fold(p - h)) / (2 * size)
+        np.testing.assert_allclose(forward[i], truth, rtol=1e-5)
+    np.testing.assert_allclose(backward, forward, rtol=1e-9)
 
 
 def test_refusals():
@@ -250,5 +285,7 @@ def test_refusals():
     refuses("a limit cycle of x itself", x.replace(P=2.0), "V", (0.5, 2.0), start)
     refuses("start must be a LimitCycle", x, "V", (0.5, 2.0), [1.0], error=TypeError)
     refuses("must be a Scene or a Structure", None, "V", (0.5, 2.0), error=TypeError)
+    single = jax.tree.map(lambda leaf: leaf.astype("float32"), x)
+    refuses("needs double precision", single, "V", (0.5, 2.0), error=TypeError)
     with pytest.raises(TypeError, match="cannot be compiled"):
         jax.jit(lambda x: fj.continue_cycle(x, "V", (0.5, 2.0), start).hopf[0].value)(x)
