@@ -8,6 +8,7 @@ or 2 (open, both faces of a joint together). Components are the first axis; lane
 """
 
 import functools
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -384,14 +385,31 @@ def _solve(W, b) -> Array:
 def degrees_of_freedom(mechanism: Mechanism) -> int:
     """n of a structure; a scene has two.
 
-    **Raises:** `TypeError` for anything else; `ValueError` for one that holds a batch.
+    **Raises:** `TypeError` for anything else; `ValueError` for one that holds a batch, or has two
+    joints that slide in one direction at one V.
     """
     if isinstance(mechanism, Structure):
         require_single(mechanism)
+        _require_determinate(mechanism)
         return mechanism.n
     require_kind("mechanism", mechanism, Scene)
     require_scalar(mechanism)
     return 2
+
+
+def _require_determinate(structure: Structure) -> None:
+    joints = zip(structure.joint_names, structure.joints, strict=True)
+    for (name, joint), (other, second) in itertools.combinations(joints, 2):
+        t, d = structure.direction(joint.tangential), structure.direction(second.tangential)
+        V, W = (None if j.V is None else concrete(jnp.asarray(j.V)) for j in (joint, second))
+        if V is None or W is None:
+            continue
+        ratio = t @ d / (t @ t)
+        if np.allclose(d, ratio * t, rtol=0, atol=1e-12 * np.abs(d).max()) and ratio * V == W:
+            raise ValueError(
+                f"joints {name} and {other} slide in one direction at one V: how they share the "
+                "force in stick is not determined, make them one joint"
+            )
 
 
 def hybrid_system(mechanism: Any) -> HybridSystem:
@@ -485,8 +503,8 @@ def start_state(start: ArrayLike | Sequence[float], n: int) -> Float[Array, " 2n
     """`start` as an array [x, v]; `ValueError` unless it has that shape."""
     state = number("start", jnp.asarray(start))
     if state.shape != (2 * n,):
-        wanted = f"start must have shape ({2 * n},), got {state.shape}"
-        raise ValueError(f"{wanted}; use jax.vmap for many")
+        many = "; use jax.vmap for many" if state.ndim > 1 else ""
+        raise ValueError(f"start must have shape ({2 * n},), got {state.shape}{many}")
     return state
 
 

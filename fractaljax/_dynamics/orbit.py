@@ -20,6 +20,7 @@ from .runge_kutta import runge_kutta
 _ITERATIONS = 16
 _PHASES = 256  # most of one contact state in an orbit
 _BLOCK = 32  # of sums
+_SMALL = 8  # states up to which products of matrices are sums
 
 
 class Segments(eqx.Module):
@@ -109,6 +110,11 @@ def cumulative(x) -> Array:
     return (inside + before[..., None]).reshape(x.shape)
 
 
+def _product(A, B) -> Array:
+    """A @ B; a small one as a sum, which compiles into one loop with what surrounds it."""
+    return jnp.sum(A[:, :, None] * B[None], axis=1) if len(A) <= _SMALL else A @ B
+
+
 def _in_phase(phase, values) -> Array:
     """The sum of `values` (N,) over the phase of each segment."""
     return jax.ops.segment_sum(values, phase, len(phase))[phase]
@@ -128,36 +134,40 @@ def corrections(local: Maps, segments: Segments, gap, guard, constant: int | Non
     share = share.astype(gap.dtype)
     b = local.b * share[None]
 
-    def chain(before, segment):
-        """The affine map from the first state to this end, and what the phase's duration adds."""
-        M, q, B = before
-        A, b, c, gap, guard, last = segment
-        M, q, B = A @ M, A @ q + gap, A @ B + b
-        speed = jnp.where(last, c @ B, 1)
-        # The duration of the phase is r dy_first + d; it is known at its end.
-        r, d = jnp.where(last, -(c @ M) / speed, 0), jnp.where(last, -(guard + c @ q) / speed, 0)
-        M, q = M + B[:, None] * r[None], q + B * d
-        B = jnp.where(last, 0, B)
-        return (M, q, B), (r, d)
+    def chain(W, segment):
+        """The affine map from the first state to this end, and what the phase's duration adds.
+
+        The columns of W are the derivatives by the first state, the shift, and those by the
+        duration of the phase so far, which is known at its end: r dy_first + d.
+        """
+        A, added, c, guard, last = segment
+        W = _product(A, W) + added
+        off = jnp.sum(c[:, None] * W, axis=0).at[n].add(guard)
+        off = jnp.where(last, off / jnp.where(last, -off[-1], 1), 0)
+        return W + W[:, -1:] * off[None], off[:-1]
 
     n = len(gap)
-    eye, zero = jnp.eye(n, dtype=gap.dtype), jnp.zeros(n, gap.dtype)
-    lanes = tuple(jnp.moveaxis(x, -1, 0) for x in (local.A, b, local.c, gap, guard))
-    (jacobian, shift, _), (r, d) = jax.lax.scan(chain, (eye, zero, zero), (*lanes, ends))
+    eye, none = jnp.eye(n, dtype=gap.dtype), jnp.zeros((n, 2), gap.dtype)
+    A, c = jnp.moveaxis(local.A, -1, 0), local.c.T
+    added = jnp.stack([gap.T, b.T], axis=-1)
+    added = jnp.concatenate([jnp.zeros_like(A), added], axis=-1)
+    W, durations = jax.lax.scan(
+        chain, jnp.concatenate([eye, none], axis=1), (A, added, c, guard, ends)
+    )
+    jacobian, shift = W[:, :n], W[:, n]
     # Without segments the equations would be singular.
     jacobian = jnp.where(jnp.any(ends), jacobian, 0)
     matrix = eye - jacobian
     if constant is not None:
         matrix, shift = matrix.at[constant].set(eye[constant]), shift.at[constant].set(0)
     first = jnp.linalg.solve(matrix, shift)
-    durations = share * _in_phase(phase, jnp.where(ends, r @ first + d, 0))
+    durations = share * _in_phase(phase, durations[:, :n] @ first + durations[:, n])
 
     def along(dy, segment):
         A, b, gap, dt = segment
-        return A @ dy + b * dt + gap, dy
+        return _product(A, dy[:, None])[:, 0] + b * dt + gap, dy
 
-    moved = tuple(jnp.moveaxis(x, -1, 0) for x in (local.A, local.b, gap))
-    _, starts = jax.lax.scan(along, first, (*moved, durations))
+    _, starts = jax.lax.scan(along, first, (A, local.b.T, gap.T, durations))
     return starts.T, durations, jacobian
 
 
@@ -173,7 +183,7 @@ def remesh(system: HybridSystem, steps: Segments, h, length: int) -> Segments:
     ended = cumulative(steps.used & (steps.guard != NONE))
     phases = jnp.arange(min(length, _PHASES))
     exists = phases < ended[-1]
-    last_step = jnp.sum(ended[None] <= phases[:, None], axis=1)
+    last_step = jnp.searchsorted(ended, phases, side="right")
     last_step = jnp.where(exists, last_step, 0)
     first_step = jnp.where(phases > 0, jnp.roll(last_step, 1) + 1, 0)
     begin = (ends_w - weight)[first_step]

@@ -105,8 +105,9 @@ def _segments(run: _Run, order) -> Segments:
 
 
 def _returns(run: _Run, order, guard, count: int) -> _Returns:
-    at = jnp.where(guard == SECTION, jnp.arange(len(order)), -1)
-    at, _ = jax.lax.top_k(at, count)
+    seen = cumulative(guard == SECTION)
+    number = seen[-1] - jnp.arange(count)
+    at = jnp.where(number > 0, jnp.searchsorted(seen, number), -1)
     # A step ends where the next one starts.
     following = run.steps[: len(run.y), order[(at + 1) % len(order)]]
     y = jnp.where((at == len(order) - 1)[None], run.y[:, None], following)

@@ -85,7 +85,7 @@ def test_cycle_of_a_structure(capsys):
         titles, *rows = csv.reader(file)
     assert titles == ["time [s]", "x1 [m]", "v1 [m/s]"]
     np.testing.assert_array_equal(np.array(rows, float), np.column_stack(cycle.orbit(512)))
-    said = "fractaljax: start must have shape (2,), got (1,); use jax.vmap for many\n"
+    said = "fractaljax: start must have shape (2,), got (1,)\n"
     assert run(capsys, "cycle", "belt.toml", "--start", 1.5) == (2, "", said)
 
 

@@ -106,3 +106,15 @@ def test_a_joint_without_speed_is_named():
     for call in (fj.limit_cycle, lambda x: fj.simulate(x, [0.0, 0.0], 1.0)):
         with pytest.raises(ValueError, match="joint pad: V must be given"):
             call(still)
+
+
+@pytest.mark.parametrize("call", [fj.limit_cycle, lambda x: fj.simulate(x, [0.0, 0.0], 1.0)])
+def test_joints_that_share_a_force_are_named(call):
+    """Two pads on one direction at one speed stick together: their forces are not determined."""
+    contact = fj.FixedContact(1.0, 0.0, 1.0)
+    inner = fj.Joint(contact, fj.Coulomb(0.3), [1.0], V=0.5)
+    outer = fj.Joint(contact, fj.Coulomb(0.3), [2.0], V=1.0)
+    both = {"inner": inner, "outer": outer}
+    disc = fj.Structure(np.eye(1), None, np.eye(1), both)
+    with pytest.raises(ValueError, match="joints inner and outer slide in one direction at one V"):
+        call(disc)

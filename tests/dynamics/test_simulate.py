@@ -433,8 +433,12 @@ GOOD = {"start": [0.0, 0.0, 0.0, 0.0], "t1": 1e-3}
 @pytest.mark.parametrize(
     ("bad", "message"),
     [
-        ({"start": [0.0] * 3}, r"start must have shape \(4,\), got \(3,\); use jax.vmap for many"),
-        ({"start": 0.0}, r"start must have shape \(4,\), got \(\); use jax.vmap for many"),
+        ({"start": [0.0] * 3}, r"start must have shape \(4,\), got \(3,\)"),
+        ({"start": 0.0}, r"start must have shape \(4,\), got \(\)"),
+        (
+            {"start": jnp.zeros((3, 4))},
+            r"start must have shape \(4,\), got \(3, 4\); use jax.vmap for many",
+        ),
         ({"start": [np.nan, 0, 0, 0]}, "start must be finite, got nan"),
         ({"t1": -1.0}, "t1 must be above 0, got -1.0"),
         ({"t1": np.inf}, "t1 must be above 0, got inf"),
@@ -461,7 +465,7 @@ def test_refusals(bad, message):
         ([0.0, 1.0], "^times must be from t0 to the end of the simulation, .*, got 1.0$"),
         ([-1e-9], "^times must be from t0 to the end of the simulation, .*, got -1e-09$"),
         ([np.nan], "^times must be finite, got nan$"),
-        (1e-6, r"^times must have shape \(k,\), got \(\)$"),
+        (1e-6, r"^times must have shape \(k,\), got \(\)"),
     ],
 )
 def test_times_outside(times, message):
