@@ -6,6 +6,7 @@ without a label is searched in full; the orbit found becomes a known one.
 """
 
 import concurrent.futures
+import dataclasses
 import functools
 import os
 from collections.abc import Mapping, Sequence
@@ -29,7 +30,9 @@ from .orbit import next_start
 
 _MOST_STARTS = 1_000_000
 _LANES = 256  # that run side by side
-_STEP = 0.15  # of the run, in scaled time: no eigenfrequency exceeds 1
+_CHUNKS = 4  # of lanes, shared by the cores; not their number, on which nothing shall depend
+_STEPS_OF = 0.1, 0.2  # lengths, in scaled time: no eigenfrequency exceeds 1
+_FINE = 64  # rounds of the shorter steps, for a start may be near the boundary of two basins
 _STEPS = 128  # in a round
 _SAMPLED = 4  # steps between two samples of the energy
 _ROUNDS = 16  # before the starts that have ended make room for others
@@ -68,16 +71,17 @@ class Basin(Record):
         return {name: float(np.sqrt(p * (1 - p) / k)) for name, p in self.shares.items()}
 
     def __repr__(self) -> str:
-        counts, errors = np.bincount(self.labels, minlength=len(self.outcomes)), (
-            self.standard_errors
-        )
+        counts = np.bincount(self.labels, minlength=len(self.outcomes))
+        errors = self.standard_errors
         cycles = [None, *self.cycles, None, None]
         columns = [
             {
                 "starts": f"{count}",
                 "share": f"{share:.2%} +- {errors[name]:.2%}",
                 "frequency [Hz]": "-" if cycle is None else f"{cycle.frequency:.6g}",
-                "largest peak to peak [m]": "-" if cycle is None else f"{cycle.amplitude.max():.6g}",
+                "largest peak to peak [m]": "-"
+                if cycle is None
+                else f"{cycle.amplitude.max():.6g}",
             }
             for (name, share), count, cycle in zip(self.shares.items(), counts, cycles, strict=True)
         ]
@@ -116,12 +120,14 @@ class _Modes(eqx.Module):
     inverse: Complex[Array, "2n 2n"]
     reach: Float[Array, "g 2n"]  # what each mode takes of the way to every switch
     attracts: Bool[Array, ""]
+    free: bool = eqx.field(static=True)  # not excited: only then is there an equilibrium
 
     @classmethod
     def of(cls, system: HybridSystem) -> "_Modes":
         n, equilibrium = system.n, system.equilibrium()
         slip = jnp.ones(len(system.P), equilibrium.dtype)
-        values, vectors = np.linalg.eig(jax.jacfwd(lambda y: system.field(y, slip))(equilibrium))
+        A = jax.jacfwd(lambda y: system.field(y, slip))(equilibrium)
+        values, vectors = map(np.asarray, np.linalg.eig(A))
         T = np.eye(n) if system.T is None else np.asarray(system.T)
         rows = [T @ vectors[n:] / np.asarray(system.V)[:, None]]
         loads = np.asarray(system.loads(equilibrium[:n]))
@@ -130,9 +136,8 @@ class _Modes(eqx.Module):
                 i = faces[0]
                 rows.append(np.asarray(system.L)[i : i + 1] @ vectors[:n] / loads[i])
         inverse, reach = np.linalg.inv(vectors), abs(np.concatenate(rows))
-        # An excited motion has no equilibrium.
-        attracts = values.real.max() < 0 and not system.excited
-        return cls(equilibrium, *map(jnp.asarray, (values, vectors, inverse, reach, attracts)))
+        arrays = values, vectors, inverse, reach, np.real(values).max() < 0
+        return cls(equilibrium, *map(jnp.asarray, arrays), free=not system.excited)
 
     def amplitudes(self, y) -> Array:
         """Those (2n, k), complex, of states (2n, k)."""
@@ -167,9 +172,13 @@ def _first(system: HybridSystem, y) -> _Lanes:
     )
 
 
+def _step_length(rounds, dtype) -> Array:
+    return jnp.where(rounds < _FINE, *_STEPS_OF).astype(dtype)
+
+
 def _advance(system: HybridSystem, modes: _Modes, lanes: _Lanes) -> _Lanes:
     """One round of steps of every lane."""
-    h = jnp.full(lanes.y.shape[1], _STEP, lanes.y.dtype)
+    h = _step_length(lanes.rounds, lanes.y.dtype)
 
     def one(_, carry):
         y, s, guard, seen, returns, switches = carry
@@ -186,26 +195,29 @@ def _advance(system: HybridSystem, modes: _Modes, lanes: _Lanes) -> _Lanes:
     start = lanes.y, lanes.s, lanes.guard, lanes.seen, lanes.returns, jnp.zeros_like(lanes.returns)
     count = _STEPS // _SAMPLED
     (*moved, switches), energy = jax.lax.fori_loop(0, count, some, (start, lanes.energy))
-    smooth = jnp.where(switches > 0, 0, lanes.smooth + 1)
-    moved = *moved, lanes.rounds + 1, smooth, energy, lanes.log, lanes.rate
-    return _Lanes(*moved, lanes.owner, lanes.distance, lanes.approach, lanes.near, lanes.label)
+    moved = dict(zip(("y", "s", "guard", "seen", "returns"), moved, strict=True))
+    moved |= {"rounds": lanes.rounds + 1, "energy": energy}
+    moved |= {"smooth": jnp.where(switches > 0, 0, lanes.smooth + 1)}
+    return dataclasses.replace(lanes, **moved)
 
 
 def _decay(modes: _Modes, lanes: _Lanes):
-    """Which lanes die out, and the lanes after a window, with slow changes extrapolated.
+    """Which lanes come to rest, and the lanes after a round, with slow changes extrapolated.
 
     A motion without switches is followed by the mean energy of its modes in windows of some
     rounds, in which ripples average out.
     """
     switched = lanes.smooth == 0
-    full = ~switched & (lanes.smooth % _WINDOW == 0)
+    slips = jnp.all(lanes.s == 1, axis=0) & modes.free
+    full = ~switched & slips & (lanes.smooth % _WINDOW == 0)
     samples = _WINDOW * _STEPS // _SAMPLED
     log = jnp.log(lanes.energy / samples + jnp.finfo(lanes.y.dtype).tiny) / 2
     rate, before = log - lanes.log, lanes.rate
     ways = modes.reach[:, :, None] * jnp.exp(log)[None]
     way, share = jnp.max(jnp.sum(ways, axis=1), axis=0), jnp.max(ways, axis=0)
     small = share < 0.02 * way[None]
-    linear = modes.values.real[:, None] * (_WINDOW * _STEPS * _STEP)
+    window = _WINDOW * _STEPS * _step_length(lanes.rounds - 1, lanes.y.dtype)
+    linear = modes.values.real[:, None] * window[None]
     steady = jnp.abs(rate - before) < 0.2 * jnp.abs(rate)
     # No switch is reached any more, and every mode decays much as the smallest motions do.
     decays = (way < 0.9) & jnp.all(small | (steady & (rate < 0.6 * linear)), axis=0)
@@ -217,17 +229,13 @@ def _decay(modes: _Modes, lanes: _Lanes):
     skips = full & jnp.all(small | steady, axis=0) & (windows > 1) & (windows < 1000)
     log_skipped = windows[None] * jnp.where(small, jnp.minimum(linear, 0), rate)
     y = jnp.where(skips & ~decays, modes.grown(lanes.y, jnp.where(skips, log_skipped, 0)), lanes.y)
-    again, nan = switched | full, jnp.nan
-    unknown = switched | skips
-    return decays, eqx.tree_at(
-        lambda lanes: (lanes.y, lanes.energy, lanes.log, lanes.rate),
+    again, unknown, nan = switched | full, switched | skips, jnp.nan
+    return decays, dataclasses.replace(
         lanes,
-        (
-            y,
-            jnp.where(again, 0, lanes.energy),
-            jnp.where(unknown, nan, jnp.where(full, log, lanes.log)),
-            jnp.where(unknown, nan, jnp.where(full, rate, before)),
-        ),
+        y=y,
+        energy=jnp.where(again, 0, lanes.energy),
+        log=jnp.where(unknown, nan, jnp.where(full, log, lanes.log)),
+        rate=jnp.where(unknown, nan, jnp.where(full, rate, before)),
     )
 
 
@@ -245,24 +253,23 @@ def _label(modes: _Modes, lanes: _Lanes, returned, points, owners) -> _Lanes:
     near = jnp.where(same & (distance < _NEAR), lanes.near + 1, 0)
     patience = jnp.where(distance < _NEAR, _FEW, _STAYS)
     arrived = (approach >= patience) | (near >= _STAYS)
-    owner, distance, approach, near = (
-        jnp.where(returned, found, old)
-        for found, old in zip(
-            (owner, distance, approach, near),
-            (lanes.owner, lanes.distance, lanes.approach, lanes.near),
-            strict=True,
-        )
-    )
     label = jnp.where(decays, _EQUILIBRIUM, jnp.where(arrived & returned, owner, _RUNNING))
-    return eqx.tree_at(
-        lambda lanes: (lanes.owner, lanes.distance, lanes.approach, lanes.near, lanes.label),
+
+    def since(found, old):
+        return jnp.where(returned, found, old)
+
+    return dataclasses.replace(
         lanes,
-        (owner, distance, approach, near, jnp.where(far, _DIVERGES, label)),
+        owner=since(owner, lanes.owner),
+        distance=since(distance, lanes.distance),
+        approach=since(approach, lanes.approach),
+        near=since(near, lanes.near),
+        label=jnp.where(far, _DIVERGES, label),
     )
 
 
 @jax.jit
-def _run(system, modes: _Modes, lanes: _Lanes, points, owners) -> _Lanes:
+def _run(system, modes: _Modes, points, owners, lanes: _Lanes) -> _Lanes:
     """Rounds until half of the lanes have a label, at most `_ROUNDS`."""
     most = jnp.sum(lanes.label == _RUNNING) // 2
 
@@ -331,10 +338,13 @@ def basin(
 ) -> Basin:
     """What the motions from many starts end in: the equilibrium, which limit cycle, or neither.
 
-    Every start runs on, coarsely, until the returns to the section of `limit_cycle` approach
-    those of an attracting orbit that is known, to 2 %, or until the motion dies out at the
-    equilibrium or diverges. A start without a label after some 40 returns is searched in full by
-    `limit_cycle`, and what that finds is known from then on.
+    Every start runs on, coarsely, until its returns to the section of `limit_cycle` approach those
+    of a known attracting orbit: in three rounds of some returns within 2 % of its size, or in
+    eight within 15 %. It comes to rest once the linear modes that it holds reach no switch and
+    each decays at 0.6 of its linear rate or faster. A start that gets no label is searched in full
+    by `limit_cycle`, and an orbit that this finds is known from then on. Starts that are still
+    without a label after `max_returns` are undecided, with the reason of the last full search
+    that found nothing.
 
     **Arguments:**
 
@@ -372,20 +382,18 @@ def _label_all(system, lanes, known, reasons, search, modes, max_returns, progre
     """Label every lane of NumPy arrays in place."""
     from tqdm import tqdm
 
-    k, workers = len(lanes.label), min(os.cpu_count() or 1, 8)
-    size = min(_LANES, -(-k // workers))
+    k = len(lanes.label)
+    size = min(_LANES, -(-k // _CHUNKS))
     searched, failures, patience = np.zeros(k, bool), 0, _PATIENCE
     failure = CycleResult.exhausted
     bar = tqdm(total=k, desc="basin", unit="start", disable=not progress)
-    with bar, concurrent.futures.ThreadPoolExecutor(workers) as pool:
+    with bar, concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
         while (running := np.flatnonzero(lanes.label == _RUNNING)).size:
             bar.update(k - running.size - bar.n)
-            known_orbits = known.padded(lanes.y.dtype)
-            chosen = running[: size * workers]
+            chosen = running[: size * _CHUNKS]
             chunks = [chosen[i : i + size] for i in range(0, len(chosen), size)]
-            results = pool.map(
-                lambda chunk: _run(system, modes, _some(lanes, chunk, size), *known_orbits), chunks
-            )
+            run = functools.partial(_run, system, modes, *known.padded(lanes.y.dtype))
+            results = pool.map(run, [_some(lanes, chunk, size) for chunk in chunks])
             for chunk, result in zip(chunks, results, strict=True):
                 for whole_array, piece in zip(
                     jax.tree.leaves(lanes), jax.tree.leaves(result), strict=True
@@ -486,8 +494,10 @@ def _sobol(count: int, dimensions: int, seed: int) -> np.ndarray:
 
     if not dimensions:
         return np.zeros((count, 0))
+    sobol: Any = qmc.Sobol  # SciPy 1.15 renamed `seed`, and takes both names
+    points = sobol(dimensions, seed=seed)
     # The first ones of a power of two, for which Sobol's points are balanced.
-    return qmc.Sobol(dimensions, seed=seed).random_base2((count - 1).bit_length())[:count]
+    return points.random_base2((count - 1).bit_length())[:count]
 
 
 def _in_unit_ball(count: int, dimensions: int, seed: int) -> np.ndarray:
