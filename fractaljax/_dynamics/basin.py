@@ -29,7 +29,7 @@ from .limit_cycle import limit_cycle
 from .orbit import next_start
 
 _MOST_STARTS = 1_000_000
-_LANES = 256  # that run side by side
+_LANES, _FEW_LANES = 256, 32  # that run side by side, of many starts and of few
 _CHUNKS = 4  # of lanes, shared by the cores; not their number, on which nothing shall depend
 _STEPS_OF = 0.1, 0.2  # lengths, in scaled time: no eigenfrequency exceeds 1
 _FINE = 64  # rounds of the shorter steps, for a start may be near the boundary of two basins
@@ -383,7 +383,7 @@ def _label_all(system, lanes, known, reasons, search, modes, max_returns, progre
     from tqdm import tqdm
 
     k = len(lanes.label)
-    size = min(_LANES, -(-k // _CHUNKS))
+    size = _FEW_LANES if k <= _FEW_LANES * _CHUNKS else _LANES
     searched, failures, patience = np.zeros(k, bool), 0, _PATIENCE
     failure = CycleResult.exhausted
     bar = tqdm(total=k, desc="basin", unit="start", disable=not progress)

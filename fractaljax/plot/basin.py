@@ -8,6 +8,7 @@ from .._dynamics.basin import Basin
 from .axes import Axes, given_or_new, legend_above
 
 _PIXELS = 400  # along each axis
+_SMALL = 1e-2  # [m]
 _COLOURS = {"equilibrium": "#c6dbef", "diverges": "0.25", "undecided": "#d62728"}
 
 
@@ -15,7 +16,7 @@ def basin(result: Basin, ax: Axes | None = None) -> Axes:
     """The outcomes of a section as areas: each point has that of the nearest start.
 
     For starts that differ in two coordinates only, as in a box with all others fixed.
-    Displacements are in um, velocities in m/s.
+    Displacements are in um, in m where one is above 1 cm; velocities are in m/s.
 
     **Raises:** `ValueError` unless exactly two coordinates differ.
     """
@@ -29,7 +30,8 @@ def basin(result: Basin, ax: Axes | None = None) -> Axes:
     if len(moved) != 2:
         raise ValueError(f"a picture needs starts that differ in 2 coordinates, got {len(moved)}")
     ax, n = given_or_new(ax), starts.shape[1] // 2
-    unit = np.where(moved < n, 1e6, 1)
+    small = np.abs(starts[:, :n]).max() < _SMALL
+    unit = np.where((moved < n) & small, 1e6, 1)
     points = starts[:, moved] * unit
     low, high = points.min(axis=0), points.max(axis=0)
     x, y = (low + (high - low) * ((np.arange(_PIXELS) + 0.5) / _PIXELS)[:, None]).T
@@ -49,7 +51,7 @@ def basin(result: Basin, ax: Axes | None = None) -> Axes:
         if shares[name]
     ]
     for which, i in zip("xy", moved.tolist(), strict=True):
-        name = f"x{i + 1} [µm]" if i < n else f"dx{i - n + 1}/dt [m/s]"
+        name = f"x{i + 1} [{'µm' if small else 'm'}]" if i < n else f"dx{i - n + 1}/dt [m/s]"
         ax.set(**{f"{which}label": name})
     legend_above(ax, handles)
     return ax
