@@ -241,12 +241,13 @@ def _decay(modes: _Modes, lanes: _Lanes):
 
 def _label(modes: _Modes, lanes: _Lanes, returned, points, owners) -> _Lanes:
     """The lanes after a round, labelled where their end is known."""
-    size = jnp.max(jnp.abs(lanes.y - modes.equilibrium[:, None]), axis=0)
+    centre = modes.equilibrium[:, None]
+    size = jnp.max(jnp.abs(lanes.y - centre), axis=0)
     far = ~(size < _DIVERGENCE * (1 + jnp.max(jnp.abs(modes.equilibrium))))
     decays, lanes = _decay(modes, lanes)
     gaps = jnp.max(jnp.abs(lanes.seen[:, None] - points[:, :, None]), axis=0)
     owner = owners[jnp.argmin(gaps, axis=0)]
-    distance = jnp.min(gaps, axis=0) / (1 + jnp.max(jnp.abs(lanes.seen), axis=0))
+    distance = jnp.min(gaps, axis=0) / (1 + jnp.max(jnp.abs(lanes.seen - centre), axis=0))
     same = owner == lanes.owner
     closer = same & (distance < lanes.distance) & (distance < _APPROACHES)
     approach = jnp.where(closer, lanes.approach + 1, 0)
@@ -270,8 +271,8 @@ def _label(modes: _Modes, lanes: _Lanes, returned, points, owners) -> _Lanes:
 
 @jax.jit
 def _run(system, modes: _Modes, points, owners, lanes: _Lanes) -> _Lanes:
-    """Rounds until half of the lanes have a label, at most `_ROUNDS`."""
-    most = jnp.sum(lanes.label == _RUNNING) // 2
+    """Rounds until a quarter of the lanes have got a label, at most `_ROUNDS`."""
+    most = 3 * jnp.sum(lanes.label == _RUNNING) // 4
 
     def going(carry):
         lanes, rounds = carry
@@ -383,13 +384,13 @@ def _label_all(system, lanes, known, reasons, search, modes, max_returns, progre
     from tqdm import tqdm
 
     k = len(lanes.label)
-    size = _FEW_LANES if k <= _FEW_LANES * _CHUNKS else _LANES
     searched, failures, patience = np.zeros(k, bool), 0, _PATIENCE
     failure = CycleResult.exhausted
     bar = tqdm(total=k, desc="basin", unit="start", disable=not progress)
     with bar, concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
         while (running := np.flatnonzero(lanes.label == _RUNNING)).size:
             bar.update(k - running.size - bar.n)
+            size = _FEW_LANES if running.size <= _FEW_LANES * _CHUNKS else _LANES
             chosen = running[: size * _CHUNKS]
             chunks = [chosen[i : i + size] for i in range(0, len(chosen), size)]
             run = functools.partial(_run, system, modes, *known.padded(lanes.y.dtype))

@@ -78,8 +78,8 @@ def test_belt_comes_to_rest_or_not():
 
 
 @pytest.mark.slow
-def test_four_thousand_starts_of_the_belt():
-    assert unlike(4000) <= 0.005 * 4000
+def test_many_starts_of_the_belt():
+    assert unlike(1000) <= 0.005 * 1000
 
 
 @pytest.mark.slow
