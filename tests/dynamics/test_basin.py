@@ -132,13 +132,27 @@ def test_designed_brake_against_the_independent_solver():
 
 @pytest.mark.slow
 def test_labels_are_the_cycles_of_the_search():
-    """Several cycles of the reference scene: each start by itself ends in the same one."""
+    """Each start by itself ends in the same cycle; where it does not, the truth decides.
+
+    `limit_cycle` takes longer steps, and may leave a start at the wrong side of a boundary.
+    """
     scene = reference_scene().replace(K_n=6e8, K_t=3e8)
     found = fj.basin(scene, radius=2.0, starts=64, progress=False)
     alone = jax.vmap(lambda start: fj.limit_cycle(scene, start, throw=False))(found.starts)
     periods = np.array([np.nan, *(float(c.period) for c in found.cycles), np.nan, np.nan])
+    periods = periods[found.labels]
     assert len(found.cycles) >= 2
-    np.testing.assert_allclose(periods[found.labels], alone.period, rtol=1e-7)
+    differ = np.flatnonzero(~np.isclose(periods, alone.period, rtol=1e-7, equal_nan=True))
+    assert len(differ) <= 2
+    mechanism, tops = hybrid_truth.Mechanism.of(problem_of(scene)), []
+    for i in differ:
+        start = found.starts[i] / mechanism.units
+        for p in hybrid_truth.phases(mechanism.scaled, start, 1e-9, maxima=True):
+            tops += [p.t1 / mechanism.omega] if p.event[0] == "maximum" else []
+            if len(tops) == 300:
+                break
+        assert np.diff(tops)[-40:].mean() == pytest.approx(periods[i], rel=1e-3)
+        tops.clear()
 
 
 @pytest.mark.slow
