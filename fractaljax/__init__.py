@@ -25,6 +25,7 @@ from ._design.envelope import Envelope as Envelope
 from ._design.pareto import Front as Front, pareto as pareto
 from ._design.tolerance import Tolerance as Tolerance, squeal_probability as squeal_probability
 from ._dynamics.attractors import attractors as attractors
+from ._dynamics.basin import Basin as Basin, basin as basin
 from ._dynamics.branch import (
     Branch as Branch,
     BranchEnd as BranchEnd,

@@ -608,3 +608,42 @@ def test_a_notebook_is_given_the_picture():
     assert picture(ax.figure).min() == 0
     again = pickle.loads(pickle.dumps(ax.figure))
     assert picture(again).shape == (640, 840, 4)
+
+
+# --- basins ---------------------------------------------------------------------------------
+
+
+def section(scale):
+    """A made-up basin on a grid of starts: three outcomes of five, by x2 and dx1/dt."""
+    x, v = np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-0.5, 0.5, 21))
+    starts = np.stack([0 * x, scale * x, v, 0 * x], axis=-1).reshape(-1, 4)
+    marks = np.where(x.ravel() < 0, 0, np.where(v.ravel() < 0, 1, 3))
+    outcomes = "equilibrium", "cycle 1", "diverges", "undecided"
+    return fj.Basin(starts, marks, outcomes, (), {})
+
+
+@pytest.mark.parametrize(("scale", "unit", "times"), [(2e-5, "µm", 1e6), (2.0, "m", 1)])
+def test_basin(scale, unit, times):
+    """Each point has the outcome of the nearest start; an outcome without starts has no colour."""
+    made = section(scale)
+    ax = plot.basin(made)
+    assert_whole(ax.figure)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == (f"x2 [{unit}]", "dx1/dt [m/s]")
+    assert [text.split(",")[0] for text in labels(ax)] == ["equilibrium", "cycle 1", "undecided"]
+    assert labels(ax)[0].endswith(f"{made.shares['equilibrium']:.1%}")
+    (image,) = ax.images
+    left, right, bottom, top = image.get_extent()
+    np.testing.assert_allclose(
+        [left, right, bottom, top], [-scale * times, scale * times, -0.5, 0.5]
+    )
+    shown = np.asarray(image.get_array())
+    for share_x, share_v, mark in [(0.2, 0.2, 0), (0.2, 0.9, 0), (0.8, 0.2, 1), (0.8, 0.9, 3)]:
+        rows, columns = shown.shape
+        assert shown[int(share_v * rows), int(share_x * columns)] == mark
+
+
+def test_basin_needs_a_section():
+    made = section(1.0)
+    line = fj.Basin(made.starts[:21], made.labels[:21], made.outcomes, (), {})
+    with pytest.raises(ValueError, match="starts that differ in 2 coordinates, got 1"):
+        plot.basin(line)

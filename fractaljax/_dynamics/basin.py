@@ -1,0 +1,511 @@
+"""Which motion each of many starts ends in, and the share of the starts that each one takes.
+
+All starts run side by side, coarsely, as in `search.py`, and leave the run once they are labelled:
+near an attracting orbit that is known, decaying at the equilibrium, or diverging. One that stays
+without a label is searched in full; the orbit found becomes a known one.
+"""
+
+import concurrent.futures
+import dataclasses
+import functools
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Complex, Float, Int
+
+from .._base.parts import Record, concrete, flag, number, scalar, whole
+from .._base.table import table
+from .._mechanism.mechanism import Mechanism
+from .cycle import CycleResult, LimitCycle
+from .events import step
+from .excitation import Excitation, excited_system
+from .hybrid import NONE, SECTION, HybridSystem, check_rtol, degrees_of_freedom
+from .limit_cycle import limit_cycle
+from .orbit import next_start
+
+_MOST_STARTS = 1_000_000
+_LANES, _FEW_LANES = 256, 32  # that run side by side, of many starts and of few
+_CHUNKS = 4  # of lanes, shared by the cores; not their number, on which nothing shall depend
+_STEPS_OF = 0.1, 0.2  # lengths, in scaled time: no eigenfrequency exceeds 1
+_FINE = 64  # rounds of the shorter steps, for a start may be near the boundary of two basins
+_STEPS = 128  # in a round
+_SAMPLED = 4  # steps between two samples of the energy
+_ROUNDS = 16  # before the starts that have ended make room for others
+_WINDOW = 4  # rounds over which the energy of a motion without switches is averaged
+_DIVERGENCE = 1e6  # size at which a motion diverges, as in `search.py`
+_APPROACHES = 0.15  # relative distance from a known orbit below which an approach counts
+_NEAR = 0.02  # and below which few rounds of it are enough
+_FEW, _STAYS = 3, 8  # rounds of approach, or near without approach
+_PATIENCE = 8  # rounds without a label after which a start is searched in full
+_FAILURES = 8  # full searches without an orbit; then all others are left to the coarse run
+_RUNNING, _EQUILIBRIUM, _DIVERGES, _UNDECIDED = -1, -2, -3, -4  # a cycle has its number
+
+
+class Basin(Record):
+    """What the starts end in, as `basin` returns it; arrays as NumPy. Printed, it is a table."""
+
+    starts: Float[np.ndarray, "k 2n"]  # [x, v] [m, m/s]
+    labels: Int[np.ndarray, " k"]  # places in `outcomes`
+    outcomes: tuple[str, ...]  # "equilibrium", "cycle 1", ..., "diverges", "undecided"
+    cycles: tuple[LimitCycle, ...]  # "cycle 1", ..., from the largest share to the smallest
+    reasons: Mapping[int, CycleResult]  # why a start is undecided, by its place
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """The share of the starts by outcome."""
+        counts = np.bincount(self.labels, minlength=len(self.outcomes))
+        return dict(zip(self.outcomes, (counts / len(self.labels)).tolist(), strict=True))
+
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        """Of the shares: sqrt(p (1 - p)/k), that of k independent starts.
+
+        Low-discrepancy starts are mostly closer. A share of 0 is below 3/k with 95 % confidence.
+        """
+        k = len(self.labels)
+        return {name: float(np.sqrt(p * (1 - p) / k)) for name, p in self.shares.items()}
+
+    def __repr__(self) -> str:
+        counts = np.bincount(self.labels, minlength=len(self.outcomes))
+        errors = self.standard_errors
+        cycles = [None, *self.cycles, None, None]
+        columns = [
+            {
+                "starts": f"{count}",
+                "share": f"{share:.2%} +- {errors[name]:.2%}",
+                "frequency [Hz]": "-" if cycle is None else f"{cycle.frequency:.6g}",
+                "largest peak to peak [m]": "-"
+                if cycle is None
+                else f"{cycle.amplitude.max():.6g}",
+            }
+            for (name, share), count, cycle in zip(self.shares.items(), counts, cycles, strict=True)
+        ]
+        lines = [table(list(self.outcomes), columns)]
+        texts = [CycleResult[reason] for reason in self.reasons.values()]
+        lines += [f"undecided, {texts.count(text)}: {text}" for text in dict.fromkeys(texts)]
+        return "\n".join(lines)
+
+
+class _Lanes(Record):
+    """Motions side by side; their number is the last axis."""
+
+    y: Float[Array, "2n k"]
+    s: Float[Array, "f k"]
+    guard: Int[Array, " k"]  # that ended the last step
+    seen: Float[Array, "2n k"]  # the last return to the section
+    returns: Int[Array, " k"]
+    rounds: Int[Array, " k"]
+    smooth: Int[Array, " k"]  # rounds since the last switch
+    energy: Float[Array, "2n k"]  # of the modes, summed over samples of this window
+    log: Float[Array, "2n k"]  # amplitude of the modes in the last window
+    rate: Float[Array, "2n k"]  # by which that changed since the window before
+    owner: Int[Array, " k"]  # the known cycle that is nearest
+    distance: Float[Array, " k"]  # from it
+    approach: Int[Array, " k"]  # rounds in which that fell
+    near: Int[Array, " k"]  # rounds in which it was small
+    label: Int[Array, " k"]
+
+
+class _Modes(eqx.Module):
+    """Small motions about the sliding equilibrium."""
+
+    equilibrium: Float[Array, " 2n"]
+    values: Complex[Array, " 2n"]
+    vectors: Complex[Array, "2n 2n"]
+    inverse: Complex[Array, "2n 2n"]
+    reach: Float[Array, "g 2n"]  # what each mode takes of the way to every switch
+    attracts: Bool[Array, ""]
+    free: bool = eqx.field(static=True)  # not excited: only then is there an equilibrium
+
+    @classmethod
+    def of(cls, system: HybridSystem) -> "_Modes":
+        n, equilibrium = system.n, system.equilibrium()
+        slip = jnp.ones(len(system.P), equilibrium.dtype)
+        A = jax.jacfwd(lambda y: system.field(y, slip))(equilibrium)
+        values, vectors = map(np.asarray, np.linalg.eig(A))
+        T = np.eye(n) if system.T is None else np.asarray(system.T)
+        rows = [T @ vectors[n:] / np.asarray(system.V)[:, None]]
+        loads = np.asarray(system.loads(equilibrium[:n]))
+        for faces, opens in zip(system.faces, system.opens, strict=True):
+            if opens:
+                i = faces[0]
+                rows.append(np.asarray(system.L)[i : i + 1] @ vectors[:n] / loads[i])
+        inverse, reach = np.linalg.inv(vectors), abs(np.concatenate(rows))
+        arrays = values, vectors, inverse, reach, np.real(values).max() < 0
+        return cls(equilibrium, *map(jnp.asarray, arrays), free=not system.excited)
+
+    def amplitudes(self, y) -> Array:
+        """Those (2n, k), complex, of states (2n, k)."""
+        away = y - self.equilibrium[:, None]
+        return jnp.sum(self.inverse[:, :, None] * away[None], axis=1)
+
+    def grown(self, y, log) -> Array:
+        """States (2n, k) after the amplitudes have grown by exp(log), log (2n, k)."""
+        c = self.amplitudes(y) * jnp.exp(log)
+        return self.equilibrium[:, None] + jnp.sum(self.vectors[:, :, None] * c[None], axis=1).real
+
+
+@jax.jit
+def _first(system: HybridSystem, y) -> _Lanes:
+    none, zero = jnp.zeros(y.shape[1], int), jnp.zeros(y.shape[1], y.dtype)
+    return _Lanes(
+        y=y,
+        s=system.contact_state(y),
+        guard=none + NONE,
+        seen=y,
+        returns=none,
+        rounds=none,
+        smooth=none,
+        energy=jnp.zeros_like(y),
+        log=jnp.full_like(y, jnp.nan),
+        rate=jnp.full_like(y, jnp.nan),
+        owner=none - 1,
+        distance=zero + jnp.inf,
+        approach=none,
+        near=none,
+        label=none + _RUNNING,
+    )
+
+
+def _step_length(rounds, dtype) -> Array:
+    return jnp.where(rounds < _FINE, *_STEPS_OF).astype(dtype)
+
+
+def _advance(system: HybridSystem, modes: _Modes, lanes: _Lanes) -> _Lanes:
+    """One round of steps of every lane."""
+    h = _step_length(lanes.rounds, lanes.y.dtype)
+
+    def one(_, carry):
+        y, s, guard, seen, returns, switches = carry
+        y, s, _, guard = step(system, y, s, guard, h)
+        returned = guard == SECTION
+        seen = jnp.where(returned[None], y, seen)
+        return y, s, guard, seen, returns + returned, switches + (guard > 0)
+
+    def some(_, carry):
+        carry, energy = carry
+        carry = jax.lax.fori_loop(0, _SAMPLED, one, carry)
+        return carry, energy + jnp.abs(modes.amplitudes(carry[0])) ** 2
+
+    start = lanes.y, lanes.s, lanes.guard, lanes.seen, lanes.returns, jnp.zeros_like(lanes.returns)
+    count = _STEPS // _SAMPLED
+    (*moved, switches), energy = jax.lax.fori_loop(0, count, some, (start, lanes.energy))
+    moved = dict(zip(("y", "s", "guard", "seen", "returns"), moved, strict=True))
+    moved |= {"rounds": lanes.rounds + 1, "energy": energy}
+    moved |= {"smooth": jnp.where(switches > 0, 0, lanes.smooth + 1)}
+    return dataclasses.replace(lanes, **moved)
+
+
+def _decay(modes: _Modes, lanes: _Lanes):
+    """Which lanes come to rest, and the lanes after a round, with slow changes extrapolated.
+
+    A motion without switches is followed by the mean energy of its modes in windows of some
+    rounds, in which ripples average out.
+    """
+    switched = lanes.smooth == 0
+    slips = jnp.all(lanes.s == 1, axis=0) & modes.free
+    full = ~switched & slips & (lanes.smooth % _WINDOW == 0)
+    samples = _WINDOW * _STEPS // _SAMPLED
+    log = jnp.log(lanes.energy / samples + jnp.finfo(lanes.y.dtype).tiny) / 2
+    rate, before = log - lanes.log, lanes.rate
+    ways = modes.reach[:, :, None] * jnp.exp(log)[None]
+    way, share = jnp.max(jnp.sum(ways, axis=1), axis=0), jnp.max(ways, axis=0)
+    small = share < 0.02 * way[None]
+    window = _WINDOW * _STEPS * _step_length(lanes.rounds - 1, lanes.y.dtype)
+    linear = modes.values.real[:, None] * window[None]
+    steady = jnp.abs(rate - before) < 0.2 * jnp.abs(rate)
+    # No switch is reached any more, and every mode decays much as the smallest motions do.
+    decays = (way < 0.9) & jnp.all(small | (steady & (rate < 0.6 * linear)), axis=0)
+    decays = modes.attracts & full & (decays | (way < 1e-6))
+    # Of a slow change at most half is skipped that is left if it slows down geometrically.
+    left = jnp.abs(rate * before) / jnp.maximum(jnp.abs(before) - jnp.abs(rate), 1e-300)
+    windows = jnp.minimum(0.25, left / 2) / jnp.maximum(jnp.abs(rate), 1e-300)
+    windows = jnp.min(jnp.where(small, jnp.inf, windows), axis=0)
+    skips = full & jnp.all(small | steady, axis=0) & (windows > 1) & (windows < 1000)
+    log_skipped = windows[None] * jnp.where(small, jnp.minimum(linear, 0), rate)
+    y = jnp.where(skips & ~decays, modes.grown(lanes.y, jnp.where(skips, log_skipped, 0)), lanes.y)
+    again, unknown, nan = switched | full, switched | skips, jnp.nan
+    return decays, dataclasses.replace(
+        lanes,
+        y=y,
+        energy=jnp.where(again, 0, lanes.energy),
+        log=jnp.where(unknown, nan, jnp.where(full, log, lanes.log)),
+        rate=jnp.where(unknown, nan, jnp.where(full, rate, before)),
+    )
+
+
+def _label(modes: _Modes, lanes: _Lanes, returned, points, owners) -> _Lanes:
+    """The lanes after a round, labelled where their end is known."""
+    centre = modes.equilibrium[:, None]
+    size = jnp.max(jnp.abs(lanes.y - centre), axis=0)
+    far = ~(size < _DIVERGENCE * (1 + jnp.max(jnp.abs(modes.equilibrium))))
+    decays, lanes = _decay(modes, lanes)
+    gaps = jnp.max(jnp.abs(lanes.seen[:, None] - points[:, :, None]), axis=0)
+    owner = owners[jnp.argmin(gaps, axis=0)]
+    distance = jnp.min(gaps, axis=0) / (1 + jnp.max(jnp.abs(lanes.seen - centre), axis=0))
+    same = owner == lanes.owner
+    closer = same & (distance < lanes.distance) & (distance < _APPROACHES)
+    approach = jnp.where(closer, lanes.approach + 1, 0)
+    near = jnp.where(same & (distance < _NEAR), lanes.near + 1, 0)
+    patience = jnp.where(distance < _NEAR, _FEW, _STAYS)
+    arrived = (approach >= patience) | (near >= _STAYS)
+    label = jnp.where(decays, _EQUILIBRIUM, jnp.where(arrived & returned, owner, _RUNNING))
+
+    def since(found, old):
+        return jnp.where(returned, found, old)
+
+    return dataclasses.replace(
+        lanes,
+        owner=since(owner, lanes.owner),
+        distance=since(distance, lanes.distance),
+        approach=since(approach, lanes.approach),
+        near=since(near, lanes.near),
+        label=jnp.where(far, _DIVERGES, label),
+    )
+
+
+@jax.jit
+def _run(system, modes: _Modes, points, owners, lanes: _Lanes) -> _Lanes:
+    """Rounds until a quarter of the lanes have got a label, at most `_ROUNDS`."""
+    most = 3 * jnp.sum(lanes.label == _RUNNING) // 4
+
+    def going(carry):
+        lanes, rounds = carry
+        running = jnp.sum(lanes.label == _RUNNING)
+        return (running > most) & (rounds < _ROUNDS)
+
+    def body(carry):
+        old, rounds = carry
+        new = _advance(system, modes, old)
+        new = _label(modes, new, new.returns > old.returns, points, owners)
+        running = old.label == _RUNNING
+        return jax.tree.map(lambda new, old: jnp.where(running, new, old), new, old), rounds + 1
+
+    return jax.lax.while_loop(going, body, (lanes, 0))[0]
+
+
+def section_points(cycle: LimitCycle) -> Float[np.ndarray, "2n m"]:
+    """The scaled states of a cycle at its returns to the section."""
+    segments = cycle._orbit.segments
+    return np.asarray(next_start(segments.y))[:, np.asarray(segments.guard) == SECTION]
+
+
+class _Known:
+    """The attracting orbits that have been found."""
+
+    def __init__(self, size: int):
+        self.cycles: list[LimitCycle] = []
+        self._points, self._owners = np.zeros((size, 0)), np.zeros(0, int)
+
+    def number(self, cycle: LimitCycle) -> int:
+        """Its place among the known ones, to which it is added if it is new."""
+        points = section_points(cycle)
+        if self._owners.size:
+            gaps = np.abs(self._points - points[:, :1]).max(axis=0)
+            if gaps.min() < 1e-4 * (1 + np.abs(points[:, 0]).max()):
+                return int(self._owners[gaps.argmin()])
+        self.cycles.append(cycle)
+        self._points = np.concatenate([self._points, points], axis=1)
+        self._owners = np.append(self._owners, np.full(points.shape[1], len(self.cycles) - 1))
+        return len(self.cycles) - 1
+
+    def padded(self, dtype) -> tuple[np.ndarray, np.ndarray]:
+        """Points (2n, m) at the returns and the cycles (m,) that they are of; m grows rarely."""
+        m = 16
+        while m < len(self._owners):
+            m *= 4
+        points = np.full((len(self._points), m), np.inf, dtype)
+        points[:, : len(self._owners)] = self._points
+        return points, np.append(self._owners, np.full(m - len(self._owners), -1))
+
+
+def basin(
+    mechanism: Mechanism,
+    low: ArrayLike | Sequence[float] | None = None,
+    high: ArrayLike | Sequence[float] | None = None,
+    starts: int | ArrayLike | Sequence[Sequence[float]] = 4000,
+    seed: int = 0,
+    *,
+    radius: float | None = None,
+    excitation: Excitation | None = None,
+    rtol: float | None = None,
+    max_returns: int = 5000,
+    progress: bool = True,
+) -> Basin:
+    """What the motions from many starts end in: the equilibrium, which limit cycle, or neither.
+
+    Every start runs on, coarsely, until its returns to the section of `limit_cycle` approach those
+    of a known attracting orbit: in three rounds of some returns within 2 % of its size, or in
+    eight within 15 %. It comes to rest once the linear modes that it holds reach no switch and
+    each decays at 0.6 of its linear rate or faster. A start that gets no label is searched in full
+    by `limit_cycle`, and an orbit that this finds is known from then on. Starts that are still
+    without a label after `max_returns` are undecided, with the reason of the last full search
+    that found nothing.
+
+    **Arguments:**
+
+    - `mechanism`: a scene, or a structure of n degrees of freedom whose joints all have a V.
+    - `low`, `high`: (2n,), corners of a box of starts [x, v] in m and m/s. Where they are equal a
+      coordinate is fixed, so that a section of two coordinates is a box as well.
+    - `radius`: instead of a box, a ball about the sliding equilibrium. It is the Euclidean norm of
+      the state in units of V/omega and V, with omega as in `limit_cycle`.
+    - `starts`: how many, Sobol points scrambled by `seed`; or the starts themselves, (k, 2n),
+      without box and ball.
+    - `excitation`, `rtol`, `max_returns`: as in `limit_cycle`; nothing then ends in equilibrium.
+
+    **Raises:** `ValueError` for corners or starts of another shape, a box that is empty, for box,
+    ball or starts given twice or not at all, and what `limit_cycle` raises.
+    """
+    n = degrees_of_freedom(mechanism)
+    if any(concrete(jnp.asarray(x)) is None for x in jax.tree.leaves((mechanism, excitation))):
+        raise ValueError("basin runs many programs: call it outside of jit, vmap and grad")
+    system = excited_system(mechanism, excitation)
+    dtype = system.F.dtype
+    tolerance = check_rtol(rtol, dtype)
+    max_returns, progress = whole("max_returns", max_returns, 1), flag("progress", progress)
+    given = _starts(system, n, low, high, starts, whole("seed", seed, 0), radius)
+    modes = _Modes.of(system)
+    y = system.with_excitation(jnp.asarray(given.T / np.asarray(system.units)[:, None], dtype), 0.0)
+    lanes = jax.tree.map(np.array, _first(system, y))
+    options: dict[str, Any] = {"excitation": excitation, "rtol": tolerance, "throw": False}
+    known, reasons = _Known(2 * system.n), {}
+    search = functools.partial(limit_cycle, mechanism, max_returns=max_returns, **options)
+    _label_all(system, lanes, known, reasons, search, modes, max_returns, progress)
+    return _conclude(given, lanes.label, known.cycles, reasons)
+
+
+def _label_all(system, lanes, known, reasons, search, modes, max_returns, progress):
+    """Label every lane of NumPy arrays in place."""
+    from tqdm import tqdm
+
+    k = len(lanes.label)
+    searched, failures, patience = np.zeros(k, bool), 0, _PATIENCE
+    failure = CycleResult.exhausted
+    bar = tqdm(total=k, desc="basin", unit="start", disable=not progress)
+    with bar, concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+        while (running := np.flatnonzero(lanes.label == _RUNNING)).size:
+            bar.update(k - running.size - bar.n)
+            size = _FEW_LANES if running.size <= _FEW_LANES * _CHUNKS else _LANES
+            chosen = running[: size * _CHUNKS]
+            chunks = [chosen[i : i + size] for i in range(0, len(chosen), size)]
+            run = functools.partial(_run, system, modes, *known.padded(lanes.y.dtype))
+            results = pool.map(run, [_some(lanes, chunk, size) for chunk in chunks])
+            for chunk, result in zip(chunks, results, strict=True):
+                for whole_array, piece in zip(
+                    jax.tree.leaves(lanes), jax.tree.leaves(result), strict=True
+                ):
+                    whole_array[..., chunk] = np.asarray(piece)[..., : len(chunk)]
+            left = lanes.label == _RUNNING
+            over = left & ((lanes.returns >= max_returns) | (lanes.rounds >= max_returns))
+            lanes.label[over] = _UNDECIDED
+            reasons |= dict.fromkeys(np.flatnonzero(over).tolist(), failure)
+            # A motion without switches is slow, but not lost.
+            slow = (lanes.smooth >= _WINDOW) & (lanes.rounds < 16 * patience)
+            lost = left & ~over & ~searched & (lanes.rounds >= patience)
+            lost &= (lanes.approach == 0) & ~slow
+            if failures >= _FAILURES or not lost.any():
+                continue
+            i = int(np.argmax(np.where(lost, lanes.rounds, -1)))
+            searched[i] = True
+            # At a return the time of an excitation is 0 again.
+            state = lanes.seen[:, i] if lanes.returns[i] else lanes.y[:, i]
+            cycle = search(system.own(jnp.asarray(state)) * system.units)
+            result, before = cycle.result, len(known.cycles)
+            if bool((result == CycleResult.converged) | (result == CycleResult.inaccurate)):
+                lanes.label[i] = known.number(cycle)
+            elif bool(result == CycleResult.equilibrium):
+                lanes.label[i] = _EQUILIBRIUM
+            elif bool(result == CycleResult.diverged):
+                lanes.label[i] = _DIVERGES
+            else:
+                failures, failure = failures + 1, result
+                if bool(result != CycleResult.unstable):
+                    lanes.label[i], reasons[i] = _UNDECIDED, result
+            # What brings nothing new is done less and less often.
+            patience = _PATIENCE if len(known.cycles) > before else 2 * patience
+        bar.update(k - bar.n)
+
+
+def _some(lanes: _Lanes, chosen: np.ndarray, size: int) -> _Lanes:
+    """The chosen lanes, filled up to `size` with one that counts as labelled."""
+    padded = np.concatenate([chosen, np.repeat(chosen[-1:], size - len(chosen))])
+    some = jax.tree.map(lambda x: x[..., padded], lanes)
+    some.label[len(chosen) :] = _UNDECIDED
+    return some
+
+
+def _conclude(starts, labels, cycles, reasons) -> Basin:
+    """The result, with the cycles in the order of their shares."""
+    counts = [int(np.sum(labels == i)) for i in range(len(cycles))]
+    order = sorted(range(len(cycles)), key=lambda i: -counts[i])
+    names = [f"cycle {i}" for i in range(1, len(order) + 1)]
+    codes = [_EQUILIBRIUM, *order, _DIVERGES, _UNDECIDED]
+    return Basin(
+        starts=starts,
+        labels=np.array([codes.index(label) for label in labels.tolist()]),
+        outcomes=("equilibrium", *names, "diverges", "undecided"),
+        cycles=tuple(cycles[i] for i in order),
+        reasons=reasons,
+    )
+
+
+def _starts(system, n, low, high, starts, seed, radius) -> Float[np.ndarray, "k 2n"]:
+    """The starts [m, m/s] in a box, in a ball, or as they are given."""
+    box, listed = low is not None or high is not None, np.ndim(starts) > 0
+    if box + listed + (radius is not None) != 1:
+        raise ValueError("give one of: low and high, radius, or starts of shape (k, 2n)")
+    if listed:
+        given = np.asarray(number("starts", jnp.asarray(starts, dtype=float)))
+        if given.ndim != 2 or given.shape[1] != 2 * n or not len(given):
+            raise ValueError(f"starts must have shape (k, {2 * n}), got {given.shape}")
+        return given
+    count = whole("starts", starts, 1, _MOST_STARTS)
+    if radius is not None:
+        reach = float(scalar("radius", radius, above=0))
+        away = reach * _in_unit_ball(count, 2 * n, seed)
+        centre = np.asarray(system.own(system.equilibrium()))
+        return (centre + away) * np.asarray(system.units)
+    corners = [_corner("low", low, n), _corner("high", high, n)]
+    if (corners[0] > corners[1]).any():
+        raise ValueError(f"low must be at most high, got {corners[0]} and {corners[1]}")
+    # A fixed coordinate takes no dimension of the points.
+    moves = corners[0] < corners[1]
+    share = np.zeros((count, 2 * n))
+    share[:, moves] = _sobol(count, int(moves.sum()), seed)
+    return corners[0] + share * (corners[1] - corners[0])
+
+
+def _corner(name: str, value: Any, n: int) -> np.ndarray:
+    if value is None:
+        raise ValueError("a box needs both low and high")
+    corner = np.asarray(number(name, jnp.asarray(value, dtype=float)))
+    if corner.shape != (2 * n,):
+        raise ValueError(f"{name} must have shape ({2 * n},), got {corner.shape}")
+    return corner
+
+
+def _sobol(count: int, dimensions: int, seed: int) -> np.ndarray:
+    """Points (count, dimensions) that fill the unit cube evenly."""
+    from scipy.stats import qmc
+
+    if not dimensions:
+        return np.zeros((count, 0))
+    sobol: Any = qmc.Sobol  # SciPy 1.15 renamed `seed`, and takes both names
+    points = sobol(dimensions, seed=seed)
+    # The first ones of a power of two, for which Sobol's points are balanced.
+    return points.random_base2((count - 1).bit_length())[:count]
+
+
+def _in_unit_ball(count: int, dimensions: int, seed: int) -> np.ndarray:
+    """Points (count, dimensions) evenly in the unit ball."""
+    from scipy.special import ndtri
+
+    u = _sobol(count, dimensions + 1, seed)
+    direction = ndtri(np.clip(u[:, 1:], 1e-12, 1 - 1e-12))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return direction * u[:, :1] ** (1 / dimensions)
