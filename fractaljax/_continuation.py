@@ -72,7 +72,7 @@ class Continuation:
                 return None
             step, _, rank, _ = np.linalg.lstsq(jacobian[:, free], -residual)
             size = np.linalg.norm(step)
-            if size >= best:
+            if size >= best and best <= self.tolerance:
                 break  # down to rounding
             if rank < len(residual) or size > 4 * self.longest:
                 return None

@@ -15,6 +15,8 @@ from .shooting import Chain, Lifted, Place, Window, condensed, linearised, lowes
 
 _SAMPLES = 512  # of an orbit, to see where friction is stiff
 _LENGTH = 0.25  # of segments at rtol 1e-9, in scaled time
+_MEMORY = 64  # evaluations from which states between are extrapolated, the nearest of them
+_GAP = 0.3  # between segments, beyond which an evaluation is not among them
 _STALE = 1.3  # growth of a phase after which it is cut anew
 _SYMBOLS = {1: "+", -1: "-", 0: "0", OPEN: "o"}
 
@@ -92,7 +94,7 @@ class Shooting:
         u = np.concatenate([np.asarray(y[:, 0]), h, np.zeros(self.padded - m), old.u[-1:]])
         self.chain, self.m, self.length = chain, m, h.copy()
         blank = jnp.zeros((2 * n, len(u), N), y.dtype)
-        self.memory = [(u, Lifted(jnp.asarray(u), y, blank))]
+        self.memory = [(u, _GAP, Lifted(jnp.asarray(u), y, blank))]
         self.known: dict[bytes, Any] = {}  # of the last points
         size = 1 + float(np.abs(np.asarray(y)).max())
         period = float(h.sum())
@@ -194,8 +196,9 @@ class Shooting:
     # --- equations ---
 
     def near(self, u) -> Lifted:
-        distances = [np.abs(u - at).max() for at, _ in self.memory]
-        return self.memory[int(np.argmin(distances))][1]
+        """The evaluation that says best where the states are: near u, and then without gaps."""
+        errors = [np.abs(u - at).max() ** 2 + gap**2 for at, gap, _ in self.memory]
+        return self.memory[int(np.argmin(errors))][2]
 
     def evaluated(self, z):
         key = z.tobytes()
@@ -204,11 +207,11 @@ class Shooting:
         u = self.full(z)
         x, window = self.family.x, self.family.window
         residual, jacobian, lifted, gap = condensed(x, window, self.chain, self.near(u), u)
-        if float(gap) < 0.3:
-            self.memory = [*self.memory[-3:], (u, lifted)]
+        if float(gap) < _GAP:
+            self.memory = [*self.memory[-_MEMORY:], (u, float(gap), lifted)]
         rows = np.arange(2 * self.family.n + self.m)
         found = np.asarray(residual)[rows], np.asarray(jacobian)[np.ix_(rows, self.active)]
-        self.known = dict([*self.known.items()][-8:]) | {key: found}
+        self.known = dict([*self.known.items()][-_MEMORY:]) | {key: found}
         return found
 
     def equations(self, z):
