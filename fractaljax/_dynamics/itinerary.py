@@ -16,7 +16,9 @@ from .shooting import Chain, Lifted, Place, Window, condensed, linearised, lowes
 _SAMPLES = 512  # of an orbit, to see where friction is stiff
 _LENGTH = 0.25  # of segments at rtol 1e-9, in scaled time
 _MEMORY = 64  # evaluations from which states between are extrapolated, the nearest of them
-_GAP = 0.3  # between segments, beyond which an evaluation is not among them
+_GAP = 1e-7  # between segments, above which they are first brought together
+_CLOSINGS = 4  # attempts at that
+_FAR = 0.3  # gap beyond which an evaluation is not among them
 _STALE = 1.3  # growth of a phase after which it is cut anew
 _SYMBOLS = {1: "+", -1: "-", 0: "0", OPEN: "o"}
 
@@ -94,7 +96,7 @@ class Shooting:
         u = np.concatenate([np.asarray(y[:, 0]), h, np.zeros(self.padded - m), old.u[-1:]])
         self.chain, self.m, self.length = chain, m, h.copy()
         blank = jnp.zeros((2 * n, len(u), N), y.dtype)
-        self.memory = [(u, _GAP, Lifted(jnp.asarray(u), y, blank))]
+        self.memory = [(u, _FAR, Lifted(jnp.asarray(u), y, blank))]
         self.known: dict[bytes, Any] = {}  # of the last points
         size = 1 + float(np.abs(np.asarray(y)).max())
         period = float(h.sum())
@@ -205,10 +207,14 @@ class Shooting:
         if key in self.known:
             return self.known[key]
         u = self.full(z)
-        x, window = self.family.x, self.family.window
-        residual, jacobian, lifted, gap = condensed(x, window, self.chain, self.near(u), u)
-        if float(gap) < _GAP:
-            self.memory = [*self.memory[-_MEMORY:], (u, float(gap), lifted)]
+        x, window, states = self.family.x, self.family.window, self.near(u)
+        for _ in range(_CLOSINGS):
+            given = x, window, self.chain, states, u
+            residual, jacobian, states, gap = condensed(*given)
+            if not float(gap) > _GAP:
+                break
+        if float(gap) < _FAR:
+            self.memory = [*self.memory[-_MEMORY:], (u, float(gap), states)]
         rows = np.arange(2 * self.family.n + self.m)
         found = np.asarray(residual)[rows], np.asarray(jacobian)[np.ix_(rows, self.active)]
         self.known = dict([*self.known.items()][-_MEMORY:]) | {key: found}

@@ -14,6 +14,7 @@ from scipy.optimize import brentq, minimize_scalar
 
 import fractaljax as fj
 import hybrid_truth
+from fractaljax._mechanism.quantities import replaced
 from mechanisms import PROBLEMS, changed
 from structures import of_problem
 from tools import (
@@ -242,7 +243,7 @@ def test_scene():
     assert found.stick_fraction.shape == (len(found.parameter), 2)
     stable = np.flatnonzero(found.stable)
     for i in stable[[2, len(stable) // 2, -1]]:
-        scene = BRAKE.replace(mu=found.parameter[i])
+        scene = replaced(BRAKE, {"mu": found.parameter[i]})
         other = fj.limit_cycle(scene, found.state[i])
         np.testing.assert_allclose(found.amplitude[i], other.amplitude, rtol=1e-8)
         np.testing.assert_allclose(found.period[i], other.period, rtol=1e-8)
