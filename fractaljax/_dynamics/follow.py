@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import scipy.optimize
 
 from .hybrid import OPEN, SECTION
 from .itinerary import Family, Phase, Shooting, multipliers_of
@@ -170,6 +169,8 @@ class Follower:
         def along(share):
             at = self._between(shooting, z, reached, share)
             return np.nan if at is None else test(at)
+
+        import scipy.optimize  # not before it is used: it takes its time
 
         try:
             share: Any = scipy.optimize.brentq(along, 0.0, 1.0, xtol=1e-13)

@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.optimize
 
 from .._continuation import Continuation
 from .._mechanism.mechanism import Mechanism
@@ -66,6 +65,8 @@ class Family:
 
     def hopf_near(self, q, frequency) -> tuple[float, float] | None:
         """Quantity and frequency of the Hopf point near those."""
+        import scipy.optimize  # not before it is used: it takes its time
+
         try:
             at: Any = scipy.optimize.newton(
                 lambda q: self.eigenvalue(q, frequency).real, q, x1=q + 1e-4, tol=1e-15, maxiter=50
