@@ -27,6 +27,7 @@ from .excitation import Excitation, excited_system
 from .hybrid import NONE, SECTION, HybridSystem, check_rtol, degrees_of_freedom
 from .limit_cycle import limit_cycle
 from .orbit import next_start
+from .search import SearchOptions
 
 _MOST_STARTS = 1_000_000
 _LANES, _FEW_LANES = 256, 32  # that run side by side, of many starts and of few
@@ -37,7 +38,6 @@ _STEPS = 128  # in a round
 _SAMPLED = 4  # steps between two samples of the energy
 _ROUNDS = 16  # before the starts that have ended make room for others
 _WINDOW = 4  # rounds over which the energy of a motion without switches is averaged
-_DIVERGENCE = 1e6  # size at which a motion diverges, as in `search.py`
 _APPROACHES = 0.15  # relative distance from a known orbit below which an approach counts
 _NEAR = 0.02  # and below which few rounds of it are enough
 _FEW, _STAYS = 3, 8  # rounds of approach, or near without approach
@@ -243,7 +243,7 @@ def _label(modes: _Modes, lanes: _Lanes, returned, points, owners) -> _Lanes:
     """The lanes after a round, labelled where their end is known."""
     centre = modes.equilibrium[:, None]
     size = jnp.max(jnp.abs(lanes.y - centre), axis=0)
-    far = ~(size < _DIVERGENCE * (1 + jnp.max(jnp.abs(modes.equilibrium))))
+    far = ~(size < SearchOptions.divergence * (1 + jnp.max(jnp.abs(modes.equilibrium))))
     decays, lanes = _decay(modes, lanes)
     gaps = jnp.max(jnp.abs(lanes.seen[:, None] - points[:, :, None]), axis=0)
     owner = owners[jnp.argmin(gaps, axis=0)]

@@ -193,10 +193,10 @@ def _from_cycle(follower: Follower, name: str, cycle):
     end = follower.follow(shooting, z, tangent)
     if bool(end == BranchEnd.closed):
         return end, end
-    follower.turn_round()
+    follower.reverse()
     follower.home = None
     start = follower.follow(begun()[0], z, -tangent)
-    follower.turn_round()
+    follower.reverse()
     return start, end
 
 

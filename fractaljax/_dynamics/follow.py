@@ -127,7 +127,7 @@ class Follower:
             return self._hopf(shooting, z)
         return BranchEnd.lost
 
-    def turn_round(self) -> None:
+    def reverse(self) -> None:
         """The points in the opposite order."""
         self.points.reverse()
         last = len(self.points) - 1

@@ -10,7 +10,17 @@ from .._continuation import Continuation
 from .._mechanism.mechanism import Mechanism
 from .cycle import LimitCycle
 from .hybrid import NONE, OPEN, SECTION, UNUSED, hybrid_system
-from .shooting import Chain, Lifted, Place, Window, condensed, linearised, lowest, resampled
+from .shooting import (
+    Chain,
+    Lifted,
+    Place,
+    Window,
+    condensed,
+    linearised,
+    lowest,
+    resampled,
+    return_jacobian,
+)
 
 _SAMPLES = 512  # of an orbit, to see where friction is stiff
 _LENGTH = 0.25  # of segments at rtol 1e-9, in scaled time
@@ -231,10 +241,7 @@ class Shooting:
 
     def monodromy(self, jacobian) -> np.ndarray:
         """The Jacobian (2n, 2n) of the return map, from that of the equations."""
-        k = 2 * self.family.n
-        jacobian = jacobian / self.scale
-        changes = np.linalg.solve(jacobian[k:, k:-1], jacobian[k:, :k])
-        return jacobian[:k, :k] + np.eye(k) - jacobian[:k, k:-1] @ changes
+        return return_jacobian(jacobian / self.scale, 2 * self.family.n, np)
 
     def lowest(self, z) -> tuple[float, Place]:
         """The least reduced guard on the orbit, and where."""

@@ -45,7 +45,8 @@ class Maps(eqx.Module):
     c: Float[Array, "2n N"]  # of the guard by the state it ends in; 0 where none ends it
 
 
-def _tableau():
+def tableau():
+    """The coefficients of the segments' steps."""
     # Imported late: a question of stability does not wait for diffrax.
     import diffrax
 
@@ -59,7 +60,7 @@ def flow(system: HybridSystem, y, duration, s, error=False) -> Any:
     """
     field = functools.partial(_field, system, s)
     duration = jnp.asarray(duration)[None]
-    return runge_kutta(_tableau(), field, y, duration, error=error)
+    return runge_kutta(tableau(), field, y, duration, error=error)
 
 
 def _field(system: HybridSystem, s, y) -> Array:
@@ -91,7 +92,7 @@ def maps(system: HybridSystem, segments: Segments) -> tuple[Array, Maps]:
     units = jnp.broadcast_to(jnp.eye(len(y), dtype=y.dtype)[:, :, None], (len(y), *y.shape))
     columns = jnp.concatenate([y[:, None], units], axis=1)
     duration = segments.duration[None, None]
-    ends = runge_kutta(_tableau(), field, columns, duration)
+    ends = runge_kutta(tableau(), field, columns, duration)
     ends, A = ends[:, 0], ends[:, 1:]
     target = next_start(y)
     _, pull = jax.vjp(lambda end: chosen_guard(system, end, s, segments.guard), target)

@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from .._mechanism.mechanism import Mechanism
 from .hybrid import HybridSystem
-from .shooting import condensed, durations, reduced_guard
+from .shooting import condensed, durations, reduced_guard, return_jacobian
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -101,12 +101,6 @@ def _orbit(kind, x, event):
     last = jnp.zeros(len(u), u.dtype).at[-1].set(1)
     weights = jnp.linalg.solve(jnp.concatenate([jacobian, row[None]]).T, last)
     return everything, weights, jnp.ones((), u.dtype)
-
-
-def return_jacobian(jacobian, k: int) -> Array:
-    """The Jacobian (k, k) of the return map from that of the equations."""
-    changes = jnp.linalg.solve(jacobian[k:, k:-1], jacobian[k:, :k])
-    return jacobian[:k, :k] + jnp.eye(k, dtype=jacobian.dtype) - jacobian[:k, k:-1] @ changes
 
 
 def _eigenvectors(jacobian, k: int):

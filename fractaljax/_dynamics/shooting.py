@@ -18,7 +18,7 @@ from .._mechanism.quantities import substituted
 from .events import Cubic
 from .hybrid import NONE, UNUSED, HybridSystem, hybrid_system
 from .limit_cycle import extreme_values
-from .orbit import Segments, chosen_guard, flow, next_start
+from .orbit import Segments, chosen_guard, flow, next_start, tableau
 from .runge_kutta import runge_kutta
 
 
@@ -103,7 +103,7 @@ def condensed(x: Mechanism, window: Window, chain: Chain, lifted: Lifted, u):
 
     units = jnp.eye(2 * n, 2 * n + 1, dtype=y.dtype)[:, :, None]
     columns = jnp.concatenate([y[:, None], jnp.broadcast_to(units, (2 * n, 2 * n + 1, len(h)))], 1)
-    ends = runge_kutta(_tableau(), field, columns, h[None, None])
+    ends = runge_kutta(tableau(), field, columns, h[None, None])
     ends, A, Q = ends[:, 0], ends[:, 1:-1], ends[:, -1]
     b = system.field(ends, s) * chain.share[None]
     target = next_start(y)
@@ -126,11 +126,10 @@ def condensed(x: Mechanism, window: Window, chain: Chain, lifted: Lifted, u):
     return residual, jacobian, Lifted(u, y + d, D), jnp.max(jnp.abs(d))
 
 
-def _tableau():
-    # Imported late: a question of stability does not wait for diffrax.
-    import diffrax
-
-    return diffrax.Dopri8.tableau
+def return_jacobian(jacobian, k: int, xp: Any = jnp) -> Any:
+    """The Jacobian (k, k) of the return map from that of the equations, by JAX or NumPy (`xp`)."""
+    changes = xp.linalg.solve(jacobian[k:, k:-1], jacobian[k:, :k])
+    return jacobian[:k, :k] + xp.eye(k, dtype=jacobian.dtype) - jacobian[:k, k:-1] @ changes
 
 
 def _chained(chain: Chain, A, b, Q, gap, k: int):
