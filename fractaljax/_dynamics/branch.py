@@ -36,7 +36,7 @@ class BranchEvent(Record):
     value: Float[jax.Array, ""]  # of the quantity
     index: int = eqx.field(static=True)  # of the branch's point
     before: str = eqx.field(static=True)  # itinerary
-    after: str = eqx.field(static=True)
+    after: str = eqx.field(static=True)  # none where the branch ends with a jump
 
 
 class Branch(Record):
@@ -85,7 +85,8 @@ class Branch(Record):
             f"{high:.6g}: begins {BranchEnd[self.start]}, ends {BranchEnd[self.end]}"
         ]
         for event in self.events:
-            change = "" if event.before == event.after else f"  {event.before} -> {event.after}"
+            change = f"  {event.before or 'none'} -> {event.after or 'none'}"
+            change = "" if event.before == event.after else change
             rows.append(f"  {event.kind} at {self.name} = {float(event.value):.9g}{change}")
         return "\n".join(rows)
 
@@ -174,7 +175,7 @@ def _from_cycle(follower: Follower, name: str, cycle):
         raise ValueError("start must be one limit cycle that exists")
     if cycle._system.excited or not isinstance(cycle._orbit, Orbit):
         raise ValueError("start must be a cycle without excitation and regularisation")
-    solution = solution_of(cycle, q)
+    solution = solution_of(cycle, follower.x, q)
     h = solution.u[2 * follower.n : -1][: len(solution.phases)]
 
     def begun():
@@ -256,7 +257,7 @@ def _smooth(follower, y, vector, frequency, q) -> Solution:
         used=jnp.asarray(np.arange(8) < 1, float),
     )
     lifted = Lifted(jnp.asarray(u), jnp.asarray(states), jnp.zeros((len(y), len(u), N)))
-    return Solution((Phase(slips, SECTION),), chain, lifted, u)
+    return Solution(follower.x, (Phase(slips, SECTION),), chain, lifted, u)
 
 
 def _branch(follower: Follower, x, name: str, start, end) -> Branch:
@@ -287,7 +288,7 @@ def _branch(follower: Follower, x, name: str, start, end) -> Branch:
     rows["open_fraction"] = rows["open_fraction"][:, joints]
     return Branch(
         name=name,
-        parameter=np.array([float(window.value(point.q)) for point in points]),
+        parameter=np.array([float(window.value(point.place[0])) for point in points]),
         itinerary=tuple(point.itinerary for point in points),
         events=tuple(sorted(events, key=lambda event: event.index)),
         start=start,

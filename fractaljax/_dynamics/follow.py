@@ -15,7 +15,7 @@ import numpy as np
 
 from .hybrid import OPEN, SECTION
 from .itinerary import Family, Phase, Shooting, multipliers_of
-from .shooting import after_switch, guards_at, measured, rate_at
+from .shooting import after_switch, guards_at, linearised, measured, rate_at
 
 _FINER = 8  # attempts at a mesh that is fine enough
 _NEW = (1e-3, 1e-4, 1e-2)  # durations of a phase that appears, as a share of the period
@@ -38,7 +38,7 @@ class BranchEnd(eqx.Enumeration):
 class Point(NamedTuple):
     """One solution and what is shown of it."""
 
-    q: float
+    place: np.ndarray  # of the quantities that are free, in their windows
     row: dict[str, Any]
     itinerary: str
 
@@ -57,11 +57,10 @@ class Follower:
 
     def record(self, shooting: Shooting, z) -> None:
         solution = shooting.solution(z)
-        given = self.x, self.window, solution.chain, solution.lifted, solution.u
+        given = solution.x, self.window, solution.chain, solution.lifted, solution.u
         (low, high, state), second, error = map(np.asarray, measured(*given))
-        _, jacobian = shooting.equations(z)
-        n, h = self.n, solution.u[2 * self.n : 2 * self.n + shooting.m]
-        values = multipliers_of(shooting.monodromy(jacobian))
+        n, h = self.n, shooting.lengths(z)
+        values = multipliers_of(shooting.monodromy(z))
         states = np.array([phase.s for phase in shooting.phases])
         row = {
             "period": float(h.sum() * second),
@@ -75,7 +74,7 @@ class Follower:
             "state": state,
             "error": float(error),
         }
-        self.points.append(Point(float(z[-1]), row, shooting.itinerary()))
+        self.points.append(Point(z[shooting.quantity :], row, shooting.itinerary()))
 
     def note(self, kind, shooting: Shooting, z, before, after, condition=None) -> None:
         """An event at the last recorded point; `condition` is what vanishes there."""
@@ -145,12 +144,12 @@ class Follower:
         """Where to go on with a new mesh of the same itinerary, finer if that is not enough."""
         times = self._times(old, z)
         for _ in range(_FINER):
-            new = Shooting(self.family, old.solution(z), old.phases, times)
+            new = old.again(old.solution(z), old.phases, times)
             found = new.curves.corrected(new.begin)
             if found is None:
                 return BranchEnd.lost
             solution = new.solution(found[0])
-            given = self.x, self.window, solution.chain, solution.lifted, solution.u
+            given = solution.x, self.window, solution.chain, solution.lifted, solution.u
             if float(measured(*given)[2]) <= self.family.rtol / 2:
                 break
             self.family.h *= 0.7
@@ -191,7 +190,7 @@ class Follower:
                 self._noted("fold", shooting, at, ("fold",))
 
         def nontrivial(at):
-            return multipliers_of(shooting.monodromy(shooting.equations(at)[1]))[:-1]
+            return multipliers_of(shooting.monodromy(at))[:-1]
 
         def doubling(at):
             return float(np.prod(nontrivial(at) + 1).real)
@@ -217,17 +216,15 @@ class Follower:
     def _shrinks(self, shooting, z, factor=1.0) -> bool:
         """Whether a smooth orbit is about to vanish, or has passed the point where it does."""
         u = shooting.full(z)
-        y, _ = self.family.linearised(u[-1])
-        size = np.abs(u[: 2 * self.n] - y).max()
+        x, y = shooting.mechanism(z), u[: 2 * self.n]
+        equilibrium = np.asarray(linearised(x, self.window, u[-1])[0])
         s = np.array(shooting.phases[0].s, float)
-        return (
-            size < factor * SMALL
-            or float(rate_at(self.x, self.window, u[-1], u[: 2 * self.n], s)) >= 0
-        )
+        small = np.abs(y - equilibrium).max() < factor * SMALL
+        return bool(small or float(rate_at(x, self.window, u[-1], y, s)) >= 0)
 
     def _hopf(self, shooting, z):
         """The Hopf point near the small orbit z, and the end of the branch."""
-        q, period = z[-1], float(shooting.full(z)[2 * self.n : -1].sum())
+        q, period = z[shooting.quantity], float(shooting.lengths(z).sum())
         found = self.family.hopf_near(q, 2 * np.pi / period)
         if found is None:
             return BranchEnd.lost
@@ -256,7 +253,7 @@ class Follower:
             "error": 0.0,
         }
         itinerary = shooting.itinerary()
-        self.points.append(Point(q, row, itinerary))
+        self.points.append(Point(np.array([q]), row, itinerary))
         u = np.concatenate([y, [period], [q]])
         self.events.append(
             {
@@ -298,11 +295,33 @@ class Follower:
         for candidate in candidates:
             if candidate is not None:
                 return candidate
+        return self._ends(shooting, inside, outside)
+
+    def _ends(self, shooting, inside, outside) -> BranchEnd:
+        """Notes the grazing beyond which no cycle goes on."""
+        found, p = None, int(np.argmin(shooting.durations(outside)))
+        if shooting.durations(outside)[p] > 0:
+            at = self._root(shooting, inside, outside, lambda z: shooting.lowest(z)[0])
+            if at is not None:
+                found = at, ("touch", shooting.lowest(at)[1])
+        else:
+            at = self._without_duration(shooting, inside, p)
+            if at is not None:
+                found = at, ("vanish", p)
+        if found is not None:
+            self.record(shooting, found[0])
+            self.note("grazing", shooting, found[0], shooting.itinerary(), "", found[1])
         return BranchEnd.jump
 
+    def _without_duration(self, shooting, z, p: int) -> np.ndarray | None:
+        """The point of the curve near z at which phase p has none."""
+        at = z.copy()
+        at[shooting.index(p)] = 0
+        found = shooting.curves.corrected(at, shooting.index(p))
+        return None if found is None else found[0]
+
     def _times(self, shooting, z) -> np.ndarray:
-        h = shooting.durations(z) * shooting.scale[2 * self.n : -1]
-        return np.concatenate([[0], np.cumsum(h)])
+        return np.concatenate([[0], np.cumsum(shooting.lengths(z))])
 
     def _vanishing(self, shooting: Shooting, z, p: int) -> Iterator[Any]:
         """Ways on where phase p, nearly of no duration at z, is left out or changes places."""
@@ -322,18 +341,15 @@ class Follower:
             else:
                 kept, begin = [Phase(new.s, SECTION)], self.family.maximum(solution, times[-1])
                 edges = np.array([begin, begin + times[-1]])
-            yield self._merged(shooting, z, Shooting(self.family, solution, kept, edges))
+            yield self._merged(shooting, z, shooting.again(solution, kept, edges))
         elif old.guard == phases[p].guard:
             # A slip to and fro before a stick: without it the stick begins at its limit.
             kept, edges = _without(phases, times, p, old.guard)
-            yield self._merged(shooting, z, Shooting(self.family, solution, kept, edges))
+            yield self._merged(shooting, z, shooting.again(solution, kept, edges))
         # Otherwise the phase can be brought to no duration at all.
-        at = z.copy()
-        at[shooting.index(p)] = 0
-        found = shooting.curves.corrected(at, shooting.index(p))
-        if found is None:
+        at = self._without_duration(shooting, z, p)
+        if at is None:
             return
-        at = found[0]
         solution, times = shooting.solution(at), self._times(shooting, at)
         condition = ("vanish", p)
         faces = len(new.s)
@@ -371,7 +387,7 @@ class Follower:
         if since <= 0 or since >= h:
             tried = self._at_switch(phase, face, guard) if since <= 0 else []
         else:
-            engine = np.asarray(after_switch(self.x, self.window, q, y, s, guard)).astype(int)
+            engine = np.asarray(after_switch(solution.x, self.window, q, y, s, guard)).astype(int)
             tried = [tuple(int(i) for i in engine)]
             if face < len(s):
                 for other in (0, 1, -1):
@@ -380,7 +396,7 @@ class Follower:
         for state in dict.fromkeys(tried):
             if state == phase.s:
                 continue
-            values = np.abs(guards_at(self.x, self.window, q, y, np.array(state, float)))
+            values = np.abs(guards_at(solution.x, self.window, q, y, np.array(state, float)))
             values = np.asarray(values).copy()
             values[0] = np.inf
             excursion = Phase(state, int(np.argmin(values)))
@@ -433,7 +449,7 @@ class Follower:
         solution = shooting.solution(at)
         period = edges[-1] - edges[0]
         for share in _NEW:
-            new = Shooting(self.family, solution, phases, edges)
+            new = shooting.again(solution, phases, edges)
             begin = new.begin.copy()
             begin[new.index(index)] = share * period / new.scale[new.index(index)]
             found = new.curves.corrected(begin, new.index(index))
@@ -450,7 +466,7 @@ class Follower:
 
     def _direct(self, shooting, at, phases, edges, condition):
         """On without a phase that has vanished between two others."""
-        new = Shooting(self.family, shooting.solution(at), phases, edges)
+        new = shooting.again(shooting.solution(at), phases, edges)
         found = new.curves.corrected(new.begin)
         if found is None or np.linalg.norm(found[0] - new.begin) > 1e-3:
             return None

@@ -40,6 +40,7 @@ class Phase(NamedTuple):
 class Solution(NamedTuple):
     """A periodic orbit on a chain of segments, in scaled units."""
 
+    x: Any  # the mechanism
     phases: tuple[Phase, ...]
     chain: Chain
     lifted: Lifted
@@ -60,7 +61,7 @@ class Family:
         """States (2n, places) of an orbit at times, and the rates of friction there."""
         period = orbit.u[2 * self.n : -1].sum()
         wrapped = jnp.asarray(np.mod(times, period))
-        given = self.x, self.window, orbit.chain, orbit.lifted, orbit.u
+        given = orbit.x, self.window, orbit.chain, orbit.lifted, orbit.u
         return resampled(*given, wrapped, places=places)
 
     def linearised(self, q) -> tuple[np.ndarray, np.ndarray]:
@@ -98,8 +99,9 @@ class Shooting:
 
     def __init__(self, family: Family, old: Solution, phases, times):
         """`phases` begin at `times` (m,) on an old orbit; the last one ends after those."""
-        self.family, self.phases = family, tuple(phases)
+        self.family, self.phases, self.x = family, tuple(phases), old.x
         n, m = family.n, len(self.phases)
+        self.quantity = 2 * n + m  # its place among the unknowns
         chain, moments, N = self._mesh(old, np.asarray(times, float))
         y, _ = family.sampled(old, moments, N)
         h = np.diff(times)
@@ -114,19 +116,27 @@ class Shooting:
         self.scale = np.concatenate([np.full(2 * n, size), np.full(m, period), [1.0]])
         self.active = np.r_[np.arange(2 * n + m), len(u) - 1]
         self.begin = self.scaled(u)
-        far = np.full(2 * n + m, np.inf)
-        self.curves = Continuation(
+        self.curves = self._curves()
+        self.orders = self._orders()
+
+    def again(self, old: Solution, phases, times) -> "Shooting":
+        """The equations of another itinerary, or of the same one on a new mesh."""
+        return Shooting(self.family, old, phases, times)
+
+    def _curves(self) -> Continuation:
+        """Both ways along the solutions, as long as the quantities stay in their windows."""
+        inside = np.arange(len(self.begin)) >= self.quantity
+        return Continuation(
             self.equations,
-            low=np.append(-far, 0.0),
-            high=np.append(far, 1.0),
+            low=np.where(inside, 0.0, -np.inf),
+            high=np.where(inside, 1.0, np.inf),
             valid=lambda z: bool(np.isfinite(z).all()),
             tolerance=1e-9,
             settled=1e-11,
             oriented=False,
-            longest=family.step,
+            longest=self.family.step,
             shortest=1e-8,
         )
-        self.orders = self._orders()
 
     def _mesh(self, old, times):
         """The chain of segments, equal in each phase where friction counts, and their starts."""
@@ -195,11 +205,18 @@ class Shooting:
         return u
 
     def durations(self, z) -> np.ndarray:
-        return z[2 * self.family.n : -1]
+        return z[2 * self.family.n : self.quantity]
+
+    def lengths(self, z) -> np.ndarray:
+        """The durations of the phases in scaled time."""
+        return self.durations(z) * self.scale[2 * self.family.n : self.quantity]
+
+    def mechanism(self, z) -> Any:
+        return self.x
 
     def stale(self, z) -> bool:
         """Whether a phase has grown so much that it must be cut anew."""
-        h = self.durations(z) * self.scale[2 * self.family.n : -1]
+        h = self.lengths(z)
         return bool((h > _STALE * self.length + 1e-2).any())
 
     def index(self, p: int) -> int:
@@ -218,7 +235,7 @@ class Shooting:
         if key in self.known:
             return self.known[key]
         u = self.full(z)
-        x, window, states = self.family.x, self.family.window, self.near(u)
+        x, window, states = self.x, self.family.window, self.near(u)
         for _ in range(_CLOSINGS):
             given = x, window, self.chain, states, u
             residual, jacobian, states, gap = condensed(*given)
@@ -237,17 +254,17 @@ class Shooting:
 
     def solution(self, z) -> Solution:
         u = self.full(z)
-        return Solution(self.phases, self.chain, self.near(u), u)
+        return Solution(self.mechanism(z), self.phases, self.chain, self.near(u), u)
 
-    def monodromy(self, jacobian) -> np.ndarray:
-        """The Jacobian (2n, 2n) of the return map, from that of the equations."""
-        return return_jacobian(jacobian / self.scale, 2 * self.family.n, np)
+    def monodromy(self, z) -> np.ndarray:
+        """The Jacobian (2n, 2n) of the return map."""
+        return return_jacobian(self.evaluated(z)[1], 2 * self.family.n, np)
 
     def lowest(self, z) -> tuple[float, Place]:
         """The least reduced guard on the orbit, and where."""
         u = self.full(z)
-        family = self.family
-        value, place = lowest(family.x, family.window, self.chain, self.near(u), u, *self.orders)
+        given = self.mechanism(z), self.family.window, self.chain, self.near(u), u
+        value, place = lowest(*given, *self.orders)
         return float(value), jax.tree.map(lambda a: np.asarray(a)[()], place)
 
     def admissibility(self, z) -> float:
@@ -277,8 +294,8 @@ def multipliers_of(return_jacobian) -> np.ndarray:
     return np.append(values[order[:-1]], 1.0)
 
 
-def solution_of(cycle: LimitCycle, q: float) -> Solution:
-    """The orbit of a limit cycle as phases, in its own scaled units."""
+def solution_of(cycle: LimitCycle, x: Mechanism, q: float) -> Solution:
+    """The orbit of a limit cycle of x as phases, in its own scaled units."""
     segments = cycle._orbit.segments
     guard = np.asarray(segments.guard)
     used = guard != UNUSED
@@ -318,4 +335,4 @@ def solution_of(cycle: LimitCycle, q: float) -> Solution:
     y = np.concatenate([y, np.repeat(y[:, :1], rest, axis=1)], axis=1)
     u = np.concatenate([y[:, 0], lengths, np.zeros(M - len(lengths)), [q]])
     blank = jnp.zeros((len(y), len(u), N), y.dtype)
-    return Solution(phases, chain, Lifted(jnp.asarray(u), jnp.asarray(y), blank), u)
+    return Solution(x, phases, chain, Lifted(jnp.asarray(u), jnp.asarray(y), blank), u)

@@ -170,6 +170,7 @@ class Place(eqx.Module):
 
 
 _NODES = 5
+_TINY = 1e-12  # scaled time from a switch that is none
 
 
 def reduced_guard(system: HybridSystem, chain: Chain, y, h, at: Place, theta) -> Array:
@@ -187,7 +188,7 @@ def reduced_guard(system: HybridSystem, chain: Chain, y, h, at: Place, theta) ->
     value, rate = values[at.guard], rates[at.guard]
     time, rest = since + theta * h[k], left + (1 - theta) * h[k]
     # At its own zero the guard's rate takes the place of the quotient.
-    at_start, at_end = (at.before > 0) & (time <= 0), (at.after > 0) & (rest <= 0)
+    at_start, at_end = (at.before > 0) & (time <= _TINY), (at.after > 0) & (rest <= _TINY)
     plain = value / jnp.where(at_start | (at.before == 0), 1, time**at.before)
     plain = plain / jnp.where(at_end | (at.after == 0), 1, rest)
     at_start_value = rate / jnp.where(at.after > 0, rest, 1)
@@ -217,9 +218,8 @@ def lowest(x: Mechanism, window: Window, chain: Chain, lifted: Lifted, u, before
     time = ((chain.begin[None] + theta[:, None] * chain.share[None]) * phase[None])[None]
     rest = phase[None, None] - time
     p, q = before[:, chain.phase][:, None], after[:, chain.phase][:, None]
-    tiny = 1e-12
-    at_start, at_end = (p > 0) & (time <= tiny), (q > 0) & (rest <= tiny)
-    time, rest = jnp.where(time <= tiny, 1, time), jnp.where(rest <= tiny, 1, rest)
+    at_start, at_end = (p > 0) & (time <= _TINY), (q > 0) & (rest <= _TINY)
+    time, rest = jnp.where(time <= _TINY, 1, time), jnp.where(rest <= _TINY, 1, rest)
     over = jnp.where(at_start, 1, time**p) * jnp.where(at_end, 1, rest**q)
     reduced = jnp.where(at_start, rate, jnp.where(at_end, -rate, value)) / over
     # After a stick ends, a slip begins with a zero of second order, whose sign the stick's decides.
