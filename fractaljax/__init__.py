@@ -26,6 +26,10 @@ from ._design.pareto import Front as Front, pareto as pareto
 from ._design.tolerance import Tolerance as Tolerance, squeal_probability as squeal_probability
 from ._dynamics.attractors import attractors as attractors
 from ._dynamics.basin import Basin as Basin, basin as basin
+from ._dynamics.bifurcation import (
+    BifurcationMap as BifurcationMap,
+    bifurcation_map as bifurcation_map,
+)
 from ._dynamics.branch import (
     Branch as Branch,
     BranchEnd as BranchEnd,
@@ -33,6 +37,7 @@ from ._dynamics.branch import (
     continue_cycle as continue_cycle,
 )
 from ._dynamics.cycle import CycleResult as CycleResult, LimitCycle as LimitCycle
+from ._dynamics.event_curve import EventCurve as EventCurve, continue_event as continue_event
 from ._dynamics.excitation import Excitation as Excitation
 from ._dynamics.limit_cycle import limit_cycle as limit_cycle
 from ._dynamics.simulate import (

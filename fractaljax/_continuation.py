@@ -188,12 +188,12 @@ def trace(curves: Continuation, values: Values, lines: int) -> tuple[list[Curve]
             continue
         # In the same direction: the other side of a narrow tongue is another curve.
         along = curves.tangent(start[1])
-        if any((_passing(curve, seed, curves.shortest) @ along > 0).any() for curve in found):
+        if any((passing(curve, seed, curves.shortest) @ along > 0).any() for curve in found):
             continue
         curve = curves.curve(*start)
         if len(curve.points) > 1:
             found.append(curve)
-    missed = [p for p in failed if not any(len(_passing(c, p, curves.shortest)) for c in found)]
+    missed = [p for p in failed if not any(len(passing(c, p, curves.shortest)) for c in found)]
     return found, negative, len(missed)
 
 
@@ -245,7 +245,7 @@ def _beyond(values, first, last, axis, sign):
     return found
 
 
-def _passing(curve, p, shortest):
+def passing(curve, p, shortest):
     """The steps of a curve that pass p, within the error of its polyline."""
     begin, step = curve.points[:-1], np.diff(curve.points, axis=0)
     length = np.maximum(np.linalg.norm(step, axis=1), shortest**2)

@@ -1,5 +1,7 @@
 """A branch of limit cycles, stable or unstable, in one quantity of the mechanism."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -37,6 +39,9 @@ class BranchEvent(Record):
     index: int = eqx.field(static=True)  # of the branch's point
     before: str = eqx.field(static=True)  # itinerary
     after: str = eqx.field(static=True)  # none where the branch ends with a jump
+    side: int = eqx.field(static=True)  # 1: stable cycles beside it are at larger values of the
+    # quantity, -1: at smaller ones, 0: on both sides or on none
+    _found: Any = eqx.field(default=None, repr=False)  # quantity's window, cycle, what vanishes
 
 
 class Branch(Record):
@@ -77,6 +82,11 @@ class Branch(Record):
     def hopf(self) -> list[BranchEvent]:
         """Where the cycle shrinks to the equilibrium."""
         return self.of_kind("Hopf")
+
+    @property
+    def limits(self) -> list[BranchEvent]:
+        """The events at which stable cycles begin or end."""
+        return [event for event in self.events if event.side]
 
     def __repr__(self) -> str:
         low, high = self.parameter.min(), self.parameter.max()
@@ -129,11 +139,7 @@ def continue_cycle(
     """
     require_one("x", x)
     degrees_of_freedom(x)
-    require_known(x, name)
-    low, high = (float(scalar(f"window of {name}", end)) for end in _pair(window))
-    if not low < high:
-        raise ValueError(f"window must go from a lower to a higher {name}, got {window!r}")
-    require_inside(x, {name: np.array([low, high])})
+    low, high = checked_window(x, name, window)
     frozen = with_optional(jax.lax.stop_gradient(x), (name,))
     if any(concrete(leaf) is None for leaf in jax.tree.leaves(frozen)):
         raise TypeError("continue_cycle follows one branch and cannot be compiled or batched")
@@ -156,10 +162,16 @@ def continue_cycle(
     return _branch(follower, x, name, *ended)
 
 
-def _pair(window):
+def checked_window(x: Mechanism, name: str, window) -> tuple[float, float]:
+    """The ends of a window of a quantity of x."""
+    require_known(x, name)
     if not (isinstance(window, (tuple, list)) and len(window) == 2):
         raise ValueError(f"window must be (low, high), got {brief(window)}")
-    return window
+    low, high = (float(scalar(f"window of {name}", end)) for end in window)
+    if not low < high:
+        raise ValueError(f"window must go from a lower to a higher {name}, got {window!r}")
+    require_inside(x, {name: np.array([low, high])})
+    return low, high
 
 
 def _from_cycle(follower: Follower, name: str, cycle):
@@ -190,7 +202,7 @@ def _from_cycle(follower: Follower, name: str, cycle):
     tangent = shooting.curves.tangent(found[1])
     tangent = tangent if tangent[-1] > 0 else -tangent
     follower.record(shooting, z)
-    follower.home = shooting.phases, shooting.full(z)
+    follower.home = shooting.solution(z)
     end = follower.follow(shooting, z, tangent)
     if bool(end == BranchEnd.closed):
         return end, end
@@ -260,9 +272,17 @@ def _smooth(follower, y, vector, frequency, q) -> Solution:
     return Solution(follower.x, (Phase(slips, SECTION),), chain, lifted, u)
 
 
+def _side(places, stable, i: int) -> int:
+    """On which side of point i of a branch its stable neighbours are; 0 if on both or on none."""
+    beside = [k for k in (i - 1, i + 1) if 0 <= k < len(places) and stable[k]]
+    return int(np.sign(sum(np.sign(places[k] - places[i]) for k in beside)))
+
+
 def _branch(follower: Follower, x, name: str, start, end) -> Branch:
     """The result, with values of the events that depend on x."""
     points, window = follower.points, follower.window
+    rows = {key: np.array([point.row[key] for point in points]) for key in points[0].row}
+    places = np.array([point.place[0] for point in points])
     events = []
     for event in follower.events:
         kind, *details = event["condition"]
@@ -274,9 +294,10 @@ def _branch(follower: Follower, x, name: str, start, end) -> Branch:
                 index=event["index"],
                 before=event["before"],
                 after=event["after"],
+                side=_side(places, rows["stable"], event["index"]),
+                _found=(window, event["solution"], kind, data[-1], follower.family.rtol),
             )
         )
-    rows = {key: np.array([point.row[key] for point in points]) for key in points[0].row}
     # At a Hopf point a multiplier is 1: it is shown as the cycles beside it are.
     for event in events:
         if event.kind == "Hopf":

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .hybrid import OPEN, SECTION
-from .itinerary import Family, Phase, Shooting, multipliers_of
+from .itinerary import Family, Phase, Shooting, Solution, multipliers_of
 from .shooting import after_switch, guards_at, linearised, measured, rate_at
 
 _FINER = 8  # attempts at a mesh that is fine enough
@@ -31,6 +31,7 @@ class BranchEnd(eqx.Enumeration):
     closed = "where it began"
     hopf = "at a Hopf point, where the cycle vanishes"
     jump = "where no cycle with another itinerary goes on: a motion jumps from here"
+    meets = "where another event meets it"
     lost = "where it could not be followed"
     long = "after the largest number of points"
 
@@ -51,7 +52,7 @@ class Follower:
         self.x, self.window = family.x, family.window
         self.points: list[Point] = []
         self.events: list[dict[str, Any]] = []
-        self.home: tuple[Any, np.ndarray] | None = None  # phases and unknowns of the start
+        self.home: Solution | None = None  # the start
 
     # --- what is recorded ---
 
@@ -87,6 +88,7 @@ class Follower:
                 "after": after,
                 "data": (solution.chain, solution.lifted, jnp.asarray(solution.u)),
                 "condition": condition,
+                "solution": solution,
             }
         )
 
@@ -135,9 +137,9 @@ class Follower:
             event["before"], event["after"] = event["after"], event["before"]
 
     def _closes(self, shooting, z, ahead, reached) -> bool:
-        if self.home is None or self.home[0] != shooting.phases or len(self.points) < 4:
+        if self.home is None or self.home.phases != shooting.phases or len(self.points) < 4:
             return False
-        start = shooting.scaled(self.home[1])
+        start = shooting.located(self.home.u, self.home.r)
         return shooting.curves.passes(start - z, ahead, reached - z)
 
     def _remeshed(self, old: Shooting, z, ahead):
@@ -263,6 +265,7 @@ class Follower:
                 "after": itinerary,
                 "data": (None, None, jnp.asarray(u)),
                 "condition": ("hopf",),
+                "solution": None,
             }
         )
 

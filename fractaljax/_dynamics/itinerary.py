@@ -25,7 +25,6 @@ from .shooting import (
 _SAMPLES = 512  # of an orbit, to see where friction is stiff
 _LENGTH = 0.25  # of segments at rtol 1e-9, in scaled time
 _MEMORY = 64  # evaluations from which states between are extrapolated, the nearest of them
-_GAP = 1e-7  # between segments, above which they are first brought together
 _CLOSINGS = 4  # attempts at that
 _FAR = 0.3  # gap beyond which an evaluation is not among them
 _STALE = 1.3  # growth of a phase after which it is cut anew
@@ -45,6 +44,7 @@ class Solution(NamedTuple):
     chain: Chain
     lifted: Lifted
     u: np.ndarray
+    r: float = 0.0  # place of a second free quantity, if there is one
 
 
 class Family:
@@ -97,6 +97,8 @@ class Family:
 class Shooting:
     """The equations of one itinerary for NumPy: unknowns z are u without padding, scaled."""
 
+    gap = 1e-7  # between segments, above which they are first brought together
+
     def __init__(self, family: Family, old: Solution, phases, times):
         """`phases` begin at `times` (m,) on an old orbit; the last one ends after those."""
         self.family, self.phases, self.x = family, tuple(phases), old.x
@@ -109,13 +111,13 @@ class Shooting:
         u = np.concatenate([np.asarray(y[:, 0]), h, np.zeros(self.padded - m), old.u[-1:]])
         self.chain, self.m, self.length = chain, m, h.copy()
         blank = jnp.zeros((2 * n, len(u), N), y.dtype)
-        self.memory = [(u, _FAR, Lifted(jnp.asarray(u), y, blank))]
+        self.memory = [(self.key(u, old.r), _FAR, Lifted(jnp.asarray(u), y, blank))]
         self.known: dict[bytes, Any] = {}  # of the last points
         size = 1 + float(np.abs(np.asarray(y)).max())
         period = float(h.sum())
         self.scale = np.concatenate([np.full(2 * n, size), np.full(m, period), [1.0]])
         self.active = np.r_[np.arange(2 * n + m), len(u) - 1]
-        self.begin = self.scaled(u)
+        self.begin = self.located(u, old.r)
         self.curves = self._curves()
         self.orders = self._orders()
 
@@ -196,12 +198,17 @@ class Shooting:
 
     # --- unknowns ---
 
-    def scaled(self, u) -> np.ndarray:
+    def located(self, u, r=0.0) -> np.ndarray:
+        """The unknowns z of u, and of a second quantity where there is one."""
         return u[self.active] / self.scale
 
     def full(self, z) -> np.ndarray:
-        u = np.zeros(2 * self.family.n + self.padded + 1)
-        u[self.active] = z * self.scale
+        u, scale = np.zeros(2 * self.family.n + self.padded + 1), self.scale[: self.quantity + 1]
+        u[self.active] = z[: self.quantity + 1] * scale
+        return u
+
+    def key(self, u, r=0.0) -> np.ndarray:
+        """What an evaluation is remembered by."""
         return u
 
     def durations(self, z) -> np.ndarray:
@@ -225,24 +232,25 @@ class Shooting:
 
     # --- equations ---
 
-    def near(self, u) -> Lifted:
-        """The evaluation that says best where the states are: near u, and then without gaps."""
-        errors = [np.abs(u - at).max() ** 2 + gap**2 for at, gap, _ in self.memory]
+    def near(self, key) -> Lifted:
+        """The evaluation that says best where the states are: nearby, and then without gaps."""
+        errors = [np.abs(key - at).max() ** 2 + gap**2 for at, gap, _ in self.memory]
         return self.memory[int(np.argmin(errors))][2]
 
     def evaluated(self, z):
+        """Residual and Jacobian of the orbit at z, by the unknowns before they are scaled."""
         key = z.tobytes()
         if key in self.known:
             return self.known[key]
-        u = self.full(z)
-        x, window, states = self.x, self.family.window, self.near(u)
+        u, at = self.full(z), self.key(self.full(z), z[-1])
+        x, window, states = self.mechanism(z), self.family.window, self.near(at)
         for _ in range(_CLOSINGS):
             given = x, window, self.chain, states, u
             residual, jacobian, states, gap = condensed(*given)
-            if not float(gap) > _GAP:
+            if not float(gap) > self.gap:
                 break
         if float(gap) < _FAR:
-            self.memory = [*self.memory[-_MEMORY:], (u, float(gap), states)]
+            self.memory = [*self.memory[-_MEMORY:], (at, float(gap), states)]
         rows = np.arange(2 * self.family.n + self.m)
         found = np.asarray(residual)[rows], np.asarray(jacobian)[np.ix_(rows, self.active)]
         self.known = dict([*self.known.items()][-_MEMORY:]) | {key: found}
@@ -254,7 +262,8 @@ class Shooting:
 
     def solution(self, z) -> Solution:
         u = self.full(z)
-        return Solution(self.mechanism(z), self.phases, self.chain, self.near(u), u)
+        lifted = self.near(self.key(u, z[-1]))
+        return Solution(self.mechanism(z), self.phases, self.chain, lifted, u)
 
     def monodromy(self, z) -> np.ndarray:
         """The Jacobian (2n, 2n) of the return map."""
@@ -262,9 +271,8 @@ class Shooting:
 
     def lowest(self, z) -> tuple[float, Place]:
         """The least reduced guard on the orbit, and where."""
-        u = self.full(z)
-        given = self.mechanism(z), self.family.window, self.chain, self.near(u), u
-        value, place = lowest(*given, *self.orders)
+        x, _, chain, lifted, u, _ = self.solution(z)
+        value, place = lowest(x, self.family.window, chain, lifted, u, *self.orders)
         return float(value), jax.tree.map(lambda a: np.asarray(a)[()], place)
 
     def admissibility(self, z) -> float:

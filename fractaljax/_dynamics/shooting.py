@@ -201,7 +201,7 @@ def lowest(x: Mechanism, window: Window, chain: Chain, lifted: Lifted, u, before
     """The least reduced guard anywhere on the orbit, and where it is.
 
     `before` and `after` (k, M) are the orders of the zeros of the guards where phases begin and
-    end. Below zero the orbit does not keep to its itinerary.
+    end; -1 before a phase leaves a guard out. Below zero the orbit does not keep to its itinerary.
     """
     system = window.system(x, u[-1])
     y, n = lifted.at(u), system.n
@@ -224,7 +224,7 @@ def lowest(x: Mechanism, window: Window, chain: Chain, lifted: Lifted, u, before
     reduced = jnp.where(at_start, rate, jnp.where(at_end, -rate, value)) / over
     # After a stick ends, a slip begins with a zero of second order, whose sign the stick's decides.
     counted = (chain.share[None, None] > 0) & ~(at_start & (p > 1))
-    counted = counted & (jnp.arange(len(value))[:, None, None] > 0)
+    counted = counted & (jnp.arange(len(value))[:, None, None] > 0) & (p >= 0)
     reduced = jnp.where(counted, reduced, jnp.inf)
     guard, node, segment = jnp.unravel_index(jnp.argmin(reduced), reduced.shape)
     orders = before[guard, chain.phase[segment]], after[guard, chain.phase[segment]]

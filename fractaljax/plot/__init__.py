@@ -7,6 +7,7 @@ Jupyter shows as the last expression of a cell. `cycle`, `cycles`, `modes`, `sti
 
 from .axes import new_figure as new_figure
 from .basin import basin as basin
+from .bifurcation import bifurcation_map as bifurcation_map
 from .boundary import boundary as boundary
 from .branch import branch as branch
 from .curves import (

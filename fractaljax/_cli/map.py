@@ -1,0 +1,84 @@
+"""`fractaljax map`: where a mechanism is quiet, squeals, or does as it was kicked."""
+
+from pathlib import Path
+
+from .output import csv_text, output, picture
+from .parsing import add_scene_file, load_given, number, pairs_of
+
+_FORM = "NAME=LOW:HIGH"
+_AROUND = {"D": (-0.05, 0.05), "G": (0.5, 2.0)}  # of the default window: added, and a factor
+
+
+def add_map(commands) -> None:
+    """Add `fractaljax map`."""
+    parser = commands.add_parser(
+        "map",
+        help="map where it is quiet, squeals, or does as it was kicked",
+        description=_run.__doc__,
+    )
+    add_scene_file(parser)
+    parser.add_argument("--out", type=Path, default=Path("fractaljax-map"), metavar="FOLDER")
+    for which, name in (("x", "D"), ("y", "G")):
+        parser.add_argument(
+            f"--{which}", metavar=_FORM, help=f"a quantity and its window; default around {name}"
+        )
+    parser.add_argument(
+        "--radius", type=float, help="of the kicks that look for cycles; default 5 V/omega and V"
+    )
+    parser.add_argument("--starts", type=int, help="how many kicks; default 128")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+    parser.set_defaults(run=_run)
+
+
+def _run(arguments) -> int:
+    """Trace the stability boundary and the boundaries of the limit cycles in two quantities.
+
+    Of a scene, or of a structure. Writes map.png and map.csv, with a row for each point of a curve.
+    """
+    from .. import plot
+    from .._dynamics.bifurcation import bifurcation_map
+
+    x = load_given(arguments.scene, structures=True)
+    windows = [_window(x, which, getattr(arguments, which)) for which in ("x", "y")]
+    options = {name: getattr(arguments, name) for name in ("radius", "starts")}
+    options = {name: value for name, value in options.items() if value is not None}
+    with output(arguments.out) as write:
+        found = bifurcation_map(x, *windows, **options, progress=not arguments.quiet)
+        figure = picture(plot.bifurcation_map(found).figure)
+        written = write({"map.png": figure, "map.csv": _text(found).encode()})
+    print(f"{found!r}\n{written}")
+    return 0
+
+
+def _window(x, which: str, text: str | None) -> tuple[str, float, float]:
+    """A quantity and its window; by default around the fractal dimension or the roughness."""
+    from .._mechanism.quantities import known_quantities, value_of
+
+    if text is None:
+        name = {"x": "D", "y": "G"}[which]
+        if name not in known_quantities(x):
+            raise ValueError(f"--{which} must be {_FORM}: the scene has no {name}")
+        own, (low, high) = float(value_of(x, name)), _AROUND[name]
+        if name == "G":
+            return name, own * low, own * high
+        return name, max(2.001, own + low), min(2.999, own + high)
+    ((name, ends),) = pairs_of(f"--{which}", [text], _FORM).items()
+    numbers = [number(f"--{which} {name}", end) for end in ends.split(":")]
+    if len(numbers) != 2:
+        raise ValueError(f"--{which} must be {_FORM}, got {text!r}")
+    return name, numbers[0], numbers[1]
+
+
+def _text(found) -> str:
+    """The curves as a table; a Hopf point has the period of its critical mode and no amplitude."""
+    n = max((curve.amplitude.shape[1] for curve in found.curves), default=0)
+    amplitudes = [f"peak to peak of x{i + 1} [m]" for i in range(n)]
+    rows = []
+    for k, branch in enumerate(found.boundary.branches):
+        for x, y, f in zip(branch.x, branch.y, branch.frequency, strict=True):
+            rows.append([k + 1, "Hopf", x, y, 1 / f if f else "", *[0.0] * n])
+    for k, curve in enumerate(found.curves, len(found.boundary.branches)):
+        for row in zip(curve.x, curve.y, curve.period, curve.amplitude, strict=True):
+            rows.append([k + 1, curve.kind, *row[:3], *row[3]])
+    titles = ["curve", "kind", found.x[0], found.y[0], "period [s]", *amplitudes]
+    return csv_text(titles, rows)

@@ -1,0 +1,178 @@
+"""Curves in two quantities along which a cycle stays at an event of its branch."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from .._base.parts import Record, number, require_kind, whole
+from .._base.ranges import is_logarithmic
+from .._mechanism.mechanism import Mechanism
+from .._mechanism.quantities import (
+    require_independent,
+    value_of,
+    with_optional,
+)
+from .branch import BranchEvent, checked_window
+from .follow import BranchEnd, Follower
+from .itinerary import Family
+from .pinned import Event, Pinned
+from .shooting import Window
+
+_HELD = "fold", "multiplier", "touch"
+_STRAIGHT = 0.95  # cosine of the angle by which a curve may turn at a change of itinerary
+
+
+class EventCurve(Record):
+    """Where in two quantities cycles fold, graze, or change stability, as `continue_event` finds.
+
+    It has k points.
+    """
+
+    kind: str = eqx.field(static=True)  # "fold", "grazing", "period doubling", "Neimark-Sacker"
+    names: tuple[str, str] = eqx.field(static=True)  # of the quantities
+    x: Float[np.ndarray, " k"]  # the first quantity, that of the branch
+    y: Float[np.ndarray, " k"]  # the second one
+    period: Float[np.ndarray, " k"]  # of the cycle at the event [s]
+    amplitude: Float[np.ndarray, "k n"]  # peak to peak [m]
+    itinerary: tuple[str, ...] = eqx.field(static=True)
+    side: int = eqx.field(static=True)  # 1: stable cycles are on its left from first to last point,
+    # -1: on its right, 0: on both sides or on none
+    start: BranchEnd
+    end: BranchEnd
+
+    def swapped(self) -> "EventCurve":
+        """With the quantities in the other order."""
+        turned = {"names": self.names[::-1], "x": self.y, "y": self.x, "side": -self.side}
+        return dataclasses.replace(self, **turned)
+
+    def __repr__(self) -> str:
+        first, second = (
+            f"{name} from {values.min():.6g} to {values.max():.6g}"
+            for name, values in zip(self.names, (self.x, self.y), strict=True)
+        )
+        ends = f"begins {BranchEnd[self.start]}, ends {BranchEnd[self.end]}"
+        return f"{self.kind}, {len(self.x)} points, {first}, {second}: {ends}"
+
+
+class _CurveFollower(Follower):
+    """A cycle at an event: nothing is noted on the way but where the curve ends."""
+
+    def note(self, *_) -> None:
+        pass
+
+    def _smooth_events(self, *_) -> None:
+        pass
+
+    def _hopf(self, *_) -> BranchEnd:
+        return BranchEnd.hopf
+
+    def _leaves_itinerary(self, shooting, z, reached):
+        """On where the curve stays smooth: elsewhere the event is another one from there."""
+        known = len(self.points)
+        onward = super()._leaves_itinerary(shooting, z, reached)
+        if isinstance(onward, BranchEnd):
+            return onward
+        new, begin, ahead = onward
+        away, came = begin[new.quantity :] - z[shooting.quantity :], reached - z
+        before, after = came[shooting.quantity :], ahead[new.quantity :]
+        straight = before @ after > _STRAIGHT * np.linalg.norm(before) * np.linalg.norm(after)
+        if straight and np.linalg.norm(away) < 2 * np.linalg.norm(came):
+            return onward
+        del self.points[known:]
+        return BranchEnd.meets
+
+    def _ends(self, *_) -> BranchEnd:
+        return BranchEnd.meets
+
+
+def continue_event(
+    x: Mechanism,
+    event: BranchEvent,
+    name: str,
+    window: tuple[float, float],
+    *,
+    step: float = 1 / 64,
+    points: int = 1000,
+) -> EventCurve:
+    """Follow a fold, a grazing or a change of stability as a second quantity changes.
+
+    By pseudo-arclength continuation of the exact orbit together with what vanishes at the event, so
+    through extremes of either quantity, and through changes of the itinerary elsewhere on the
+    cycle. The curve goes both ways from the event.
+
+    **Arguments:**
+
+    - `x`: the scene or structure whose branch has the event.
+    - `event`: one of `Branch.events`; the first quantity is that of the branch, in its window.
+    - `name`, `window`: the second quantity and its (low, high), which holds the value of `x`.
+    - `step`, `points`: as in `continue_cycle`.
+
+    **Returns:** an `EventCurve`.
+
+    **Raises:** `ValueError` for a Hopf point (`hopf_boundary` follows it), a grazing or an order of
+    switches at which a phase vanishes, and for names and windows as `continue_cycle` does.
+    """
+    require_kind("event", event, BranchEvent)
+    first, solution, condition, detail, rtol = event._found
+    if condition == "hopf":
+        raise ValueError("event must not be a Hopf point: hopf_boundary follows those")
+    if condition not in _HELD:
+        raise ValueError(f"event must be one at which no phase vanishes, got {event.kind}")
+    low, high = checked_window(x, name, window)
+    require_independent(x, (first.name, name))
+    frozen = with_optional(jax.lax.stop_gradient(x), (first.name, name))
+    scale = is_logarithmic(low, high)
+    ends = jnp.log(jnp.array([low, high])) if scale else jnp.array([low, high])
+    second = Window(ends[0], ends[1], name, scale)
+    value = float(value_of(frozen, name))
+    r = float(second.place(value))
+    if not 0 <= r <= 1:
+        raise ValueError(f"the window must hold {name} = {value!r}, that of the event")
+    step, points = float(number("step", step, above=0)), whole("points", points, 2)
+    family = Family(frozen, first, step, rtol)
+    follower = _CurveFollower(family, points)
+    held = Event.of(condition, detail, solution.chain)
+    solution = solution._replace(x=frozen, r=r)
+    h = solution.u[2 * family.n :][: len(solution.phases)]
+    times = np.concatenate([[0], np.cumsum(h)])
+
+    def begun():
+        pinned = Pinned(family, second, held, solution, solution.phases, times)
+        return pinned, pinned.curves.corrected(pinned.begin, len(pinned.begin) - 1)
+
+    pinned, found = begun()
+    if found is None or np.linalg.norm(found[0] - pinned.begin) > 0.1:
+        raise ValueError("event must be one of a branch of x itself")
+    z, tangent = found[0], pinned.curves.tangent(found[1])
+    tangent = tangent if tangent[-1] > 0 else -tangent
+    follower.record(pinned, z)
+    # The side is to the left of a tangent upwards if it is towards smaller values.
+    side = -event.side if tangent[-1] > 0 else event.side
+    follower.home = pinned.solution(z)
+    start = end = follower.follow(pinned, z, tangent)
+    if not bool(end == BranchEnd.closed):
+        follower.reverse()
+        follower.home = None
+        start = follower.follow(begun()[0], z, -tangent)
+        follower.reverse()
+    places = np.array([point.place for point in follower.points])
+    rows: dict[str, Any] = {
+        key: np.array([point.row[key] for point in follower.points])
+        for key in ("period", "amplitude")
+    }
+    return EventCurve(
+        kind=event.kind,
+        names=(first.name, name),
+        x=np.array([float(first.value(q)) for q in places[:, 0]]),
+        y=np.array([float(second.value(r)) for r in places[:, 1]]),
+        itinerary=tuple(point.itinerary for point in follower.points),
+        side=side,
+        start=start,
+        end=end,
+        **rows,
+    )

@@ -1,0 +1,208 @@
+"""The equations of a cycle that is held at an event, with two quantities of the mechanism free.
+
+To those of `itinerary.py` comes one condition: a fold, a multiplier on the unit circle, or a guard
+that touches zero. Newton's method finds zeros of the exact equations. In its Jacobian the row of
+the condition and the column of the second quantity are differences, good to some digits.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._mechanism.mechanism import Mechanism
+from .._mechanism.quantities import substituted
+from .itinerary import Family, Shooting, Solution
+from .shooting import Chain, Place, Window, durations, reduced_guard, return_jacobian
+
+_STEP = 1e-7  # of differences
+_AWAY = 1e4  # weight of the second quantity, which the states between do not follow
+_NEAR = 1e-6  # scaled time within which a moment is that of a switch
+
+
+class Event(NamedTuple):
+    """What is held."""
+
+    condition: str  # "fold", "multiplier" or "touch"
+    place: Any = None  # of "touch"
+    side: int = 0  # -1 where that is at the start of a phase, 1 at its end
+    multiplier: complex | None = None  # by default the one nearest to the unit circle
+
+    @classmethod
+    def of(cls, condition: str, detail: Any, chain: Chain) -> "Event":
+        """From what vanishes at an event of a branch."""
+        if condition != "touch":
+            return cls(condition)
+        k, theta = int(detail.segment), float(detail.theta)
+        begins, ends = chain.begin[k] == 0, chain.begin[k] + chain.share[k] > 1 - _NEAR
+        if theta == 0 and begins:
+            return cls(condition, detail, -1)
+        return cls(condition, detail, 1 if theta == 1 and ends else 0)
+
+
+class Pinned(Shooting):
+    """The equations of one itinerary held at an event; the second quantity comes last in z."""
+
+    gap = 1e-11  # differences of the Jacobian need more than the orbit does
+
+    def __init__(self, family: Family, second: Window, event: Event, old: Solution, phases, times):
+        self.second, self.event, self.borders = second, event, None
+        super().__init__(family, old, phases, times)
+        self.scale = np.append(self.scale, 1.0)
+        if event.condition == "touch":
+            self._locate(old, np.asarray(times, float))
+
+    def again(self, old, phases, times) -> "Pinned":
+        return Pinned(self.family, self.second, self.event, old, phases, times)
+
+    def located(self, u, r=0.0) -> np.ndarray:
+        return np.append(u[self.active] / self.scale[: len(self.active)], r)
+
+    def key(self, u, r=0.0) -> np.ndarray:
+        return np.append(u, _AWAY * r)
+
+    def mechanism(self, z) -> Mechanism:
+        return mechanism(self.x, self.second, z[-1])
+
+    def solution(self, z) -> Solution:
+        return super().solution(z)._replace(r=float(z[-1]))
+
+    def stale(self, z) -> bool:
+        place = self.event.place
+        away = place is not None and not -0.2 < place.theta < 1.2
+        return away or super().stale(z)
+
+    def equations(self, z):
+        residual, jacobian = self._orbit(z)
+        beside = z.copy()
+        step = beside[-1] = z[-1] + (_STEP if z[-1] < 0.5 else -_STEP)
+        step -= z[-1]
+        other, other_jacobian = self._orbit(beside)
+        column = (other - residual) / step
+        if self.event.condition == "touch":
+            value, row = self._touch(z, keep=True)
+            along = (self._touch(beside)[0] - value) / step
+        else:
+            fold = self.event.condition == "fold"
+            value, pairs = (self._fold if fold else self._multiplier)(jacobian)
+            row, along = np.zeros(len(z) - 1), 0.0
+            for left, right in pairs:
+                # left . dJ right, by the symmetry of second derivatives, is left . dJ along right.
+                away = z + _STEP * np.append(right, [0.0, 0.0])
+                row = row + left @ (self._orbit(away)[1] - jacobian) / _STEP
+                along += left @ (other_jacobian - jacobian)[:, :-1] @ right / step
+        rows = np.column_stack([jacobian, column])
+        return np.append(residual, value), np.vstack([rows, np.append(row, along)])
+
+    def _orbit(self, z):
+        """Residual and Jacobian of the orbit by all unknowns, scaled, but the second quantity."""
+        residual, jacobian = self.evaluated(z)
+        return residual, jacobian * self.scale[:-1]
+
+    def _fold(self, jacobian):
+        """What vanishes at a fold: the last element of the inverse of the bordered Jacobian."""
+        A = jacobian[:, :-1]
+        if self.borders is None:
+            left, _, right = np.linalg.svd(A)
+            self.borders = left[:, -1], right[-1]
+        b, c = self.borders
+        bordered = np.block([[A, b[:, None]], [c[None], np.zeros((1, 1))]])
+        last = np.eye(len(bordered))[-1]
+        right, left = np.linalg.solve(bordered, last), np.linalg.solve(bordered.T, last)
+        return right[-1], [(-left[:-1], right[:-1])]
+
+    def _multiplier(self, jacobian):
+        """The modulus of the multiplier less 1."""
+        plain, k = jacobian / self.scale[:-1], 2 * self.family.n
+        values, vectors = np.linalg.eig(return_jacobian(plain, k, np))
+        last = self.event.multiplier
+        away = np.abs(np.abs(values) - 1) if last is None else np.abs(values - last)
+        i = int(np.argmin(away))
+        value, right, left = values[i], vectors[:, i], np.linalg.inv(vectors)[i]
+        self.event = self.event._replace(multiplier=complex(value))
+        S, T, Q = plain[k:, k:-1], plain[k:, :k], plain[:k, k:-1]
+        right = np.append(right, -np.linalg.solve(S, T @ right)) / self.scale[:-2]
+        left = np.append(left, -np.linalg.solve(S.T, Q.T @ left)) * np.conj(value) / abs(value)
+        return abs(value) - 1, [(left.real, right.real), (-left.imag, right.imag)]
+
+    # --- a guard that touches zero ---
+
+    def _touch(self, z, keep=False):
+        """The guard where it is least, and its gradient by the scaled unknowns but the second."""
+        if self.event.place is None:
+            return np.nan, np.full(len(z) - 1, np.nan)
+        self.evaluated(z)
+        x, _, chain, lifted, u, _ = self.solution(z)
+        place, inside = self.event.place, self.event.side == 0
+        value, row, theta = _touching(x, self.family.window, chain, lifted, u, place, inside)
+        if keep and inside:
+            self.event = self.event._replace(place=_moved(place, float(theta)))
+        return float(value), np.asarray(row)[self.active] * self.scale[:-1]
+
+    def _locate(self, old: Solution, times) -> None:
+        """Where the touching guard is on this mesh, from where it was on the old orbit."""
+        was, self.event = self.event.place, self.event._replace(place=None)
+        if was is None:
+            return
+        k, h = int(was.segment), np.asarray(durations(old.chain, old.u, self.family.n))
+        moment = h[:k].sum() + float(was.theta) * h[k]
+        s = tuple(np.asarray(old.chain.s)[:, k].astype(int))
+        period = times[-1] - times[0]
+        first, last = times[:-1] - times[0], times[1:] - times[0]
+        begun = (moment - times[0] - first + _NEAR) % period - _NEAR
+        left, side = last - first - begun, self.event.side
+        for p in np.flatnonzero([phase.s == s for phase in self.phases]):
+            outside = left[p] < -_NEAR if side == 0 else abs((begun, left)[side > 0][p]) > _NEAR
+            if not outside and last[p] > first[p]:
+                self._place_in(int(p), begun[p] / (last[p] - first[p]), was)
+                return
+
+    def _place_in(self, p: int, share: float, was: Place) -> None:
+        """The place at that share of phase p; its guard is not looked at there any more."""
+        used = np.asarray(self.chain.share) > 0
+        mine, side = np.flatnonzero(used & (np.asarray(self.chain.phase) == p)), self.event.side
+        begin, length = np.asarray(self.chain.begin)[mine], np.asarray(self.chain.share)[mine]
+        i = max(0, int(np.searchsorted(begin, share, side="right")) - 1)
+        theta = float(np.clip((share - begin[i]) / length[i], 0, 1))
+        if side:
+            i, theta = (0, 0.0) if side < 0 else (len(mine) - 1, 1.0)
+        before, after = map(np.array, self.orders)
+        place = Place(was.guard, mine[i], theta, before[was.guard, p], after[was.guard, p])
+        self.event = self.event._replace(place=place)
+        before[was.guard, p] = -1
+        self.orders = jnp.asarray(before), jnp.asarray(after)
+
+
+def _moved(place: Place, theta: float) -> Place:
+    return Place(place.guard, place.segment, theta, place.before, place.after)
+
+
+@functools.partial(jax.jit, static_argnames="inside")
+def _touching(x, window: Window, chain, lifted, u, place: Place, inside: bool):
+    """The reduced guard near a place, its gradient by u, and the share of the segment there."""
+
+    def guard(u, theta):
+        system = window.system(x, u[-1])
+        h = durations(chain, u, system.n)
+        return reduced_guard(system, chain, lifted.at(u), h, place, theta)
+
+    def vertex(theta, spacing):
+        around = theta + spacing * jnp.arange(-1, 2)
+        low, here, high = jax.vmap(lambda at: guard(u, at))(around)
+        bend = low + high - 2 * here
+        moved = jnp.clip((low - high) / (2 * jnp.where(bend > 0, bend, 1)), -1, 1)
+        return theta + spacing * jnp.where(bend > 0, moved, jnp.sign(low - high)), None
+
+    theta = jnp.asarray(place.theta, u.dtype)
+    if inside:
+        theta, _ = jax.lax.scan(vertex, theta, jnp.array([1 / 16, 1 / 64, 1 / 512, 1 / 2048]))
+    value, row = jax.value_and_grad(guard)(u, jax.lax.stop_gradient(theta))
+    return value, row, theta
+
+
+@jax.jit
+def mechanism(x: Mechanism, second: Window, r) -> Mechanism:
+    """The mechanism with the second quantity at its place r."""
+    return substituted(x, {second.name: second.value(r)})
