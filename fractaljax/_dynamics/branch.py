@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 
 from .._base.parts import Record, brief, concrete, number, require_kind, scalar, whole
-from .._base.ranges import is_logarithmic
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import (
     require_inside,
@@ -27,12 +26,14 @@ from .limit_cycle import limit_cycle
 from .sensitivity import event_value
 from .shooting import Chain, Lifted, Window, linearised
 
+_BESIDE = 1e-3, 1e-4, 1e-2  # steps from an event to a cycle at which nothing happens
 _SCANNED = 129  # places in the window at which Hopf points are looked for
 
 
 class BranchEvent(Record):
     """A point of a branch at which the cycle or its stability changes."""
 
+    name: str = eqx.field(static=True)  # of the branch's quantity
     kind: str = eqx.field(static=True)  # "fold", "period doubling", "Neimark-Sacker", "grazing",
     # "order of switches", or "Hopf"
     value: Float[jax.Array, ""]  # of the quantity
@@ -124,7 +125,7 @@ def continue_cycle(
     - `window`: (low, high) of it; logarithmic over a decade or more.
     - `start`: a limit cycle of `x`, as `limit_cycle` finds it by default; or "hopf": the Hopf
       point of `x` in the window that is nearest to its own value, where a cycle of no amplitude
-      begins.
+      begins; or an event of another branch of `x`, the quantity of which then has its value there.
     - `step`: the longest step between two points, where the window is of length 1 and so are the
       orbit's period and its largest state.
     - `points`: most points from the start each way.
@@ -139,15 +140,15 @@ def continue_cycle(
     """
     require_one("x", x)
     degrees_of_freedom(x)
+    if isinstance(start, BranchEvent):
+        x = x.replace(**{start.name: start.value})
     low, high = checked_window(x, name, window)
     frozen = with_optional(jax.lax.stop_gradient(x), (name,))
     if any(concrete(leaf) is None for leaf in jax.tree.leaves(frozen)):
         raise TypeError("continue_cycle follows one branch and cannot be compiled or batched")
     points = whole("points", points, 2)
     step = float(number("step", step, above=0))
-    scale = is_logarithmic(low, high)
-    ends = jnp.log(jnp.array([low, high])) if scale else jnp.array([low, high])
-    interval = Window(ends[0], ends[1], name, scale)
+    interval = Window.over(name, low, high)
     dtype = jnp.result_type(*jax.tree.leaves(frozen))
     if dtype != jnp.float64:
         raise TypeError(f"continue_cycle needs double precision, got numbers in {dtype}")
@@ -157,6 +158,8 @@ def continue_cycle(
         if start != "hopf":
             raise ValueError(f'start must be a LimitCycle or "hopf", got {start!r}')
         ended = _from_hopf(follower, float(interval.place(value_of(frozen, name))))
+    elif isinstance(start, BranchEvent):
+        ended = _from_event(follower, name, start)
     else:
         ended = _from_cycle(follower, name, start)
     return _branch(follower, x, name, *ended)
@@ -176,10 +179,6 @@ def checked_window(x: Mechanism, name: str, window) -> tuple[float, float]:
 
 def _from_cycle(follower: Follower, name: str, cycle):
     """Both ways from a limit cycle; returns why the branch ends at either end."""
-    value = float(value_of(follower.x, name))
-    q = float(follower.window.place(value))
-    if not 0 <= q <= 1:
-        raise ValueError(f"the window must hold {name} = {value!r}, that of the start")
     if cycle is None:
         cycle = limit_cycle(follower.x)
     require_kind("start", cycle, LimitCycle)
@@ -187,30 +186,48 @@ def _from_cycle(follower: Follower, name: str, cycle):
         raise ValueError("start must be one limit cycle that exists")
     if cycle._system.excited or not isinstance(cycle._orbit, Orbit):
         raise ValueError("start must be a cycle without excitation and regularisation")
-    solution = solution_of(cycle, follower.x, q)
-    h = solution.u[2 * follower.n : -1][: len(solution.phases)]
+    solution = solution_of(cycle, follower.x, _own_place(follower, name))
+    return follower.both_ways(lambda: _begun(follower, solution, held=True))
+
+
+def _from_event(follower: Follower, name: str, event: BranchEvent):
+    """Both ways through an event, from a cycle beside it; None in place of it for a Hopf point."""
+    q = _own_place(follower, name)
+    _, solution, *_ = event._found
+    if solution is None:
+        return _from_hopf(follower, q)
+    solution = solution._replace(x=follower.x, u=np.append(solution.u[:-1], q))
 
     def begun():
-        edges = np.concatenate([[0], np.cumsum(h)])
-        shooting = Shooting(follower.family, solution, solution.phases, edges)
-        return shooting, shooting.curves.corrected(shooting.begin, len(shooting.begin) - 1)
+        shooting, at, tangent = _begun(follower, solution)
+        for length in _BESIDE:
+            for away in (length * tangent, -length * tangent):
+                found = shooting.curves.corrected(at + away)
+                if found is not None and shooting.admissibility(found[0]) > 0:
+                    return shooting, found[0], shooting.curves.tangent(found[1])
+        raise ValueError("no cycle beside start was found")
 
-    shooting, found = begun()
+    return follower.both_ways(begun)
+
+
+def _own_place(follower: Follower, name: str) -> float:
+    """The place of the mechanism's own quantity in the window."""
+    value = float(value_of(follower.x, name))
+    q = float(follower.window.place(value))
+    if not -1e-9 <= q <= 1 + 1e-9:
+        raise ValueError(f"the window must hold {name} = {value!r}, that of the start")
+    return min(max(q, 0.0), 1.0)
+
+
+def _begun(follower: Follower, solution: Solution, held=False):
+    """Equations, unknowns and tangent of an orbit that is known, perhaps at its very quantity."""
+    h = solution.u[2 * follower.n : -1][: len(solution.phases)]
+    edges = np.concatenate([[0], np.cumsum(h)])
+    shooting = Shooting(follower.family, solution, solution.phases, edges)
+    found = shooting.curves.corrected(shooting.begin, shooting.quantity if held else None)
     if found is None or np.linalg.norm(found[0] - shooting.begin) > 0.1:
         raise ValueError("start must be a limit cycle of x itself")
-    z = found[0]
-    tangent = shooting.curves.tangent(found[1])
-    tangent = tangent if tangent[-1] > 0 else -tangent
-    follower.record(shooting, z)
-    follower.home = shooting.solution(z)
-    end = follower.follow(shooting, z, tangent)
-    if bool(end == BranchEnd.closed):
-        return end, end
-    follower.reverse()
-    follower.home = None
-    start = follower.follow(begun()[0], z, -tangent)
-    follower.reverse()
-    return start, end
+    return shooting, found[0], shooting.curves.tangent(found[1])
 
 
 def _from_hopf(follower: Follower, q: float):
@@ -289,6 +306,7 @@ def _branch(follower: Follower, x, name: str, start, end) -> Branch:
         data = (window, *event["data"], details[0] if details else None)
         events.append(
             BranchEvent(
+                name=name,
                 kind=event["kind"],
                 value=event_value(kind, x, data),
                 index=event["index"],

@@ -5,12 +5,10 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from .._base.parts import Record, number, require_kind, whole
-from .._base.ranges import is_logarithmic
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import (
     require_independent,
@@ -126,9 +124,7 @@ def continue_event(
     low, high = checked_window(x, name, window)
     require_independent(x, (first.name, name))
     frozen = with_optional(jax.lax.stop_gradient(x), (first.name, name))
-    scale = is_logarithmic(low, high)
-    ends = jnp.log(jnp.array([low, high])) if scale else jnp.array([low, high])
-    second = Window(ends[0], ends[1], name, scale)
+    second = Window.over(name, low, high)
     value = float(value_of(frozen, name))
     r = float(second.place(value))
     if not 0 <= r <= 1:
@@ -143,23 +139,12 @@ def continue_event(
 
     def begun():
         pinned = Pinned(family, second, held, solution, solution.phases, times)
-        return pinned, pinned.curves.corrected(pinned.begin, len(pinned.begin) - 1)
+        found = pinned.curves.corrected(pinned.begin, pinned.quantity + 1)
+        if found is None or np.linalg.norm(found[0] - pinned.begin) > 0.1:
+            raise ValueError("event must be one of a branch of x itself")
+        return pinned, found[0], pinned.curves.tangent(found[1])
 
-    pinned, found = begun()
-    if found is None or np.linalg.norm(found[0] - pinned.begin) > 0.1:
-        raise ValueError("event must be one of a branch of x itself")
-    z, tangent = found[0], pinned.curves.tangent(found[1])
-    tangent = tangent if tangent[-1] > 0 else -tangent
-    follower.record(pinned, z)
-    # The side is to the left of a tangent upwards if it is towards smaller values.
-    side = -event.side if tangent[-1] > 0 else event.side
-    follower.home = pinned.solution(z)
-    start = end = follower.follow(pinned, z, tangent)
-    if not bool(end == BranchEnd.closed):
-        follower.reverse()
-        follower.home = None
-        start = follower.follow(begun()[0], z, -tangent)
-        follower.reverse()
+    start, end = follower.both_ways(begun)
     places = np.array([point.place for point in follower.points])
     rows: dict[str, Any] = {
         key: np.array([point.row[key] for point in follower.points])
@@ -171,7 +156,8 @@ def continue_event(
         x=np.array([float(first.value(q)) for q in places[:, 0]]),
         y=np.array([float(second.value(r)) for r in places[:, 1]]),
         itinerary=tuple(point.itinerary for point in follower.points),
-        side=side,
+        # To the left of a curve upwards are the smaller values.
+        side=-event.side,
         start=start,
         end=end,
         **rows,

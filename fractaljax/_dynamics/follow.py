@@ -94,6 +94,25 @@ class Follower:
 
     # --- following ---
 
+    def both_ways(self, begun: Callable) -> tuple[BranchEnd, BranchEnd]:
+        """Adds the points before and beyond a solution, and says why they end.
+
+        `begun()` makes its equations, and returns them with the unknowns and the tangent there. The
+        last point is in the direction in which the last quantity rises.
+        """
+        shooting, z, tangent = begun()
+        tangent = tangent if tangent[-1] > 0 else -tangent
+        self.record(shooting, z)
+        self.home = shooting.solution(z)
+        end = self.follow(shooting, z, tangent)
+        if bool(end == BranchEnd.closed):
+            return end, end
+        self.reverse()
+        self.home = None
+        start = self.follow(begun()[0], z, -tangent)
+        self.reverse()
+        return start, end
+
     def follow(self, shooting: Shooting, z, ahead) -> BranchEnd:
         """Adds the points beyond z in the direction `ahead`, and says why they end."""
         state: Any = shooting, z, ahead

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from .._base.ranges import is_logarithmic
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import substituted
 from .events import Cubic
@@ -29,6 +30,13 @@ class Window(eqx.Module):
     high: Float[Array, ""]
     name: str = eqx.field(static=True)
     logarithmic: bool = eqx.field(static=True)
+
+    @classmethod
+    def over(cls, name: str, low: float, high: float) -> "Window":
+        """Of a quantity from low to high; logarithmic over a decade or more."""
+        scale, ends = is_logarithmic(low, high), jnp.array([low, high])
+        ends = jnp.log(ends) if scale else ends
+        return cls(ends[0], ends[1], name, scale)
 
     def value(self, q) -> Any:
         """The quantity at q."""
