@@ -224,6 +224,17 @@ def test_derivatives_of_events(kind):
     np.testing.assert_allclose(backward, slope, rtol=1e-10)
 
 
+@pytest.mark.slow
+def test_period_doubling_in_two_quantities():
+    """Followed in V and P, it is where a branch at another P has it."""
+    x = of_problem(PROBLEMS["lift_off"])
+    (event, *_) = branch("lift_off", "V", 0.2, 1.0).of_kind("period doubling")
+    curve = fj.continue_event(x, event, "P", (1.94, 2.0), step=1 / 8)
+    P, V = curve.y[-3], curve.x[-3]
+    found = fj.continue_cycle(x.replace(P=P), "V", (0.5, 0.7), cycle("lift_off"))
+    np.testing.assert_allclose(V, found.of_kind("period doubling")[0].value, rtol=1e-8)
+
+
 BRAKE = fj.brake_scene()
 
 

@@ -1,0 +1,139 @@
+"""Curves of events in two quantities: against the phase plane, other branches, derivatives."""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq, minimize_scalar
+
+import fractaljax as fj
+from mechanisms import PROBLEMS
+from structures import of_problem
+from tools import DOCS, assert_same_picture, labels, load_script
+
+BELT = of_problem(PROBLEMS["papangelo_2017"])  # x'' + 0.1 x' + x = mu(w), mu_s 1, mu_d 0.5, v_0 0.5
+WINDOW = (0.5, 2.5)
+
+
+@functools.cache
+def belt():
+    return fj.continue_cycle(BELT, "V", WINDOW, "hopf")
+
+
+@functools.cache
+def grazing():
+    return fj.continue_event(BELT, belt().grazings[0], "mu_s", (0.6, 2.0))
+
+
+def least_speed(v, mu_s):
+    """Of the slip that begins where stick ends, the least speed one turn later, by SciPy."""
+
+    def rate(_, y):
+        return [y[1], 0.5 + (mu_s - 0.5) * np.exp(-2 * (v - y[1])) - 0.1 * y[1] - y[0]]
+
+    options: Any = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-14, "dense_output": True}
+    motion = solve_ivp(rate, (0, 12), [mu_s - 0.1 * v, v], **options).sol
+    times = np.linspace(3, 9, 601)
+    i = int(np.argmin(v - motion(times)[1]))
+    ends: Any = {"bounds": times[[i - 1, i + 1]], "options": {"xatol": 1e-12}}
+    least: Any = minimize_scalar(lambda t: v - motion(t)[1], method="bounded", **ends)
+    return least.fun
+
+
+def test_grazing_of_the_belt():
+    """On the phase plane's, from edge to edge, with the stable cycles at lower speeds."""
+    curve = grazing()
+    assert curve.kind == "grazing" and curve.names == ("V", "mu_s") and "85 points" in repr(curve)
+    assert bool(curve.start == fj.BranchEnd.window) and bool(curve.end == fj.BranchEnd.window)
+    np.testing.assert_allclose(curve.x[[0, -1]], WINDOW, rtol=1e-12)
+    for i in range(4, len(curve.x), 19):
+        truth: Any = brentq(
+            lambda v, i=i: least_speed(v, curve.y[i]), *(curve.x[i] + [-0.01, 0.01])
+        )
+        np.testing.assert_allclose(curve.x[i], truth, rtol=1e-9)
+    # Walking towards larger mu_s and V, lower speeds are on the left.
+    assert curve.side == 1 and curve.swapped().side == -1 and belt().grazings[0].side == -1
+
+
+def test_slope_is_the_derivative_of_the_event():
+    curve, event = grazing(), belt().grazings[0]
+    i = int(np.argmin(np.abs(curve.y - 1)))
+    near = slice(i - 3, i + 4)
+    slope = np.polynomial.Polynomial.fit(curve.y[near], curve.x[near], 6).deriv()(1.0)
+
+    def value(mu_s):
+        return fj.continue_cycle(BELT.replace(mu_s=mu_s), "V", WINDOW, "hopf").grazings[0].value
+
+    derivative = jax.jvp(value, (jnp.array(1.0),), (jnp.array(1.0),))[1]
+    np.testing.assert_allclose(slope, derivative, rtol=1e-6)
+    np.testing.assert_allclose(curve.x[i], event.value, rtol=1e-9)
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_a_branch_starts_from_an_event(index):
+    """From the grazing and the Hopf point of the first branch to those of the second."""
+    event = belt().events[index]
+    other = fj.continue_cycle(BELT, "mu_s", (0.7, 2.5), event)
+    V = float(event.value)
+    (at,) = other.grazings
+    np.testing.assert_allclose(least_speed(V, float(at.value)), 0, atol=1e-9)
+    if event.kind == "Hopf":
+        np.testing.assert_allclose(other.hopf[0].value, 1.0, rtol=1e-9)
+        # The quantity of the first branch moves with x, and so does what the second one finds:
+        # (mu_s - mu_d) exp(-V/v_0) is the same all along Hopf's curve.
+    np.testing.assert_allclose(other.parameter.min(), at.value, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_folds_of_the_brake_meet_in_a_cusp():
+    """Two folds over friction are one curve over friction and D, and lie on other branches."""
+    x = fj.brake_scene()
+    first, second = fj.continue_cycle(x, "mu", (0.25, 0.4)).folds[1:]
+    curve = fj.continue_event(x, first, "D", (2.3, 2.6))
+    cusp = int(np.argmin(curve.x))
+    assert curve.x[cusp] < 0.264 and curve.y[cusp] < 2.387
+    on_other_arm = np.abs(curve.y - 2.4) < 0.002
+    arms = [
+        np.interp(2.4, np.sort(curve.y[part]), curve.x[part][np.argsort(curve.y[part])])
+        for part in (slice(0, cusp), slice(cusp, None))
+    ]
+    np.testing.assert_allclose(sorted(arms), sorted([first.value, second.value]), rtol=1e-3)
+    i = int(np.flatnonzero(on_other_arm)[0])
+    there = fj.continue_cycle(x.replace(D=curve.y[i]), "mu", (0.25, 0.4)).folds
+    values = np.array([float(fold.value) for fold in there])
+    np.testing.assert_allclose(
+        curve.x[i], values[np.argmin(np.abs(values - curve.x[i]))], rtol=1e-8
+    )
+
+
+def test_map(tmp_path):
+    """Of the belt: its Hopf boundary, the grazing once, and the committed picture."""
+    found = load_script(DOCS / "make_map.py").draw(tmp_path / "map.png", starts=8, lines=9)
+    assert_same_picture(tmp_path / "map.png", "map.png")
+    (curve,) = found.curves
+    assert curve.kind == "grazing" and not found.unfollowed
+    hopf = found.boundary.branches[0]
+    np.testing.assert_allclose(2 * (hopf.y - 0.5) * np.exp(-2 * hopf.x), 0.1, rtol=1e-8)
+    ax = fj.plot.bifurcation_map(found)
+    assert labels(ax)[:3] == ["small disturbances grow", "Hopf", "grazing of a cycle"]
+
+
+def test_refusals():
+    event, hopf = belt().grazings[0], belt().hopf[0]
+
+    def refuses(match, *arguments, error: type[Exception] = ValueError):
+        with pytest.raises(error, match=match):
+            fj.continue_event(*arguments)
+
+    refuses("hopf_boundary follows those", BELT, hopf, "mu_s", (0.6, 2.0))
+    refuses("event must be a BranchEvent", BELT, "grazing", "mu_s", (0.6, 2.0), error=TypeError)
+    refuses("no quantity 'mu'", BELT, event, "mu", (0.6, 2.0))
+    refuses("must hold mu_s = 1.0", BELT, event, "mu_s", (1.5, 2.0))
+    refuses("V", BELT, event, "V", (0.5, 2.0))
+    refuses("a branch of x itself", BELT.replace(mu_d=0.3), event, "mu_s", (0.6, 2.0))
+    with pytest.raises(ValueError, match="must hold V = 1"):
+        fj.bifurcation_map(BELT, ("V", 1.5, 2.0), ("mu_s", 0.6, 2.0))
