@@ -15,7 +15,7 @@ from .._mechanism.scene import Scene
 from .._stability.stability import growth_rate
 from . import search
 from .cycle import CycleResult, LimitCycle, Orbit, repels
-from .events import Cubic, first_root
+from .events import Cubic, first_root, rounding
 from .excitation import Excitation, excited_system
 from .hybrid import (
     NONE,
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 _SEGMENTS = 64  # one return takes some 35 at rtol 1e-9
 _MOST_SEGMENTS = 4096
 _CROSSINGS = 16  # segments in which x2 may change sign
+_MINIMA = 4  # nearly equal ones of a displacement or a velocity
 
 # In the order of the numbers in `search`.
 _RESULTS = (
@@ -68,16 +69,23 @@ def extreme_values(system: HybridSystem, segments: Segments, rows) -> Float[Arra
     g_0, g_1, d_0, d_1 = (
         rows @ x for x in (y, ends, h[None] * system.field(y, s), h[None] * system.field(ends, s))
     )
-    # Where the cubic through the ends of each segment is lowest.
-    cubic = Cubic.through(g_0, g_1, d_0, d_1)
+    # Minima inside of segments, by the cubic through the ends. Of those nearly as low it cannot say
+    # which is the lowest, so that a few are refined. A row at rest has none.
+    cubic, small = Cubic.through(g_0, g_1, d_0, d_1), jnp.max(rounding(y))
     theta, inside = cubic.minimum()
-    k = jnp.argmin(cubic(theta), axis=1)[:, None]
-    theta = jax.lax.stop_gradient(jnp.take_along_axis(theta, k, axis=1)[:, 0])
-    inside, k = jnp.take_along_axis(inside, k, axis=1)[:, 0], k[:, 0]
-    value, rate, change = _along(system, y[:, k], s[:, k], theta * h[k], rows.T)
+    least = jnp.where(inside & (d_1 - d_0 > small / 64), cubic(theta), jnp.inf)
+    least, k = (x.ravel() for x in jax.lax.top_k(-least, _MINIMA))
+    of_row = jnp.arange(len(k)) // _MINIMA
+    theta = jax.lax.stop_gradient(theta[of_row, k])
+    value, rate, change = _along(system, y[:, k], s[:, k], theta * h[k], rows[of_row].T)
     # The cubic's minimum is near; the parabola there has the orbit's.
-    inside = inside & (change > 0)
-    value = value - jnp.where(inside, rate**2 / jnp.where(inside, 2 * change, 1), 0)
+    near = jnp.abs(rate) < change * h[k] / 8
+    value = value - jnp.where(near, rate**2 / jnp.where(near, 2 * change, 1), 0)
+    value = jnp.where(least > -jnp.inf, value, jnp.inf).reshape(-1, _MINIMA)
+    value = jnp.min(value, axis=1)
+    # Where one ends a segment both are equal to rounding, and the parabola alone follows it.
+    node = jnp.min(g_0, axis=1)
+    value = jnp.where(value <= node + small, value, node)
     low, high = jnp.split(value, 2)
     return jnp.stack([low, -high])
 
