@@ -63,7 +63,7 @@ def critical_pair(
     i = jnp.argmin(chosen.test)
     j, alone, undamped = (x[i] for x in (chosen.partner, chosen.alone, chosen.undamped))
     sigma, delta = _mean_and_spread(M, C, K, s, i, j)
-    test = jnp.where(alone, -s[i].real * jnp.abs(fixed[i]), _test(sigma, delta, undamped))
+    test = jnp.where(alone, _alone(s[i].real, jnp.abs(fixed[i])), _test(sigma, delta, undamped))
     apart = _quotient(delta.imag, 2 * -sigma.real, undamped)
     imaginary = jnp.where(alone, fixed[i].imag, sigma.imag + apart)
     real = (fixed[j] == fixed[i].conj()) | ((fixed[i].imag == 0) & (fixed[j].imag == 0))
@@ -101,10 +101,15 @@ def _choice(s: Complex[Array, " k"], rigid, conservative) -> _Choice:
     eps = jnp.finfo(size.dtype).eps
     # Exactly 0 where C = 0, but for neighbours of which one grows alone.
     undamped = jnp.abs(sigma.real) <= jnp.where(conservative, eps**0.5, _UNDAMPED * eps) * size
-    alone = (s.imag > 0) & (s[partner] == s.conj()) & ~undamped
-    test = jnp.where(alone, -s.real * size, _test(sigma, delta, undamped))
+    alone = (s.imag > 0) & (s[partner] == s.conj()) & ~(undamped & conservative)
+    test = jnp.where(alone, _alone(s.real, size), _test(sigma, delta, undamped))
     test = jnp.where(counted & (s.imag >= 0), test, jnp.inf)
     return _Choice(test, counted, partner, alone, undamped)
+
+
+def _alone(growth, size):
+    """T = u |s| of a mode whose neighbour is its conjugate, above 0 if it may be undamped."""
+    return (_UNDAMPED * jnp.finfo(size.dtype).eps * size - growth) * size
 
 
 def _test(sigma, delta, undamped):

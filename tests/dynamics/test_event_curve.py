@@ -116,7 +116,8 @@ def test_map(tmp_path):
     assert_same_picture(tmp_path / "map.png", "map.png")
     (curve,) = found.curves
     assert curve.kind == "grazing" and not found.unfollowed
-    hopf = found.boundary.branches[0]
+    (hopf,) = found.boundary.branches
+    assert bool(hopf.start == fj.BoundaryEnd.window) and bool(hopf.end == fj.BoundaryEnd.window)
     np.testing.assert_allclose(2 * (hopf.y - 0.5) * np.exp(-2 * hopf.x), 0.1, rtol=1e-8)
     ax = fj.plot.bifurcation_map(found)
     assert labels(ax)[:3] == ["small disturbances grow", "Hopf", "grazing of a cycle"]
