@@ -71,6 +71,13 @@ def add_design(commands) -> None:
         help="longest and shortest wavelength that --sq counts [m]; default 1e-3 1e-6",
     )
     parser.add_argument(
+        "--quiet-within",
+        type=float,
+        nargs="+",
+        metavar="R",
+        help="every kick up to R, in units of V/omega and V, comes to rest; or semi-axes [m, m/s]",
+    )
+    parser.add_argument(
         "--repeat", type=Path, metavar="FILE", help="run again what a run.toml holds, nothing else"
     )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
@@ -140,6 +147,9 @@ def _options(arguments) -> dict:
         for name, text in pairs_of("--bounds", arguments.bounds, _SEVERAL["bounds"][0]).items():
             options["bounds"][name] = tuple(_numbers(f"--bounds {name}", text, ":"))
     options["constraints"] = _constraints(arguments)
+    if arguments.quiet_within is not None:
+        radius, *axes = arguments.quiet_within
+        options["quiet_within"] = [radius, *axes] if axes else radius
     if arguments.risk is not None:
         kind, _, value = arguments.risk.partition(":")
         options["risk"] = (kind, number("--risk", value)) if value else kind

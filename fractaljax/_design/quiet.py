@@ -18,7 +18,7 @@ import numpy as np
 
 from .._base.parts import brief, number
 from .._dynamics.basin import Basin, basin, in_unit_ball
-from .._dynamics.branch import Branch, continue_cycle
+from .._dynamics.branch import followed, value_at
 from .._dynamics.cycle import LimitCycle
 from .._dynamics.hybrid import degrees_of_freedom, hybrid_system
 from .._mechanism.mechanism import Mechanism
@@ -30,8 +30,8 @@ VERIFIED = 4000  # starts of the last draw
 _TRIED = 64, 256  # of those before
 _EXCHANGES = 16
 _REACH = 0.1  # of a cut at least, in scaled variables; halved where nothing is left
-_BEYOND = 0.02  # of the way to an event that a cut goes on
-_BISECTIONS = 5
+_BEYOND = 0.005  # of the way to an event that a cut goes on
+_BISECTIONS, _NEARLY = 6, 0.9  # of the way back, and its first step
 _NONE = 1e3  # distance of a plane that is none
 
 
@@ -73,13 +73,13 @@ class Kicks:
         moves = np.linalg.norm(away[found.labels != 0], axis=1)
         return moves.min(initial=radius), found
 
-    def least(self, x: Mechanism, counts=_TRIED) -> tuple[float, Basin]:
+    def least(self, x: Mechanism) -> tuple[float, Basin]:
         """As `tried`, of the size asked for, by larger and larger draws until a kick is found."""
-        radius, found = self.size, None
-        for count in counts:
-            radius, found = self.tried(x, self.size, count)
-            if radius < self.size:
-                break
+        first, *more = _TRIED
+        radius, found = self.tried(x, self.size, first)
+        for count in more:
+            if radius == self.size:
+                radius, found = self.tried(x, self.size, count)
         return radius, found
 
     def survived(self, x: Mechanism) -> float:
@@ -134,22 +134,24 @@ def quiet(
 
 def _moved_back(problem, failed, found, solve, kicks, scene) -> list[Found]:
     """Better designs that seem to survive, the best first: towards the first one that failed."""
-    moved = []
+    moved: list[Found] = []
     if not failed:
         return moved
     centre = failed[0][1].path[-1]
     way = found.path[-1] - centre
-    length, low, high = float(np.linalg.norm(way)), 0.0, 1.0
+    length, low, high, share = float(np.linalg.norm(way)), 0.0, 1.0, _NEARLY
     for _ in range(_BISECTIONS):
-        share = (low + high) / 2
         plane = np.stack([way / length, np.zeros_like(way)]), np.array([share * length, _NONE])
         cuts = Cuts.none(_EXCHANGES, problem.low).added(0, centre, *plane, _NONE)
         other = solve(dataclasses.replace(problem, cuts=cuts))
         if other.evaluation.worst[0] <= 0 and kicks.least(scene(other))[0] == kicks.size:
             moved.insert(0, other)
             high = share
+        elif high == 1:  # a tenth of the way is not worth more
+            break
         else:
             low = share
+        share = (low + high) / 2
     return moved
 
 
@@ -166,7 +168,9 @@ def _planes(problem: DesignProblem, u: np.ndarray, ends: Basin):
     return normals, gaps
 
 
-def _ends(problem: DesignProblem, u: np.ndarray, i: int, cycle: LimitCycle):
+def _ends(
+    problem: DesignProblem, u: np.ndarray, i: int, cycle: LimitCycle
+) -> list[tuple[np.ndarray, float] | None]:
     """Tangent planes at both ends of a cycle in quantity i, None where it goes on."""
     name, logarithmic = problem.names[i], problem.logarithmic[i]
     low, high = float(problem.low[i]), float(problem.high[i])
@@ -177,42 +181,40 @@ def _ends(problem: DesignProblem, u: np.ndarray, i: int, cycle: LimitCycle):
 
     at = quantity(u[i])
     window = min(quantity(0), at), max(quantity(1), at)  # rounding may put it outside
-    seen: list[Branch] = []
-
-    def values(u):
-        x = problem.moved(u, problem.own_condition)
-        branch = continue_cycle(x, name, window, start=cycle)
-        seen.append(branch)
-        return jnp.stack([event.value for event in branch.events] or [jnp.zeros(())])
-
+    x = problem.moved(jnp.asarray(u), problem.own_condition)
     try:
-        _, linear = jax.linearize(values, jnp.asarray(u))
+        branch, *_ = followed(x, name, window, cycle)
     except ValueError:  # the cycle cannot be followed
-        return None, None
-    (branch,) = seen
-    slopes = np.stack([np.asarray(linear(unit)) for unit in np.eye(len(u))], axis=1)
-    gap = abs(branch.parameter - at) / (window[1] - window[0])
-    index = int(np.argmin(gap + abs(branch.period / float(cycle.period) - 1)))
-    unlike = np.flatnonzero(~branch.stable)
-    run = np.arange(
-        unlike[unlike < index].max(initial=-1) + 1,
-        unlike[unlike > index].min(initial=len(branch.stable)),
+        return [None, None]
+    parameter = np.array([float(branch.window.value(point.q)) for point in branch.points])
+    period, stable = (
+        np.array([point.row[key] for point in branch.points]) for key in ("period", "stable")
     )
+    gap = abs(parameter - at) / (window[1] - window[0])
+    index = int(np.argmin(gap + abs(period / float(cycle.period) - 1)))
+    unlike = np.flatnonzero(~stable)
+    first = unlike[unlike < index].max(initial=-1) + 1
+    run = np.arange(first, unlike[unlike > index].min(initial=len(stable)))
     if not run.size:
-        return None, None
-    planes = []
+        return [None, None]
+
+    def value(u, event):
+        return value_at(event, problem.moved(u, problem.own_condition), branch.window)
+
+    planes: list[tuple[np.ndarray, float] | None] = []
     for sign, edge in ((-1, window[0]), (1, window[1])):
-        last = run[np.argmax(sign * branch.parameter[run])]
-        value = branch.parameter[last]
-        if abs(value - edge) < 1e-9 * abs(window[1] - window[0]):
+        last = run[np.argmax(sign * parameter[run])]
+        end = parameter[last]
+        if abs(end - edge) < 1e-9 * abs(window[1] - window[0]):
             planes.append(None)
             continue
-        place = ((np.log(value) if logarithmic else value) - low) / (high - low)
+        place = ((np.log(end) if logarithmic else end) - low) / (high - low)
         normal = np.eye(len(u))[i]
         if branch.events:
-            nearest = int(np.argmin([abs(event.index - last) for event in branch.events]))
-            normal = normal - slopes[nearest] / ((value if logarithmic else 1) * (high - low))
+            nearest = min(branch.events, key=lambda event: abs(event["index"] - last))
+            slope = jax.grad(value)(jnp.asarray(u), nearest)
+            normal = normal - np.asarray(slope) / ((end if logarithmic else 1) * (high - low))
         length = np.linalg.norm(normal)
         distance = sign * (place - u[i]) / length
-        planes.append((sign * normal / length, distance + max(_BEYOND * distance, 1e-4)))
+        planes.append((sign * normal / length, distance + max(_BEYOND * distance, 1e-5)))
     return planes

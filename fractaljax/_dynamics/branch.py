@@ -126,6 +126,12 @@ def continue_cycle(
     does not hold the start, a cycle that is excited, regularised or none, and where there is no
     Hopf point; `TypeError` under `jit` or `vmap`, and for single precision.
     """
+    follower, *ends = followed(x, name, window, start, step=step, points=points, rtol=rtol)
+    return _branch(follower, x, name, *ends)
+
+
+def followed(x, name, window, start, *, step=1 / 64, points=1000, rtol=None):
+    """A follower that has been along the branch of `continue_cycle`, and why either end is one."""
     require_one("x", x)
     degrees_of_freedom(x)
     require_known(x, name)
@@ -139,8 +145,8 @@ def continue_cycle(
     points = whole("points", points, 2)
     step = float(number("step", step, above=0))
     scale = is_logarithmic(low, high)
-    ends = jnp.log(jnp.array([low, high])) if scale else jnp.array([low, high])
-    interval = Window(ends[0], ends[1], name, scale)
+    edges = jnp.log(jnp.array([low, high])) if scale else jnp.array([low, high])
+    interval = Window(edges[0], edges[1], name, scale)
     dtype = jnp.result_type(*jax.tree.leaves(frozen))
     if dtype != jnp.float64:
         raise TypeError(f"continue_cycle needs double precision, got numbers in {dtype}")
@@ -149,10 +155,16 @@ def continue_cycle(
     if isinstance(start, str):
         if start != "hopf":
             raise ValueError(f'start must be a LimitCycle or "hopf", got {start!r}')
-        ended = _from_hopf(follower, float(interval.place(value_of(frozen, name))))
+        ends = _from_hopf(follower, float(interval.place(value_of(frozen, name))))
     else:
-        ended = _from_cycle(follower, name, start)
-    return _branch(follower, x, name, *ended)
+        ends = _from_cycle(follower, name, start)
+    return follower, *ends
+
+
+def value_at(event, x, window: Window):
+    """The quantity at an event of a follower, differentiable by x."""
+    kind, *details = event["condition"]
+    return event_value(kind, x, (window, *event["data"], details[0] if details else None))
 
 
 def _pair(window):
@@ -264,12 +276,10 @@ def _branch(follower: Follower, x, name: str, start, end) -> Branch:
     points, window = follower.points, follower.window
     events = []
     for event in follower.events:
-        kind, *details = event["condition"]
-        data = (window, *event["data"], details[0] if details else None)
         events.append(
             BranchEvent(
                 kind=event["kind"],
-                value=event_value(kind, x, data),
+                value=value_at(event, x, window),
                 index=event["index"],
                 before=event["before"],
                 after=event["after"],
