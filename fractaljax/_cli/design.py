@@ -72,10 +72,9 @@ def add_design(commands) -> None:
     )
     parser.add_argument(
         "--quiet-within",
-        type=float,
-        nargs="+",
         metavar="R",
-        help="every kick up to R, in units of V/omega and V, comes to rest; or semi-axes [m, m/s]",
+        help="every kick up to R, in units of V/omega and V, comes to rest; or a list of semi-axes "
+        "in m and m/s, X1,X2,V1,V2",
     )
     parser.add_argument(
         "--repeat", type=Path, metavar="FILE", help="run again what a run.toml holds, nothing else"
@@ -148,8 +147,8 @@ def _options(arguments) -> dict:
             options["bounds"][name] = tuple(_numbers(f"--bounds {name}", text, ":"))
     options["constraints"] = _constraints(arguments)
     if arguments.quiet_within is not None:
-        radius, *axes = arguments.quiet_within
-        options["quiet_within"] = [radius, *axes] if axes else radius
+        axes = _numbers("--quiet-within", arguments.quiet_within, ",")
+        options["quiet_within"] = axes if len(axes) > 1 else axes[0]
     if arguments.risk is not None:
         kind, _, value = arguments.risk.partition(":")
         options["risk"] = (kind, number("--risk", value)) if value else kind

@@ -268,14 +268,14 @@ def design(
     if solver is not None and not callable(solver):
         raise TypeError(f"solver must be a function, got {brief(solver)}")
     whole("seed", seed, 0, _SEED_MAX)
+    problem = state_problem(x, **options)
+    options["bounds"] = dict(options["bounds"])
     kicks = None
     if quiet_within is not None:
         if envelope is not None or tolerance is not None:
             raise ValueError("quiet_within takes no envelope and no tolerance")
         kicks = Kicks.of(x, quiet_within, seed, progress)
-        options["quiet_within"] = np.asarray(quiet_within, float).tolist()
-    problem = state_problem(x, **options)
-    options["bounds"] = dict(options["bounds"])
+        options["quiet_within"] = kicks.axes or kicks.size
     evaluator = evaluator_of(problem, envelope, risk)
     count, designs = screened(problem, starts, lattice)
     own = np.asarray(problem.start, float)

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._base.parts import brief, number
+from .._base.parts import scalar
 from .._dynamics.basin import Basin, basin, in_unit_ball
 from .._dynamics.branch import followed, value_at
 from .._dynamics.cycle import LimitCycle
@@ -43,7 +43,7 @@ class Kicks:
     of V/omega and V.
     """
 
-    axes: np.ndarray | None
+    axes: list[float] | None
     size: float  # asked for
     seed: int
     progress: bool
@@ -51,16 +51,14 @@ class Kicks:
     @classmethod
     def of(cls, x: Mechanism, within: Any, seed: int, progress: bool) -> "Kicks":
         """Those of `design(quiet_within=)`, checked."""
-        hybrid_system(x)  # refuses a joint without V
         n = degrees_of_freedom(x)
-        given = np.asarray(number("quiet_within", jnp.asarray(within, dtype=float), above=0))
-        if given.shape not in ((), (2 * n,)):
-            raise ValueError(
-                f"quiet_within must be a radius or semi-axes ({2 * n},), got {brief(within)}"
-            )
-        if given.ndim:
-            return cls(given, 1.0, seed, progress)
-        return cls(None, float(given), seed, progress)
+        hybrid_system(x)  # refuses a joint without V
+        if not isinstance(within, (list, tuple)) and not np.ndim(within):
+            return cls(None, float(scalar("quiet_within", within, above=0)), seed, progress)
+        axes = [float(scalar("quiet_within", axis, above=0)) for axis in within]
+        if len(axes) != 2 * n:
+            raise ValueError(f"quiet_within must have {2 * n} semi-axes, got {len(axes)}")
+        return cls(axes, 1.0, seed, progress)
 
     def tried(self, x: Mechanism, radius: float, count: int) -> tuple[float, Basin]:
         """The least of `count` kicks within `radius` that does not come to rest, else `radius`."""
@@ -68,7 +66,7 @@ class Kicks:
         system = hybrid_system(x)
         units, centre = np.asarray(system.units), np.asarray(system.equilibrium())
         away = radius * in_unit_ball(count, len(units), self.seed)
-        starts = centre * units + away * (units if self.axes is None else self.axes)
+        starts = centre * units + away * (units if self.axes is None else np.array(self.axes))
         found = basin(x, starts=starts, progress=self.progress)
         moves = np.linalg.norm(away[found.labels != 0], axis=1)
         return moves.min(initial=radius), found
