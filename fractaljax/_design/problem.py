@@ -84,7 +84,7 @@ class Cuts(eqx.Module):
 
     def residuals(self, u: Float[Array, " v"]) -> Float[Array, " k"]:
         """At most 0 where a design is excluded by none."""
-        away = u - self.centres
+        away = u[None] - self.centres
         planes = jnp.min(self.gaps - jnp.einsum("kpv,kv->kp", self.normals, away), axis=1)
         distance = jnp.sqrt(jnp.sum(away**2, axis=1) + 1e-24)
         return 10 * jnp.minimum(planes, self.reach - distance)

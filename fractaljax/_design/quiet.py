@@ -190,11 +190,12 @@ def _ends(
     )
     gap = abs(parameter - at) / (window[1] - window[0])
     index = int(np.argmin(gap + abs(period / float(cycle.period) - 1)))
-    unlike = np.flatnonzero(~stable)
-    first = unlike[unlike < index].max(initial=-1) + 1
-    run = np.arange(first, unlike[unlike > index].min(initial=len(stable)))
-    if not run.size:
+    if not stable[index]:
         return [None, None]
+    # With the points at which it ceases to attract.
+    unlike = np.flatnonzero(~stable)
+    first = unlike[unlike < index].max(initial=0)
+    run = np.arange(first, 1 + unlike[unlike > index].min(initial=len(stable) - 1))
 
     def value(u, event):
         return value_at(event, problem.moved(u, problem.own_condition), branch.window)
