@@ -163,14 +163,14 @@ class Design(Record):
 
     def _under_kicks(self) -> list[str]:
         """What is known of kicks, and how well."""
-        if self.quiet_radius is None:
-            return []
-        asked = self.options["quiet_within"]
-        unit = "of the ellipsoid" if isinstance(asked, list) else "in units of V/omega and V"
+        if not self.quiet_radius:
+            return [] if self.quiet_radius is None else ["largest kick survived: none"]
+        ellipsoid = isinstance(self.options["quiet_within"], list)
+        unit = "of the ellipsoid" if ellipsoid else "in units of V/omega and V"
+        share = f"share below {3 / VERIFIED:.2g} with 95 % confidence"
         return [
-            f"largest kick survived: {self.quiet_radius:.6g} {unit}, as {VERIFIED} starts confirm",
-            f"(below {3 / VERIFIED:.2%} of all kicks within it do not come to rest, with 95 % "
-            "confidence)",
+            f"largest kick survived: {self.quiet_radius:.6g} {unit}",
+            f"none of {VERIFIED} starts within it ends anywhere but at rest ({share})",
         ]
 
     def _under_conditions(self) -> list[str]:

@@ -164,6 +164,21 @@ def test_random_arguments(capsys, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
+    ("text", "asked"), [("2", 2.0), ("1e-5,2e-5,0.1,0.2", [1e-5, 2e-5, 0.1, 0.2])]
+)
+def test_size_of_kicks(capsys, monkeypatch, text, asked):
+    """A radius or semi-axes; the file of the scene may follow, and --quiet is another option."""
+
+    def design(_, quiet_within, **__):
+        raise ValueError(f"{quiet_within}")
+
+    monkeypatch.setattr("fractaljax._design.design.design", design)
+    fj.brake_scene().save("mine.toml")
+    _, _, err = run(capsys, "design", "--quiet", "--quiet-within", text, "mine.toml")
+    assert err == f"fractaljax: {asked}\n"
+
+
+@pytest.mark.parametrize(
     ("where", "error", "status", "message"),
     [
         ("_design.design.design", KeyboardInterrupt(), 130, "interrupted, nothing written"),
