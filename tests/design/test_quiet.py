@@ -1,6 +1,7 @@
 """Designs that survive kicks: against the repelling cycle of a belt and an independent solver."""
 
 import functools
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,9 +15,12 @@ from fractaljax._design.problem import Cuts, state_problem
 from fractaljax._design.quiet import Kicks, _planes
 from mechanisms import PROBLEMS, changed
 from structures import of_problem, two_joints
+from tools import ROOT
 
 GRAZING = 1.8366009722  # the belt's speed at which its stick-slip cycle ends
-OPTIONS = dict(K_n_min=None, constraints=(), envelope=None, tolerance=None, quantile=0.95)
+OPTIONS: dict[str, Any] = dict(
+    K_n_min=None, constraints=(), envelope=None, tolerance=None, quantile=0.95
+)
 OPTIONS |= dict(objective=None, target=0.0, area_ratio_min=2.0, slip_ratio_max=0.9)
 
 
@@ -159,9 +163,10 @@ def test_cuts():
         ({"quiet_within": [1.0, 2.0]}, "must have 4 semi-axes, got 2"),
     ],
 )
-def test_refusals(arguments, message):
+def test_refusals(arguments: dict[str, Any], message):
+    given: dict[str, Any] = {"quiet_within": 1.0} | arguments
     with pytest.raises(ValueError, match="quiet_within " + message):
-        fj.design(fj.brake_scene(), **{"quiet_within": 1.0} | arguments)
+        fj.design(fj.brake_scene(), **given)
 
 
 def test_a_joint_without_a_speed_is_refused():
@@ -204,6 +209,9 @@ def test_brake_survives_the_kicks_of_an_independent_solver():
     best = fj.design(scene, bounds, quiet_within=2.0, progress=False)
     assert best.violated == () and best.quiet_radius == 2.0
     assert best.growth_rate <= -np.pi
+    surface = best.scene.contact.surface
+    page = (ROOT / "README.md").read_text()
+    assert f"D = {surface.D:.6g} and\nG = {surface.G:.6g} m" in page
     plain = fj.design(scene, bounds, progress=False)
     assert plain.value < best.value < 0.01
     random = np.random.default_rng(5)
