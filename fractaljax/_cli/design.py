@@ -71,6 +71,12 @@ def add_design(commands) -> None:
         help="longest and shortest wavelength that --sq counts [m]; default 1e-3 1e-6",
     )
     parser.add_argument(
+        "--quiet-within",
+        metavar="R",
+        help="every kick up to R, in units of V/omega and V, comes to rest; or a list of semi-axes "
+        "in m and m/s, X1,X2,V1,V2",
+    )
+    parser.add_argument(
         "--repeat", type=Path, metavar="FILE", help="run again what a run.toml holds, nothing else"
     )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
@@ -140,6 +146,9 @@ def _options(arguments) -> dict:
         for name, text in pairs_of("--bounds", arguments.bounds, _SEVERAL["bounds"][0]).items():
             options["bounds"][name] = tuple(_numbers(f"--bounds {name}", text, ":"))
     options["constraints"] = _constraints(arguments)
+    if arguments.quiet_within is not None:
+        axes = _numbers("--quiet-within", arguments.quiet_within, ",")
+        options["quiet_within"] = axes if len(axes) > 1 else axes[0]
     if arguments.risk is not None:
         kind, _, value = arguments.risk.partition(":")
         options["risk"] = (kind, number("--risk", value)) if value else kind

@@ -28,8 +28,10 @@ from . import constraints as limits
 from .design_file import design_files, read_design
 from .envelope import Envelope, condition_text
 from .problem import DEFAULT_BOUNDS, DesignProblem, describe, state_problem
+from .quiet import VERIFIED, Kicks, quiet
 from .search import (
     Evaluation,
+    Found,
     Search,
     Solver,
     choose_starts,
@@ -82,6 +84,7 @@ class Design(Record):
     squeal_probability: float | None = None  # as machined
     squeal_probability_error: float | None = None  # its standard error
     initial_squeal_probability: float | None = None
+    quiet_radius: float | None = None  # the largest kick survived, as `quiet_within` measures it
 
     @property
     def outcome(self) -> str:
@@ -150,13 +153,25 @@ class Design(Record):
         if self.has_surface:
             L, L_s = self.wavelengths
             lines.append(f"Sq and Sdq: wavelengths from {L:g} to {L_s:g} m")
-        lines += self._under_conditions()
+        lines += self._under_conditions() + self._under_kicks()
         lines += [f"not met: {name}" for name in self.violated]
         growth = self.growth_rate if self.growth_rates is None else self.growth_rates[1]
         promise = "not stable: small disturbances grow"
         if growth < 0:
             promise = "stable against small disturbances; a larger kick may still end in squeal"
         return "\n".join([*lines, self.outcome, promise])
+
+    def _under_kicks(self) -> list[str]:
+        """What is known of kicks, and how well."""
+        if not self.quiet_radius:
+            return [] if self.quiet_radius is None else ["largest kick survived: none"]
+        ellipsoid = isinstance(self.options["quiet_within"], list)
+        unit = "of the ellipsoid" if ellipsoid else "in units of V/omega and V"
+        share = f"share below {3 / VERIFIED:.2g} with 95 % confidence"
+        return [
+            f"largest kick survived: {self.quiet_radius:.6g} {unit}",
+            f"none of {VERIFIED} starts within it ends anywhere but at rest ({share})",
+        ]
 
     def _under_conditions(self) -> list[str]:
         """What the envelope and the tolerance make of it, before and after, and the worst."""
@@ -200,6 +215,7 @@ def design(
     starts: int | None = None,
     lattice: int | None = None,
     seed: int = 0,
+    quiet_within: Any = None,
     progress: bool = True,
 ) -> Design:
     """Find by gradients the scene or structure inside `bounds` that is best and meets all that is
@@ -229,6 +245,12 @@ def design(
     taken, at its `quantile`, at each condition of the envelope by itself. The probability of squeal
     counts 100,000 draws by `seed`, each at a condition drawn evenly from the envelope.
 
+    With `quiet_within`, a radius as in `basin`, in units of V/omega and V, or the semi-axes (2n,)
+    of an ellipsoid in m and m/s, no start within it of the sliding equilibrium ends anywhere else,
+    as 4000 starts drawn by `seed` confirm. `Design.quiet_radius` is the largest radius, or share of
+    the semi-axes, so confirmed. Motions follow the whole friction law whatever `friction_slope`.
+    It needs a V of every joint, and takes no envelope and no tolerance.
+
     `solver(objective, constraints, start, bounds)`, by default SciPy's SLSQP (see `slsqp`), lands
     from `starts` designs, by default 12: those given, the most promising of `lattice` a side (48,
     or 24 with an envelope or a tolerance; 1024 or 256 in one variable; lattice^2 designs of a
@@ -248,18 +270,35 @@ def design(
     whole("seed", seed, 0, _SEED_MAX)
     problem = state_problem(x, **options)
     options["bounds"] = dict(options["bounds"])
+    kicks = None
+    if quiet_within is not None:
+        if envelope is not None or tolerance is not None:
+            raise ValueError("quiet_within takes no envelope and no tolerance")
+        kicks = Kicks.of(x, quiet_within, seed, progress)
+        options["quiet_within"] = kicks.axes or kicks.size
     evaluator = evaluator_of(problem, envelope, risk)
     count, designs = screened(problem, starts, lattice)
     own = np.asarray(problem.start, float)
     before = evaluator.evaluate(own[None])
     if not np.isfinite(before.rows).all() and isinstance(x, Scene):
         require_computable(x, problem.friction_slope)
+
+    def solved(problem):
+        evaluator = evaluator_of(problem, envelope, risk)
+        us, scale = choose_starts(own, designs, evaluator.screen(designs), count)
+        search = Search(evaluator, solver or slsqp, 1.0 if objective is None else scale)
+        path, after, failed = search.best(us, progress)
+        return Found(path, after, len(us), failed)
+
     if objective is None and before.worst[0] <= 0:
-        return _conclude(x, problem, options, before, before, own[None], 0, 0)
-    us, scale = choose_starts(own, designs, evaluator.screen(designs), count)
-    search = Search(evaluator, solver or slsqp, 1.0 if objective is None else scale)
-    path, after, failed = search.best(us, progress)
-    return _conclude(x, problem, options, before, after, path, len(us), failed)
+        found = Found(own[None], before, 0, 0)
+    else:
+        found = solved(problem)
+    if kicks is None:
+        return _conclude(x, problem, options, before, found)
+    found, survived = quiet(problem, found, solved, kicks)
+    found = found._replace(evaluation=evaluator.evaluate(found.path[-1:]))  # without cuts
+    return _conclude(x, problem, options, before, found, survived)
 
 
 def screened(problem: DesignProblem, starts: int | None, lattice: int | None):
@@ -280,12 +319,11 @@ def _conclude(
     problem: DesignProblem,
     options: Mapping[str, Any],
     before: Evaluation,
-    after: Evaluation,
-    path: np.ndarray,
-    starts: int,
-    failed: int,
+    found: Found,
+    quiet_radius: float | None = None,
 ) -> Design:
-    """How every requirement stands at the end of `path` (s, v); unchanged without a start."""
+    """How every requirement stands at the end of the path; unchanged without a start."""
+    path, after, starts, failed = found
     final = x
     if starts:
         # exp(ln G) and the scaling back may end a rounding beyond a bound.
@@ -299,6 +337,9 @@ def _conclude(
     for name, place in zip(problem.names, path[-1].tolist(), strict=True):
         residuals |= {f"{name} >= lower bound": -place, f"{name} <= upper bound": place - 1}
     violated = tuple(name for name, residual in residuals.items() if not residual <= 0)
+    asked = options["quiet_within"]
+    if quiet_radius is not None and quiet_radius < (1 if isinstance(asked, list) else asked):
+        violated += (f"quiet within {asked}",)
     active = max(_ACTIVE, 100 * problem.rounding)
     more: dict[str, Any] = {}
     if envelope is not None or tolerance is not None:
@@ -333,6 +374,7 @@ def _conclude(
         starts=starts,
         failed_starts=failed,
         options=options,
+        quiet_radius=quiet_radius,
         **more,
     )
 

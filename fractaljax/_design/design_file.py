@@ -27,7 +27,7 @@ from .tolerance import Tolerance
 
 _PACKAGE = __name__.split(".")[0]
 OPTIONS = (*[*inspect.signature(state_problem).parameters][1:-1], "risk", "solver", "starts")
-OPTIONS += ("lattice", "seed")  # the arguments of `design` that a file holds
+OPTIONS += ("lattice", "seed", "quiet_within")  # the arguments of `design` that a file holds
 _NOT_RESULTS = {"scene", "initial", "result", "history", "options"}  # of the fields of a `Design`
 
 

@@ -81,8 +81,8 @@ def pareto(
 ) -> Front:
     """The front of two objectives, both functions of a scene or structure that are minimised.
 
-    `options` are those of `design`, but for `objective`, `starts`, `envelope` and `risk`: bounds,
-    target, K_n_min, constraints, tolerance and so on hold for every member.
+    `options` are those of `design`, but for `objective`, `starts`, `envelope`, `risk` and
+    `quiet_within`: bounds, target, K_n_min, constraints, tolerance and so on hold for every member.
 
     **Raises:** `ValueError` for fewer than three points, where no design meets the requirements,
     for objectives without a trade-off, and as `design`.
@@ -96,9 +96,9 @@ def pareto(
         if not callable(objective):
             raise TypeError(f"{name} must be a function of a scene, got {brief(objective)}")
     progress = flag("progress", progress)
-    refused = sorted({"objective", "starts", "envelope", "risk"} & set(options))
+    refused = {"objective", "starts", "envelope", "risk", "quiet_within"} & set(options)
     if refused:
-        raise ValueError(f"pareto does not take {', '.join(refused)}")
+        raise ValueError(f"pareto does not take {', '.join(sorted(refused))}")
     asked: dict[str, Any] = {**options, "progress": False}
     ends = design(x, objective=first, **asked), design(x, objective=second, **asked)
     for name, end in zip(names, ends, strict=True):

@@ -55,6 +55,41 @@ class Scatter(eqx.Module):
     level: Float[Array, ""]
 
 
+class Cuts(eqx.Module):
+    """Neighbourhoods of designs that are excluded, each up to two planes.
+
+    Within `reach` of a centre a design must be beyond one of its planes.
+    """
+
+    centres: Float[Array, "k v"]
+    normals: Float[Array, "k 2 v"]
+    gaps: Float[Array, "k 2"]  # distances of the planes from the centre
+    reach: Float[Array, " k"]
+
+    @classmethod
+    def none(cls, count: int, u: Array) -> "Cuts":
+        """Room for so many cuts of designs like u (v,)."""
+        zeros = jnp.zeros((count, len(u)), u.dtype)
+        gaps = jnp.full((count, 2), 1e3, u.dtype)
+        return cls(zeros - 10, jnp.stack([zeros, zeros], axis=1), gaps, gaps[:, 0] * 0)
+
+    def added(self, k: int, centre, normals, gaps, reach: float) -> "Cuts":
+        """With the cut of number k."""
+        return Cuts(
+            self.centres.at[k].set(centre),
+            self.normals.at[k].set(normals),
+            self.gaps.at[k].set(gaps),
+            self.reach.at[k].set(reach),
+        )
+
+    def residuals(self, u: Float[Array, " v"]) -> Float[Array, " k"]:
+        """At most 0 where a design is excluded by none."""
+        away = u[None] - self.centres
+        planes = jnp.min(self.gaps - jnp.einsum("kpv,kv->kp", self.normals, away), axis=1)
+        distance = jnp.sqrt(jnp.sum(away**2, axis=1) + 1e-24)
+        return 10 * jnp.minimum(planes, self.reach - distance)
+
+
 class DesignProblem(eqx.Module):
     """What a design asks; problems that differ in leaves alone share one compiled program."""
 
@@ -76,6 +111,7 @@ class DesignProblem(eqx.Module):
     objective: Callable[[Any], Any] | None = eqx.field(static=True)
     friction_slope: bool = eqx.field(static=True)
     conditions: tuple[str, ...] = eqx.field(static=True)  # quantities of the envelope
+    cuts: Cuts | None = None
 
     # --- in JAX: one design at one condition ---------------------------------------------
 
@@ -114,6 +150,8 @@ class DesignProblem(eqx.Module):
             stiff.append((K_n_min - state.K_n) / jnp.where(K_n_min > 0, K_n_min, 1))
         pressing = jnp.arcsinh((growth - self.target) / self.growth_scale)
         own = [jnp.asarray(asked(x)) for asked in self.constraints]
+        if self.cuts is not None:
+            own += list(self.cuts.residuals(u))
         value = jnp.sum((u - self.start) ** 2) if self.objective is None else self.objective(x)
         numbers = {}
         if "" in states:  # of a scene
@@ -163,6 +201,8 @@ class DesignProblem(eqx.Module):
             model += [f"{of}Q_e <= slip_ratio_max mu_s P"] * _slips(self.x, name)
             stiff.append(f"{of}K_n >= K_n_min")
         own = [asked.name for asked in self.constraints]
+        if self.cuts is not None:
+            own += [f"cut {k}" for k in range(len(self.cuts.reach))]
         return [*model, "growth_rate <= target", *stiff, *own]
 
     def scaled(self, x: Mechanism) -> np.ndarray:

@@ -11,7 +11,7 @@ import dataclasses
 import functools
 import queue
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -71,6 +71,15 @@ class Evaluation:
     def of(self, i: int) -> "Evaluation":
         """That of one design alone, still with a leading axis."""
         return Evaluation(self.rows[i : i + 1], self.places[i : i + 1])
+
+
+class Found(NamedTuple):
+    """What a search ended with."""
+
+    path: np.ndarray  # (s, v), to the best end
+    evaluation: Evaluation  # of that
+    starts: int
+    failed: int
 
 
 @dataclasses.dataclass(frozen=True)

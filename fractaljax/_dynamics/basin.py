@@ -467,7 +467,7 @@ def _starts(system, n, low, high, starts, seed, radius) -> Float[np.ndarray, "k 
     count = whole("starts", starts, 1, _MOST_STARTS)
     if radius is not None:
         reach = float(scalar("radius", radius, above=0))
-        away = reach * _in_unit_ball(count, 2 * n, seed)
+        away = reach * in_unit_ball(count, 2 * n, seed)
         centre = np.asarray(system.own(system.equilibrium()))
         return (centre + away) * np.asarray(system.units)
     corners = [_corner("low", low, n), _corner("high", high, n)]
@@ -501,7 +501,7 @@ def _sobol(count: int, dimensions: int, seed: int) -> np.ndarray:
     return points.random_base2((count - 1).bit_length())[:count]
 
 
-def _in_unit_ball(count: int, dimensions: int, seed: int) -> np.ndarray:
+def in_unit_ball(count: int, dimensions: int, seed: int) -> np.ndarray:
     """Points (count, dimensions) evenly in the unit ball."""
     from scipy.special import ndtri
 

@@ -42,7 +42,16 @@ class BranchEvent(Record):
     after: str = eqx.field(static=True)  # none where the branch ends with a jump
     side: int = eqx.field(static=True)  # 1: stable cycles beside it are at larger values of the
     # quantity, -1: at smaller ones, 0: on both sides or on none
-    _found: Any = eqx.field(default=None, repr=False)  # quantity's window, cycle, what vanishes
+    _data: Any = eqx.field(default=None, repr=False)  # what vanishes, of which equations
+    _cycle: Any = eqx.field(default=None, repr=False)
+    _rtol: float = eqx.field(static=True, default=0.0, repr=False)
+
+    def value_at(self, x: Mechanism) -> Float[jax.Array, ""]:
+        """`value` as a function of the mechanism, whose other quantities are as on the branch.
+
+        To be differentiated, not moved: nothing is followed again.
+        """
+        return event_value(self._data[0], x, self._data[1:])
 
 
 class Branch(Record):
@@ -193,7 +202,7 @@ def _from_cycle(follower: Follower, name: str, cycle):
 def _from_event(follower: Follower, name: str, event: BranchEvent):
     """Both ways through an event, from a cycle beside it; None in place of it for a Hopf point."""
     q = _own_place(follower, name)
-    _, solution, *_ = event._found
+    solution = event._cycle
     if solution is None:
         return _from_hopf(follower, q)
     solution = solution._replace(x=follower.x, u=np.append(solution.u[:-1], q))
@@ -303,17 +312,19 @@ def _branch(follower: Follower, x, name: str, start, end) -> Branch:
     events = []
     for event in follower.events:
         kind, *details = event["condition"]
-        data = (window, *event["data"], details[0] if details else None)
+        data = kind, window, *event["data"], details[0] if details else None
         events.append(
             BranchEvent(
                 name=name,
                 kind=event["kind"],
-                value=event_value(kind, x, data),
+                value=event_value(kind, x, data[1:]),
                 index=event["index"],
                 before=event["before"],
                 after=event["after"],
                 side=_side(places, rows["stable"], event["index"]),
-                _found=(window, event["solution"], kind, data[-1], follower.family.rtol),
+                _data=data,
+                _cycle=event["solution"],
+                _rtol=follower.family.rtol,
             )
         )
     # At a Hopf point a multiplier is 1: it is shown as the cycles beside it are.

@@ -116,7 +116,7 @@ def continue_event(
     switches at which a phase vanishes, and for names and windows as `continue_cycle` does.
     """
     require_kind("event", event, BranchEvent)
-    first, solution, condition, detail, rtol = event._found
+    (condition, first, *_, detail), solution = event._data, event._cycle
     if condition == "hopf":
         raise ValueError("event must not be a Hopf point: hopf_boundary follows those")
     if condition not in _HELD:
@@ -130,7 +130,7 @@ def continue_event(
     if not 0 <= r <= 1:
         raise ValueError(f"the window must hold {name} = {value!r}, that of the event")
     step, points = float(number("step", step, above=0)), whole("points", points, 2)
-    family = Family(frozen, first, step, rtol)
+    family = Family(frozen, first, step, event._rtol)
     follower = _CurveFollower(family, points)
     held = Event.of(condition, detail, solution.chain)
     solution = solution._replace(x=frozen, r=r)

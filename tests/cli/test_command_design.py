@@ -121,6 +121,8 @@ def test_robust_design_and_its_repetition(capsys):
         (["--lattice", 200000], "lattice must be a whole number of at most 1000, got"),
         (["--lattice", 2, "--starts", 5], "starts must be at most the 4 of the lattice"),
         (["--quantile", "nan"], "quantile must be at least 0.5 and at most 0.999, got "),
+        (["--quiet-within", "x"], "--quiet-within must be numbers, got 'x'"),
+        (["--quiet-within", "1,2"], "quiet_within must have 4 semi-axes, got 2"),
         (["--risk", "cvar:x"], "--risk must be numbers, got 'x'"),
         (["--sq", "2:1"], "Sq at_least must be below at_most, got 2.0, 1.0"),
         (["--sq-lengths", 1, 2], "--sq-lengths needs --sq"),
@@ -146,7 +148,9 @@ def test_random_arguments(capsys, tmp_path, monkeypatch):
     values = "nan inf -inf 0 -1 1e20 1e400 x : 1: 1:1 2:1 2.5 P=1 P=nan:2 P=1:2 D=-1 =1 cvar:1 "
     values = (values + "smooth:0 1_ é 10 1e-9").split()
     options = {"--D": 2, "--G": 2, "--sq-lengths": 2, "--envelope": 1, "--tolerance": 1}
-    options |= {f"--{name.replace('_', '-')}": 1 for name in (*_OPTIONS, *_LIMITS, "risk")}
+    options |= {
+        f"--{name.replace('_', '-')}": 1 for name in (*_OPTIONS, *_LIMITS, "risk", "quiet-within")
+    }
     for _ in range(150):
         arguments = ["design", "--quiet"]
         for name in random.choice(list(options), random.integers(1, 3), replace=False):
@@ -157,6 +161,21 @@ def test_random_arguments(capsys, tmp_path, monkeypatch):
         accepted += err == "fractaljax: accepted\n"
     assert 0 < accepted < 75
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "asked"), [("2", 2.0), ("1e-5,2e-5,0.1,0.2", [1e-5, 2e-5, 0.1, 0.2])]
+)
+def test_size_of_kicks(capsys, monkeypatch, text, asked):
+    """A radius or semi-axes; the file of the scene may follow, and --quiet is another option."""
+
+    def design(_, quiet_within, **__):
+        raise ValueError(f"{quiet_within}")
+
+    monkeypatch.setattr("fractaljax._design.design.design", design)
+    fj.brake_scene().save("mine.toml")
+    _, _, err = run(capsys, "design", "--quiet", "--quiet-within", text, "mine.toml")
+    assert err == f"fractaljax: {asked}\n"
 
 
 @pytest.mark.parametrize(

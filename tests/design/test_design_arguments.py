@@ -27,6 +27,7 @@ DESIGN = {
     "starts": [0, -1, 1.5, True, "4", np.nan, np.inf, [4], 10**30, 65],
     "lattice": [0, 200_000, 10**30, np.nan],
     "seed": [-1, 0.5, 10**20, 2**63, True, None],
+    "quiet_within": [0, -1.0, np.nan, "2", True, {}, [], [1.0], [1, 1, 1, 0], [[1.0] * 4] * 2],
     "progress": ["no", None],
 }
 

@@ -1,0 +1,228 @@
+"""Designs that survive kicks: against the repelling cycle of a belt and an independent solver."""
+
+import functools
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import filippov
+import fractaljax as fj
+from fractaljax._design.design_file import read_design
+from fractaljax._design.problem import Cuts, state_problem
+from fractaljax._design.quiet import Kicks, _planes
+from mechanisms import PROBLEMS, changed
+from structures import of_problem, two_joints
+from tools import ROOT
+
+GRAZING = 1.8366009722  # the belt's speed at which its stick-slip cycle ends
+OPTIONS: dict[str, Any] = dict(
+    K_n_min=None, constraints=(), envelope=None, tolerance=None, quantile=0.95
+)
+OPTIONS |= dict(objective=None, target=0.0, area_ratio_min=2.0, slip_ratio_max=0.9)
+
+
+def belt(V):
+    """x'' + 0.1 x' + x = mu(V - x'), mu = 0.5 + 0.5 exp(-w/0.5); omega is 1."""
+    return of_problem(changed(PROBLEMS["papangelo_2017"], ["joints.0.V"], [V]))
+
+
+@functools.cache
+def designed(V, r, low=0.5, high=2.5):
+    return fj.design(belt(V), {"V": (low, high)}, target=0.0, quiet_within=r, progress=False)
+
+
+def speed(best):
+    return float(best.scene.joints[0].V)
+
+
+@functools.cache
+def smallest_kick(V):
+    """Units of V from the equilibrium to the repelling cycle, which bounds all that come to rest.
+
+    Backwards in time it attracts. It slips as long as the stick-slip cycle exists.
+    """
+
+    def mu(w):
+        return 0.5 + 0.5 * np.exp(-w / 0.5)
+
+    def backwards(_, y):
+        return [-y[1], y[0] + 0.1 * y[1] - mu(V - y[1])]
+
+    times = np.linspace(380, 400, 4001)
+    start = [mu(V) + 0.3, 0.0]
+    x, v = solve_ivp(backwards, (0, 400), start, "DOP853", times, rtol=1e-10, atol=1e-12).y
+    assert (v < V).all()
+    return np.hypot(x - mu(V), v).min() / V
+
+
+def test_belt_is_moved_until_its_basin_holds_the_ball():
+    """Not so far that the cycle ends; nearer than that it would not hold it."""
+    best = designed(1.3, 0.75)
+    assert best.result == fj.DesignResult.found and best.quiet_radius == 0.75
+    assert smallest_kick(1.3) < 0.6
+    # What 4000 starts do not find is a sliver.
+    assert 0.75 - 0.01 < smallest_kick(speed(best)) < 0.75 + 0.02
+    text = str(best)
+    assert "largest kick survived: 0.75 in units of V/omega and V\n" in text
+    assert "none of 4000 starts within it ends anywhere but at rest (share below 0.00075" in text
+
+
+@pytest.mark.slow
+def test_belt_is_moved_beyond_the_end_of_its_cycle():
+    """Where every kick is to be survived, just beyond the grazing."""
+    best = designed(1.3, 1.5)
+    assert best.violated == () and best.quiet_radius == 1.5
+    assert GRAZING < speed(best) < 1.005 * GRAZING
+
+
+def test_unchanged_where_the_ball_is_held():
+    best = designed(1.5, 0.6)
+    assert best.result == fj.DesignResult.unchanged and best.quiet_radius == 0.6
+
+
+@pytest.mark.slow
+def test_request_that_cannot_be_met():
+    """What is survived is said of the best design that was tried."""
+    best = designed(1.3, 1.0, 1.2, 1.6)
+    assert best.result == fj.DesignResult.infeasible
+    assert best.violated == ("quiet within 1.0",) and best.growth_rate <= 0
+    assert best.quiet_radius is not None and 1.4 < speed(best) <= 1.6
+    # A kick below the true one is always survived; the nearest of 4000 is close to it.
+    assert 1 <= best.quiet_radius / smallest_kick(speed(best)) < 1.03
+    assert "not met: quiet within 1.0" in str(best)
+
+
+@pytest.mark.slow  # draws again for each smaller kick
+def test_kicks_in_an_ellipsoid():
+    """Semi-axes of 0.9 V hold a kick of the share that the ball of 0.9 V/omega holds."""
+    x, axes = belt(1.5), [0.9 * 1.5, 0.9 * 1.5]
+    found = Kicks.of(x, axes, 0, False).survived(x)
+    assert 1 <= found * 0.9 / smallest_kick(1.5) < 1.03
+
+
+def test_starts_in_an_ellipsoid():
+    x = belt(1.5)
+    narrow = Kicks.of(x, [0.01, 0.9 * 1.5], 0, False)
+    away = narrow.tried(x, 1.0, 64)[1].starts - [0.5 + 0.5 * np.exp(-3), 0.0]
+    shares = np.linalg.norm(away / [0.01, 0.9 * 1.5], axis=1)
+    assert shares.max() <= 1 and np.mean(shares**2) == pytest.approx(0.5, abs=0.05)
+
+
+def test_nothing_comes_to_rest_where_the_equilibrium_repels():
+    x = belt(1.0)
+    assert Kicks.of(x, 0.1, 0, False).survived(x) == 0
+
+
+def test_a_plane_is_the_tangent_of_where_the_cycle_ends():
+    """Over speed and load: at other loads the cycle ends there, up to second order."""
+    x = belt(1.5)
+    bounds = {"V": (0.5, 2.5), "P": (0.5, 2.0)}
+    problem = state_problem(x, bounds, friction_slope=True, **OPTIONS)
+    u = np.asarray(problem.start)
+    ends = fj.basin(x, radius=2.0, starts=16, progress=False)
+    normals, gaps = _planes(problem, u, ends)
+    assert gaps[0] == 1e3 and np.linalg.norm(normals[1]) == pytest.approx(1)
+    errors = []
+    for step in (0.01, -0.01):
+        along = u + np.array([0.0, step])
+        moved = problem.moved(jnp.asarray(along), jnp.zeros(0))
+        (graze,) = fj.continue_cycle(moved, "V", (1.4, 2.2)).grazings
+        end = problem.scaled(moved.replace(V=graze.value))
+        errors.append(normals[1] @ (end - u) - gaps[1] / 1.005)
+    assert abs(np.array(errors)).max() < 1e-4 and abs(errors[0] - errors[1]) < 1e-6
+    assert abs(normals[1][1]) > 0.1
+
+
+def test_cuts():
+    """Out of the neighbourhood of a design, or beyond either of its planes."""
+    cuts = Cuts.none(2, jnp.zeros(2))
+    assert (cuts.residuals(jnp.array([0.5, 0.5])) < 0).all()
+    normals, gaps = np.array([[1.0, 0.0], [-0.6, 0.8]]), np.array([0.1, 0.2])
+    cuts = cuts.added(0, np.array([0.5, 0.5]), normals, gaps, 0.3)
+    for away, met in [
+        ([0.0, 0.0], False),
+        ([0.09, 0.0], False),
+        ([0.11, 0.0], True),
+        ([-0.09, 0.12], False),
+        ([-0.15, 0.2], True),
+        ([0.0, -0.29], False),
+        ([0.0, -0.31], True),
+    ]:
+        residual = cuts.residuals(jnp.array([0.5, 0.5]) + jnp.array(away))
+        assert (residual[0] <= 0) == met and residual[1] < 0, away
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"envelope": {"P": (1800.0, 2000.0)}}, "takes no envelope and no tolerance"),
+        ({"tolerance": {"D": 0.01}}, "takes no envelope and no tolerance"),
+        ({"quiet_within": [1.0, 2.0]}, "must have 4 semi-axes, got 2"),
+    ],
+)
+def test_refusals(arguments: dict[str, Any], message):
+    given: dict[str, Any] = {"quiet_within": 1.0} | arguments
+    with pytest.raises(ValueError, match="quiet_within " + message):
+        fj.design(fj.brake_scene(), **given)
+
+
+def test_a_joint_without_a_speed_is_refused():
+    joint = fj.Joint(fj.FixedContact(3e6, 1.4e6), fj.Coulomb(0.4), (0, 2), (1, 3))
+    plain = two_joints(4)
+    x = fj.Structure(plain.M, plain.C, plain.K, {"left": joint})
+    with pytest.raises(ValueError, match="joint left: V must be given, for the motion depends"):
+        fj.design(x, {"mu": (0.1, 0.5)}, target=1e6, quiet_within=1.0)
+
+
+def test_pareto_has_no_kicks():
+    with pytest.raises(ValueError, match="pareto does not take quiet_within"):
+        fj.pareto(fj.brake_scene(), fj.growth_rate, fj.growth_rate, quiet_within=1.0)
+
+
+def test_file_holds_the_option(tmp_path):
+    """And nothing of it where it was not asked for."""
+    best = designed(1.5, 0.6)
+    best.save(tmp_path / "run.toml")
+    assert read_design(tmp_path / "run.toml")[1]["quiet_within"] == 0.6
+    assert "quiet_radius = 0.6\n" in (tmp_path / "run.toml").read_text()
+    plain = fj.design(belt(1.5), {"V": (0.5, 2.5)}, target=0.0, progress=False)
+    plain.save(tmp_path / "plain.toml")
+    assert plain.quiet_radius is None and "kick survived" not in str(plain)
+    assert "quiet" not in (tmp_path / "plain.toml").read_text()
+
+
+@pytest.mark.slow
+def test_a_repeated_design_is_kicked_alike(tmp_path):
+    best = designed(1.3, 0.75)
+    best.save(tmp_path / "run.toml")
+    again = fj.repeat_design(tmp_path / "run.toml", progress=False)
+    assert repr(again) == repr(best)
+
+
+@pytest.mark.slow
+def test_brake_survives_the_kicks_of_an_independent_solver():
+    """Of two V/omega and V, some of which squeal without the requirement."""
+    scene, bounds = fj.brake_scene(), {"D": (2.3, 2.8), "G": (1e-11, 1e-9)}
+    best = fj.design(scene, bounds, quiet_within=2.0, progress=False)
+    assert best.violated == () and best.quiet_radius == 2.0
+    assert best.growth_rate <= -np.pi
+    surface = best.scene.contact.surface
+    page = (ROOT / "README.md").read_text()
+    assert f"D = {surface.D:.6g} and\nG = {surface.G:.6g} m" in page
+    plain = fj.design(scene, bounds, progress=False)
+    assert plain.value < best.value < 0.01
+    random = np.random.default_rng(5)
+    ways = random.standard_normal((24, 4))
+    ways *= 1.99 / np.linalg.norm(ways, axis=1, keepdims=True)
+    ends = []
+    for x in (best.scene, plain.scene):
+        K_n, K_t = (float(k) for k in fj.stiffness(x))
+        mechanism = filippov.replace(filippov.PLAIN, K_n=K_n, K_t=K_t)
+        centre = mechanism.si(mechanism.equilibrium)
+        starts = centre + ways * mechanism.units
+        ends.append([filippov.cycle(mechanism, start, coarse=1e-6).kind for start in starts])
+    assert set(ends[0]) == {"equilibrium"}
+    assert 2 <= ends[1].count("cycle") <= 12
