@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 
 from .._base.batches import in_batches
 from .._base.parts import brief, flag, scalar, substitute
+from .._base.quick import quick_jit
 from .._contact.fixed import FixedContact
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import (
@@ -213,16 +214,6 @@ class DesignProblem(eqx.Module):
         return np.clip((values - low) / (high - low), 0, 1)
 
 
-# Nearly all of a first design is compilation: a quick one, whose programs run as fast.
-_jit = functools.partial(
-    jax.jit,
-    compiler_options={
-        "xla_backend_optimization_level": 1,
-        "xla_cpu_use_fusion_emitters": False,
-    },
-)
-
-
 def linearise(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray):
     """Rows (n, 1 + k), their Jacobians (n, 1 + k, v), and what describes designs us (n, v).
 
@@ -266,10 +257,10 @@ def linearised(problem: DesignProblem, us, conditions):
     return jax.vmap(one)(us, conditions)
 
 
-_linearise = _jit(linearised)
+_linearise = quick_jit(linearised)
 
 
-@_jit
+@quick_jit
 def _evaluate(problem: DesignProblem, us, conditions):
     return jax.vmap(lambda u, condition: problem.at(u, condition)[0])(us, conditions)
 

@@ -3,9 +3,9 @@
 import functools
 import math
 
-import jax
 import numpy as np
 
+from .._base.quick import quick_jit
 from .._base.table import table
 from .._contact.contact import Regime
 from .._mechanism.quantities import sliding_friction
@@ -22,7 +22,7 @@ _ROUNDING = 1e-14  # relative: growth rates and excesses of friction below it sa
 _LEAST_DAMPED = 10  # stable modes of a structure that its table lists
 
 
-@functools.partial(jax.jit, static_argnames="friction_slope")
+@functools.partial(quick_jit, static_argnames="friction_slope")
 def _numbers(scene: Scene, friction_slope: bool):
     """Stability, stiffness and state of the contact, in one program: eager operations are slow."""
     friction, state = scene.friction, None
@@ -102,7 +102,7 @@ def verdict(modes: Stability) -> dict[str, str]:
     return {"growth rate [1/s]": f"{growth:+.6g}  ({verdict})"}
 
 
-@jax.jit
+@quick_jit
 def _friction(law, speed):
     return law.mu(speed), law.mu_s
 
