@@ -8,8 +8,9 @@ import numpy as np
 from .._base.parts import Record, flag
 from .._base.ranges import is_logarithmic
 from .._continuation import Curve, CurveEnd, passing
-from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import value_of
+from .._mechanism.scene import Scene
+from .._mechanism.structure import Structure
 from .._stability.boundary import Boundary, hopf_boundary
 from .basin import basin
 from .branch import Branch, BranchEvent, continue_cycle
@@ -21,7 +22,7 @@ Range = tuple[str, float, float]
 class BifurcationMap(Record):
     """The boundaries of every kind in a window of two quantities, as `bifurcation_map` finds."""
 
-    mechanism: Mechanism
+    mechanism: Scene | Structure
     x: Range = eqx.field(static=True)  # name and range
     y: Range = eqx.field(static=True)
     boundary: Boundary  # of stability against small disturbances
@@ -43,7 +44,7 @@ class BifurcationMap(Record):
 
 
 def bifurcation_map(
-    mechanism: Mechanism,
+    mechanism: Scene | Structure,
     x: Range,
     y: Range,
     *,

@@ -169,14 +169,15 @@ class Pinned(Shooting):
         if side:
             i, theta = (0, 0.0) if side < 0 else (len(mine) - 1, 1.0)
         before, after = map(np.array, self.orders)
-        place = Place(was.guard, mine[i], theta, before[was.guard, p], after[was.guard, p])
+        orders = before[was.guard, p], after[was.guard, p]
+        place = Place(was.guard, mine[i], jnp.asarray(theta), *orders)
         self.event = self.event._replace(place=place)
         before[was.guard, p] = -1
         self.orders = jnp.asarray(before), jnp.asarray(after)
 
 
 def _moved(place: Place, theta: float) -> Place:
-    return Place(place.guard, place.segment, theta, place.before, place.after)
+    return Place(place.guard, place.segment, jnp.asarray(theta), place.before, place.after)
 
 
 @functools.partial(jax.jit, static_argnames="inside")

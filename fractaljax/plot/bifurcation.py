@@ -32,7 +32,7 @@ def bifurcation_map(result: BifurcationMap, ax: Axes | None = None) -> Axes:
 
     ax, windows = given_or_new(ax), (result.x, result.y)
     places = np.linspace(0, 1, _POINTS)
-    x, y = (within(*ends, places) for _, *ends in windows)
+    x, y = (within(low, high, places) for _, low, high in windows)
     axes: Any = {result.x[0]: x, result.y[0]: y}
     slope = result.boundary.friction_slope
     growth = sweep(lambda x: growth_rate(x, slope), result.mechanism, progress=False, **axes).values
