@@ -23,7 +23,8 @@ from .._dynamics.cycle import LimitCycle
 from .._dynamics.hybrid import degrees_of_freedom, hybrid_system
 from .._mechanism.mechanism import Mechanism
 from .._stability.stability import growth_rate
-from .problem import Cuts, DesignProblem
+from .cuts import Cuts
+from .problem import DesignProblem
 from .search import Found
 
 VERIFIED = 4000  # starts of the last draw
