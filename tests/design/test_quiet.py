@@ -10,8 +10,8 @@ from scipy.integrate import solve_ivp
 
 import filippov
 import fractaljax as fj
-from fractaljax._design.design_file import read_design
 from fractaljax._design.cuts import Cuts
+from fractaljax._design.design_file import read_design
 from fractaljax._design.problem import state_problem
 from fractaljax._design.quiet import Kicks, _planes
 from mechanisms import PROBLEMS, changed
