@@ -59,6 +59,7 @@ def smallest_kick(V):
     return np.hypot(x - mu(V), v).min() / V
 
 
+@pytest.mark.slow
 def test_belt_is_moved_until_its_basin_holds_the_ball():
     """Not so far that the cycle ends; nearer than that it would not hold it."""
     best = designed(1.3, 0.75)
@@ -117,6 +118,7 @@ def test_nothing_comes_to_rest_where_the_equilibrium_repels():
     assert Kicks.of(x, 0.1, 0, False).survived(x) == 0
 
 
+@pytest.mark.slow
 def test_a_plane_is_the_tangent_of_where_the_cycle_ends():
     """Over speed and load: at other loads the cycle ends there, up to second order."""
     x = belt(1.5)

@@ -59,6 +59,7 @@ def test_grazing_of_the_belt():
     assert curve.side == 1 and curve.swapped().side == -1 and belt().grazings[0].side == -1
 
 
+@pytest.mark.slow
 def test_slope_is_the_derivative_of_the_event():
     curve, event = grazing(), belt().grazings[0]
     i = int(np.argmin(np.abs(curve.y - 1)))
@@ -73,6 +74,7 @@ def test_slope_is_the_derivative_of_the_event():
     np.testing.assert_allclose(curve.x[i], event.value, rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", [0, 1])
 def test_a_branch_starts_from_an_event(index):
     """From the grazing and the Hopf point of the first branch to those of the second."""
@@ -110,6 +112,7 @@ def test_folds_of_the_brake_meet_in_a_cusp():
     )
 
 
+@pytest.mark.slow
 def test_map(tmp_path):
     """Of the belt: its Hopf boundary, the grazing once, and the committed picture."""
     found = load_script(DOCS / "make_map.py").draw(tmp_path / "map.png", starts=8, lines=9)
