@@ -16,14 +16,7 @@ import pytest
 import fractaljax as fj
 from fractaljax.__main__ import main
 from fractaljax._dynamics.summary import cycle_table
-from tools import (
-    DOCS,
-    load_script,
-    motionless_scene,
-    reference_cycle,
-    reference_scene,
-    run_command as run,
-)
+from tools import motionless_scene, reference_cycle, reference_scene, run_command as run
 
 _CYCLE = ["cycle.csv", "cycle.png"]
 _SEARCH = "fractaljax._dynamics.limit_cycle.limit_cycle"
@@ -57,21 +50,6 @@ def test_scene_and_version(capsys):
     assert status == 0
     assert fj.Scene.load("scene.toml").to_toml() == fj.brake_scene().to_toml() == out
     assert run(capsys, "--version") == (0, f"fractaljax {fj.__version__}\n", "")
-
-
-@pytest.mark.slow
-def test_map(capsys):
-    """Of the belt of the guide: the curves of the library, as rows and as a picture."""
-    load_script(DOCS / "make_map.py").belt().save("belt.toml")
-    windows = "--x", "V=0.5:2.5", "--y", "mu_s=0.6:1.4"
-    status, out, _ = run(capsys, "map", "belt.toml", *windows, "--starts", "8", "--quiet")
-    assert status == 0 and "grazing, " in out and "cycles: 2 branches" in out
-    assert names("fractaljax-map") == ["map.csv", "map.png"]
-    with open("fractaljax-map/map.csv") as file:
-        rows = list(csv.DictReader(file))
-    hopf = np.array([[float(r["V"]), float(r["mu_s"])] for r in rows if r["kind"] == "Hopf"])
-    np.testing.assert_allclose(2 * (hopf[:, 1] - 0.5) * np.exp(-2 * hopf[:, 0]), 0.1, rtol=1e-8)
-    assert {row["kind"] for row in rows} == {"Hopf", "grazing"}
 
 
 @pytest.mark.parametrize(

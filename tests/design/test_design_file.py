@@ -207,7 +207,8 @@ def test_wrong_kinds_are_refused_before_the_search(robust, tmp_path, monkeypatch
             table[name] = given
             with pytest.raises((ValueError, TypeError)) as refused:
                 fj.repeat_design(tmp_path / "wrong.toml", {"coarse": coarse}, progress=False)
-            assert "\n" not in str(refused.value) and len(str(refused.value)) < 300
+            said = str(refused.value).replace(str(tmp_path), "")
+            assert "\n" not in said and len(said) < 300
 
 
 def test_unknown_and_missing_entries(robust, tmp_path):

@@ -1,6 +1,8 @@
 """Curves of events in two quantities: against the phase plane, other branches, derivatives."""
 
+import csv
 import functools
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -13,7 +15,7 @@ from scipy.optimize import brentq, minimize_scalar
 import fractaljax as fj
 from mechanisms import PROBLEMS
 from structures import of_problem
-from tools import DOCS, assert_same_picture, labels, load_script
+from tools import DOCS, assert_same_picture, labels, load_script, run_command
 
 BELT = of_problem(PROBLEMS["papangelo_2017"])  # x'' + 0.1 x' + x = mu(w), mu_s 1, mu_d 0.5, v_0 0.5
 WINDOW = (0.5, 2.5)
@@ -113,8 +115,8 @@ def test_folds_of_the_brake_meet_in_a_cusp():
 
 
 @pytest.mark.slow
-def test_map(tmp_path):
-    """Of the belt: its Hopf boundary, the grazing once, and the committed picture."""
+def test_map(tmp_path, capsys, monkeypatch):
+    """Of the belt: its Hopf boundary, the grazing once, the committed picture, and the command."""
     found = load_script(DOCS / "make_map.py").draw(tmp_path / "map.png", starts=8, lines=9)
     assert_same_picture(tmp_path / "map.png", "map.png")
     (curve,) = found.curves
@@ -124,6 +126,26 @@ def test_map(tmp_path):
     np.testing.assert_allclose(2 * (hopf.y - 0.5) * np.exp(-2 * hopf.x), 0.1, rtol=1e-8)
     ax = fj.plot.bifurcation_map(found)
     assert labels(ax)[:3] == ["small disturbances grow", "Hopf", "grazing of a cycle"]
+
+    def mapped(x, *windows, **options):
+        assert float(x.joints[0].friction.mu_d) == 0.5
+        assert windows == (("V", 0.5, 2.5), ("mu_s", 0.6, 1.4))
+        assert options == {"starts": 8, "progress": False}
+        return found
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("fractaljax._dynamics.bifurcation.bifurcation_map", mapped)
+    BELT.save("belt.toml")
+    windows = "--x", "V=0.5:2.5", "--y", "mu_s=0.6:1.4"
+    status, out, _ = run_command(
+        capsys, "map", "belt.toml", *windows, "--starts", "8", "--quiet", "--out", "out"
+    )
+    assert status == 0 and repr(found) in out
+    assert sorted(path.name for path in Path("out").iterdir()) == ["map.csv", "map.png"]
+    with open("out/map.csv") as file:
+        rows = list(csv.DictReader(file))
+    assert [float(r["V"]) for r in rows if r["kind"] == "Hopf"] == hopf.x.tolist()
+    assert [float(r["mu_s"]) for r in rows if r["kind"] == "grazing"] == curve.y.tolist()
 
 
 def test_refusals():
