@@ -9,6 +9,7 @@ from .parsing import (
     add_scene_file,
     load_given,
     number,
+    numbers,
     pairs_of,
     remarks,
 )
@@ -144,10 +145,10 @@ def _options(arguments) -> dict:
         options["bounds"] = DEFAULT_BOUNDS | options["bounds"]
     else:
         for name, text in pairs_of("--bounds", arguments.bounds, _SEVERAL["bounds"][0]).items():
-            options["bounds"][name] = tuple(_numbers(f"--bounds {name}", text, ":"))
+            options["bounds"][name] = tuple(numbers(f"--bounds {name}", text, ":"))
     options["constraints"] = _constraints(arguments)
     if arguments.quiet_within is not None:
-        axes = _numbers("--quiet-within", arguments.quiet_within, ",")
+        axes = numbers("--quiet-within", arguments.quiet_within, ",")
         options["quiet_within"] = axes if len(axes) > 1 else axes[0]
     if arguments.risk is not None:
         kind, _, value = arguments.risk.partition(":")
@@ -156,7 +157,7 @@ def _options(arguments) -> dict:
         ranges, samples = {}, {}
         for name, text in pairs_of("--envelope", arguments.envelope, "NAME=LOW:HIGH").items():
             into, separator = (ranges, ":") if ":" in text else (samples, ",")
-            into[name] = _numbers(f"--envelope {name}", text, separator)
+            into[name] = numbers(f"--envelope {name}", text, separator)
             if len(into[name]) < 2:
                 raise ValueError(
                     f"--envelope {name} must be LOW:HIGH or at least two samples, got {text!r}"
@@ -169,10 +170,6 @@ def _options(arguments) -> dict:
             for name, text in pairs.items()
         }
     return options
-
-
-def _numbers(option, text, separator) -> list[float]:
-    return [number(option, value) for value in text.split(separator)]
 
 
 def _constraints(arguments) -> list:

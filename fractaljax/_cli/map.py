@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from .output import csv_text, output, picture
-from .parsing import add_scene_file, load_given, number, pairs_of
+from .parsing import add_scene_file, load_given, numbers, pairs_of
 
 _FORM = "NAME=LOW:HIGH"
 _AROUND = {"D": (-0.05, 0.05), "G": (0.5, 2.0)}  # of the default window: added, and a factor
@@ -63,10 +63,10 @@ def _window(x, which: str, text: str | None) -> tuple[str, float, float]:
             return name, own * low, own * high
         return name, max(2.001, own + low), min(2.999, own + high)
     ((name, ends),) = pairs_of(f"--{which}", [text], _FORM).items()
-    numbers = [number(f"--{which} {name}", end) for end in ends.split(":")]
-    if len(numbers) != 2:
+    window = numbers(f"--{which} {name}", ends, ":")
+    if len(window) != 2:
         raise ValueError(f"--{which} must be {_FORM}, got {text!r}")
-    return name, numbers[0], numbers[1]
+    return name, window[0], window[1]
 
 
 def _text(found) -> str:

@@ -126,3 +126,8 @@ def number(option: str, text: str) -> float:
         return float(text)
     except ValueError:
         raise ValueError(f"{option} must be numbers, got {text!r}") from None
+
+
+def numbers(option: str, text: str, separator: str) -> list[float]:
+    """The numbers that `option` was given as one text."""
+    return [number(option, value) for value in text.split(separator)]

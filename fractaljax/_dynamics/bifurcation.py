@@ -6,7 +6,6 @@ import equinox as eqx
 import numpy as np
 
 from .._base.parts import Record, flag
-from .._base.ranges import is_logarithmic
 from .._continuation import Curve, CurveEnd, passing
 from .._mechanism.quantities import value_of
 from .._mechanism.scene import Scene
@@ -15,6 +14,7 @@ from .._stability.boundary import Boundary, hopf_boundary
 from .basin import basin
 from .branch import Branch, BranchEvent, continue_cycle
 from .event_curve import EventCurve, continue_event
+from .shooting import Window
 
 Range = tuple[str, float, float]
 
@@ -149,12 +149,9 @@ def _same(branch: Branch, other: Branch) -> bool:
 
 def _on(curve: EventCurve, at: dict[str, float], ranges) -> bool:
     """Whether a curve passes through a place."""
-    places, point = [], []
-    for (name, *ends), values in zip(ranges, (curve.x, curve.y), strict=True):
-        both = np.array([*values, at[name], *ends])
-        both = np.log(both) if is_logarithmic(*ends) else both
-        *scaled, own = (both[:-2] - both[-2]) / (both[-1] - both[-2])
-        places.append(scaled)
-        point.append(own)
-    known = Curve(np.array(places).T, CurveEnd.edge, CurveEnd.edge)
-    return len(known.points) > 1 and len(passing(known, np.array(point), 1e-6)) > 0
+    windows = [Window.over(*each) for each in ranges]
+    pairs = zip(windows, (curve.x, curve.y), strict=True)
+    places = np.stack([window.place(values) for window, values in pairs], axis=1)
+    point = np.array([float(window.place(at[window.name])) for window in windows])
+    known = Curve(places, CurveEnd.edge, CurveEnd.edge)
+    return len(places) > 1 and len(passing(known, point, 1e-6)) > 0

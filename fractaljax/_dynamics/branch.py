@@ -168,9 +168,9 @@ def continue_cycle(
             raise ValueError(f'start must be a LimitCycle or "hopf", got {start!r}')
         ended = _from_hopf(follower, float(interval.place(value_of(frozen, name))))
     elif isinstance(start, BranchEvent):
-        ended = _from_event(follower, name, start)
+        ended = _from_event(follower, start)
     else:
-        ended = _from_cycle(follower, name, start)
+        ended = _from_cycle(follower, start)
     return _branch(follower, x, name, *ended)
 
 
@@ -186,7 +186,7 @@ def checked_window(x: Mechanism, name: str, window) -> tuple[float, float]:
     return low, high
 
 
-def _from_cycle(follower: Follower, name: str, cycle):
+def _from_cycle(follower: Follower, cycle):
     """Both ways from a limit cycle; returns why the branch ends at either end."""
     if cycle is None:
         cycle = limit_cycle(follower.x)
@@ -195,13 +195,13 @@ def _from_cycle(follower: Follower, name: str, cycle):
         raise ValueError("start must be one limit cycle that exists")
     if cycle._system.excited or not isinstance(cycle._orbit, Orbit):
         raise ValueError("start must be a cycle without excitation and regularisation")
-    solution = solution_of(cycle, follower.x, _own_place(follower, name))
+    solution = solution_of(cycle, follower.x, own_place(follower.x, follower.window))
     return follower.both_ways(lambda: _begun(follower, solution, held=True))
 
 
-def _from_event(follower: Follower, name: str, event: BranchEvent):
+def _from_event(follower: Follower, event: BranchEvent):
     """Both ways through an event, from a cycle beside it; None in place of it for a Hopf point."""
-    q = _own_place(follower, name)
+    q = own_place(follower.x, follower.window)
     solution = event._cycle
     if solution is None:
         return _from_hopf(follower, q)
@@ -219,20 +219,18 @@ def _from_event(follower: Follower, name: str, event: BranchEvent):
     return follower.both_ways(begun)
 
 
-def _own_place(follower: Follower, name: str) -> float:
-    """The place of the mechanism's own quantity in the window."""
-    value = float(value_of(follower.x, name))
-    q = float(follower.window.place(value))
+def own_place(x: Mechanism, window: Window) -> float:
+    """The place of a mechanism's own quantity in the window."""
+    value = float(value_of(x, window.name))
+    q = float(window.place(value))
     if not -1e-9 <= q <= 1 + 1e-9:
-        raise ValueError(f"the window must hold {name} = {value!r}, that of the start")
+        raise ValueError(f"the window must hold {window.name} = {value!r}, that of the start")
     return min(max(q, 0.0), 1.0)
 
 
 def _begun(follower: Follower, solution: Solution, held=False):
     """Equations, unknowns and tangent of an orbit that is known, perhaps at its very quantity."""
-    h = solution.u[2 * follower.n : -1][: len(solution.phases)]
-    edges = np.concatenate([[0], np.cumsum(h)])
-    shooting = Shooting(follower.family, solution, solution.phases, edges)
+    shooting = Shooting(follower.family, solution, solution.phases, solution.times)
     found = shooting.curves.corrected(shooting.begin, shooting.quantity if held else None)
     if found is None or np.linalg.norm(found[0] - shooting.begin) > 0.1:
         raise ValueError("start must be a limit cycle of x itself")

@@ -12,10 +12,9 @@ from .._base.parts import Record, number, require_kind, whole
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import (
     require_independent,
-    value_of,
     with_optional,
 )
-from .branch import BranchEvent, checked_window
+from .branch import BranchEvent, checked_window, own_place
 from .follow import BranchEnd, Follower
 from .itinerary import Family
 from .pinned import Event, Pinned
@@ -125,20 +124,14 @@ def continue_event(
     require_independent(x, (first.name, name))
     frozen = with_optional(jax.lax.stop_gradient(x), (first.name, name))
     second = Window.over(name, low, high)
-    value = float(value_of(frozen, name))
-    r = float(second.place(value))
-    if not 0 <= r <= 1:
-        raise ValueError(f"the window must hold {name} = {value!r}, that of the event")
     step, points = float(number("step", step, above=0)), whole("points", points, 2)
     family = Family(frozen, first, step, event._rtol)
     follower = _CurveFollower(family, points)
     held = Event.of(condition, detail, solution.chain)
-    solution = solution._replace(x=frozen, r=r)
-    h = solution.u[2 * family.n :][: len(solution.phases)]
-    times = np.concatenate([[0], np.cumsum(h)])
+    solution = solution._replace(x=frozen, r=own_place(frozen, second))
 
     def begun():
-        pinned = Pinned(family, second, held, solution, solution.phases, times)
+        pinned = Pinned(family, second, held, solution, solution.phases, solution.times)
         found = pinned.curves.corrected(pinned.begin, pinned.quantity + 1)
         if found is None or np.linalg.norm(found[0] - pinned.begin) > 0.1:
             raise ValueError("event must be one of a branch of x itself")

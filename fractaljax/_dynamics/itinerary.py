@@ -46,6 +46,12 @@ class Solution(NamedTuple):
     u: np.ndarray
     r: float = 0.0  # place of a second free quantity, if there is one
 
+    @property
+    def times(self) -> np.ndarray:
+        """When each phase begins, and the period, in scaled time."""
+        k = len(self.lifted.y)
+        return np.concatenate([[0], np.cumsum(self.u[k : k + len(self.phases)])])
+
 
 class Family:
     """The cycles of one mechanism with one quantity free, and how finely they are cut."""

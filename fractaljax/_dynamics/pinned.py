@@ -15,7 +15,15 @@ import numpy as np
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import substituted
 from .itinerary import Family, Shooting, Solution
-from .shooting import Chain, Place, Window, durations, reduced_guard, return_jacobian
+from .shooting import (
+    Chain,
+    Place,
+    Window,
+    descended,
+    durations,
+    reduced_guard,
+    return_jacobian,
+)
 
 _STEP = 1e-7  # of differences
 _AWAY = 1e4  # weight of the second quantity, which the states between do not follow
@@ -189,16 +197,9 @@ def _touching(x, window: Window, chain, lifted, u, place: Place, inside: bool):
         h = durations(chain, u, system.n)
         return reduced_guard(system, chain, lifted.at(u), h, place, theta)
 
-    def vertex(theta, spacing):
-        around = theta + spacing * jnp.arange(-1, 2)
-        low, here, high = jax.vmap(lambda at: guard(u, at))(around)
-        bend = low + high - 2 * here
-        moved = jnp.clip((low - high) / (2 * jnp.where(bend > 0, bend, 1)), -1, 1)
-        return theta + spacing * jnp.where(bend > 0, moved, jnp.sign(low - high)), None
-
     theta = jnp.asarray(place.theta, u.dtype)
     if inside:
-        theta, _ = jax.lax.scan(vertex, theta, jnp.array([1 / 16, 1 / 64, 1 / 512, 1 / 2048]))
+        theta = descended(lambda at: guard(u, at), theta, (1 / 16, 1 / 64, 1 / 512, 1 / 2048))
     value, row = jax.value_and_grad(guard)(u, jax.lax.stop_gradient(theta))
     return value, row, theta
 

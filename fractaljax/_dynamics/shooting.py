@@ -6,6 +6,7 @@ zero. Their derivatives by the states between are eliminated by the affine maps 
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -243,18 +244,10 @@ def lowest(x: Mechanism, window: Window, chain: Chain, lifted: Lifted, u, before
     first = jnp.maximum(-chain.begin[segment] / chain.share[segment], -0.3)
     last = jnp.minimum((1 - chain.begin[segment]) / chain.share[segment], 1.3)
 
-    def vertex(theta, spacing):
-        """The minimum of the parabola through three points around the last one."""
-        theta = jnp.clip(theta, first + spacing, last - spacing)
-        around = theta + spacing * jnp.arange(-1, 2)
-        low, here, high = jax.vmap(lambda at: reduced_guard(system, chain, y, h, place, at))(around)
-        bend = low + high - 2 * here
-        moved = (low - high) / (2 * jnp.where(bend > 0, bend, 1))
-        moved = jnp.where(bend > 0, jnp.clip(moved, -1, 1), jnp.sign(low - high))
-        return theta + spacing * moved, None
+    def guard_at(theta):
+        return reduced_guard(system, chain, y, h, place, theta)
 
-    spacings = jnp.array([1 / 4, 1 / 32, 1 / 256, 1 / 2048], y.dtype)
-    refined, _ = jax.lax.scan(vertex, place.theta, spacings)
+    refined = descended(guard_at, place.theta, (1 / 4, 1 / 32, 1 / 256, 1 / 2048), first, last)
     refined = jnp.where(fixed, place.theta, refined)
     value = reduced[guard, node, segment]
     found = jnp.where(
@@ -262,6 +255,23 @@ def lowest(x: Mechanism, window: Window, chain: Chain, lifted: Lifted, u, before
     )
     theta = jnp.where(found < value, refined, place.theta)
     return found, Place(guard, segment, theta, *orders)
+
+
+def descended(function: Callable, theta, spacings, first=-jnp.inf, last=jnp.inf) -> Array:
+    """The minimum of a function of one variable near theta, between two ends.
+
+    That of the parabola through three points around the last one, time and again.
+    """
+
+    def vertex(theta, spacing):
+        theta = jnp.clip(theta, first + spacing, last - spacing)
+        low, here, high = jax.vmap(function)(theta + spacing * jnp.arange(-1, 2))
+        bend = low + high - 2 * here
+        moved = (low - high) / (2 * jnp.where(bend > 0, bend, 1))
+        moved = jnp.where(bend > 0, jnp.clip(moved, -1, 1), jnp.sign(low - high))
+        return theta + spacing * moved, None
+
+    return jax.lax.scan(vertex, theta, jnp.array(spacings, theta.dtype))[0]
 
 
 @functools.partial(jax.jit, static_argnames="places")

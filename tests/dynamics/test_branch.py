@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
-from scipy.optimize import brentq, minimize_scalar
+from scipy.optimize import brentq
 
 import fractaljax as fj
 import hybrid_truth
+from belt import least_speed, slip
 from fractaljax._mechanism.quantities import replaced
 from mechanisms import PROBLEMS, changed
 from structures import of_problem
@@ -45,26 +45,6 @@ def branch(name, quantity, low, high):
 
 
 # --- the one-mass belt, whose phase plane says where its cycles end ---
-
-
-def slip(v, start, time, **options):
-    """x'' + 0.1 x' + x = 0.5 + 0.5 exp(-2 (v - x')) from a start, by SciPy."""
-
-    def rate(_, y):
-        return [y[1], 0.5 + 0.5 * np.exp(-2 * (v - y[1])) - 0.1 * y[1] - y[0]]
-
-    options = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-14, "dense_output": True} | options
-    return solve_ivp(rate, (0, time), start, **options)
-
-
-def least_speed(v):
-    """Of the slip that begins where stick ends, the least sliding speed one turn later."""
-    motion = slip(v, [1 - 0.1 * v, v], 12).sol
-    times = np.linspace(3, 9, 601)
-    i = int(np.argmin(v - motion(times)[1]))
-    ends: Any = {"bounds": times[[i - 1, i + 1]], "options": {"xatol": 1e-12}}
-    least: Any = minimize_scalar(lambda t: v - motion(t)[1], method="bounded", **ends)
-    return least.fun
 
 
 def test_belt():

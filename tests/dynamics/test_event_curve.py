@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
-from scipy.optimize import brentq, minimize_scalar
+from scipy.optimize import brentq
 
 import fractaljax as fj
+from belt import least_speed
 from mechanisms import PROBLEMS
 from structures import of_problem
 from tools import DOCS, assert_same_picture, labels, load_script, run_command
@@ -29,21 +29,6 @@ def belt():
 @functools.cache
 def grazing():
     return fj.continue_event(BELT, belt().grazings[0], "mu_s", (0.6, 2.0))
-
-
-def least_speed(v, mu_s):
-    """Of the slip that begins where stick ends, the least speed one turn later, by SciPy."""
-
-    def rate(_, y):
-        return [y[1], 0.5 + (mu_s - 0.5) * np.exp(-2 * (v - y[1])) - 0.1 * y[1] - y[0]]
-
-    options: Any = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-14, "dense_output": True}
-    motion = solve_ivp(rate, (0, 12), [mu_s - 0.1 * v, v], **options).sol
-    times = np.linspace(3, 9, 601)
-    i = int(np.argmin(v - motion(times)[1]))
-    ends: Any = {"bounds": times[[i - 1, i + 1]], "options": {"xatol": 1e-12}}
-    least: Any = minimize_scalar(lambda t: v - motion(t)[1], method="bounded", **ends)
-    return least.fun
 
 
 def test_grazing_of_the_belt():
@@ -87,8 +72,6 @@ def test_a_branch_starts_from_an_event(index):
     np.testing.assert_allclose(least_speed(V, float(at.value)), 0, atol=1e-9)
     if event.kind == "Hopf":
         np.testing.assert_allclose(other.hopf[0].value, 1.0, rtol=1e-9)
-        # The quantity of the first branch moves with x, and so does what the second one finds:
-        # (mu_s - mu_d) exp(-V/v_0) is the same all along Hopf's curve.
     np.testing.assert_allclose(other.parameter.min(), at.value, rtol=1e-9)
 
 
