@@ -257,7 +257,9 @@ def lowest(x: Mechanism, window: Window, chain: Chain, lifted: Lifted, u, before
     return found, Place(guard, segment, theta, *orders)
 
 
-def descended(function: Callable, theta, spacings, first=-jnp.inf, last=jnp.inf) -> Array:
+def descended(
+    function: Callable, theta, spacings, first: Any = -jnp.inf, last: Any = jnp.inf
+) -> Array:
     """The minimum of a function of one variable near theta, between two ends.
 
     That of the parabola through three points around the last one, time and again.
