@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, ScalarLike
 
 from .._base.parts import concrete, number, raise_unless, require_kind, whole
+from .._base.quick import quick_jit
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.scene import Scene
 from .._stability.stability import growth_rate
@@ -132,7 +133,7 @@ def _monodromy(system: HybridSystem, segments: Segments, local: Maps) -> Float[A
     return product
 
 
-@functools.partial(jax.jit, static_argnames=("segments", "rtol"))
+@functools.partial(quick_jit, static_argnames=("segments", "rtol"))
 def _limit_cycle(
     mechanism: Mechanism, start, excitation, max_returns, *, segments: int, rtol: float
 ) -> LimitCycle:
