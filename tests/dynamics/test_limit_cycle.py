@@ -270,9 +270,11 @@ def test_error_falls_with_the_eighth_power():
 
 @SLOW
 def test_batch():
-    """More scenes than run together, of every outcome and both modes: each as on its own."""
-    numbers = {name: jnp.array([float(row[name]) for row in ROWS]) for name in NAMES}
-    starts = jnp.array([row["start"] for row in ROWS])
+    """Scenes of every outcome together: each as on its own, and so its gradient."""
+    outcomes = [int(solved(row, row["start"])[0].result._value) for row in ROWS]
+    rows = [row for i, row in enumerate(ROWS) if outcomes[:i].count(outcomes[i]) < 4]
+    numbers = {name: jnp.array([float(row[name]) for row in rows]) for name in NAMES}
+    starts = jnp.array([row["start"] for row in rows])
 
     def size(V, numbers, start):
         cycle = fj.limit_cycle(scene_of(numbers | {"V": V}), start, segments=40, throw=False)
@@ -281,8 +283,8 @@ def test_batch():
 
     measures = jax.jit(jax.vmap(jax.value_and_grad(size, has_aux=True)))
     (sizes, (periods, results)), slopes = measures(numbers["V"], numbers, starts)
-    assert len(ROWS) > 64 and len(set(results.tolist())) >= 4
-    for i, row in enumerate(ROWS):
+    assert len(set(results.tolist())) == len(set(outcomes)) >= 4
+    for i, row in enumerate(rows):
         cycle, forward, _ = solved(row, row["start"])
         assert results[i] == cycle.result._value, row
         np.testing.assert_allclose(periods[i], cycle.period, rtol=1e-9)
