@@ -35,6 +35,7 @@ CALLS = {
     "roughness": (fj.constraints.Roughness, LIMITS | dict(L=1e-3, L_s=1e-6)),
     "frequency": (fj.constraints.Frequency, LIMITS | dict(friction_slope=True)),
     "damping": (fj.constraints.DampingRatio, dict(at_least=0.1, friction_slope=True)),
+    "amplitude": (fj.constraints.CycleAmplitude, dict(at_most=1e-6)),
     "envelope": (fj.Envelope, dict(ranges={"P": (1.0, 2.0)}, samples={"V": (1.0, 2.0)})),
 }
 NEVER = [True, np.True_, jnp.array(True), "1", b"1", 1j, np.array(["1"]), [1.0], (1, 2), object()]

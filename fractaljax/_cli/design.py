@@ -21,6 +21,8 @@ _LIMITS = {  # option: class of `fractaljax.constraints`, and its meaning
     "real-area": ("RealContactArea", "real contact area [m^2]"),
     "damping-ratio": ("DampingRatio", "least damping ratio"),
     "frequency": ("Frequency", "frequencies of all modes [Hz]"),
+    "cycle-amplitude": ("CycleAmplitude", "peak-to-peak amplitude of the limit cycle in x1 [m]"),
+    "velocity-level": ("VelocityLevel", "velocity level of the limit cycle in x1 [dB re 1 nm/s]"),
 }
 _OPTIONS = {  # plain arguments of `design`
     "target": (float, "largest growth rate allowed [1/s]"),
@@ -189,8 +191,12 @@ def _constraints(arguments) -> list:
         asked = {end: number(f"--{name}", x) if x else None for end, x in asked.items()}
         law = getattr(constraints, kind)
         takes = inspect.signature(law).parameters
-        if asked["at_most"] is not None and "at_most" not in takes:
-            raise ValueError(f"--{name} has a lower limit only: LOW:")
+        for end, only in (
+            ("at_most", "a lower limit only: LOW:"),
+            ("at_least", "an upper limit only: :HIGH"),
+        ):
+            if asked[end] is not None and end not in takes:
+                raise ValueError(f"--{name} has {only}")
         found.append(law(**{key: x for key, x in (asked | more).items() if key in takes}))
     return found
 

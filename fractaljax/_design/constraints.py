@@ -14,8 +14,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from .._base.parts import Record, flag, scalar
+from .._base.parts import Record, flag, scalar, whole
 from .._contact.contact import ContactState
+from .._dynamics.cycle import VELOCITY_REFERENCE, CycleResult
+from .._dynamics.limit_cycle import limit_cycle
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.scene import Scene, stiffness
 from .._stability.margin import least_damping_ratio
@@ -255,3 +257,65 @@ class Frequency(Constraint):
 
     def above(self, value):
         return super().above(value[1])
+
+
+class CycleConstraint(Constraint):
+    """A measure of the limit cycle in one degree of freedom: at most a limit, or an objective.
+
+    Without a limit it is an objective only. `design` follows the cycle from one design to the next.
+    Called by itself it searches for the one that `limit_cycle` finds. At rest the measure is 0.
+    """
+
+    dof: int = eqx.field(static=True)  # from 0
+
+    def __init__(self, at_most: ArrayLike | None = None, *, dof: int = 0):
+        if at_most is None:
+            self.at_least = self.at_most = None
+        else:
+            super().__init__(at_most=at_most)
+        self.dof = whole("dof", dof, 0)
+
+    @abc.abstractmethod
+    def of(self, amplitude: Array, velocity: Array) -> Array:
+        """The measure of an amplitude peak to peak [m] and a velocity, root mean square [m/s]."""
+
+    def __call__(self, scene):
+        return self.measure(scene) if self.at_most is None else super().__call__(scene)
+
+    def measure(self, scene):
+        cycle = limit_cycle(scene, throw=False)
+        at_rest = cycle.result == CycleResult.equilibrium
+        measures = cycle.amplitude[self.dof], cycle.velocity_rms[self.dof]
+        return self.of(*(jnp.where(at_rest, 0, measure) for measure in measures))
+
+
+class CycleAmplitude(CycleConstraint):
+    """Peak-to-peak amplitude [m] of the limit cycle in a degree of freedom, at most a limit."""
+
+    symbol: ClassVar[str] = "cycle amplitude"
+    unit: ClassVar[str] = "m"
+
+    def __init__(self, at_most: ArrayLike | None = None, *, dof: int = 0):
+        super().__init__(at_most, dof=dof)
+
+    def of(self, amplitude, velocity):
+        return amplitude
+
+
+class VelocityLevel(CycleConstraint):
+    """20 lg(v/1 nm/s) [dB] of the root mean square v of a velocity of the limit cycle.
+
+    At most a limit. The level of the sound of one radiator rises and falls by as much. 0 at rest.
+    """
+
+    symbol: ClassVar[str] = "velocity level"
+    unit: ClassVar[str] = "dB"
+
+    def __init__(self, at_most: ArrayLike | None = None, *, dof: int = 0):
+        super().__init__(at_most, dof=dof)
+
+    def of(self, amplitude, velocity):
+        return 20 * jnp.log10(jnp.maximum(velocity, VELOCITY_REFERENCE) / VELOCITY_REFERENCE)
+
+    def above(self, value):
+        return (value - self.at_most) / 10

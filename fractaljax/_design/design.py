@@ -42,7 +42,7 @@ from .search import (
 from .summary import comparison_table
 from .tolerance import Tolerance, squeal_probability
 
-_STARTS = 12
+_STARTS, _FOLLOWED = 12, 1  # the latter where cycles are followed
 # Designs a side that are screened, in one variable and in more, and what memory holds of them.
 _LATTICE = {False: (1024, 48), True: (256, 24)}  # whether under many conditions
 _LATTICE_MAX = 1_000_000, 1000
@@ -84,6 +84,8 @@ class Design(Record):
     squeal_probability: float | None = None  # as machined
     squeal_probability_error: float | None = None  # its standard error
     initial_squeal_probability: float | None = None
+    # What is asked of the limit cycle, before and after; 0 at rest.
+    cycles: Mapping[str, tuple[float, float]] | None = None
     quiet_radius: float | None = None  # the largest kick survived, as `quiet_within` measures it
 
     @property
@@ -153,6 +155,8 @@ class Design(Record):
         if self.has_surface:
             L, L_s = self.wavelengths
             lines.append(f"Sq and Sdq: wavelengths from {L:g} to {L_s:g} m")
+        for name, (before, after) in (self.cycles or {}).items():
+            lines.append(f"{name}: {before:.6g}, then {after:.6g}")
         lines += self._under_conditions() + self._under_kicks()
         lines += [f"not met: {name}" for name in self.violated]
         growth = self.growth_rate if self.growth_rates is None else self.growth_rates[1]
@@ -227,7 +231,13 @@ def design(
 
     Best is, without an `objective`, nearest to the given quantities: the least sum of
     (dq/(q_hi - q_lo))^2, with ln q for scales. An objective is any function of a scene that `jax`
-    can differentiate, and is minimised.
+    can differentiate, and is minimised. `constraints.CycleAmplitude` and `VelocityLevel`, without a
+    limit as the objective or with one among the `constraints`, are of the limit cycle of the given
+    design that `limit_cycle` finds, which is followed from design to design, from the given one
+    alone if `starts` is not given. Such a cycle may need a larger `target`: where it is negative
+    only cycles beside a stable equilibrium are left. Where the cycle ends it leaves silence or
+    another cycle behind, suddenly, so that no slope leads there. They take no envelope and no
+    tolerance.
 
     The requirements: growth rate <= `target` [1/s], by default minus half the least damping rate
     without friction (min xi_i omega_i of a scene); every function of a scene in `constraints` <= 0,
@@ -286,6 +296,8 @@ def design(
     def solved(problem):
         evaluator = evaluator_of(problem, envelope, risk)
         us, scale = choose_starts(own, designs, evaluator.screen(designs), count)
+        if problem.cycles is not None:
+            scale = abs(float(before.values[0])) or 1.0
         search = Search(evaluator, solver or slsqp, 1.0 if objective is None else scale)
         path, after, failed = search.best(us, progress)
         return Found(path, after, len(us), failed)
@@ -308,7 +320,8 @@ def screened(problem: DesignProblem, starts: int | None, lattice: int | None):
         lattice = _LATTICE[problem.robust][min(variables, 2) - 1]
     lattice = whole("lattice", lattice, 1, _LATTICE_MAX[min(variables, 2) - 1])
     count = lattice ** min(variables, 2)
-    starts = whole("starts", min(_STARTS, count) if starts is None else starts, 1, _STARTS_MAX)
+    default = _STARTS if problem.cycles is None else _FOLLOWED
+    starts = whole("starts", min(default, count) if starts is None else starts, 1, _STARTS_MAX)
     if starts > count:
         raise ValueError(f"starts must be at most the {count} of the lattice, got {starts}")
     return starts, screened_designs(lattice, variables)
@@ -357,6 +370,8 @@ def _conclude(
         first, last = (squeal_probability(s, tolerance, envelope, **draw) for s in (x, final))
         more["initial_squeal_probability"] = first.value
         more |= {"squeal_probability": last.value, "squeal_probability_error": last.standard_error}
+    if problem.cycles is not None:
+        more["cycles"] = problem.cycles.ends(problem, path[-1])
     result = DesignResult.found if starts else DesignResult.unchanged
     return Design(
         scene=final,

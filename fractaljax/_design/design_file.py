@@ -49,8 +49,10 @@ def design_files(best: Any, path: Path) -> dict[Path, bytes]:
             heads[name] = beside.name
             files |= x._files(beside)
     options = dict(best.options)
-    for name in ("objective", "solver"):
-        options[name] = options[name] and _function_name(options[name])
+    options["solver"] = options["solver"] and _function_name(options["solver"])
+    if (objective := options["objective"]) is not None:
+        table = _constraint_table(objective)
+        options["objective"] = table if isinstance(objective, Constraint) else table["function"]
     options["constraints"] = [_constraint_table(asked) for asked in options["constraints"]]
     if (envelope := options["envelope"]) is not None:
         options["envelope"] = {"ranges": envelope.ranges, "samples": envelope.samples}
@@ -120,7 +122,11 @@ def _options(table, functions) -> dict[str, Any]:
     options["bounds"] = table_at(options, "bounds", "options.")
     for name in ("objective", "solver"):
         if name in options:
-            options[name] = _function(options[name], functions)
+            given = options[name]
+            if name == "objective" and isinstance(given, dict):
+                options[name] = _constraint(given, functions)
+            else:
+                options[name] = _function(given, functions)
     for name, kind in (("envelope", Envelope), ("tolerance", Tolerance)):
         if name in options:
             given = table_at(options, name, "options.")
@@ -160,7 +166,8 @@ def _constraint_table(asked) -> dict[str, Any]:
         return {"function": _function_name(asked)}
     fields = {name: value for name, value in vars(asked).items() if value is not None}
     return {"kind": type(asked).__name__} | {
-        name: value if isinstance(value, bool) else float(value) for name, value in fields.items()
+        name: value if isinstance(value, (bool, int)) else float(value)
+        for name, value in fields.items()
     }
 
 

@@ -21,6 +21,7 @@ from .._base.batches import in_batches
 from .._base.parts import brief, flag, scalar, substitute
 from .._base.quick import quick_jit
 from .._contact.fixed import FixedContact
+from .._dynamics.hybrid import degrees_of_freedom, hybrid_system
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import (
     joints_of,
@@ -37,9 +38,10 @@ from .._mechanism.quantities import (
 from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
 from .._stability.stability import growth_rate
-from .constraints import Constraint, Plain
+from .constraints import Constraint, CycleConstraint, Plain
 from .cuts import Cuts
 from .envelope import Envelope
+from .followed import FollowedCycles
 from .tolerance import Tolerance, nodes, quantile
 
 DEFAULT_BOUNDS: dict[str, tuple[float, float]] = {"D": (2.1, 2.9), "G": (1e-12, 1e-8)}
@@ -79,6 +81,7 @@ class DesignProblem(eqx.Module):
     friction_slope: bool = eqx.field(static=True)
     conditions: tuple[str, ...] = eqx.field(static=True)  # quantities of the envelope
     cuts: Cuts | None = None
+    cycles: FollowedCycles | None = None  # where a requirement or the objective is of a cycle
 
     # --- in JAX: one design at one condition ---------------------------------------------
 
@@ -116,7 +119,11 @@ class DesignProblem(eqx.Module):
                 model.append(10 * (state.slip_ratio - self.slip_ratio_max))
             stiff.append((K_n_min - state.K_n) / jnp.where(K_n_min > 0, K_n_min, 1))
         pressing = jnp.arcsinh((growth - self.target) / self.growth_scale)
-        own = [jnp.asarray(asked(x)) for asked in self.constraints]
+        # Cycles are followed outside of this program.
+        own = [
+            jnp.zeros_like(growth) if isinstance(asked, CycleConstraint) else jnp.asarray(asked(x))
+            for asked in self.constraints
+        ]
         if self.cuts is not None:
             own += list(self.cuts.residuals(u))
         value = jnp.sum((u - self.start) ** 2) if self.objective is None else self.objective(x)
@@ -128,7 +135,9 @@ class DesignProblem(eqx.Module):
             for key in ("K_n", "K_t", "log_area_ratio", "slip_ratio"):
                 if getattr(state, key) is not None:
                     numbers[_dot(name) + key] = getattr(state, key)
-        return jnp.stack([value, *model, pressing, *stiff, *own]), numbers
+        return jnp.stack(
+            [jnp.asarray(value, growth.dtype), *model, pressing, *stiff, *own]
+        ), numbers
 
     def at(self, u: Float[Array, " v"], condition: Float[Array, " c"]):
         """As `_row`; quantiles, and no more than the row, where quantities scatter.
@@ -186,7 +195,11 @@ def linearise(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray):
     Each design is at a condition (n, c).
     """
     rows, jacobians, numbers = _in_batches(_linearise, problem, us, conditions)
-    return rows.astype(float), jacobians.astype(float), numbers
+    rows, jacobians = rows.astype(float), jacobians.astype(float)
+    if problem.cycles is not None:
+        problem.cycles.fill(problem, us, rows, jacobians)
+        numbers = numbers | {"objective": rows[:, 0]}
+    return rows, jacobians, numbers
 
 
 def evaluate(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray) -> np.ndarray:
@@ -204,6 +217,7 @@ def describe(problem: DesignProblem, us: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _in_batches(program, problem, us, conditions):
+    problem = dataclasses.replace(problem, cycles=None)
     dtype = problem.low.dtype
     pairs = np.asarray(us, dtype), np.asarray(conditions, dtype)
     return in_batches(functools.partial(program, problem), _BATCH, *pairs)
@@ -314,6 +328,8 @@ def state_problem(
             f"constraints must be a list of functions of a scene, got {brief(constraints)}"
         )
     bounds = checked_bounds(x, bounds)
+    cycles = _cycles(x, objective, constraints, envelope is not None or tolerance is not None)
+    objective = _followed if isinstance(objective, CycleConstraint) else objective
     numbers: dict[str, Any] = dict(
         area_ratio_min=scalar("area_ratio_min", area_ratio_min, at_least=1),
         slip_ratio_max=scalar("slip_ratio_max", slip_ratio_max, above=0, at_most=1),
@@ -370,10 +386,33 @@ def state_problem(
         conditions=conditions,
     )
     if K_n_min is not None or not contacts:
-        return problem
+        return dataclasses.replace(problem, cycles=cycles)
     given = describe(problem, np.asarray(problem.start)[None])
     own = tuple(jnp.asarray(given[_dot(name) + "K_n"][0], dtype) for name in contacts)
-    return dataclasses.replace(problem, K_n_min=own)
+    return dataclasses.replace(problem, K_n_min=own, cycles=cycles)
+
+
+def _followed(x) -> float:
+    """Stands for an objective that `FollowedCycles` fills in."""
+    return 0.0
+
+
+def _cycles(x, objective, constraints, robust: bool) -> FollowedCycles | None:
+    """What follows the cycles of the designs, where something is asked of them."""
+    of_cycle = objective if isinstance(objective, CycleConstraint) else None
+    asked = [each for each in constraints if isinstance(each, CycleConstraint)]
+    if of_cycle is None and not asked:
+        return None
+    if robust:
+        raise ValueError(f"{(of_cycle or asked[0]).symbol} takes no envelope and no tolerance")
+    n = degrees_of_freedom(x)
+    hybrid_system(x)  # refuses a joint without V
+    for each in asked if of_cycle is None else [of_cycle, *asked]:
+        if each.dof >= n:
+            raise ValueError(f"dof of {each.symbol} must be below {n}, got {each.dof}")
+        if each is not of_cycle and each.at_most is None:
+            raise ValueError(f"{each.symbol} as a requirement needs at_most")
+    return FollowedCycles(of_cycle)
 
 
 def checked_bounds(x: Mechanism, bounds: Mapping[str, Sequence[float]]) -> dict[str, tuple]:

@@ -106,7 +106,9 @@ class Evaluator:
 
     def screen(self, us: np.ndarray) -> np.ndarray:
         """Objective and residuals (n, 1 + k) of us (n, v), roughly: to choose starts by."""
-        return self._at_all(us, self.likely).max(axis=1)
+        # Cycles are followed from the starts only.
+        rough = dataclasses.replace(self, problem=dataclasses.replace(self.problem, cycles=None))
+        return rough._at_all(us, self.likely).max(axis=1)
 
     def evaluate(self, us: np.ndarray) -> Evaluation:
         """Designs us (n, v), over all conditions."""

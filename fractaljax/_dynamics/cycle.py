@@ -10,9 +10,11 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._base.parts import Record, concrete
 from .hybrid import OPEN, UNUSED, HybridSystem
-from .orbit import Segments, flow
+from .orbit import Segments, flow, mean_square
 
 _SQUARINGS = 40  # of a monodromy matrix
+_SAMPLES = 1024  # of a smooth orbit, for a mean
+VELOCITY_REFERENCE = 1e-9  # [m/s], of levels
 
 
 class CycleResult(eqx.Enumeration):
@@ -128,6 +130,25 @@ class LimitCycle(Record):
     def frequency(self) -> Float[Array, ""]:
         """1/period [Hz]."""
         return 1 / self.period
+
+    @property
+    def velocity_rms(self) -> Float[Array, " n"]:
+        """The root mean square of each dx/dt over a period [m/s], of one cycle."""
+        system = self._system
+        if isinstance(self._orbit, Orbit):
+            square = system.own(mean_square(system, self._orbit.segments)) * system.units**2
+            square = jnp.where(jnp.isfinite(self.period), square, jnp.nan)
+        else:
+            square = jnp.mean(self.orbit(_SAMPLES)[1] ** 2, axis=0)
+        return jnp.sqrt(square[len(self.amplitude) :])
+
+    @property
+    def velocity_level(self) -> Float[Array, " n"]:
+        """20 lg(`velocity_rms`/1 nm/s) [dB], as ISO 1683 has it.
+
+        The sound power level of one radiator rises and falls by as much.
+        """
+        return 20 * jnp.log10(self.velocity_rms / VELOCITY_REFERENCE)
 
     def orbit(self, n: int = 512) -> tuple[Float[Array, " n"], Float[Array, "n 2dofs"]]:
         """Times [s] and states [x, v] [m, m/s], evenly spaced over one period from `state`."""

@@ -12,6 +12,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .hybrid import NONE, UNUSED, HybridSystem
@@ -220,6 +221,16 @@ def remesh(system: HybridSystem, steps: Segments, h, length: int) -> Segments:
         s=jnp.where(used[None], s, s[:, last][:, None]),
         guard=jnp.where(used, guard, UNUSED),
     )
+
+
+def mean_square(system: HybridSystem, segments: Segments) -> Float[Array, " 2n"]:
+    """The mean of each component squared over a period, by Gauss-Legendre quadrature."""
+    nodes, weights = np.polynomial.legendre.leggauss(5)
+    share = jnp.asarray((nodes + 1) / 2, segments.y.dtype)
+    y, h, s = segments.y, segments.duration, segments.s
+    inside = jax.vmap(lambda share: flow(system, y, share * h, s))(share)
+    weights = jnp.asarray(weights / 2, y.dtype)
+    return jnp.einsum("g,gin,n->i", weights, inside**2, h) / jnp.sum(h)
 
 
 class PeriodicOrbit(eqx.Module):

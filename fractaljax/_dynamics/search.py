@@ -151,7 +151,7 @@ def admissible(system: HybridSystem, segments: Segments, middle) -> Array:
     return holds & jnp.all(after == jnp.roll(s, -1, axis=-1))
 
 
-def _attracts(return_jacobian) -> Array:
+def attracts(return_jacobian) -> Array:
     """Whether no eigenvalue exceeds 1 in modulus by more than 1e-3: by repeated squaring."""
 
     def square(_, power):
@@ -201,7 +201,7 @@ def _candidate(system, steps: Segments, y, first, last, returns, h, rtol, *, len
     orbit = found.segments
     near = jnp.max(jnp.abs(orbit.y[:, 0] - y)) < 0.2 * (1 + jnp.max(jnp.abs(y)))
     moves = jnp.max(jnp.abs(orbit.y[system.n :])) > 1e-4
-    ok = found.converged & near & moves & _attracts(found.return_jacobian)
+    ok = found.converged & near & moves & attracts(found.return_jacobian)
     ok = ok & admissible(system, orbit, found.middle) & ~_has_shorter_period(orbit, returns)
     return orbit, found.error, ok
 

@@ -127,6 +127,7 @@ def test_robust_design_and_its_repetition(capsys):
         (["--sq", "2:1"], "Sq at_least must be below at_most, got 2.0, 1.0"),
         (["--sq-lengths", 1, 2], "--sq-lengths needs --sq"),
         (["--damping-ratio", "0:1"], "--damping-ratio has a lower limit only: LOW:"),
+        (["--cycle-amplitude", "1:"], "--cycle-amplitude has an upper limit only: :HIGH"),
         (["--repeat", "nowhere.toml"], "no such file: nowhere.toml"),
         (["--repeat", "file"], "file: "),
         (["--repeat", "file", "--seed", 1], "takes everything from its file, got seed"),
