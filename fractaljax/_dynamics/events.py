@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
-from .hybrid import NONE, SECTION, HybridSystem
+from .hybrid import NONE, SECTION, HybridSystem, first_least, row_numbers
 
 
 class Cubic(eqx.Module):
@@ -133,15 +133,13 @@ def step(system: HybridSystem, y, s, last, h):
     start, rate = guards[0], guards[1] - guards[0]
     # A guard starts on its own side: at zero it is entered, unless it falls on.
     near = rounding(y)[None]
-    entered = (jnp.abs(start) <= near) & (rate >= -near)
-    guards = guards.at[0].set(jnp.where(entered, 0, start))
-    # Only a fall through the section counts.
-    falls = (guards[0, SECTION] > 0) & (last != SECTION)
-    roots = first_root(Cubic.at_thirds(guards))
-    roots = roots.at[SECTION].set(jnp.where(falls, roots[SECTION], 2))
-    theta = jnp.min(roots, axis=0)
+    start = jnp.where((jnp.abs(start) <= near) & (rate >= -near), 0, start)
+    roots = first_root(Cubic.at_thirds((start, *guards[1:])))
+    # Only a fall through the section counts. (XLA does not turn updates of rows into vectors.)
+    falls = (start > 0) & (last != SECTION)[None]
+    first, theta = first_least(jnp.where((row_numbers(roots) != SECTION) | falls, roots, 2))
     hit = theta <= 1
-    guard = jnp.where(hit, jnp.argmin(roots, axis=0), NONE)
+    guard = jnp.where(hit, first, NONE)
     end = jnp.where(hit[None], between(jnp.where(hit, theta, 1)[None]), y_1)
     y_end, s_end = system.switch(end, s, guard)
     return system.with_unit_excitation(y_end), s_end, jnp.where(hit, theta, 1) * h, guard

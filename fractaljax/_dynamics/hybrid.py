@@ -154,13 +154,13 @@ class HybridSystem(eqx.Module):
         x, u = y[: self.n], y[self.n :]
         if s is not None and any(self.opens):
             # An open joint has no springs: their forces, which K holds, are taken back.
-            loads, taken = self.loads(x), jnp.zeros_like(friction)
+            loads = self.loads(x)
+            taken = list(loads)
             for faces, opens in zip(self.faces, self.opens, strict=True):
                 if opens:
                     tangential, normal = faces
-                    taken = taken.at[normal].set(loads[tangential])
-                    taken = taken.at[tangential].set(-loads[normal])
-            friction = jnp.where(s == OPEN, taken, friction)
+                    taken[normal], taken[tangential] = loads[tangential], -loads[normal]
+            friction = jnp.where(s == OPEN, jnp.stack(taken), friction)
         free = self._leaf(self.F, x.ndim - 1) - self._times(self.K, x) - self._times(self.C, u)
         return free + self._acceleration(friction)
 
@@ -189,7 +189,7 @@ class HybridSystem(eqx.Module):
         W = self._leaf(jnp.sum(self.T[:, :, None] * self.B[None], axis=1), held.ndim - 1)
         own = jnp.eye(len(W), dtype=W.dtype).reshape(len(W), len(W), *(1,) * (held.ndim - 1))
         W = jnp.where(held[:, None] & held[None], W, own)
-        return jnp.where(held, _solve(W, wanted), 0)
+        return jnp.where(held, _solve_positive(W, wanted), 0)
 
     def field(self, y, s) -> Array:
         """dy/dt in contact state s. A sticking face must have w = 0."""
@@ -268,7 +268,7 @@ class HybridSystem(eqx.Module):
         sticks. Under a negative load it always reverses: the sliding mode there is repelling.
         """
         f = len(s)
-        number_of = jnp.arange(f).reshape(f, *(1,) * (s.ndim - 1))
+        number_of = row_numbers(s)
         guard = jnp.broadcast_to(jnp.asarray(guard), s.shape[1:])
         ended = (guard[None] - 1) // 2 == number_of
         lower = guard[None] == 1 + 2 * number_of
@@ -279,7 +279,7 @@ class HybridSystem(eqx.Module):
         after = jnp.where(s == 0, jnp.where(lower, 1, -1), after_slip)
         new = jnp.where(ended, after.astype(s.dtype), s)
         exact = ended | (s == 0) | (new == 0)
-        k, x, u = 1 + 2 * f, y[: self.n], y[self.n :]
+        k, x, u, parts = 1 + 2 * f, y[: self.n], y[self.n :], list(new)
         for faces, opens in zip(self.faces, self.opens, strict=True):
             if opens:
                 tangential, normal = faces
@@ -287,12 +287,11 @@ class HybridSystem(eqx.Module):
                 changes = guard == k
                 w = self.sliding(u)
                 for i in faces:
-                    slips = jnp.where(w[i] < 0, -1, 1)
-                    new = new.at[i].set(
-                        jnp.where(changes, jnp.where(closes, slips, OPEN), new[i]).astype(s.dtype)
-                    )
+                    slips = jnp.where(closes, jnp.where(w[i] < 0, -1, 1), OPEN)
+                    parts[i] = jnp.where(changes, slips.astype(s.dtype), parts[i])
                 x = self._without_load(x, tangential, normal, changes)
                 k += 1
+        new = jnp.stack(parts)
         # To rounding, the velocity of a face that sticks or starts to slip is the belt's.
         if self.B is None:
             u = jnp.where(exact, self._leaf(self.V, u.ndim - 1), u)
@@ -312,22 +311,28 @@ class HybridSystem(eqx.Module):
         A force beyond its limits starts a slip; a slip that its own acceleration reverses sticks.
         The largest contradiction goes first, as in the pivoting of a complementarity problem.
         """
-        limits = self.limits(self.loads(y[: self.n]))
-        number = jnp.arange(len(s)).reshape(-1, *(1,) * (s.ndim - 1))
+        # A contact state has no derivative, and the loop none in reverse mode.
+        system, y = jax.lax.stop_gradient((self, y))
+        limits = system.limits(system.loads(y[: self.n]))
         # To rounding, a face at its limit does either.
         slack = 64 * jnp.finfo(y.dtype).eps
 
-        def pivot(_, s):
-            rate = self.along(self._driven(y, self._slipping(y, s), s))
-            force = self.held(rate, s == 0)
-            rate = rate + self.along(self._acceleration(force))
+        def pivot(carry):
+            s, _, pivots = carry
+            rate = system.along(system._driven(y, system._slipping(y, s), s))
+            force = system.held(rate, s == 0)
+            rate = rate + system.along(system._acceleration(force))
             excess = jnp.where(s == 0, jnp.abs(force) * (1 - slack) - limits, s * rate - slack)
-            worst = jnp.argmax(jnp.where(free, excess, -1), axis=0)[None] == number
+            excess = jnp.where(free, excess, -1)
+            worst = (first_least(-excess)[0][None] == row_numbers(s)) & (excess > 0)
             slips = jnp.where(force > limits, 1, -1)
             changed = jnp.where(s == 0, slips, 0).astype(s.dtype)
-            return jnp.where(worst & free & (excess > 0), changed, s)
+            return jnp.where(worst, changed, s), jnp.any(worst), pivots + 1
 
-        return jax.lax.fori_loop(0, 2 * len(s), pivot, s)
+        def going(carry):
+            return carry[1] & (carry[2] < 2 * len(s))
+
+        return jax.lax.while_loop(going, pivot, (s, jnp.array(True), 0))[0]
 
     def _without_load(self, x, tangential, normal, where) -> Array:
         """x moved along the normal of a joint to where its normal force is 0."""
@@ -339,12 +344,8 @@ class HybridSystem(eqx.Module):
 
     def contact_state(self, y) -> Array:
         """The contact state in which the motion from y begins."""
-        x, u = y[: self.n], y[self.n :]
-        w, loads = self.sliding(u), self.loads(x)
-        s = jnp.sign(w)
-        for faces, opens in zip(self.faces, self.opens, strict=True):
-            for i in faces if opens else ():
-                s = s.at[i].set(jnp.where(loads[faces[0]] < 0, OPEN, s[i]))
+        w = self.sliding(y[self.n :])
+        s = jnp.where(self.open_faces(y), OPEN, jnp.sign(w))
         # At the belt's velocity: the side whose own field leaves it, forward if both do.
         return self._consistent(y, s.astype(y.dtype), s == 0)
 
@@ -369,6 +370,20 @@ class HybridSystem(eqx.Module):
         return jnp.concatenate([jnp.full(n, length), jnp.full(n, self.speed)])
 
 
+def row_numbers(x) -> Array:
+    """The numbers (k, 1, ...) of the rows of x (k, ...)."""
+    return jnp.arange(len(x)).reshape(-1, *(1,) * (x.ndim - 1))
+
+
+def first_least(x) -> tuple[Array, Array]:
+    """Which row of x (k, ...) holds the least value (...), and that; k where it is not a number.
+
+    What `argmin` says, in reductions that XLA turns into vector instructions.
+    """
+    least = jnp.min(x, axis=0)
+    return jnp.min(jnp.where(x == least[None], row_numbers(x), len(x)), axis=0), least
+
+
 def _solve(W, b) -> Array:
     """The solution of W x = b for W (f, f, ...) and b (f, ...), lanes last."""
     if len(b) == 1:
@@ -380,6 +395,17 @@ def _solve(W, b) -> Array:
         return jnp.stack([first, second]) / det[None]
     W, b = jnp.moveaxis(W, (0, 1), (-2, -1)), jnp.moveaxis(b, 0, -1)
     return jnp.moveaxis(jnp.linalg.solve(W, b[..., None])[..., 0], -1, 0)
+
+
+def _solve_positive(W, b) -> Array:
+    """`_solve` of a symmetric positive definite W: elimination, which then needs no pivots."""
+    if len(b) < 3:
+        return _solve(W, b)
+    A = jnp.concatenate([W, b[:, None]], axis=1)
+    for k in range(len(b)):
+        row = (A[k] / A[k, k][None])[None]
+        A = jnp.where(row_numbers(A) == k, row, A - A[:, k, None] * row)
+    return A[:, -1]
 
 
 def degrees_of_freedom(mechanism: Mechanism) -> int:
