@@ -8,7 +8,7 @@ import jax
 
 from .page import INDEX, index, measured, write
 
-NAMES = "contact eigenvalues extremes growth_rate limit_cycle many_cycles scale scene_cost"
+NAMES = "branches contact eigenvalues extremes growth_rate limit_cycle many_cycles scale scene_cost"
 PAGES = {n: importlib.import_module(f".{n}", __package__) for n in (*NAMES.split(), "whole_design")}
 
 

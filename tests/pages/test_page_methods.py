@@ -6,6 +6,7 @@ import pytest
 
 import fractaljax as fj
 from benchmarks import (
+    branches,
     eigenvalues,
     limit_cycle,
     loops,
@@ -34,6 +35,13 @@ def test_loops_and_arrays_agree_in_every_regime():
     rate, omega = np.array([state[:2] for state in states]).T
     for found in (loops.arrays(loops.brake())(D, G), [state[0] for state in others]):
         assert np.max(np.abs(found - rate) / omega) < 1e-14
+
+
+@pytest.mark.parametrize("mu_s", [0.3, transients.MU_S, 0.7])
+def test_smooth_equations_over_friction_are_those_of_each_law(mu_s):
+    np.testing.assert_allclose(
+        branches.numbers(mu_s), transients.law(mu_s=mu_s).numbers, rtol=1e-15
+    )
 
 
 @pytest.mark.parametrize("order", [2, 4])

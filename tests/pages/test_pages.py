@@ -13,7 +13,16 @@ from tools import ROOT, quick_benchmark
 
 RESULTS = ROOT / "benchmarks" / "results"
 STORED = page.stored(RESULTS)
-MISSED = {"limit_cycle"}  # the ratio to the best peer of one cycle
+# The ratio to the best peer of one cycle; the time of a branch.
+MISSED = {"limit_cycle", "branches"}
+
+
+def branches(numbers):
+    own, swept, *_ = numbers["rows"]
+    assert own["error"]["worst"] < 1e-8 and own["compared"] > 1
+    assert len([kind for kind, _ in own["events"] if kind == "fold"]) == own["folds"] == 3
+    assert own["unstable"] > 0 == swept["unstable"]
+    assert numbers["basin"]["alike"] == numbers["basin"]["sample"]
 
 
 def contact(numbers):
