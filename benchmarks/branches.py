@@ -6,19 +6,27 @@ other, up and down, each from the last state; or they smooth the law, and follow
 with JaxCont's collocation. A basin is beside a search from every single start.
 """
 
-import math
 import time
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.integrate import solve_ivp
 
 import fractaljax as fj
 
 from .page import in_words, png, spread, subplots, table
 from .timing import seconds, versions
-from .transients import MU_M, MU_S, PERIOD, V_M, V, accelerations, law, reference
+from .transients import (
+    MU_S,
+    accelerations,
+    cubic,
+    extremes_of,
+    last_period,
+    law,
+    reading,
+    reference,
+    scipy_states,
+)
 
 TITLE = "Branches and basins: error against run time"
 PACKAGES = ("numpy", "scipy", "diffrax", "jaxcont")
@@ -31,13 +39,6 @@ COLLOCATION = 4  # points in an interval of JaxCont's mesh
 SETTLING = 60  # periods of the smooth motion before JaxCont takes over
 RADIUS = 2.0  # of the ball of starts, in V/omega and V
 Row = dict[str, Any]
-
-
-def numbers(mu_s: Any) -> tuple[Any, ...]:
-    """Those of the scaled equations, as `transients.law` has them, for any mu_s."""
-    *rest, _, _, _ = law().numbers
-    a, b = 1.5 * (mu_s - MU_M) * V / V_M, 0.5 * (mu_s - MU_M) * (V / V_M) ** 3
-    return *rest, mu_s, a, b
 
 
 def searched(mu_s: float, state: Any) -> Any:
@@ -105,29 +106,20 @@ def smooth_field(eps: float):
     """du/dt of the tanh law for u (4,) and mu_s."""
 
     def field(u, mu_s, args):
-        return jnp.stack([u[2], u[3], *accelerations(jnp.tanh, numbers(mu_s), eps)(*u)])
+        numbers = *law().numbers[:-3], *cubic(mu_s)
+        return jnp.stack([u[2], u[3], *accelerations(jnp.tanh, numbers, eps)(*u)])
 
     return field
 
 
-def smooth_orbit(eps: float) -> tuple[np.ndarray, np.ndarray]:
-    """Times (k,) and states (k, 4) of one period after the transient, in scaled units."""
-    of, period = accelerations(math.tanh, law().numbers, eps), PERIOD / law().time
-
-    def rates(_, y):
-        return [y[2], y[3], *of(*y.tolist())]
-
-    def maximum(_, y):
-        return y[2]
-
-    maximum.direction = -1
-    span = (0, SETTLING * period)
-    found = solve_ivp(
-        rates, span, law().start, "LSODA", rtol=1e-9, atol=1e-9, events=maximum, max_step=0.05
-    )
-    first, last = found.t_events[0][-2:]
-    chosen = (found.t >= first) & (found.t <= last)
-    return found.t[chosen] - found.t[chosen][0], found.y.T[chosen]
+def smooth_orbit(eps: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Times (k,) and states (k, 4) of one period after the transient, and that period; scaled."""
+    times, units = reading(SETTLING), law()
+    y = scipy_states("LSODA", units, eps, 1e-9, times)()
+    rate = accelerations(np.tanh, units.numbers, eps)(*y.T)[0]
+    period = last_period(units, extremes_of(times, y[:, 0], y[:, 2], rate))[0] / units.time
+    last = times >= times[-1] - period
+    return times[last] - times[last][0], y[last], period
 
 
 def jaxcont_branch(eps: float, intervals: int, checked: int) -> tuple[Row, Row]:
@@ -138,13 +130,13 @@ def jaxcont_branch(eps: float, intervals: int, checked: int) -> tuple[Row, Row]:
         periodic_orbit_problem,
     )
 
-    times, states = smooth_orbit(eps)
+    times, states, period = smooth_orbit(eps)
     mesh = Collocation(ntst=intervals, ncol=COLLOCATION)
     setting = f"eps {eps:g} V, {intervals} intervals"
     row = {"name": f"{JAXCONT}, {setting}", "unstable": None, "error": None, "compared": 0}
     start = time.perf_counter()
     problem = periodic_orbit_problem(
-        smooth_field(eps), jnp.array(states), jnp.array(times), float(times[-1]), MU_S, mesh
+        smooth_field(eps), jnp.array(states), jnp.array(times), period, MU_S, mesh
     )
     # Steps in mu_s as fine as the package's, in the norm of all unknowns.
     options = {"ds": 0.1, "ds_min": 1e-4, "ds_max": 1.0, "max_steps": 120}

@@ -65,13 +65,18 @@ class Law(NamedTuple):
     length: float  # m
 
 
+def cubic(mu_s: Any, V: float = V) -> tuple[Any, Any, Any]:
+    """The last numbers of a law: mu, a and b."""
+    r, drop = V / V_M, mu_s - MU_M
+    return mu_s, 1.5 * drop * r, 0.5 * drop * r**3
+
+
 def law(K_n: float = K_N, mu_s: float = MU_S, V: float = V) -> Law:
     """Of the reference scene, in doubles whatever JAX is set to."""
     w_1, w_2, xi_1, xi_2, F = OSCILLATOR.values()
-    omega, r, drop = math.sqrt(K_n), V / V_M, mu_s - MU_M
+    omega, (mu_s, a, b) = math.sqrt(K_n), cubic(mu_s, V)
     k_1, k_2 = (w_1 / omega) ** 2 + KAPPA, (w_2 / omega) ** 2 + 1
     c_1, c_2 = 2 * xi_1 * w_1 / omega, 2 * xi_2 * w_2 / omega
-    a, b = 1.5 * drop * r, 0.5 * drop * r**3
     f, mu = F / math.sqrt(2) / (omega * V), mu_s - a + b
     x_1, x_2 = np.linalg.solve([[k_1, -mu], [mu * KAPPA, k_2]], [f, -f]).tolist()
     displaced = omega / math.sqrt(w_1**2 + w_2**2 + K_n * (1 + KAPPA))  # the package's start

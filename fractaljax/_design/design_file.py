@@ -166,8 +166,7 @@ def _constraint_table(asked) -> dict[str, Any]:
         return {"function": _function_name(asked)}
     fields = {name: value for name, value in vars(asked).items() if value is not None}
     return {"kind": type(asked).__name__} | {
-        name: value if isinstance(value, (bool, int)) else float(value)
-        for name, value in fields.items()
+        name: value if isinstance(value, int) else float(value) for name, value in fields.items()
     }
 
 

@@ -90,15 +90,15 @@ class FollowedCycles:
         reach, shortest = _REACH
         while True:
             away = float(np.abs(u - last.u).max())
-            ends = away <= reach
-            next_u = u if ends else last.u + reach / away * (u - last.u)
+            arrives = away <= reach
+            next_u = u if arrives else last.u + reach / away * (u - last.u)
             found = self._newton(problem, next_u, last.segments)
             if found is None and reach > shortest:
                 reach = min(away, reach) / 2
                 continue
             if found is None:
                 found = self._searched(problem, next_u, last.start)
-                if found.segments is None and not ends:
+                if found.segments is None and not arrives:
                     found = self._beyond(problem, u, found, last.start)
             self.known[found.u.tobytes()] = found
             if np.array_equal(found.u, u):
@@ -107,7 +107,7 @@ class FollowedCycles:
 
     def _beyond(self, problem, u, found: _Known, start) -> _Known:
         """What is at u if the cycle has ended before it, where `found` was."""
-        x = problem.moved(jnp.asarray(u, problem.low.dtype), problem.own_condition)
+        x = _mechanism(problem, u)
         at_rest = not found.measures.any()
         if at_rest and float(growth_rate(x)) < 0:
             return found._replace(u=u)
@@ -126,7 +126,7 @@ class FollowedCycles:
 
     def _searched(self, problem, u, start) -> _Known:
         """What the motion from a start ends in."""
-        x = problem.moved(jnp.asarray(u, problem.low.dtype), problem.own_condition)
+        x = _mechanism(problem, u)
         cycle = limit_cycle(x, start, throw=False)
         n = len(cycle.amplitude)
         found = None
@@ -139,6 +139,10 @@ class FollowedCycles:
             found = _Known(u, None, np.full(2 * n, np.nan), measures, none)
         self.known[u.tobytes()] = found
         return found
+
+
+def _mechanism(problem, u):
+    return problem.moved(jnp.asarray(u, problem.low.dtype), problem.own_condition)
 
 
 @quick_jit

@@ -384,12 +384,13 @@ def state_problem(
         objective=objective,
         friction_slope=flag("friction_slope", friction_slope),
         conditions=conditions,
+        cycles=cycles,
     )
     if K_n_min is not None or not contacts:
-        return dataclasses.replace(problem, cycles=cycles)
+        return problem
     given = describe(problem, np.asarray(problem.start)[None])
     own = tuple(jnp.asarray(given[_dot(name) + "K_n"][0], dtype) for name in contacts)
-    return dataclasses.replace(problem, K_n_min=own, cycles=cycles)
+    return dataclasses.replace(problem, K_n_min=own)
 
 
 def _followed(x) -> float:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .hybrid import NONE, UNUSED, HybridSystem
+from .hybrid import NONE, UNUSED, HybridSystem, row_numbers
 from .runge_kutta import runge_kutta
 
 _ITERATIONS = 16
@@ -76,8 +76,7 @@ def next_start(y) -> Array:
 def chosen_guard(system: HybridSystem, y, s, guard) -> Array:
     """The guard that ends each segment, at y; 0 where none does."""
     guards = system.guards(y, s)
-    chosen = jnp.arange(len(guards)).reshape(-1, *(1,) * guard.ndim) == guard[None]
-    return jnp.sum(jnp.where(chosen, guards, 0), axis=0)
+    return jnp.sum(jnp.where(row_numbers(guards) == guard[None], guards, 0), axis=0)
 
 
 def maps(system: HybridSystem, segments: Segments) -> tuple[Array, Maps]:
