@@ -7,6 +7,7 @@ from .output import csv_text, npy, output, picture
 from .parsing import (
     add_constant_friction,
     add_scene_file,
+    kick_size,
     load_given,
     number,
     numbers,
@@ -150,8 +151,7 @@ def _options(arguments) -> dict:
             options["bounds"][name] = tuple(numbers(f"--bounds {name}", text, ":"))
     options["constraints"] = _constraints(arguments)
     if arguments.quiet_within is not None:
-        axes = numbers("--quiet-within", arguments.quiet_within, ",")
-        options["quiet_within"] = axes if len(axes) > 1 else axes[0]
+        options["quiet_within"] = kick_size("--quiet-within", arguments.quiet_within)
     if arguments.risk is not None:
         kind, _, value = arguments.risk.partition(":")
         options["risk"] = (kind, number("--risk", value)) if value else kind

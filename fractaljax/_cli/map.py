@@ -1,9 +1,10 @@
 """`fractaljax map`: where a mechanism is quiet, squeals, or does as it was kicked."""
 
 from pathlib import Path
+from typing import Any
 
 from .output import csv_text, output, picture
-from .parsing import add_scene_file, load_given, numbers, pairs_of
+from .parsing import add_scene_file, kick_size, load_given, numbers, pairs_of
 
 _FORM = "NAME=LOW:HIGH"
 _AROUND = {"D": (-0.05, 0.05), "G": (0.5, 2.0)}  # of the default window: added, and a factor
@@ -23,7 +24,10 @@ def add_map(commands) -> None:
             f"--{which}", metavar=_FORM, help=f"a quantity and its window; default around {name}"
         )
     parser.add_argument(
-        "--radius", type=float, help="of the kicks that look for cycles; default 5 V/omega and V"
+        "--radius",
+        metavar="R",
+        help="of the kicks that look for cycles, in units of V/omega and V, 5 by default; or a "
+        "list of semi-axes in m and m/s, X1,X2,V1,V2",
     )
     parser.add_argument("--starts", type=int, help="how many kicks; default 128")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
@@ -40,8 +44,11 @@ def _run(arguments) -> int:
 
     x = load_given(arguments.scene, structures=True)
     windows = [_window(x, which, getattr(arguments, which)) for which in ("x", "y")]
-    options = {name: getattr(arguments, name) for name in ("radius", "starts")}
-    options = {name: value for name, value in options.items() if value is not None}
+    options: dict[str, Any] = {}
+    if arguments.radius is not None:
+        options["radius"] = kick_size("--radius", arguments.radius)
+    if arguments.starts is not None:
+        options["starts"] = arguments.starts
     with output(arguments.out) as write:
         found = bifurcation_map(x, *windows, **options, progress=not arguments.quiet)
         figure = picture(plot.bifurcation_map(found).figure)

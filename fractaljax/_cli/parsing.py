@@ -131,3 +131,9 @@ def number(option: str, text: str) -> float:
 def numbers(option: str, text: str, separator: str) -> list[float]:
     """The numbers that `option` was given as one text."""
     return [number(option, value) for value in text.split(separator)]
+
+
+def kick_size(option: str, text: str) -> float | list[float]:
+    """A radius, or semi-axes separated by commas."""
+    axes = numbers(option, text, ",")
+    return axes if len(axes) > 1 else axes[0]

@@ -255,7 +255,7 @@ def design(
     taken, at its `quantile`, at each condition of the envelope by itself. The probability of squeal
     counts 100,000 draws by `seed`, each at a condition drawn evenly from the envelope.
 
-    With `quiet_within`, a radius as in `basin`, in units of V/omega and V, or the semi-axes (2n,)
+    With `quiet_within`, the `radius` of `basin`, in units of V/omega and V, or the semi-axes (2n,)
     of an ellipsoid in m and m/s, no start within it of the sliding equilibrium ends anywhere else,
     as 4000 starts drawn by `seed` confirm. `Design.quiet_radius` is the largest radius, or share of
     the semi-axes, so confirmed. Motions follow the whole friction law whatever `friction_slope`.
@@ -285,7 +285,7 @@ def design(
         if envelope is not None or tolerance is not None:
             raise ValueError("quiet_within takes no envelope and no tolerance")
         kicks = Kicks.of(x, quiet_within, seed, progress)
-        options["quiet_within"] = kicks.axes or kicks.size
+        options["quiet_within"] = kicks.within
     evaluator = evaluator_of(problem, envelope, risk)
     count, designs = screened(problem, starts, lattice)
     own = np.asarray(problem.start, float)

@@ -16,8 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._base.parts import scalar
-from .._dynamics.basin import Basin, basin, in_unit_ball
+from .._dynamics.basin import Basin, basin, ellipsoid, kick_size
 from .._dynamics.branch import BranchEvent, continue_cycle
 from .._dynamics.cycle import LimitCycle
 from .._dynamics.hybrid import degrees_of_freedom, hybrid_system
@@ -40,12 +39,11 @@ _NONE = 1e3  # distance of a plane that is none
 class Kicks:
     """Starts about the equilibrium, each time others.
 
-    Their norm is 1 on the ellipsoid of `axes` (2n,) [m, m/s]; without them it is Euclidean in units
-    of V/omega and V.
+    Their norm is 1 on the ellipsoid of semi-axes `within` (2n,) [m, m/s], or Euclidean in units of
+    V/omega and V.
     """
 
-    axes: list[float] | None
-    size: float  # asked for
+    within: float | list[float]  # asked for
     seed: int
     progress: bool
 
@@ -54,22 +52,20 @@ class Kicks:
         """Those of `design(quiet_within=)`, checked."""
         n = degrees_of_freedom(x)
         hybrid_system(x)  # refuses a joint without V
-        if not isinstance(within, (list, tuple)) and not np.ndim(within):
-            return cls(None, float(scalar("quiet_within", within, above=0)), seed, progress)
-        axes = [float(scalar("quiet_within", axis, above=0)) for axis in within]
-        if len(axes) != 2 * n:
-            raise ValueError(f"quiet_within must have {2 * n} semi-axes, got {len(axes)}")
-        return cls(axes, 1.0, seed, progress)
+        return cls(kick_size("quiet_within", within, n), seed, progress)
+
+    @property
+    def size(self) -> float:
+        """The norm of the largest kicks asked for."""
+        return 1.0 if isinstance(self.within, list) else self.within
 
     def tried(self, x: Mechanism, radius: float, count: int) -> tuple[float, Basin]:
         """The least of `count` kicks within `radius` that does not come to rest, else `radius`."""
         self.seed += 1
-        system = hybrid_system(x)
-        units, centre = np.asarray(system.units), np.asarray(system.equilibrium())
-        away = radius * in_unit_ball(count, len(units), self.seed)
-        starts = centre * units + away * (units if self.axes is None else np.array(self.axes))
-        found = basin(x, starts=starts, progress=self.progress)
-        moves = np.linalg.norm(away[found.labels != 0], axis=1)
+        centre, axes = ellipsoid(hybrid_system(x), self.within)
+        axes = axes / self.size  # of norm 1
+        found = basin(x, radius=radius * axes, starts=count, seed=self.seed, progress=self.progress)
+        moves = np.linalg.norm((found.starts[found.labels != 0] - centre) / axes, axis=1)
         return moves.min(initial=radius), found
 
     def least(self, x: Mechanism) -> tuple[float, Basin]:

@@ -331,7 +331,7 @@ def basin(
     starts: int | ArrayLike | Sequence[Sequence[float]] = 4000,
     seed: int = 0,
     *,
-    radius: float | None = None,
+    radius: ArrayLike | Sequence[float] | None = None,
     excitation: Excitation | None = None,
     rtol: float | None = None,
     max_returns: int = 5000,
@@ -353,13 +353,14 @@ def basin(
     - `low`, `high`: (2n,), corners of a box of starts [x, v] in m and m/s. Where they are equal a
       coordinate is fixed, so that a section of two coordinates is a box as well.
     - `radius`: instead of a box, a ball about the sliding equilibrium. It is the Euclidean norm of
-      the state in units of V/omega and V, with omega as in `limit_cycle`.
+      the state in units of V/omega and V, with omega as in `limit_cycle`; or the semi-axes (2n,) of
+      an ellipsoid in m and m/s.
     - `starts`: how many, Sobol points scrambled by `seed`; or the starts themselves, (k, 2n),
       without box and ball.
     - `excitation`, `rtol`, `max_returns`: as in `limit_cycle`; nothing then ends in equilibrium.
 
-    **Raises:** `ValueError` for corners or starts of another shape, a box that is empty, for box,
-    ball or starts given twice or not at all, and what `limit_cycle` raises.
+    **Raises:** `ValueError` for corners, semi-axes or starts of another shape, a box that is empty,
+    for box, ball or starts given twice or not at all, and what `limit_cycle` raises.
     """
     n = degrees_of_freedom(mechanism)
     if any(concrete(jnp.asarray(x)) is None for x in jax.tree.leaves((mechanism, excitation))):
@@ -466,10 +467,8 @@ def _starts(system, n, low, high, starts, seed, radius) -> Float[np.ndarray, "k 
         return given
     count = whole("starts", starts, 1, _MOST_STARTS)
     if radius is not None:
-        reach = float(scalar("radius", radius, above=0))
-        away = reach * in_unit_ball(count, 2 * n, seed)
-        centre = np.asarray(system.own(system.equilibrium()))
-        return (centre + away) * np.asarray(system.units)
+        centre, axes = ellipsoid(system, kick_size("radius", radius, n))
+        return centre + _in_unit_ball(count, 2 * n, seed) * axes
     corners = [_corner("low", low, n), _corner("high", high, n)]
     if (corners[0] > corners[1]).any():
         raise ValueError(f"low must be at most high, got {corners[0]} and {corners[1]}")
@@ -478,6 +477,23 @@ def _starts(system, n, low, high, starts, seed, radius) -> Float[np.ndarray, "k 
     share = np.zeros((count, 2 * n))
     share[:, moves] = _sobol(count, int(moves.sum()), seed)
     return corners[0] + share * (corners[1] - corners[0])
+
+
+def kick_size(name: str, given: Any, n: int) -> float | list[float]:
+    """A radius in units of V/omega and V, or the semi-axes (2n,) [m, m/s] of an ellipsoid."""
+    if not isinstance(given, (list, tuple)) and not np.ndim(given):
+        return float(scalar(name, given, above=0))
+    axes = [float(scalar(name, axis, above=0)) for axis in given]
+    if len(axes) != 2 * n:
+        raise ValueError(f"{name} must have {2 * n} semi-axes, got {len(axes)}")
+    return axes
+
+
+def ellipsoid(system: HybridSystem, size: float | list[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Centre and semi-axes (2n,) [m, m/s] of kicks of a size, as `kick_size` gives it."""
+    units = np.asarray(system.units)
+    centre = np.asarray(system.own(system.equilibrium())) * units
+    return centre, np.array(size) if isinstance(size, list) else size * units
 
 
 def _corner(name: str, value: Any, n: int) -> np.ndarray:
@@ -501,7 +517,7 @@ def _sobol(count: int, dimensions: int, seed: int) -> np.ndarray:
     return points.random_base2((count - 1).bit_length())[:count]
 
 
-def in_unit_ball(count: int, dimensions: int, seed: int) -> np.ndarray:
+def _in_unit_ball(count: int, dimensions: int, seed: int) -> np.ndarray:
     """Points (count, dimensions) evenly in the unit ball."""
     from scipy.special import ndtri
 

@@ -1,9 +1,11 @@
 """Where in two quantities a mechanism is quiet, squeals, or does as it was kicked."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
 import numpy as np
+from jaxtyping import ArrayLike
 
 from .._base.parts import Record, flag
 from .._continuation import Curve, CurveEnd, passing
@@ -48,7 +50,7 @@ def bifurcation_map(
     x: Range,
     y: Range,
     *,
-    radius: float = 5.0,
+    radius: ArrayLike | Sequence[float] = 5.0,
     starts: int = 128,
     seed: int = 0,
     step: float = 1 / 64,

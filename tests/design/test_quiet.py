@@ -105,12 +105,16 @@ def test_kicks_in_an_ellipsoid():
     assert 1 <= found * 0.9 / smallest_kick(1.5) < 1.03
 
 
-def test_starts_in_an_ellipsoid():
-    x = belt(1.5)
-    narrow = Kicks.of(x, [0.01, 0.9 * 1.5], 0, False)
-    away = narrow.tried(x, 1.0, 64)[1].starts - [0.5 + 0.5 * np.exp(-3), 0.0]
-    shares = np.linalg.norm(away / [0.01, 0.9 * 1.5], axis=1)
-    assert shares.max() <= 1 and np.mean(shares**2) == pytest.approx(0.5, abs=0.05)
+@pytest.mark.parametrize(("within", "axes"), [([1.5, 2.0], [1.5, 2.0]), (2.0, [1.5, 1.5])])
+def test_kicks_are_the_starts_of_a_basin(within, axes):
+    """The least that fails is measured in the semi-axes, or in units of V/omega and V."""
+    x, axes = belt(1.5), np.array(axes)
+    least, found = Kicks.of(x, within, 7, False).tried(x, 0.9, 64)
+    again = fj.basin(x, radius=0.9 * axes, starts=64, seed=8, progress=False)
+    np.testing.assert_allclose(found.starts, again.starts, rtol=1e-14)
+    away = (again.starts - [0.5 + 0.5 * np.exp(-3), 0.0])[again.labels != 0]
+    assert 0 < len(away) < 64
+    assert least == pytest.approx(np.linalg.norm(away / axes, axis=1).min(), rel=1e-12)
 
 
 def test_nothing_comes_to_rest_where_the_equilibrium_repels():

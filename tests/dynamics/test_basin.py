@@ -197,6 +197,19 @@ def test_starts_in_a_ball():
     assert found.shares["equilibrium"] == 1
 
 
+def test_starts_in_an_ellipsoid():
+    """Semi-axes of the ball give its starts; others stretch them about the equilibrium."""
+    ball = fj.basin(of_problem(BELT), radius=0.01, starts=64, progress=False).starts
+    axes = 0.01 * V, 0.01 * V
+    alike = fj.basin(of_problem(BELT), radius=axes, starts=64, progress=False).starts
+    np.testing.assert_allclose(alike, ball, rtol=0, atol=1e-15)
+    axes = np.array([0.03 * V, 0.02 * V])
+    found = fj.basin(of_problem(BELT), radius=axes, starts=64, progress=False)
+    centre = friction(V), 0.0
+    np.testing.assert_allclose(found.starts - centre, (ball - centre) * [3, 2], atol=1e-15)
+    assert found.shares["equilibrium"] == 1
+
+
 def test_undecided_with_the_reason():
     found = fj.basin(of_problem(BELT), *BOX, 4, max_returns=1, progress=False)
     undecided = np.flatnonzero(found.labels == found.outcomes.index("undecided"))
@@ -225,6 +238,9 @@ def test_shares_and_their_table():
         ({"low": [0.0, 1.0], "high": [1.0, 0.0]}, "low must be at most high, got"),
         ({"low": [0.0, np.nan], "high": [1.0, 0.0]}, "low must be finite, got nan"),
         ({"radius": 0.0}, "radius must be above 0, got 0.0"),
+        ({"radius": [1.0]}, "radius must have 2 semi-axes, got 1"),
+        ({"radius": np.ones((2, 2))}, "radius must be a single number, got shape"),
+        ({"radius": [1.0, 0.0]}, "radius must be above 0, got 0.0"),
         ({"radius": 1.0, "low": [0, 0], "high": [1, 1]}, "give one of"),
         ({"radius": 1.0, "starts": 0}, "starts must be a whole number of at least 1, got 0"),
         ({"radius": 1.0, "seed": -1}, "seed must be a whole number of at least 0, got -1"),

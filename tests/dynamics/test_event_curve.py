@@ -113,15 +113,16 @@ def test_map(tmp_path, capsys, monkeypatch):
     def mapped(x, *windows, **options):
         assert float(x.joints[0].friction.mu_d) == 0.5
         assert windows == (("V", 0.5, 2.5), ("mu_s", 0.6, 1.4))
-        assert options == {"starts": 8, "progress": False}
+        assert options == {"radius": [1.0, 2.0], "starts": 8, "progress": False}
         return found
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("fractaljax._dynamics.bifurcation.bifurcation_map", mapped)
     BELT.save("belt.toml")
     windows = "--x", "V=0.5:2.5", "--y", "mu_s=0.6:1.4"
+    radius = "--radius", "1,2"
     status, out, _ = run_command(
-        capsys, "map", "belt.toml", *windows, "--starts", "8", "--quiet", "--out", "out"
+        capsys, "map", "belt.toml", *windows, *radius, "--starts", 8, "--quiet", "--out", "out"
     )
     assert status == 0 and repr(found) in out
     assert sorted(path.name for path in Path("out").iterdir()) == ["map.csv", "map.png"]
