@@ -2,6 +2,16 @@
 
 from . import plot as plot
 from ._base.parts import quantity as quantity
+from ._contact.boundary_element import (
+    BoundaryElement as BoundaryElement,
+    BoundaryElementResult as BoundaryElementResult,
+    boundary_element as boundary_element,
+)
+from ._contact.compare import (
+    LawComparison as LawComparison,
+    LawCurve as LawCurve,
+    compare_laws as compare_laws,
+)
 from ._contact.contact import Contact as Contact, ContactState as ContactState, Regime as Regime
 from ._contact.dimensionless import (
     dimensionless_normal_stiffness as dimensionless_normal_stiffness,
@@ -14,6 +24,8 @@ from ._contact.fractal import (
     contact_state as contact_state,
 )
 from ._contact.material import Material as Material
+from ._contact.measured import MeasuredContact as MeasuredContact
+from ._contact.persson import PerssonContact as PerssonContact
 from ._design import constraints as constraints
 from ._design.design import (
     Design as Design,
@@ -24,6 +36,12 @@ from ._design.design import (
 from ._design.envelope import Envelope as Envelope
 from ._design.pareto import Front as Front, pareto as pareto
 from ._design.tolerance import Tolerance as Tolerance, squeal_probability as squeal_probability
+from ._design.verdict import (
+    Suggestion as Suggestion,
+    Verdict as Verdict,
+    suggest as suggest,
+    verdict as verdict,
+)
 from ._dynamics.attractors import attractors as attractors
 from ._dynamics.basin import Basin as Basin, basin as basin
 from ._dynamics.bifurcation import (

@@ -1,4 +1,4 @@
-"""The `fractaljax` command: design, stability, cycle, map, identify, scene."""
+"""The `fractaljax` command: design, stability, cycle, map, contact, identify, scene."""
 
 import contextlib
 import logging
@@ -9,6 +9,7 @@ import threading
 
 from ._cli.commands import add_cycle, add_scene, add_stability
 from ._cli.compiled import keep_compiled
+from ._cli.contact import add_contact
 from ._cli.design import add_design
 from ._cli.identify import add_identify
 from ._cli.map import add_map
@@ -25,7 +26,15 @@ def main(argv: list[str] | None = None) -> int:
     parser = Parser(prog="fractaljax", description="From a machined surface to a stable mechanism.")
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, parser_class=Parser)
-    for add in (add_design, add_stability, add_cycle, add_map, add_identify, add_scene):
+    for add in (
+        add_design,
+        add_stability,
+        add_cycle,
+        add_map,
+        add_contact,
+        add_identify,
+        add_scene,
+    ):
         add(commands)
     arguments = parser.parse_args(argv)
     import jax

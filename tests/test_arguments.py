@@ -18,6 +18,14 @@ CALLS = {
     "material": (fj.Material, dict(E=1e11, nu=0.3, sigma_y=3e8, H=9e8)),
     "pair": (fj.Material.pair, dict(E1=1e11, nu1=0.3, E2=1e11, nu2=0.3, sigma_y=3e8, H=9e8)),
     "contact": (partial(fj.FractalContact, SURFACE, MATERIAL), dict(P=1e3, stiffness_ratio=0.5)),
+    "persson": (
+        partial(fj.PerssonContact, SURFACE, MATERIAL),
+        dict(P=1e3, area=1e-4, L=1e-2, L_s=1e-5),
+    ),
+    "measured": (
+        partial(fj.MeasuredContact, (1.0, 2.0), (1e7, 2e7)),
+        dict(P=1e3, stiffness_ratio=0.8),
+    ),
     "fixed": (fj.FixedContact, dict(K_n=1e8, K_t=1e8)),
     "coulomb": (fj.Coulomb, dict(mu=0.3)),
     "stribeck": (fj.Stribeck, dict(mu_s=0.4, mu_m=0.2, v_m=0.5)),
@@ -28,6 +36,10 @@ CALLS = {
     "parts": (
         partial(fj.contact_load, A_r=1e-6, mu_m=0.2),
         dict(surface=SURFACE, material=MATERIAL),
+    ),
+    "boundary": (
+        partial(fj.boundary_element, material=MATERIAL),
+        dict(heights=np.eye(3), dx=1e-6, P=1.0, rtol=1e-6),
     ),
     "dimensionless": (fj.dimensionless_normal_stiffness, dict(D=2.4, A_r=1e-3, a_e=1e-5)),
     "equilibrium": (partial(fj.equilibrium, SCENE.oscillator), dict(K_n=1e8, K_t=1e8, mu=0.3)),

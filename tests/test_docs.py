@@ -34,7 +34,7 @@ def numbers(pattern, text):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "pattern"),
-    [("float32", MEASURED), ("figures_7_to_10", NUMBER)],
+    [("float32", MEASURED), ("figures_7_to_10", NUMBER), ("contact_laws", NUMBER)],
 )
 def test_page_has_the_text_that_its_script_generates(name, pattern):
     committed, now = (pattern.sub("#", page) for page in pages(name))
@@ -92,6 +92,26 @@ def test_pictures_of_the_figures():
         figure = made.figure(number, 12)
         assert len(figure.axes) == panels
         assert_whole(figure)
+
+
+@pytest.mark.slow
+def test_contact_laws_page_has_the_numbers_that_are_found_now():
+    committed, now = (numbers(NUMBER, page) for page in pages("contact_laws"))
+    assert len(now) > 200
+    np.testing.assert_allclose(committed, now, rtol=0.011, atol=0.011)  # of the last digit shown
+
+
+def test_contact_laws_are_judged_as_the_page_says(monkeypatch):
+    """With fewer and coarser surfaces; the picture is whole."""
+    made = script("contact_laws")
+    monkeypatch.setattr(made, "DIMENSIONS", (2.1, 2.9))
+    monkeypatch.setattr(made, "N", 64)
+    text = made.page(seeds=2, n=64)
+    assert "2 periodic surfaces of 64 x 64 points" in text
+    (factor,) = re.findall(r"within a factor of (\d.\d+)", text)
+    assert 1 < float(factor) < 2
+    assert made.PAGE.with_name("contact_laws.png").stat().st_size < 100_000
+    assert_whole(made.picture(seeds=2, n=64))
 
 
 def test_identification_is_drawn_as_it_is_shown_and_finds_the_surface(tmp_path):

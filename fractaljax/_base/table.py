@@ -4,8 +4,11 @@
 def table(titles: list[str], columns: list[dict[str, str]]) -> str:
     """Columns with the same rows as aligned text, row names at the left."""
     lines = [["", *titles], *([name, *(c[name] for c in columns)] for name in columns[0])]
-    if not any(titles):
-        lines = lines[1:]
+    return aligned(lines if any(titles) else lines[1:])
+
+
+def aligned(lines: list[list[str]]) -> str:
+    """Rows of as many cells as aligned text."""
     widths = [max(len(cell) for cell in cells) for cells in zip(*lines, strict=True)]
     return "\n".join(
         "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()

@@ -78,15 +78,19 @@ def part_table(part: Part, laws: Laws) -> dict[str, Any]:
     for field in dataclasses.fields(part):
         name, value = quantity_name(field), getattr(part, field.name)
         if isinstance(value, Part):
-            table[name] = part_table(value, laws)
-            if name in laws:
-                table[name] = _law(name, type(value), laws[name]) | table[name]
+            law = name in laws
+            table[name] = law_table(name, value, laws) if law else part_table(value, laws)
         elif "unit" in field.metadata:
             table[name] = Noted(value, "{unit}: {meaning}".format(**field.metadata))
         else:
             note = field.metadata.get("note")
             table[name] = value if note is None else Noted(value, note)
     return table
+
+
+def law_table(name: str, part: Part, laws: Laws) -> dict[str, Any]:
+    """The table of a part that is one of several laws, by the name of its kind; errors as there."""
+    return _law(name, type(part), laws[name]) | part_table(part, laws)
 
 
 def _law(name: str, kind: type[Part], kinds: Mapping[str, type[Part]]) -> dict[str, Any]:
@@ -147,16 +151,23 @@ def read_part(kind: type[Part], table: Mapping[str, Any], laws: Laws, name: str 
     given, parameters = dict(table), inspect.signature(kind.__init__).parameters
     for key, inner in fields.items():
         if key in laws or (isinstance(inner, type) and issubclass(inner, Part)):
-            below = dict(table_at(table, key, inside))
+            below = table_at(table, key, inside)
             if key in laws:
-                inner = _kind(f"{inside}{key}", below.pop("law", ""), laws[key])
-            given[key] = read_part(cast(type[Part], inner), below, laws, f"{inside}{key}")
+                given[key] = read_law(key, below, laws, f"{inside}{key}")
+            else:
+                given[key] = read_part(cast(type[Part], inner), below, laws, f"{inside}{key}")
         elif key not in table and parameters[key].default is inspect.Parameter.empty:
             raise ValueError(f"{where} lacks the key {key!r}")
     try:
         return kind(**given)
     except (ValueError, TypeError) as error:
         raise type(error)(f"{where} {error}" if name else str(error)) from None
+
+
+def read_law(key: str, table: Mapping[str, Any], laws: Laws, name: str) -> Any:
+    """The part whose `law_table` is in the table `name` of a file; errors as `read_part`."""
+    below = dict(table)
+    return read_part(_kind(name, below.pop("law", ""), laws[key]), below, laws, name)
 
 
 def _kind(name: str, law: Any, kinds: Mapping[str, type[Part]]) -> type[Part]:

@@ -81,10 +81,13 @@ def add_design(commands) -> None:
         "in m and m/s, X1,X2,V1,V2",
     )
     parser.add_argument(
+        "--area", type=float, help="nominal area [m^2], for a verdict by Persson's law too"
+    )
+    parser.add_argument(
         "--repeat", type=Path, metavar="FILE", help="run again what a run.toml holds, nothing else"
     )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
-    kept = {"repeat", "quiet", "out", "help"}  # beside --repeat
+    kept = {"repeat", "quiet", "out", "area", "help"}  # beside --repeat
     own = [action.dest for action in parser._actions if action.dest not in kept]
     parser.set_defaults(run=_run, own=own)
 
@@ -97,8 +100,10 @@ def _run(arguments) -> int:
     topography.npy with the heights of the designed one [m].
     """
     from .. import plot
+    from .._base.parts import scalar
     from .._design.design import design
     from .._design.design_file import design_files, read_design
+    from .._mechanism.scene import Scene
     from .._mechanism.structure import Structure
 
     if arguments.repeat is None:
@@ -109,6 +114,10 @@ def _run(arguments) -> int:
             raise ValueError(f"--repeat takes everything from its file, got {', '.join(given)} too")
         with remarks():
             x, options = read_design(arguments.repeat)
+    if arguments.area is not None:  # before the work, which an error at its end would lose
+        scalar("--area", arguments.area, above=0)
+        if not isinstance(x, Scene) or not x.contact.has_surface:
+            raise ValueError("--area needs a scene whose contact has a surface")
     with output(arguments.out) as write:
         best = design(x, **options, progress=not arguments.quiet)
         heights, designed = [], arguments.out / "design.toml"
@@ -129,8 +138,18 @@ def _run(arguments) -> int:
             heights = [f"topography.npy: {side} x {side} heights in m, dx = {dx:g} m"]
         written = write(files)
     *table, promise = str(best).splitlines()
-    print("\n".join([*table, *_remarks(x, options), written, *heights, promise]))
+    rests = [] if isinstance(x, Structure) else _verdict(best, arguments.area)
+    print("\n".join([*table, *_remarks(x, options), *rests, written, *heights, promise]))
     return 1 if best.violated else 0
+
+
+def _verdict(best, area) -> list[str]:
+    """What the designed scene rests on."""
+    from .._design.verdict import verdict
+
+    keys = ("laws", "tolerance", "envelope", "friction_slope", "seed")
+    asked = {name: best.options[name] for name in keys}
+    return ["", *str(verdict(best.scene, area=area, **asked)).splitlines(), ""]
 
 
 def _options(arguments) -> dict:

@@ -7,6 +7,7 @@ from .output import output, picture
 from .parsing import load_given
 
 _FOLDER = Path("fractaljax-identification")
+_MANY = 5  # warnings, with which a surface is not worth a design
 _OPTIONS = {
     "--dx": {"type": float, "help": "step between heights [m], if not in the file"},
     "--dy": {"type": float, "help": "step across a map [m], if not in the file; default dx"},
@@ -30,6 +31,14 @@ _OPTIONS = {
         "metavar": "FILE",
         "help": "scene for the surface; default the brake",
     },
+    "--area": {
+        "type": float,
+        "help": "nominal area [m^2] of the joint, for a verdict by Persson's law too",
+    },
+    "--force": {
+        "action": "store_true",
+        "help": "write a scene even where the warnings leave D and G no meaning",
+    },
     "--out": {"type": Path, "default": _FOLDER, "metavar": "FOLDER"},
 }
 
@@ -48,12 +57,15 @@ def add_identify(commands) -> None:
 def _run(arguments) -> int:
     """Find D and G of a measured surface; write identification.png and scene.toml."""
     from .. import plot
+    from .._base.parts import scalar
     from .._identify.files import read_measurement
     from .._identify.identify import identify
 
     base = load_given(arguments.scene)
-    if not base.contact.fractal:
-        raise ValueError(f"{arguments.scene}: its joint is fixed and takes no surface")
+    if not base.contact.has_surface:
+        raise ValueError(f"{arguments.scene}: the law of its contact takes no surface")
+    if arguments.area is not None:
+        scalar("--area", arguments.area, above=0)
     names = ("dx", "dy", "unit", "position_unit", "channel")
     read = read_measurement(arguments.file, **{name: getattr(arguments, name) for name in names})
     given = {name: getattr(arguments, name) for name in ("resolution", "stylus_radius")}
@@ -68,12 +80,14 @@ def _run(arguments) -> int:
             **{name: getattr(read, name) if x is None else x for name, x in given.items()},
         )
         files, failure = {"identification.png": picture(plot.identification(found).figure)}, None
+        rests: list[str] = []
         try:
-            files["scene.toml"] = _scene_text(base, read, found).encode()
+            files["scene.toml"] = _scene_text(base, read, found, arguments.force).encode()
+            rests = _joint(base, found, arguments.area)
         except ValueError as error:
             failure = error
         written = write(files)
-    print(f"{read.source}\n{read.description}\n\n{found}\n\n{written}")
+    print("\n".join([read.source, read.description, "", str(found), "", *rests, written]))
     path = arguments.out / "scene.toml"
     if failure is not None:
         if path.exists():
@@ -84,13 +98,15 @@ def _run(arguments) -> int:
     return 0
 
 
-def _scene_text(base, read, found) -> str:
+def _scene_text(base, read, found, force) -> str:
     """The scene with this surface, and its origin. **Raises:** `ValueError` if there is none."""
     from .._identify.warnings import DISQUALIFYING
 
     for warning in found.warnings:
-        if warning.startswith(DISQUALIFYING):
-            raise ValueError(warning)
+        if warning.startswith(DISQUALIFYING) and not force:
+            raise ValueError(f"{warning} (--force writes one all the same)")
+    if len(found.warnings) >= _MANY and not force:
+        raise ValueError(f"{len(found.warnings)} warnings (--force writes one all the same)")
     scene = base.replace(surface=found.surface)
     comments = [
         f"surface identified from {read.source}",
@@ -100,6 +116,36 @@ def _scene_text(base, read, found) -> str:
         *found.warnings,
     ]
     return "\n".join([*(f"# {' '.join(line.split())}" for line in comments), scene.to_toml()])
+
+
+def _joint(base, found, area) -> list[str]:
+    """The joint of the measured surface, with the errors of D and G, and what it rests on."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from .._design.verdict import verdict
+    from .._mechanism.quantities import substituted
+    from .._mechanism.scene import stiffness
+    from .._stability.stability import growth_rate
+
+    scene = base.replace(surface=found.surface)
+
+    def joint(x):
+        moved = substituted(scene, {"D": x[0], "G": jnp.exp(x[1])})
+        return jnp.stack([*stiffness(moved), growth_rate(moved)])
+
+    at = jnp.stack([jnp.asarray(found.D), jnp.log(found.G)])
+    values, slopes = map(np.asarray, jax.jit(lambda x: (joint(x), jax.jacfwd(joint)(x)))(at))
+    errors = np.sqrt(np.einsum("ij,jk,ik->i", slopes, np.asarray(found.covariance), slopes))
+    names = ("K_n = {} N/m", "K_t = {} N/m", "growth rate {} 1/s")
+    shown = zip(names, values, errors, strict=True)
+    lines = [name.format(f"{value:.4g} +- {error:.2g}") for name, value, error in shown]
+    try:
+        said = str(verdict(scene, tolerance=found, area=area))
+    except ValueError as error:  # errors so large that they leave the domain of the model
+        said = f"no verdict: {error}"
+    return [", ".join(lines), "", *said.splitlines(), ""]
 
 
 def _bounds(found) -> str:

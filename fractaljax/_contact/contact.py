@@ -1,12 +1,14 @@
 """What every contact law gives, and what a joint asks of it."""
 
 import abc
+from collections.abc import Callable
 from typing import ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float, ScalarLike
 
-from .._base.parts import Part, Record
+from .._base.parts import Numbers, Part, Record
 
 MU_M_MAX = 0.9  # Eq. 19, of the fractal law, ends there
 
@@ -18,13 +20,44 @@ class Contact(Part):
     `jit` and `vmap` if its `stiffness` does.
     """
 
-    fractal: ClassVar[bool] = False  # has a surface and a material: there is a `ContactState`
+    has_surface: ClassVar[bool] = False  # its stiffness is that of a `Surface`
+    fractal: ClassVar[bool] = False  # the source's law: there is a `ContactState`
+
+    @property
+    def depends_on_friction(self) -> bool:
+        """Whether the stiffness does."""
+        return self.fractal
 
     @abc.abstractmethod
     def stiffness(
         self, mu_s: ScalarLike, mu_m: ScalarLike
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """(K_n, K_t) [N/m] at the given static and smallest friction coefficient."""
+
+    def real_area(self, mu_m: ScalarLike) -> Float[Array, ""] | None:
+        """Real contact area [m^2]; None where the law has none."""
+        return None
+
+
+def on_the_same_joint(law: Contact, contact: Contact) -> Contact:
+    """`law` with the surface, the material and the load of `contact`, as far as both have them."""
+    shared = [
+        name
+        for name in ("surface", "material", "P")
+        if getattr(law, name, None) is not None and getattr(contact, name, None) is not None
+    ]
+    values = [getattr(contact, name) for name in shared]
+    return eqx.tree_at(lambda law: [getattr(law, name) for name in shared], law, values)
+
+
+def partial_slip(K_n: Callable[[Numbers], Numbers], P: Numbers, Q: Numbers, mu_s) -> Numbers:
+    """K_t over the ratio at Q = 0: K_n(P - Q/mu_s) under a tangential load Q, 0 in gross slip.
+
+    Slip reduces the stuck contacts to those of that load (Ciavarella, J. Appl. Mech. 65, 998, 1998,
+    doi:10.1115/1.2791944; Jaeger, Arch. Appl. Mech. 68, 583, 1998).
+    """
+    stuck = P - Q / mu_s
+    return jnp.where(stuck > 0, K_n(jnp.where(stuck > 0, stuck, P)), 0)
 
 
 class Regime(eqx.Enumeration):

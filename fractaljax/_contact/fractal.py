@@ -103,6 +103,7 @@ class FractalContact(Contact):
     P: Numbers = quantity("N", "normal load", log=True)
     stiffness_ratio: Numbers | None = quantity("-", "K_t/K_n, if not by the tangential law")
 
+    has_surface: ClassVar[bool] = True
     fractal: ClassVar[bool] = True
 
     def __init__(
@@ -124,6 +125,11 @@ class FractalContact(Contact):
     def stiffness(self, mu_s, mu_m):
         solved = self._solve(mu_s, mu_m)
         return solved.K_n, solved.K_t
+
+    def real_area(self, mu_m):
+        """Eq. 28."""
+        # The static friction bounds the tangential load only.
+        return self.state(jnp.ones_like(self.P), mu_m).A_r
 
     @jax.jit
     def state(self, mu_s: ScalarLike, mu_m: ScalarLike) -> ContactState:

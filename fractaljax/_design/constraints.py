@@ -110,14 +110,14 @@ class Plain(Constraint):
 
 
 def _surface(scene: Mechanism, symbol: str) -> Surface:
-    if not isinstance(scene, Scene) or not scene.contact.fractal:
-        raise ValueError(f"{symbol} needs a FractalContact: a FixedContact has no surface")
+    if not isinstance(scene, Scene) or not scene.contact.has_surface:
+        raise ValueError(f"{symbol} needs a scene whose contact has a surface")
     return scene.contact.surface
 
 
 def _state(scene: Mechanism, symbol: str) -> ContactState:
-    _surface(scene, symbol)
-    assert isinstance(scene, Scene)
+    if not isinstance(scene, Scene) or not scene.contact.fractal:
+        raise ValueError(f"{symbol} needs a FractalContact")
     return scene.contact.state(scene.friction.mu_s, scene.friction.mu_m)
 
 
@@ -160,9 +160,9 @@ class ElasticShare(Constraint):
 
 
 class RealContactArea(_LogConstraint):
-    """Real contact area A_r [m^2] within limits (Eq. 28).
+    """Real contact area A_r [m^2] within limits, of the contact law (Eq. 28 of the fractal one).
 
-    Fully plastic, A_r is P/H for every surface, the least there is.
+    Fully plastic, Eq. 28 is P/H for every surface, the least there is.
     """
 
     symbol: ClassVar[str] = "A_r"
@@ -170,7 +170,12 @@ class RealContactArea(_LogConstraint):
     flat_if_plastic: ClassVar[bool] = True
 
     def measure(self, scene):
-        return _state(scene, self.symbol).A_r
+        area = None
+        if isinstance(scene, Scene):
+            area = scene.contact.real_area(scene.friction.mu_m)
+        if area is None:
+            raise ValueError(f"{self.symbol} needs a scene whose contact law has a real area")
+        return area
 
 
 class Roughness(_LogConstraint):

@@ -18,6 +18,8 @@ from jaxtyping import ScalarLike
 from .._base.files import write_together
 from .._base.parts import Record, brief, flag, whole
 from .._base.table import table
+from .._contact.contact import Contact
+from .._contact.persson import PerssonContact
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import replaced
 from .._mechanism.scene import Scene
@@ -96,14 +98,19 @@ class Design(Record):
     @property
     def has_surface(self) -> bool:
         """Whether it is a scene with a fractal surface."""
-        return isinstance(self.scene, Scene) and self.scene.contact.fractal
+        return isinstance(self.scene, Scene) and self.scene.contact.has_surface
 
     @property
     def wavelengths(self) -> tuple[float, float]:
-        """Longest and shortest [m] that roughness counts: of a limit on Sq, or 1 mm and 1 um."""
+        """Longest and shortest [m] that roughness counts.
+
+        Of a limit on Sq, or of the contact law, or 1 mm and 1 um.
+        """
         for asked in self.options["constraints"]:
             if isinstance(asked, limits.Roughness):
                 return float(asked.L), float(asked.L_s)
+        if isinstance(self.scene, Scene) and isinstance(self.scene.contact, PerssonContact):
+            return float(self.scene.contact.L), float(self.scene.contact.L_s)
         return _WAVELENGTHS
 
     def roughness(
@@ -137,7 +144,7 @@ class Design(Record):
 
     def _surfaces(self):
         if not self.has_surface:
-            raise ValueError("roughness and topographies need a scene with a FractalContact")
+            raise ValueError("roughness and topographies need a scene whose contact has a surface")
         return self.initial.contact.surface, self.scene.contact.surface
 
     def save(self, path: str | os.PathLike) -> None:
@@ -208,6 +215,7 @@ def design(
     K_n_min: float | None = None,
     constraints: Sequence[Callable[[Any], Any]] = (),
     *,
+    laws: Sequence[Contact] = (),
     envelope: Envelope | Mapping[str, Any] | None = None,
     risk: str | tuple[str, float] = "worst",
     tolerance: Any = None,
@@ -245,6 +253,10 @@ def design(
     whose stiffness the bounds move: K_n >= `K_n_min` [N/m], by default its own; a_l >=
     `area_ratio_min` a_e; Q_e <= `slip_ratio_max` mu_s P, not with a given stiffness ratio. The
     growth rate is that of small disturbances: a larger kick may still end in a limit cycle.
+
+    With other contact `laws` of a scene the growth rate must be as low under each, in the place of
+    the scene's own: with their own quantities, but with its surface, material and load where they
+    have them.
 
     With an `envelope`, a range (lower, upper) or samples of any quantities by name (see
     `Envelope`), every requirement holds, and an objective is taken, over all its conditions:

@@ -14,8 +14,17 @@ import numpy as np
 
 from .._base.files import read_bounded
 from .._base.parts import brief
-from .._base.toml import naming, read_toml, refuse_unknown, table_at, write_toml
+from .._base.toml import (
+    law_table,
+    naming,
+    read_law,
+    read_toml,
+    refuse_unknown,
+    table_at,
+    write_toml,
+)
 from .._base.versions import versions, versions_differ
+from .._mechanism.joint import JOINT_LAWS
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
@@ -54,6 +63,9 @@ def design_files(best: Any, path: Path) -> dict[Path, bytes]:
         table = _constraint_table(objective)
         options["objective"] = table if isinstance(objective, Constraint) else table["function"]
     options["constraints"] = [_constraint_table(asked) for asked in options["constraints"]]
+    options["laws"] = {
+        f"{i}": law_table("contact", law, JOINT_LAWS) for i, law in enumerate(options["laws"], 1)
+    }
     if (envelope := options["envelope"]) is not None:
         options["envelope"] = {"ranges": envelope.ranges, "samples": envelope.samples}
     if (tolerance := options["tolerance"]) is not None:
@@ -135,6 +147,13 @@ def _options(table, functions) -> dict[str, Any]:
             options[name] = kind(**given)
     if isinstance(options["risk"], list):
         options["risk"] = tuple(options["risk"])
+    laws = table_at(options, "laws", "options.") if "laws" in options else {}
+    options["laws"] = [
+        read_law(
+            "contact", table_at(laws, name, "options.laws."), JOINT_LAWS, f"options.laws.{name}"
+        )
+        for name in laws
+    ]
     constraints = options["constraints"]
     if not (isinstance(constraints, list) and all(isinstance(c, dict) for c in constraints)):
         raise TypeError(f"constraints must be a list of tables, got {brief(constraints)}")

@@ -9,7 +9,7 @@ far it is from carrying load elastically. Where quantities scatter, a residual i
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,8 +18,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.batches import in_batches
-from .._base.parts import brief, flag, scalar, substitute
+from .._base.parts import brief, flag, require_kind, require_scalar, scalar, substitute
 from .._base.quick import quick_jit
+from .._contact.contact import Contact, on_the_same_joint
 from .._contact.fixed import FixedContact
 from .._dynamics.hybrid import degrees_of_freedom, hybrid_system
 from .._mechanism.mechanism import Mechanism
@@ -73,10 +74,11 @@ class DesignProblem(eqx.Module):
     area_ratio_min: Float[Array, ""]
     slip_ratio_max: Float[Array, ""]
     constraints: tuple[Constraint, ...]
+    laws: tuple[Contact, ...]  # under each of which the growth rate must be as low
     scatter: Scatter | None
     names: tuple[str, ...] = eqx.field(static=True)
     logarithmic: tuple[bool, ...] = eqx.field(static=True)
-    contacts: tuple[str, ...] = eqx.field(static=True)  # fractal ones that the design moves
+    contacts: tuple[str, ...] = eqx.field(static=True)  # with a law, that the design moves
     objective: Callable[[Any], Any] | None = eqx.field(static=True)
     friction_slope: bool = eqx.field(static=True)
     conditions: tuple[str, ...] = eqx.field(static=True)  # quantities of the envelope
@@ -106,19 +108,21 @@ class DesignProblem(eqx.Module):
         """Objective and residuals (1 + k,), and the numbers that describe a design, by name."""
         x = self.moved(u, condition, shift)
         states = {
-            name: part.contact.state(part.friction.mu_s, part.friction.mu_m)
+            name: _state(part)
             for name, part in joints_of(x).items()
-            if part.contact.fractal
+            if part.contact.fractal or name in self.contacts
         }
         growth = growth_rate(_with_stiffness(x, states), self.friction_slope)
         model, stiff = [], []
         for name, K_n_min in zip(self.contacts, self.K_n_min, strict=True):
             state = states[name]
-            model.append(2 * (jnp.log(self.area_ratio_min) - state.log_area_ratio))
+            if state.log_area_ratio is not None:
+                model.append(2 * (jnp.log(self.area_ratio_min) - state.log_area_ratio))
             if state.slip_ratio is not None:
                 model.append(10 * (state.slip_ratio - self.slip_ratio_max))
             stiff.append((K_n_min - state.K_n) / jnp.where(K_n_min > 0, K_n_min, 1))
-        pressing = jnp.arcsinh((growth - self.target) / self.growth_scale)
+        rates = [growth, *(growth_rate(under(x, law), self.friction_slope) for law in self.laws)]
+        pressing = [jnp.arcsinh((rate - self.target) / self.growth_scale) for rate in rates]
         # Cycles are followed outside of this program.
         own = [
             jnp.zeros_like(growth) if isinstance(asked, CycleConstraint) else jnp.asarray(asked(x))
@@ -128,7 +132,7 @@ class DesignProblem(eqx.Module):
             own += list(self.cuts.residuals(u))
         value = jnp.sum((u - self.start) ** 2) if self.objective is None else self.objective(x)
         numbers = {}
-        if "" in states:  # of a scene
+        if "" in states and x.contact.has_surface:  # of a scene
             numbers |= {"D": x.contact.surface.D, "G": x.contact.surface.G}
         numbers |= self.quantities(u) | {"objective": value, "growth_rate": growth}
         for name, state in states.items():
@@ -136,7 +140,7 @@ class DesignProblem(eqx.Module):
                 if getattr(state, key) is not None:
                     numbers[_dot(name) + key] = getattr(state, key)
         return jnp.stack(
-            [jnp.asarray(value, growth.dtype), *model, pressing, *stiff, *own]
+            [jnp.asarray(value, growth.dtype), *model, *pressing, *stiff, *own]
         ), numbers
 
     def at(self, u: Float[Array, " v"], condition: Float[Array, " c"]):
@@ -165,7 +169,7 @@ class DesignProblem(eqx.Module):
     @property
     def model_residuals(self) -> int:
         """How many residuals, the first, keep the joints inside the model."""
-        return sum(_slips(self.x, name) + 1 for name in self.contacts)
+        return sum(_fractal(self.x, name) + _slips(self.x, name) for name in self.contacts)
 
     @property
     def residual_names(self) -> list[str]:
@@ -173,13 +177,14 @@ class DesignProblem(eqx.Module):
         model, stiff = [], []
         for name in self.contacts:
             of = f"{name}: " if name else ""
-            model.append(f"{of}a_l >= area_ratio_min a_e")
+            model += [f"{of}a_l >= area_ratio_min a_e"] * _fractal(self.x, name)
             model += [f"{of}Q_e <= slip_ratio_max mu_s P"] * _slips(self.x, name)
             stiff.append(f"{of}K_n >= K_n_min")
         own = [asked.name for asked in self.constraints]
         if self.cuts is not None:
             own += [f"cut {k}" for k in range(len(self.cuts.reach))]
-        return [*model, "growth_rate <= target", *stiff, *own]
+        growing = [f"growth_rate <= target by {type(law).__name__}" for law in self.laws]
+        return [*model, "growth_rate <= target", *growing, *stiff, *own]
 
     def scaled(self, x: Mechanism) -> np.ndarray:
         """The scaled variables (v,) of a scene or structure."""
@@ -252,16 +257,36 @@ def _dot(name: str) -> str:
     return f"{name}." if name else ""
 
 
+class _Stiffness(NamedTuple):
+    """What designs ask of a `ContactState`, of a law without one."""
+
+    K_n: Array
+    K_t: Array
+    log_area_ratio: None = None
+    slip_ratio: None = None
+
+
+def _state(part) -> Any:
+    law, friction = part.contact, part.friction
+    if law.fractal:
+        return law.state(friction.mu_s, friction.mu_m)
+    return _Stiffness(*law.stiffness(friction.mu_s, friction.mu_m))
+
+
+def _fractal(x, name) -> bool:
+    return joints_of(x)[name].contact.fractal
+
+
 def _slips(x, name) -> bool:
-    """Whether a contact has a tangential law, which slips."""
-    return joints_of(x)[name].contact.stiffness_ratio is None
+    """Whether a contact has the source's tangential law, which slips."""
+    return _fractal(x, name) and joints_of(x)[name].contact.stiffness_ratio is None
 
 
 def _with_stiffness(x, states):
     """`x` with contacts of known stiffness where their states (by name) are known already."""
     parts, zero = joints_of(x), FixedContact(0.0, 0.0, 1.0)
     for name, state in states.items():
-        P = parts[name].contact.P  # of a preloaded joint
+        P = getattr(parts[name].contact, "P", zero.P)  # of a preloaded joint
         known = substitute(zero, {"K_n": state.K_n, "K_t": state.K_t, "P": P})
         parts[name] = eqx.tree_at(lambda part: part.contact, parts[name], known)
     if isinstance(x, Structure):
@@ -269,13 +294,20 @@ def _with_stiffness(x, states):
     return parts[""]
 
 
+def under(scene: Scene, law: Contact) -> Scene:
+    """`scene` with another contact law for its surface, material and load."""
+    other = on_the_same_joint(law, scene.contact)
+    return eqx.tree_at(lambda scene: scene.contact, scene, other)
+
+
 def _moved_contacts(x, names) -> tuple[str, ...]:
-    """The fractal contacts whose stiffness these quantities move."""
+    """The contacts with a law whose stiffness these quantities move."""
     moved = {each for name in names for each in moved_by(x, name)}
     found = []
     for name, part in joints_of(x).items():
         own = {*own_quantities(part.contact), *own_quantities(part.friction)}
-        if part.contact.fractal and moved & {_dot(name) + each for each in own}:
+        law = not isinstance(part.contact, FixedContact)
+        if law and moved & {_dot(name) + each for each in own}:
             found.append(name)
     return tuple(found)
 
@@ -317,6 +349,7 @@ def state_problem(
     area_ratio_min: float,
     slip_ratio_max: float,
     friction_slope: bool,
+    laws: Sequence[Contact] = (),
     **_: Any,
 ) -> DesignProblem:
     """Check the arguments of `design` that state a problem, which that documents; no others."""
@@ -327,6 +360,13 @@ def state_problem(
         raise TypeError(
             f"constraints must be a list of functions of a scene, got {brief(constraints)}"
         )
+    if not isinstance(laws, (list, tuple)):
+        raise TypeError(f"laws must be a list of contacts, got {brief(laws)}")
+    for i, law in enumerate(laws):
+        require_kind(f"laws[{i}]", law, Contact)
+        require_scalar(law)
+    if laws and not isinstance(x, Scene):
+        raise ValueError("laws need a scene: the contacts of a structure are its joints'")
     bounds = checked_bounds(x, bounds)
     cycles = _cycles(x, objective, constraints, envelope is not None or tolerance is not None)
     objective = _followed if isinstance(objective, CycleConstraint) else objective
@@ -371,6 +411,7 @@ def state_problem(
         growth_scale=max(damping, 1e-4 * frequency),
         K_n_min=(least,) * len(contacts),
         constraints=tuple(c if isinstance(c, Constraint) else Plain(c) for c in constraints),
+        laws=tuple(laws),
         scatter=scatter,
     )
     # In the precision of the scene, whatever that of the arguments.

@@ -15,11 +15,18 @@ from .._base.toml import Laws
 from .._contact.contact import MU_M_MAX, Contact
 from .._contact.fixed import FixedContact
 from .._contact.fractal import FractalContact
+from .._contact.measured import MeasuredContact
+from .._contact.persson import PerssonContact
 from .._friction import LAWS, Friction
 
 # By their names in files.
 JOINT_LAWS: Laws = {
-    "contact": {"fractal": FractalContact, "fixed": FixedContact},
+    "contact": {
+        "fractal": FractalContact,
+        "persson": PerssonContact,
+        "measured": MeasuredContact,
+        "fixed": FixedContact,
+    },
     "friction": LAWS,
     "of": LAWS,  # the law that a `Scaled` one scales
 }

@@ -299,7 +299,7 @@ def _stiffness_ratio(scene):
 
 
 def _set_stiffness_ratio(scene, ratio):
-    if scene.contact.fractal:
+    if hasattr(scene.contact, "stiffness_ratio"):
         return {"stiffness_ratio": ratio}
     return {"K_t": ratio * scene.contact.K_n}
 

@@ -40,11 +40,12 @@ def scene_rows(
     """
     modes, K, state, _ = _numbers(scene, friction_slope)
     contact, surface, after = scene.contact, {}, {}
-    if contact.fractal:
+    if contact.has_surface:
         surface = {"D": f"{contact.surface.D:.6g}", "G [m]": f"{contact.surface.G:.6g}"}
         if wavelengths is not None:
             rough = roughness(contact.surface, *wavelengths)
             surface |= {"Sq [m]": f"{rough.Sq:.6g}", "Sdq": f"{rough.Sdq:.6g}"}
+    if state is not None:
         slip = state.slip_ratio
         after = {
             "regime": Regime[state.regime].split(":")[0],
@@ -195,9 +196,10 @@ def _structure_verdict(modes, unstable, unresolved) -> str:
 def _joint_rows(joint: Joint) -> dict[str, str]:
     rows = dict.fromkeys(("D", "G [m]"), ABSENT) | _stiffness_rows(joint.stiffness())
     rows |= {"friction coefficient": f"{joint.coefficient():.6g}", "regime": ABSENT}
-    if joint.contact.fractal:
+    if joint.contact.has_surface:
         surface = joint.contact.surface
-        state = joint.contact.state(joint.friction.mu_s, joint.friction.mu_m)
         rows |= {"D": f"{surface.D:.6g}", "G [m]": f"{surface.G:.6g}"}
+    if joint.contact.fractal:
+        state = joint.contact.state(joint.friction.mu_s, joint.friction.mu_m)
         rows["regime"] = Regime[state.regime].split(":")[0]
     return rows

@@ -16,7 +16,16 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, ScalarLike
 
 from .._base.memory import require_memory
-from .._base.parts import concrete, number, ordered, require_kind, require_scalar, scalar, whole
+from .._base.parts import (
+    concrete,
+    flag,
+    number,
+    ordered,
+    require_kind,
+    require_scalar,
+    scalar,
+    whole,
+)
 from .surface import Surface, frequency_count
 
 _BLOCK = 256  # waves in one product of matrices
@@ -40,12 +49,19 @@ def topography(
     key: PRNGKeyArray,
     L_s: ScalarLike | None = None,
     M: int = 10,
+    periodic: bool = False,
 ) -> Float[Array, "n n"]:
     """Heights z [m] of a surface on a square grid: z[i, j] is Eq. 13 at x = i L/n, y = j L/n.
 
     Wavelengths run from L [m] down to L_s [m] (default 2 L/n, the shortest that the grid
     resolves), with M directions each. `key` draws the phases: the same key gives the same surface,
     and a smaller L_s adds waves without moving the others.
+
+    `periodic` makes opposite edges meet, as contact by FFT wants. The vector gamma^n (cos a, sin a)
+    of each wave is rounded to whole waves k per L along x and y, none shorter than L_s, and its
+    amplitude follows its own wavelength: |k|^(D-3) in place of gamma^((D-3)n). The phases are the
+    same. With M = 10, `roughness` stays right to 0.3 percent in Sdq, and in Sq to 1 percent at
+    gamma = 1.5, 8 at gamma = 2. A derivative in gamma leaves the waves in place.
 
     Differentiable in D, G, gamma and L; `jit` and `vmap` work over D, G and key. The number of
     waves is structure: gamma must be known at trace time, and so must L and L_s if L_s is given.
@@ -57,7 +73,7 @@ def topography(
     """
     require_kind("surface", surface, Surface)
     require_scalar(surface)
-    n, M = whole("n", n, 2), whole("M", M, 1)
+    n, M, periodic = whole("n", n, 2), whole("M", M, 1), flag("periodic", periodic)
     dtype = surface.D.dtype
     require_memory(f"a topography of {n} x {n} points", dtype.itemsize * n * (3 * n + 4 * _BLOCK))
     L = scalar("L", L, above=0)
@@ -72,12 +88,18 @@ def topography(
     require_memory(f"{count} x {M} waves", 8 * count * M * _ARRAYS_OF_WAVES)
     angles = np.pi * np.arange(1, M + 1) / M
     directions = np.stack([np.cos(angles), np.sin(angles)])[:, None]
-    steps = (float(gamma) ** np.arange(count))[None, :, None] * directions / n
+    k, lengths = (float(gamma) ** np.arange(count))[None, :, None] * directions, None
+    if periodic:
+        most = np.floor(ratio * (1 + 1e-9))  # rounding may not pass L_s
+        k = np.clip(np.round(k), -most, most)  # never (0, 0): |k| was 1 or more
+        lengths = np.hypot(*k)
+    steps = k / n
     # Cycles per grid step, the coarse part with so few bits that n times it is exact.
     steps = steps - np.round(steps)
     bits = jnp.finfo(dtype).nmant + 1 - (n - 1).bit_length()
     coarse = np.round(steps * 2.0**bits) / 2.0**bits
-    return _sum(surface, L, random_phases(key, count, M), directions, coarse, steps - coarse, n)
+    phases = random_phases(key, count, M)
+    return _sum(surface, L, phases, directions, coarse, steps - coarse, lengths, n)
 
 
 def random_phases(key: PRNGKeyArray, count: int, M: int) -> Float[Array, "count M"]:
@@ -107,16 +129,19 @@ def _known(name: str, value: jax.Array) -> np.ndarray:
 
 
 @functools.partial(jax.jit, static_argnames="n")
-def _sum(surface, L, phases, directions, coarse, fine, n):
-    """Eq. 13 on the grid (n, n): phases (n_max + 1, M), coarse and fine (2, n_max + 1, M)."""
+def _sum(surface, L, phases, directions, coarse, fine, lengths, n):
+    """Eq. 13 on the grid (n, n): phases (n_max + 1, M), coarse and fine (2, n_max + 1, M).
+
+    `lengths` (n_max + 1, M) stand for gamma^n, which moves no wave then, unless they are None.
+    """
     D, G, gamma, dtype = surface.D, surface.G, surface.gamma, surface.D.dtype
     count, M = phases.shape
-    powers = gamma ** jnp.arange(count)
+    powers = gamma ** jnp.arange(count)[:, None] if lengths is None else jnp.asarray(lengths, dtype)
     # Zero, with the derivatives of gamma^n: its value is in coarse and fine already.
-    slope = (powers - jax.lax.stop_gradient(powers))[None, :, None]
+    slope = (powers - jax.lax.stop_gradient(powers))[None]
     fine = fine + slope * jnp.asarray(directions / n, dtype)
     scale = L * (G / L) ** (D - 2) * jnp.sqrt(jnp.log(gamma) / M)
-    heights = jnp.broadcast_to((scale * powers ** (D - 3))[:, None], (count, M))
+    heights = jnp.broadcast_to(scale * powers ** (D - 3), (count, M))
     blocks = math.ceil(phases.size / _BLOCK)
     size = math.ceil(phases.size / blocks)
 

@@ -1,7 +1,7 @@
 """Pictures: each function takes a result and an optional Axes, and returns the Axes.
 
 Without an Axes it makes a new figure, outside pyplot and its global state: `ax.figure`, which
-Jupyter shows as the last expression of a cell. `cycle`, `cycles`, `modes`, `stiffness` and
+Jupyter shows as the last expression of a cell. `cycle`, `cycles`, `modes`, `stiffness`, `laws` and
 `topographies` fill a figure of their own and return it.
 """
 
@@ -23,6 +23,7 @@ from .identification import (
     identification as identification,
     power_spectrum as power_spectrum,
 )
+from .laws import law_curves as law_curves, laws as laws
 from .maps import frequency_map as frequency_map, growth_map as growth_map
 from .modes import (
     mode_lines as mode_lines,

@@ -17,6 +17,14 @@ _WRITTEN += ["topographies.png", "topography.npy"]
 _ROWS = ["D ", "G [m]", "Sq [m]", "Sdq", "K_n [N/m]", "K_t [N/m]", "K_t/K_n", "regime", "a_l/a_e"]
 _ROWS += ["Q_e/(mu_s P)", "growth rate [1/s]", "frequency [Hz]", "damping ratio"]
 _ROWS += ["active constraints", "Sq and Sdq: wavelengths from 0.001 to 1e-06 m", "found: "]
+_ROWS += [
+    "",
+    " ",
+    "as it is (FractalContact)",
+    "friction on P + K_n x2",
+    "K_t/K_n from 0.355 to 0.824",
+]
+_ROWS += ["Quiet, but it rests on: friction on K_n x2; K_t/K_n = 0.355.", ""]
 _ROWS += ["written to fractaljax-design: ", "topography.npy: 1024 x 1024 heights in m, dx = "]
 _ROWS += ["stable against small disturbances; a larger kick may still end in squeal"]
 
@@ -233,3 +241,19 @@ def test_remarks_on_friction_beyond_its_law():
     assert line.startswith("remark: at a sliding speed of 2 m/s the friction law gives 4.3, above")
     (line,) = _remarks(scene.replace(V=5.0), {"envelope": None})
     assert "gives 73.15, above mu_s = 0.4" in line
+
+
+@pytest.mark.parametrize(
+    ("contact", "area", "said"),
+    [
+        (None, 0, "--area must be above 0, got 0.0"),
+        (fj.FixedContact(4e8, 2e8), 1e-4, "--area needs a scene whose contact has a surface"),
+    ],
+)
+def test_area_is_checked_before_the_design(capsys, contact, area, said):
+    """An error at the end would lose the table of a design that is done."""
+    scene = fj.brake_scene()
+    (scene if contact is None else scene.replace(contact=contact)).save("mine.toml")
+    arguments = ("mine.toml", "--area", area, "--quiet")
+    status, out, err = run(capsys, "design", *arguments)
+    assert (status, out) == (2, "") and said in err and not Path("fractaljax-design").exists()

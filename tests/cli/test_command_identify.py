@@ -1,5 +1,6 @@
 """`fractaljax identify`: from a file of heights to a scene that can be designed."""
 
+import dataclasses
 import math
 from pathlib import Path
 
@@ -129,6 +130,26 @@ def test_no_scene(capsys, z, message):
     assert SCENE.read_text() == ""
 
 
+def test_force_writes_a_scene_all_the_same(capsys, monkeypatch):
+    """Of a surface that is not fractal, and of one with five warnings."""
+    ripple = 3e-7 * np.sin(2 * np.pi * DX * np.arange(4096) / 3e-5)
+    np.save("z.npy", profile(4096) + ripple)
+    arguments = ("identify", "z.npy", "--dx", DX, "--unit", "m")
+    assert run(capsys, *arguments)[0] == 1
+    status, out, _ = run(capsys, *arguments, "--force")
+    assert status == 0 and DISQUALIFYING[0] in SCENE.read_text() and "no scene" not in out
+    write_profile("mine.csv", profile(4096))
+    found = fj.identify(profile(4096), DX)
+    for count, expected in ((4, 0), (5, 1)):
+        warned = dataclasses.replace(found, warnings=tuple("abcde"[:count]))
+        monkeypatch.setattr("fractaljax._identify.identify.identify", lambda *_, **__: warned)  # noqa: B023
+        status, out, _ = run(capsys, "identify", "mine.csv")
+        assert status == expected
+        if expected:
+            assert "no scene: 5 warnings (--force writes one all the same)" in out
+            assert run(capsys, "identify", "mine.csv", "--force")[0] == 0
+
+
 @pytest.mark.parametrize(
     ("D", "G", "options"),
     [
@@ -180,3 +201,29 @@ def test_from_a_measurement_to_a_design(capsys):
     assert err == "" and (status, "found: " in out) in [(0, True), (1, False)]
     start, end = fj.Scene.load(SCENE), fj.Scene.load("fractaljax-design/design.toml")
     assert fj.growth_rate(start) > 0 > fj.growth_rate(end)
+
+
+def test_the_joint_of_the_measured_surface_and_what_it_rests_on(capsys):
+    """K_n, K_t and growth rate with the errors of D and ln G; the verdict with their scatter."""
+    np.save("map.npy", gaussian_map(np.random.default_rng(1), D, (256, 256), G=G, dx=DX))
+    arguments = ("map.npy", "--dx", DX, "--unit", "m")
+    status, out, _ = run(capsys, "identify", *arguments, "--area", 1e-4)
+    scene = fj.Scene.load(SCENE)
+    found = fj.identify(np.load("map.npy"), DX)
+    assert status == 0 and str(fj.verdict(scene, tolerance=found, area=1e-4)) in out
+    assert "by PerssonContact" in out and "D and ln G scatter" in out
+    (line,) = (line for line in out.splitlines() if line.startswith("K_n = "))
+    shown, _, _ = line.removeprefix("K_n = ").partition(" N/m")
+    value, error = map(float, shown.split("+-"))
+    h, surface = 1e-6, scene.contact.surface
+    slopes = [
+        np.diff([float(fj.stiffness(scene.replace(D=a, G=b))[0]) for a, b in pair])[0] / (2 * h)
+        for pair in (
+            [(surface.D - h, surface.G), (surface.D + h, surface.G)],
+            [(surface.D, surface.G * math.exp(-h)), (surface.D, surface.G * math.exp(h))],
+        )
+    ]
+    assert value == pytest.approx(float(fj.stiffness(scene)[0]), rel=1e-3)
+    assert error == pytest.approx(math.sqrt(slopes @ found.covariance @ slopes), rel=0.05)
+    status, _, err = run(capsys, "identify", *arguments, "--area", 0)
+    assert status == 2 and "--area must be above 0, got 0.0" in err

@@ -128,9 +128,23 @@ def test_joints_of_given_stiffness(scene):
     fixed = scene.replace(contact=fj.FixedContact(4e8, 2e8))
     assert NormalStiffness(5e8)(fixed) == pytest.approx(0.2)
     assert jnp.isfinite(DampingRatio(0.001)(fixed)) and jnp.isfinite(Frequency(10)(fixed))
-    for constraint in (ElasticShare(0.1), RealContactArea(1e-6, None), ALL["Sq <= 2e-06 m"]):
-        with pytest.raises(ValueError, match="needs a FractalContact"):
+    for constraint, message in (
+        (ElasticShare(0.1), "elastic share needs a FractalContact"),
+        (RealContactArea(1e-6, None), "A_r needs a scene whose contact law has a real area"),
+        (ALL["Sq <= 2e-06 m"], "Sq needs a scene whose contact has a surface"),
+    ):
+        with pytest.raises(ValueError, match=message):
             constraint(fixed)
+
+
+def test_real_area_is_that_of_the_contact_law(scene):
+    for law in (
+        scene.contact,
+        fj.PerssonContact(scene.contact.surface, scene.contact.material, 1907.3, 1e-4, 1e-2, 1e-4),
+    ):
+        expected = np.log(1e-6 / law.real_area(scene.friction.mu_m))
+        found = RealContactArea(1e-6, None)(scene.replace(contact=law))
+        assert found == pytest.approx(expected, abs=1e-12)
 
 
 @pytest.mark.parametrize(

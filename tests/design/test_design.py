@@ -649,7 +649,7 @@ def test_contact_of_given_stiffness_is_designed_by_its_stiffness(scene):
     best = fj.design(fixed, {"K_n": (1e8, 1e10), "K_t/K_n": (0.05, 0.6)}, progress=False)
     assert best.result == fj.DesignResult.found and fj.growth_rate(best.scene) <= -math.pi
     assert best.active == ("growth_rate <= target",) and not best.has_surface
-    with pytest.raises(ValueError, match="need a scene with a FractalContact"):
+    with pytest.raises(ValueError, match="need a scene whose contact has a surface"):
         best.roughness()
     assert "Sq" not in repr(best) and "K_t/K_n" in repr(best)
 

@@ -89,6 +89,137 @@ def test_a_finer_grid_is_the_same_surface():
     np.testing.assert_allclose(added, rest, rtol=0, atol=1e-18)
 
 
+# --- periodic ---------------------------------------------------------------------------------
+
+
+def whole_waves(count, M, gamma, ratio):
+    """Waves per L along x and y (2, count, M), rounded by hand."""
+    k = np.zeros((2, count, M))
+    for i, m in np.ndindex(count, M):
+        for axis, part in enumerate((math.cos, math.sin)):
+            exact = gamma**i * part(math.pi * (m + 1) / M)
+            k[axis, i, m] = math.copysign(min(round(abs(exact)), math.floor(ratio)), exact)
+    return k
+
+
+def periodic_sum(x, y, D, G, phi, k, gamma=GAMMA):
+    """Eq. 13 with waves k at points x, y [m]."""
+    x, y, z = np.asarray(x), np.asarray(y), 0
+    for i, m in np.ndindex(*phi.shape):
+        a, b = k[:, i, m]
+        wave = 2 * math.pi * (a * x + b * y) / L + phi[i, m]
+        z = z + math.hypot(a, b) ** (D - 3) * (math.cos(phi[i, m]) - np.cos(wave))
+    return L * (G / L) ** (D - 2) * math.sqrt(math.log(gamma) / phi.shape[1]) * z
+
+
+@pytest.mark.parametrize(
+    ("n", "M", "gamma", "L_s"),
+    [
+        (48, 10, 1.5, None),
+        (33, 3, 1.2, 1e-4),
+        (3, 10, 1.5, None),  # 1.5 waves would round to 2, finer than the grid
+        (40, 10, 1.08, None),
+        (16, 4, 2.0, L / 64),  # finer than the grid because L_s says so
+    ],
+)
+def test_periodic_equals_the_double_sum_of_whole_waves(n, M, gamma, L_s):
+    ratio = n / 2 if L_s is None else round(L / L_s)
+    count = 1 + int(math.log(ratio) / math.log(gamma) + 1e-9)
+    k = whole_waves(count, M, gamma, ratio)
+    assert np.hypot(*k).min() >= 1 and (L_s is not None or abs(k).max() <= n / 2)
+    x, y = np.meshgrid(np.arange(n) * L / n, np.arange(n) * L / n, indexing="ij")
+    expected = periodic_sum(x, y, 2.6, 1e-9, phases(count, M), k, gamma)
+    surface = fj.Surface(2.6, 1e-9, gamma)
+    z = topography(surface, L, n, key=KEY, L_s=L_s, M=M, periodic=True)
+    np.testing.assert_allclose(z, expected, rtol=0, atol=1e-12 * abs(expected).max())
+    single = jax.tree.map(lambda x: x.astype(jnp.float32), surface)
+    z = topography(single, L, n, key=KEY, L_s=L_s, M=M, periodic=True)
+    assert z.dtype == jnp.float32
+    np.testing.assert_allclose(z, expected, rtol=0, atol=2e-5 * expected.std())
+
+
+def test_periodic_edges_meet():
+    """The grid goes on as itself at x = L, and no step at an edge is beyond those inside."""
+    n, ratio = 96, 48
+    count = 1 + int(math.log(ratio) / math.log(GAMMA))
+    z = np.asarray(topography(SURFACE, L, n, key=KEY, periodic=True))
+    k, x = whole_waves(count, 10, GAMMA, ratio), np.arange(n) * L / n
+    for at in ((x + L, 0 * x), (x, 0 * x + L), (x - L, 0 * x + 3 * L)):
+        beyond = periodic_sum(*at, D, G, phases(count), k)
+        np.testing.assert_allclose(beyond, z[:, 0], rtol=0, atol=1e-11 * z.std())
+
+    def steps(z):  # rms over the edge, and inside
+        change = np.diff(z, axis=0, append=z[:1])
+        return np.sqrt((change[-1] ** 2).mean()), np.sqrt((change[:-1] ** 2).mean())
+
+    for each in (z, z.T):
+        edge, inside = steps(each)
+        assert edge < 1.3 * inside
+    edge, inside = steps(np.asarray(topography(SURFACE, L, n, key=KEY)))
+    assert edge > 3 * inside
+
+
+@pytest.mark.slow
+def test_periodic_roughness():
+    """Sq and Sdq over seeds: half the squares of all amplitudes, near the closed form."""
+    n, count = 64, 1 + int(math.log(32) / math.log(GAMMA))
+    keys = jax.random.split(jax.random.key(3), 200)
+    z = jax.vmap(lambda key: topography(SURFACE, L, n, key=key, periodic=True))(keys)
+    alone = topography(SURFACE, L, n, key=keys[5], periodic=True)
+    np.testing.assert_allclose(z[5], alone, rtol=0, atol=1e-13 * float(jnp.ptp(alone)))
+    f = 2 * np.pi * np.fft.fftfreq(n, 1 / n) / L
+    power = abs(np.fft.fft2(z)) ** 2 / n**4  # the grid holds whole waves: no leak, no alias
+    power[:, 0, 0] = 0  # the mean
+    k = whole_waves(count, 10, GAMMA, 32)
+    square = L**2 * (G / L) ** (2 * D - 4) * math.log(1.5) / 20 * np.hypot(*k) ** (2 * D - 6)
+    closed = fj.roughness(SURFACE, L, 2 * L / n)
+    for weight, of_wave, stated in (
+        (1.0, 1.0, closed.Sq),
+        (f[:, None] ** 2 + f**2, (2 * math.pi / L) ** 2 * (k**2).sum(axis=0), closed.Sdq),
+    ):
+        samples = (power * weight).sum(axis=(1, 2))
+        error, expected = samples.std(ddof=1) / math.sqrt(keys.size), np.sum(square * of_wave)
+        assert abs(samples.mean() - expected) < 3 * error < 0.1 * expected
+        assert math.sqrt(expected) == pytest.approx(float(stated), rel=0.01)
+
+
+def test_periodic_derivatives():
+    """By D, ln G and L in both modes, the second by D, against differences in long digits."""
+    cycles = np.asarray(random_phases(KEY, 5, 3))
+    k = whole_waves(5, 3, AT[2], 5)
+
+    def measured(x):
+        surface = fj.Surface(x[0], jnp.exp(x[1]), AT[2])
+        z = topography(surface, x[2], SIDE, key=KEY, L_s=1.3e-3 / 5, M=3, periodic=True)
+        return jnp.vdot(WEIGHTS, z)
+
+    def exact(at):
+        D, log_G, L = at
+        total = mpmath.mpf(0)
+        for i, m in np.ndindex(5, 3):
+            phi = 2 * mpmath.pi * mpmath.mpf(cycles[i, m])
+            a, b = (int(each) for each in k[:, i, m])
+            for (p, q), weight in np.ndenumerate(WEIGHTS):
+                wave = 2 * mpmath.pi * mpmath.mpf(a * p + b * q) / SIDE + phi
+                height = mpmath.cos(phi) - mpmath.cos(wave)
+                total += mpmath.mpf(weight) * mpmath.sqrt(a * a + b * b) ** (D - 3) * height
+        return total * L * (mpmath.exp(log_G) / L) ** (D - 2) * mpmath.sqrt(mpmath.log(AT[2]) / 3)
+
+    at = (AT[0], math.log(AT[1]), AT[3])
+    found, forward = jax.grad(measured)(at), jax.jacfwd(measured)(at)
+    np.testing.assert_allclose(forward, found, rtol=1e-10)
+    second = jax.grad(lambda D: jax.grad(measured)((D, *at[1:]))[0])(at[0])
+    with mpmath.workdps(30):
+        at = [mpmath.mpf(value) for value in at]
+        for i, slope in enumerate(found):
+            step = at[i] * mpmath.mpf("1e-9")
+            up, down = (exact([*at[:i], at[i] + s, *at[i + 1 :]]) for s in (step, -step))
+            assert float(slope) == pytest.approx(float((up - down) / (2 * step)), rel=1e-9)
+            if i == 0:
+                curvature = (up + down - 2 * exact(at)) / step**2
+                assert float(second) == pytest.approx(float(curvature), rel=1e-6)
+
+
 # --- derivatives and batches ------------------------------------------------------------------
 
 AT = (2.45, 2e-10, 1.4, 1.3e-3)
@@ -198,6 +329,7 @@ def test_spectrum_is_the_continuous_power_law(D):
     [
         ({"n": 1}, "n must be a whole number of at least 2, got 1"),
         ({"n": None}, "n must be a whole number of at least 2, got None"),
+        ({"periodic": 1}, "periodic must be True or False, got 1"),
         ({"M": True}, "M must be a whole number of at least 1, got True"),
         ({"L": math.inf}, "L must be above 0, got inf"),
         ({"L": jnp.array([1.0, 2.0])}, "L must be a single number, got shape (2,)"),

@@ -1,0 +1,124 @@
+"""Judge contact laws by boundary elements, `python docs/make_contact_laws.py`."""
+
+import functools
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from writing import run, small_png, table
+
+import fractaljax as fj
+from fractaljax._contact.compare import BOUNDARY_ELEMENTS
+
+PAGE = Path(__file__).with_name("contact_laws.md")
+PICTURE = PAGE.with_name("contact_laws.png")
+DIMENSIONS = (2.1, 2.3, 2.5, 2.7, 2.9)
+LOADS = np.geomspace(100.0, 1e4, 5)
+AREA, L, N = 1e-4, 1e-2, 256
+SQ = 1e-6  # m, of every surface
+
+INTRODUCTION = """\
+# Contact laws and boundary elements
+
+Five surfaces of Eq. 13 with the same height, Sq = 1 um over (10 mm)^2, and D from 2.1 to 2.9,
+pressed by 100 to 10000 N. The material is that of the reference brake. Wavelengths run from 10 mm
+to 0.16 mm. Boundary elements take {seeds} periodic surfaces of {n} x {n} points each; the scatter
+is that of ln K_n between surfaces.
+
+![K_n over the load for five D: Persson's law runs through the boundary elements](contact_laws.png)
+
+"""
+
+CLOSING = """\
+
+What the table says:
+
+- The fractal law is {low:.2g} to {high:.2g} times boundary elements. It is 0 where every contact is
+  plastic, and it can ask for more real area than there is.
+- Persson's law is within {half:.0%} of boundary elements wherever less than half of the area
+  touches, and within a factor of {full:.2f} up to the largest load.
+- Published exponents alpha = d ln K_n/d ln P: 0.50 to 0.77 for D = 2 to 3 (Pohrt and Popov, Phys.
+  Rev. Lett. 108, 104301, 2012); 1/(1 + H), H = 3 - D, of a finite surface at small loads (Pastewka
+  et al., Phys. Rev. E 87, 062809, 2013); 1 of a large one (Campañá, Persson and Müser, J. Phys.
+  Condens. Matter 23, 085001, 2011). Those of boundary elements here lie between {least:.2f} and
+  {most:.2f} below a tenth of the area. Towards full contact alpha grows without bound.
+- K_t/K_n is 0.824 at nu = 0.3 in Persson's law (Mindlin). In the fractal law it is {ratios}.
+
+`fj.compare_laws(surface, material, loads, area=...)` and `fractaljax contact --area A` do the same
+for a surface of your own.
+
+Written by `python docs/make_contact_laws.py`.
+"""
+
+
+def surface(D: float) -> fj.Surface:
+    """The surface of this D that is as high as the others."""
+    unit = fj.Surface(D, L)
+    G = L * (SQ / float(fj.roughness(unit, L, 4 * L / N).Sq)) ** (1 / (D - 2))
+    return fj.Surface(D, G)
+
+
+@functools.cache
+def comparison(D: float, seeds: int = 8, n: int = N) -> fj.LawComparison:
+    """The laws on the surface of this D."""
+    material, L_s = fj.brake_scene().contact.material, 4 * L / N
+    return fj.compare_laws(
+        surface(D), material, LOADS, area=AREA, L_s=L_s, seeds=seeds, n=n, progress=False
+    )
+
+
+def picture(**options):
+    """The figure: K_n over the load, a panel for each D."""
+    figure = fj.plot.new_figure(13, 4.2)
+    panels = figure.subplots(1, len(DIMENSIONS), sharey=True)
+    for ax, D in zip(panels, DIMENSIONS, strict=True):
+        fj.plot.law_curves(comparison(D, **options), ax)
+        ax.set_title(f"D = {D}, G = {float(surface(D).G):.2g} m", fontsize="medium")
+        if ax is not panels[0]:
+            ax.set_ylabel("")
+            ax.get_legend().remove()
+    return figure
+
+
+def page(**options) -> str:
+    """The text of contact_laws.md."""
+    rows, fractal, persson, alphas, ratios = [], [], [], [], []
+    for D in DIMENSIONS:
+        found = comparison(D, **options)
+        laws: dict[str, Any] = found.curves
+        judge, source, theirs = laws[BOUNDARY_ELEMENTS], laws["fractal"], laws["Persson"]
+        touching = np.asarray(judge.real_area) / AREA
+        fractal += [float(x) for x in source.K_n / judge.K_n if x > 0]
+        persson += list(zip(touching, np.abs(np.log(theirs.K_n / judge.K_n)), strict=True))
+        alphas += np.asarray(judge.alpha)[touching < 0.1].tolist()
+        ratios += [float(t / n) for t, n in zip(source.K_t, source.K_n, strict=True) if n > 0]
+        for i, P in enumerate(LOADS):
+            row = [f"{D}" if i == 0 else "", f"{P:.0f}", f"{touching[i]:.2g}"]
+            row += [f"{float(law.K_n[i]):.3g}" for law in (source, theirs, judge)]
+            row.append(f"{float(judge.scatter[i]):.0%}")
+            row += [number(law.alpha[i]) for law in (source, theirs, judge)]
+            rows.append([*row, f"{float(source.real_area[i]) / AREA:.2g}"])
+    head = ["D", "P [N]", "A_r/A", "K_n fractal [N/m]", "Persson", "boundary elements", "scatter"]
+    head += ["alpha fractal", "Persson", "boundary elements", "A_r/A fractal"]
+    closing = CLOSING.format(
+        low=min(fractal),
+        high=max(fractal),
+        half=np.expm1(max(off for share, off in persson if share < 0.5)),
+        full=np.exp(max(off for _, off in persson)),
+        least=min(alphas),
+        most=max(alphas),
+        ratios=f"{min(ratios):.2f} to {max(ratios):.2f}",
+    )
+    introduction = INTRODUCTION.format(n=options.get("n", N), seeds=options.get("seeds", 8))
+    return introduction + "\n".join(table(head, rows)) + "\n" + closing
+
+
+def number(value) -> str:
+    """Three digits, or a dash where there is none."""
+    return f"{float(value):.2f}" if np.isfinite(value) else "-"
+
+
+if __name__ == "__main__":
+    mpl.use("agg")
+    run({PAGE: lambda: page().encode(), PICTURE: lambda: small_png(picture())})

@@ -1,0 +1,80 @@
+"""`fractaljax contact`: the stiffness of a joint by every contact law."""
+
+from pathlib import Path
+from typing import Any
+
+from .output import csv_text, output, picture
+from .parsing import add_scene_file, load_given, numbers
+
+_OPTIONS: dict[str, dict[str, Any]] = {
+    "--area": {"type": float, "help": "nominal area of the joint [m^2], if not in the scene"},
+    "--loads": {
+        "metavar": "LOW:HIGH",
+        "help": "normal loads [N]; default a tenth to ten times that of the scene",
+    },
+    "--points": {"type": int, "default": 9, "help": "how many loads; default 9"},
+    "--L": {"type": float, "help": "longest wavelength [m]; default the side of the area"},
+    "--L-s": {"type": float, "help": "shortest wavelength [m]; default 4 L/n"},
+    "--n": {"type": int, "help": "points of a boundary-element surface along a side; default 128"},
+    "--seeds": {"type": int, "help": "how many such surfaces, 0 for none; default 4"},
+    "--out": {"type": Path, "default": Path("fractaljax-contact"), "metavar": "FOLDER"},
+}
+
+
+def add_contact(commands) -> None:
+    """Add `fractaljax contact`."""
+    parser = commands.add_parser(
+        "contact", help="compare contact laws with boundary elements", description=_run.__doc__
+    )
+    add_scene_file(parser)
+    for name, options in _OPTIONS.items():
+        parser.add_argument(name, **options)
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+    parser.set_defaults(run=_run)
+
+
+def _run(arguments) -> int:
+    """K_n, K_t, d ln K_n/d ln P and the real area of a scene's joint by every contact law.
+
+    Beside them boundary elements on surfaces of the same D and G. Writes contact.png, contact.csv.
+    """
+    import numpy as np
+
+    from .. import plot
+    from .._contact.compare import compare_laws
+    from .._contact.persson import PerssonContact
+
+    scene = load_given(arguments.scene)
+    law, friction = scene.contact, scene.friction
+    if not law.has_surface:
+        raise ValueError(f"{arguments.scene}: the law of its contact takes no surface")
+    options: dict[str, Any] = {}
+    if isinstance(law, PerssonContact):
+        options = {"area": law.area, "L": law.L, "L_s": law.L_s}
+    for name in ("area", "L", "L_s", "n", "seeds"):
+        if (given := getattr(arguments, name)) is not None:
+            options[name] = given
+    if "area" not in options:
+        raise ValueError("--area must be given: the law of the scene knows no nominal area")
+    ends = [float(law.P) / 10, float(law.P) * 10]
+    if arguments.loads is not None:
+        ends = numbers("--loads", arguments.loads, ":")
+    if len(ends) != 2 or not 0 < ends[0] < ends[1]:
+        raise ValueError(f"--loads must be LOW:HIGH with 0 < LOW < HIGH, got {arguments.loads!r}")
+    if arguments.points < 2:
+        raise ValueError(f"--points must be at least 2, got {arguments.points}")
+    loads = np.geomspace(ends[0], ends[1], arguments.points)
+    with output(arguments.out) as write:
+        found = compare_laws(
+            law.surface,
+            law.material,
+            loads,
+            mu_s=friction.mu_s,
+            mu_m=friction.mu_m,
+            **options,
+            progress=not arguments.quiet,
+        )
+        files = {"contact.png": picture(plot.laws(found))}
+        written = write(files | {"contact.csv": csv_text(*found.rows()).encode()})
+    print(f"{found!r}\n{written}")
+    return 0

@@ -1,0 +1,184 @@
+"""Contact laws side by side, and boundary elements on surfaces of the same D and G."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, ScalarLike
+
+from .._base.parts import (
+    Record,
+    flag,
+    number,
+    ordered,
+    rebuild,
+    require_kind,
+    require_scalar,
+    scalar,
+    whole,
+)
+from .._base.table import aligned
+from .._surface.surface import Surface
+from .._surface.topography import topography
+from .boundary_element import boundary_element
+from .contact import MU_M_MAX, Contact
+from .fractal import FractalContact
+from .material import Material
+from .persson import PerssonContact
+
+BOUNDARY_ELEMENTS = "boundary elements"
+
+
+class LawCurve(Record):
+    """What one law gives at the loads of a comparison (k,); SI units."""
+
+    K_n: Float[Array, " k"]  # normal stiffness [N/m]
+    K_t: Float[Array, " k"] | None  # tangential stiffness [N/m]; None of boundary elements
+    alpha: Float[Array, " k"]  # d ln K_n/d ln P, NaN where K_n is 0 or infinite
+    real_area: Float[Array, " k"] | None  # [m^2]; None where the law has none
+    scatter: Float[Array, " k"] | None = None  # standard deviation of ln K_n over seeds
+
+
+class LawComparison(Record):
+    """Contact laws at the same loads, as `compare_laws` returns them; printed as a table."""
+
+    surface: Surface
+    material: Material
+    loads: Float[Array, " k"]  # [N]
+    area: Float[Array, ""]  # nominal [m^2]
+    L: Float[Array, ""]  # longest and
+    L_s: Float[Array, ""]  # shortest wavelength [m]
+    curves: dict[str, LawCurve]  # by the name of the law
+
+    def rows(self) -> tuple[list[str], list[list[str]]]:
+        """The titles and the rows of the table: one for each load and law."""
+        titles = ["P [N]", "law", "K_n [N/m]", "scatter", "K_t/K_n", "d ln K_n/d ln P", "A_r/A"]
+        found = []
+        for i, P in enumerate(np.asarray(self.loads).tolist()):
+            for law, curve in self.curves.items():
+                cells = [f"{P:.6g}", law, f"{curve.K_n[i]:.4g}"]
+                cells.append(_shown(curve.scatter, i, ".1%"))
+                ratio = None if curve.K_t is None else curve.K_t / curve.K_n
+                cells += [_shown(ratio, i, ".3f"), _shown(curve.alpha, i, ".3f")]
+                share = None if curve.real_area is None else curve.real_area / self.area
+                cells.append(_shown(share, i, ".3g"))
+                found.append(cells)
+        return titles, found
+
+    def __repr__(self) -> str:
+        titles, rows = self.rows()
+        laws = len(self.curves)  # the load only beside the first
+        return aligned([titles, *(["" if k % laws else P, *x] for k, (P, *x) in enumerate(rows))])
+
+
+def compare_laws(
+    surface: Surface,
+    material: Material,
+    loads: Float[ArrayLike, " k"] | Sequence[float],
+    *,
+    area: ScalarLike,
+    L: ScalarLike | None = None,
+    L_s: ScalarLike | None = None,
+    mu_s: ScalarLike = 0.4,
+    mu_m: ScalarLike = 0.25,
+    laws: Mapping[str, Contact] | None = None,
+    n: int = 128,
+    seeds: int = 4,
+    key: PRNGKeyArray | None = None,
+    progress: bool = True,
+) -> LawComparison:
+    """Stiffness and real area of a joint by every contact law, and by boundary elements.
+
+    At loads (k,) [N] on the nominal area [m^2]: the source's `FractalContact`, `PerssonContact`,
+    and other `laws` by name, each with P replaced by the loads. Boundary elements press `seeds`
+    periodic surfaces of the same D and G, of n x n points, drawn from `key`: K_n and real area are
+    means over the seeds, K_n a geometric one, and alpha is the slope of that mean from load to
+    load. They are elastic and without friction.
+
+    Wavelengths run from L, by default the side of the area, down to L_s [m], by default 4 L/n; no
+    wave is longer than the side. On a larger area than L^2 surfaces lie side by side. `mu_s` and
+    `mu_m` are the friction that the fractal law takes, by default the reference brake's. With no
+    `seeds` there are no boundary elements.
+
+    **Raises:** `ValueError` unless loads rise and are above 0, area > 0, 2 L/n <= L_s <= L,
+    n >= 8, seeds >= 0, mu_s > 0 and 0 <= mu_m <= 0.9; `RuntimeError` if boundary elements do not
+    converge.
+    """
+    require_kind("surface", surface, Surface)
+    require_kind("material", material, Material)
+    for part in (surface, material):
+        require_scalar(part)
+    loads = jnp.atleast_1d(number("loads", np.asarray(loads), above=0))
+    if loads.ndim > 1 or not (jnp.diff(loads) > 0).all():
+        raise ValueError(f"loads must be a row of rising numbers, got {np.asarray(loads)}")
+    area, n, seeds = scalar("area", area, above=0), whole("n", n, 8), whole("seeds", seeds, 0)
+    side = jnp.sqrt(area)
+    L = side if L is None else jnp.minimum(scalar("L", L, above=0), side)
+    L_s = 4 * L / n if L_s is None else scalar("L_s", L_s, above=0)
+    L = ordered("L", L, "L_s", L_s)
+    if seeds:
+        ordered("L_s", L_s * (1 + 1e-9), "2 L/n", 2 * L / n)
+    mu_m = scalar("mu_m", mu_m, at_least=0, at_most=MU_M_MAX)
+    mu_s = ordered("mu_s", scalar("mu_s", mu_s, above=0), "mu_m", mu_m)
+    known: dict[str, Contact] = {
+        "fractal": FractalContact(surface, material, loads[0]),
+        "Persson": PerssonContact(surface, material, loads[0], area, L, L_s),
+    }
+    for name, law in (laws or {}).items():
+        require_kind(f"laws[{name!r}]", law, Contact)
+        known[name] = law
+    curves = {name: _curve(law, loads, mu_s, mu_m) for name, law in known.items()}
+    if seeds:
+        from tqdm import tqdm
+
+        keys = jax.random.split(jax.random.key(0) if key is None else key, seeds)
+        cells, total, quiet = area / L**2, seeds * len(loads), not flag("progress", progress)
+        found = []
+        with tqdm(total=total, desc=BOUNDARY_ELEMENTS, unit="load", disable=quiet) as bar:
+            for each in keys:
+                heights = topography(surface, L, n, key=each, L_s=L_s, periodic=True)
+                for P in loads / cells:
+                    pressed = boundary_element(heights, L / n, material, P)
+                    found.append((pressed.K_n * cells, pressed.area * cells))
+                    bar.update()
+        curves[BOUNDARY_ELEMENTS] = _over_seeds(np.reshape(found, (seeds, -1, 2)), loads)
+    return LawComparison(surface, material, loads, area, L, L_s, curves)
+
+
+def _shown(values, i, form):
+    number = math.nan if values is None else float(values[i])
+    return f"{number:{form}}" if math.isfinite(number) else "-"
+
+
+@eqx.filter_jit
+def _curve(law: Contact, loads, mu_s, mu_m) -> LawCurve:
+    def at(P):
+        moved = rebuild(law, {"P": P})
+        K_n, K_t = moved.stiffness(mu_s, mu_m)
+        return K_n, (K_t, moved.real_area(mu_m))
+
+    def one(P):
+        K_n, slope, (K_t, real_area) = jax.jvp(at, (P,), (jnp.ones_like(P),), has_aux=True)
+        alpha = jnp.where(K_n > 0, P * slope / jnp.where(K_n > 0, K_n, 1), jnp.nan)
+        return LawCurve(K_n, K_t, alpha, real_area)
+
+    return jax.vmap(one)(loads)
+
+
+def _over_seeds(found, loads) -> LawCurve:
+    """The curve of boundary elements from K_n and real area (seeds, k, 2)."""
+    stiff = np.isfinite(found[..., 0]).all(0)  # not in full contact
+    log_K_n = np.log(np.where(stiff, found[..., 0], np.nan))
+    slope = np.full(len(loads), np.nan)
+    if len(loads) > 1:
+        slope = np.gradient(log_K_n.mean(0), np.log(loads))
+    return LawCurve(
+        K_n=jnp.asarray(np.where(stiff, np.exp(log_K_n.mean(0)), np.inf)),
+        K_t=None,
+        alpha=jnp.asarray(slope),
+        real_area=jnp.asarray(found[..., 1].mean(0)),
+        scatter=jnp.asarray(log_K_n.std(0, ddof=1)) if len(found) > 1 else None,
+    )

@@ -1,0 +1,71 @@
+"""A contact law read off a measurement."""
+
+from collections.abc import Sequence
+from typing import final
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike
+
+from .._base.parts import Numbers, concrete, number, quantity
+from .contact import Contact
+
+
+@final
+class MeasuredContact(Contact):
+    """Measured stiffness: K_n(P) through the points of a table, and K_t = stiffness_ratio K_n.
+
+    ln K_n is a monotone cubic of ln P between `loads` [N] (Fritsch and Carlson, SIAM J. Numer.
+    Anal. 17, 238, 1980), with the `stiffnesses` [N/m] measured there; beyond the first and the last
+    load, the power law that it has there. The table is structure: it has no derivatives.
+
+    **Raises:** `ValueError` unless P > 0, stiffness_ratio >= 0, and the table has two rows or more,
+    loads above 0 that rise, and as many stiffnesses above 0; `TypeError` for a traced table.
+    """
+
+    loads: tuple[float, ...] = eqx.field(static=True, metadata={"note": "N, of the measurement"})
+    stiffnesses: tuple[float, ...] = eqx.field(static=True, metadata={"note": "N/m, K_n there"})
+    P: Numbers = quantity("N", "normal load", log=True)
+    stiffness_ratio: Numbers = quantity("-", "K_t/K_n")
+
+    def __init__(
+        self,
+        loads: Sequence[float] | ArrayLike,
+        stiffnesses: Sequence[float] | ArrayLike,
+        P: ArrayLike,
+        stiffness_ratio: ArrayLike,
+    ):
+        self.loads = _column("loads", loads)
+        self.stiffnesses = _column("stiffnesses", stiffnesses)
+        if len(self.loads) < 2 or len(self.loads) != len(self.stiffnesses):
+            raise ValueError(
+                "loads and stiffnesses must be two or more and as many, got "
+                f"{len(self.loads)} and {len(self.stiffnesses)}"
+            )
+        if not (np.diff(self.loads) > 0).all():
+            raise ValueError(f"loads must rise, got {self.loads}")
+        self.P = number("P", P, above=0)
+        self.stiffness_ratio = number("stiffness_ratio", stiffness_ratio, at_least=0)
+
+    def stiffness(self, mu_s, mu_m):
+        from scipy.interpolate import PchipInterpolator
+
+        x, y = np.log(self.loads), np.log(self.stiffnesses)
+        curve = PchipInterpolator(x, y)
+        first, last = curve.derivative()(x[[0, -1]])
+        # Columns are cubics of the distance from the left end of an interval.
+        cubics = np.column_stack([[0, 0, first, y[0]], curve.c, [0, 0, last, y[-1]]])
+        at = jnp.log(self.P)
+        interval = jnp.searchsorted(jnp.asarray(x, at.dtype), at)
+        a, b, c, d = jnp.asarray(cubics, at.dtype)[:, interval]
+        t = at - jnp.asarray(x[[0, *range(len(x))]], at.dtype)[interval]
+        K_n = jnp.exp(((a * t + b) * t + c) * t + d)
+        return K_n, self.stiffness_ratio * K_n
+
+
+def _column(name: str, values) -> tuple[float, ...]:
+    column = [number(f"{name}[{i}]", x, above=0) for i, x in enumerate(values)]
+    if any(concrete(x) is None for x in column):
+        raise TypeError(f"{name} must be known when a program is traced")
+    return tuple(map(float, column))

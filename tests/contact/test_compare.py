@@ -1,0 +1,179 @@
+"""Contact laws side by side: each as it gives by itself, and boundary elements over seeds."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fractaljax as fj
+from tools import assert_whole
+
+BRAKE = fj.brake_scene().contact
+SURFACE, MATERIAL = BRAKE.surface, BRAKE.material
+LOADS = np.array([600.0, 1907.3, 6000.0])
+MEASURED = fj.MeasuredContact((100.0, 1e4), (1e8, 1e10), 1.0, 0.7)
+
+
+@pytest.fixture(scope="module")
+def compared():
+    return fj.compare_laws(
+        SURFACE,
+        MATERIAL,
+        LOADS,
+        area=4e-4,
+        L=1e-2,
+        L_s=1e-3,
+        laws={"measured": MEASURED},
+        n=64,
+        seeds=3,
+        key=jax.random.key(5),
+        progress=False,
+    )
+
+
+def test_every_law_is_as_by_itself(compared):
+    assert list(compared.curves) == ["fractal", "Persson", "measured", "boundary elements"]
+    for i, P in enumerate(LOADS):
+        state = fj.contact_state(SURFACE, MATERIAL, P, mu_s=0.4, mu_m=0.25)
+        found = compared.curves["fractal"]
+        for name, alone in (("K_n", state.K_n), ("K_t", state.K_t), ("real_area", state.A_r)):
+            assert float(getattr(found, name)[i]) == pytest.approx(float(alone), rel=1e-12)
+        law = fj.PerssonContact(SURFACE, MATERIAL, P, 4e-4, 1e-2, 1e-3)
+        found = compared.curves["Persson"]
+        for given, alone in zip((found.K_n, found.K_t), law.stiffness(0.4, 0.25), strict=True):
+            assert float(given[i]) == pytest.approx(float(alone), rel=1e-12)
+        assert float(found.real_area[i]) == pytest.approx(float(law.real_area(0.25)), rel=1e-12)
+
+
+def test_alpha_is_the_logarithmic_slope(compared):
+    h = 1e-5
+    low, high = (
+        fj.compare_laws(
+            SURFACE, MATERIAL, LOADS * x, area=4e-4, L=1e-2, L_s=1e-3, seeds=0, progress=False
+        ).curves
+        for x in (np.exp(-h), np.exp(h))
+    )
+    for name in ("fractal", "Persson"):
+        slope = np.log(high[name].K_n / low[name].K_n) / (2 * h)
+        np.testing.assert_allclose(compared.curves[name].alpha, slope, rtol=1e-8)
+    np.testing.assert_allclose(compared.curves["measured"].alpha, 1.0, rtol=1e-12)
+    assert compared.curves["measured"].real_area is None
+
+
+def test_boundary_elements_are_means_over_the_seeds(compared):
+    """Four surfaces side by side on four times the area, each under a quarter of the load."""
+    stiff, touching = [], []
+    for key in jax.random.split(jax.random.key(5), 3):
+        z = fj.topography(SURFACE, 1e-2, 64, key=key, L_s=1e-3, periodic=True)
+        pressed = [fj.boundary_element(z, 1e-2 / 64, MATERIAL, P / 4) for P in LOADS]
+        stiff.append([float(4 * one.K_n) for one in pressed])
+        touching.append([float(4 * one.area) for one in pressed])
+    found = compared.curves["boundary elements"]
+    np.testing.assert_allclose(found.K_n, np.exp(np.log(stiff).mean(0)), rtol=1e-12)
+    np.testing.assert_allclose(found.scatter, np.log(stiff).std(0, ddof=1), rtol=1e-10)
+    np.testing.assert_allclose(found.real_area, np.mean(touching, 0), rtol=1e-12)
+    slope = np.log(found.K_n[2] / found.K_n[1]) / np.log(LOADS[2] / LOADS[1])
+    assert float(found.alpha[2]) == pytest.approx(slope, rel=1e-12)
+    assert found.K_t is None
+
+
+def test_table(compared):
+    lines = repr(compared).splitlines()
+    assert len(lines) == 1 + 3 * 4
+    assert lines[0].split("  ")[0] == "P [N]"
+    assert lines[1].startswith("600") and lines[2].startswith("  ")
+    assert "boundary elements" in lines[4] and "%" in lines[4]
+    titles, rows = compared.rows()
+    assert len(titles) == len(rows[0]) == 7
+    plastic = fj.compare_laws(SURFACE, MATERIAL, [100.0], area=1e-4, seeds=0, progress=False)
+    assert plastic.rows()[1][0][2:6] == ["0", "-", "-", "-"]
+
+
+def test_full_contact_is_infinitely_stiff():
+    smooth = fj.Surface(2.9, 1e-12)
+    found = fj.compare_laws(
+        smooth, MATERIAL, [1e5, 1e6], area=1e-4, n=16, L_s=5e-3, seeds=2, progress=False
+    )
+    judge: Any = found.curves["boundary elements"]
+    assert np.isinf(judge.K_n).all() and np.isnan(judge.alpha).all()
+    assert np.isnan(judge.scatter).all()
+    np.testing.assert_allclose(judge.real_area, 1e-4, rtol=1e-12)
+    assert found.rows()[1][2][2:6] == ["inf", "-", "-", "-"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("D", [2.1, 2.3, 2.5, 2.7, 2.9])
+@pytest.mark.parametrize("waves", [16, 64])
+def test_persson_s_law_is_near_boundary_elements(D, waves):
+    """Within 35 % below half contact, within a factor of 2 to nearly full; area and roughness."""
+    n, side = 256, 5e-3
+    loads = np.geomspace(1.0, 3e4, 10)
+    one = float(fj.roughness(fj.Surface(D, side), side, side / waves).Sq)
+    surface = fj.Surface(D, side * (0.5e-6 / one) ** (1 / (D - 2)))
+    found = fj.compare_laws(
+        surface, MATERIAL, loads, area=side**2, L_s=side / waves, n=n, seeds=6, progress=False
+    ).curves
+    judge = found["boundary elements"]
+    share = np.asarray(judge.real_area) / side**2
+    ratio = np.asarray(found["Persson"].K_n / judge.K_n)
+    # Below twice a shortest wavelength squared a single summit carries, as Hertz has it.
+    seen = share * waves**2 > 2
+    low, high = seen & (share < 0.5), seen & (share >= 0.5) & (share < 0.95)
+    assert low.sum() >= 4
+    assert np.abs(np.log(ratio[low])).max() < np.log(1.35)
+    assert np.abs(np.log(ratio[high])).max(initial=0) < np.log(2)
+
+
+def test_picture(compared):
+    figure = fj.plot.laws(compared)
+    assert_whole(figure)
+    alpha: Any
+    _, alpha, ratio, _ = figure.axes
+    assert [line.get_label() for line in ratio.get_lines()] == ["fractal", "Persson", "measured"]
+    assert any("Pastewka" in text.get_text() for text in alpha.get_legend().get_texts())
+    assert {ax.get_xlabel() for ax in figure.axes} == {"normal load P [N]"}
+    with pytest.raises(ValueError, match="show must be one of K_n, alpha, ratio, share, got 'P'"):
+        fj.plot.law_curves(compared, show="P")
+
+
+@pytest.mark.parametrize(
+    "wrong, message",
+    [
+        ({"loads": [2.0, 1.0]}, "loads must be a row of rising numbers, got [2. 1.]"),
+        ({"loads": [[1.0, 2.0]]}, "loads must be a row of rising numbers"),
+        ({"loads": [0.0, 1.0]}, "loads must be above 0, got 0.0"),
+        ({"area": 0.0}, "area must be above 0, got 0.0"),
+        ({"L_s": 1e-6}, "L_s must be at least 2 L/n"),
+        ({"L_s": 1.0}, "L must be at least L_s = 1.0, got 0.01"),
+        ({"n": 7}, "n must be a whole number of at least 8, got 7"),
+        ({"seeds": -1}, "seeds must be a whole number of at least 0, got -1"),
+        ({"mu_m": 0.5}, "mu_s must be at least mu_m = 0.5, got 0.4"),
+    ],
+)
+def test_refuses(wrong, message):
+    given = {"loads": [1.0], "area": 1e-4, "progress": False} | wrong
+    with pytest.raises(ValueError) as refusal:
+        fj.compare_laws(SURFACE, MATERIAL, given.pop("loads"), **given)
+    assert message in str(refusal.value)
+
+
+def test_refuses_what_is_no_law():
+    with pytest.raises(TypeError, match=r"laws\['mine'\] must be a Contact, got 3"):
+        laws: Any = {"mine": 3}
+        fj.compare_laws(SURFACE, MATERIAL, [1.0], area=1e-4, laws=laws, progress=False)
+
+
+def test_a_law_of_its_own_scene_is_differentiable():
+    """alpha comes from the law's derivative, also of a law of the user's."""
+
+    class Hertz(fj.Contact):
+        P: jax.Array
+
+        def stiffness(self, mu_s, mu_m):
+            return 1e7 * jnp.cbrt(self.P), 5e6 * jnp.cbrt(self.P)
+
+    laws = {"Hertz": Hertz(jnp.array(1.0))}
+    found = fj.compare_laws(SURFACE, MATERIAL, LOADS, area=1e-4, laws=laws, seeds=0, progress=False)
+    np.testing.assert_allclose(found.curves["Hertz"].alpha, 1 / 3, rtol=1e-12)

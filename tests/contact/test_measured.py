@@ -1,0 +1,85 @@
+"""A measured contact law: SciPy's monotone cubic of the logarithms, power laws beyond the table."""
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.interpolate import PchipInterpolator
+
+import fractaljax as fj
+from tools import both_modes
+
+LOADS, STIFFNESSES = (100.0, 300.0, 700.0, 2000.0), (1e7, 2.5e7, 9e7, 1.5e8)
+
+
+def K_n(P, loads=LOADS, stiffnesses=STIFFNESSES):
+    return fj.MeasuredContact(loads, stiffnesses, P, 0.8).stiffness(0.4, 0.25)[0]
+
+
+def test_passes_through_the_table():
+    np.testing.assert_allclose(jax.vmap(K_n)(np.array(LOADS)), STIFFNESSES, rtol=1e-14)
+
+
+def test_is_scipy_s_monotone_cubic_of_the_logarithms():
+    curve = PchipInterpolator(np.log(LOADS), np.log(STIFFNESSES))
+    x = np.linspace(math.log(101), math.log(1999), 50)
+    value, forward, reverse = both_modes(
+        lambda x: jax.vmap(lambda x: jnp.log(K_n(jnp.exp(x))))(x), x
+    )
+    np.testing.assert_allclose(value, curve(x), rtol=1e-14)
+    for jacobian in (forward, reverse):
+        np.testing.assert_allclose(np.diag(jacobian), curve.derivative()(x), rtol=1e-10, atol=1e-12)
+    assert (np.diff(value) > 0).all()
+
+
+@pytest.mark.parametrize("P", [1e-3, 99.0, 2001.0, 1e7])
+def test_is_the_power_law_of_its_end_beyond_the_table(P):
+    x, y = np.log(LOADS), np.log(STIFFNESSES)
+    end = 0 if P < 100 else -1
+    slope = PchipInterpolator(x, y).derivative()(x[end])
+    assert float(jnp.log(K_n(P))) == pytest.approx(y[end] + slope * (np.log(P) - x[end]), rel=1e-13)
+
+
+def test_two_points_are_a_power_law():
+    P = np.array([1.0, 50.0, 100.0, 150.0, 400.0, 9e4])
+    found = jax.vmap(lambda P: K_n(P, (100.0, 400.0), (1e7, 2e7)))(P)
+    np.testing.assert_allclose(found, 1e7 * (P / 100) ** 0.5, rtol=1e-13)
+
+
+def test_scene_with_a_table_comes_back_from_its_file():
+    scene = fj.brake_scene().replace(contact=fj.MeasuredContact(LOADS, STIFFNESSES, 500, 0.8))
+    back = fj.Scene.from_toml(scene.to_toml())
+    assert back.contact.loads == LOADS and back.contact.stiffnesses == STIFFNESSES
+    assert jax.tree.structure(back) == jax.tree.structure(scene)
+    assert float(fj.growth_rate(back)) == float(fj.growth_rate(scene))
+    # A tuple of the table is not a quantity, the load is.
+    assert float(fj.stiffness(scene.replace(P=300.0))[0]) == pytest.approx(2.5e7, rel=1e-14)
+    axes: Any = {"K_t/K_n": [0.5]}
+    K_n, K_t = fj.sweep(fj.stiffness, scene, progress=False, **axes).values
+    assert float(K_t[0] / K_n[0]) == pytest.approx(0.5, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    "wrong, message",
+    [
+        ({"loads": (100.0,), "stiffnesses": (1e7,)}, "two or more and as many, got 1 and 1"),
+        ({"stiffnesses": (1e7,)}, "two or more and as many, got 4 and 1"),
+        ({"loads": (1.0, 3.0, 2.0, 4.0)}, "loads must rise, got (1.0, 3.0, 2.0, 4.0)"),
+        ({"loads": (0.0, 1.0, 2.0, 3.0)}, "loads[0] must be above 0, got 0.0"),
+        ({"stiffnesses": (1e7, 2e7, -1.0, 3e7)}, "stiffnesses[2] must be above 0, got -1.0"),
+        ({"P": 0.0}, "P must be above 0, got 0.0"),
+    ],
+)
+def test_refuses_what_is_no_measurement(wrong, message):
+    given = dict(loads=LOADS, stiffnesses=STIFFNESSES, P=1.0, stiffness_ratio=0.8) | wrong
+    with pytest.raises(ValueError) as refusal:
+        fj.MeasuredContact(**given)
+    assert message in str(refusal.value)
+
+
+def test_refuses_a_traced_table():
+    with pytest.raises(TypeError, match="loads must be known when a program is traced"):
+        jax.jit(lambda x: K_n(500.0, (x, 2 * x)))(1.0)
