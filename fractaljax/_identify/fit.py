@@ -33,6 +33,7 @@ class PowerLaw(Record):
     error: Float[np.ndarray, " bins"]  # relative standard error of each
     ratio: Float[np.ndarray, " bins"]  # of measured and fitted power
     slope: Float[np.ndarray, "bins 3"]  # d(ln of the fit)/d(ln A, p, flat)
+    influence: Float[np.ndarray, "3 bins"]  # d(ln A, p, flat)/d(ln of a bin's power)
     scatter: float  # relative variance of a bin beyond that of its ordinates
     deviance: float
     nyquist: float
@@ -89,8 +90,8 @@ def bin_edges(band: tuple[float, float], ratio: float) -> np.ndarray:
     return edges[::-1]
 
 
-class _Bins:
-    """Means over the bins of a band."""
+class Bins:
+    """Means over the bins of a band that hold any ordinates."""
 
     def __init__(self, spectrum: Spectrum, band, ratio):
         low, high = band[0] * (1 - 1e-9), band[1] * (1 + 1e-9)
@@ -100,7 +101,7 @@ class _Bins:
             getattr(spectrum, name)[inside] for name in ("f", "power", "count", "weight", "spread")
         )
         which = np.clip(np.searchsorted(edges, self.f, side="left") - 1, 0, edges.size - 2)
-        _, self.start = np.unique(which, return_index=True)
+        self.which, self.start = np.unique(which, return_index=True)
         self.total = np.add.reduceat(self.weight, self.start)
         self.variance = np.add.reduceat(self.weight**2 / count, self.start) / self.total**2
 
@@ -127,7 +128,7 @@ def fit(
     cross at an angle.) A given `scatter` is not estimated: deviances of laws that share it compare.
     A `factor(f, p)` multiplies the law.
     """
-    bins = _Bins(spectrum, band, ratio)
+    bins = Bins(spectrum, band, ratio)
     u = bins.f / spectrum.nyquist
     level = _level(u, spectrum.kind)
 
@@ -191,6 +192,7 @@ def fit(
         error=np.sqrt(variance),
         ratio=ratios,
         slope=slope,
+        influence=inverse @ (slope.T / variance),
         scatter=estimated,
         deviance=float(deviance),
         nyquist=spectrum.nyquist,

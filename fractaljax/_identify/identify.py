@@ -12,6 +12,7 @@ from .._base.table import table
 from .._surface.surface import Surface
 from .band import HIGHEST, LOWEST, PER_RESOLUTION, chosen_band, given_band
 from .fit import PowerLaw
+from .patches import between_patches
 from .preparation import checked, prepared, spacing
 from .quantisation import quantisation_limit
 from .spectrum import Spectrum, log_mean_cosine_power, map_spectra, profile_spectrum
@@ -66,7 +67,9 @@ class Identification(Record):
             "D": f"{self.D:.4f} +- {self.D_standard_error:.4f}",
             "G [m]": f"{self.G:.4g}  (ln G +- {self.ln_G_standard_error:.2g})",
             "G by the profile formula [m]": f"{self.G_profile:.4g}",
-            "D by structure function": f"{other.D:.4f} +- {other.D_standard_error:.4f}",
+            "D by structure function": f"{other.D:.4f} +- {other.D_standard_error:.4f}"
+            if other.D == other.D
+            else "none: no power law of a surface fits it",
             "band [1/m]": f"{low:.4g} to {high:.4g}  ({self.decades:.2f} decades)",
             "wavelengths [m]": f"{1 / high:.4g} to {1 / low:.4g}",
             "finer waves": "aliased" if self.aliased else "not aliased",
@@ -91,7 +94,8 @@ def identify(
     """D and G of heights z [m], a profile (n,) or a map (n, m), from their power spectrum.
 
     Points are dx [m] apart along the first axis, dy (default dx) along the second; NaN is missing.
-    The surface is taken to be that of Eq. 13, a profile a cut through it.
+    The surface is taken to be that of Eq. 13, a profile a cut through it. Standard errors of a map
+    count what differs from place to place in it; those of a profile hold where nothing does.
 
     - `band`: lowest and highest frequency [1/m] of the fit; chosen by default.
     - `resolution` [m]: lateral resolution, or the cut-off wavelength of a Gaussian filter.
@@ -136,6 +140,10 @@ def identify(
         )
     noise, ends = chosen.noise, (chosen.low, chosen.high)
     law = noise.fit(spectrum, ends, ratio)
+    if z.ndim == 2:
+        between = between_patches(heights.segments[0], dx, dy, spectrum, law, ends, ratio)
+        covariance = law.covariance + np.pad(between, (0, 1))
+        law = eqx.tree_at(lambda law: law.covariance, law, covariance)
     log_G, log_G_profile, covariance = _parameters(law, ratio)
     other = structure_function(
         lines,

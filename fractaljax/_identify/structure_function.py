@@ -20,11 +20,12 @@ from .spectrum import log_mean_cosine_power
 _BLOCKS = 10  # for the standard error
 _SHARED = 1.4  # waves longer than a block are in several, which then agree too well
 _TINY = 1e-300  # m^2
+_BOUNDS, _AT_BOUND = (1.005, 2.995), 1e-4  # of p
 _SHORTEST, _SHARE, _LAGS = 4, 12, 12  # lags from 4 points to a twelfth of the length, 12 of them
 
 
 class StructureFunction(Record):
-    """D and G by the structure function alone."""
+    """D and G by the structure function alone: NaN where no power law of a surface fits it."""
 
     tau: Float[np.ndarray, " lags"]  # m
     W: Float[np.ndarray, " lags"]  # m^2, of second differences
@@ -74,6 +75,8 @@ def structure_function(
 
     every = np.arange(_BLOCKS)
     W, p, log_C = estimate(every)
+    if min(abs(p - bound) for bound in _BOUNDS) < _AT_BOUND:
+        return StructureFunction(tau, W, math.nan, math.nan, math.nan)
     others = [estimate(np.delete(every, i))[1] for i in every]
     error = _SHARED * math.sqrt((_BLOCKS - 1) * np.var(others)) / 2
     with np.errstate(over="ignore"):  # C = m(p) G^(3-p)/2
@@ -88,5 +91,5 @@ def _fit(tau, W, end) -> tuple[float, float]:
     def difference(p):
         return np.log(W) - np.log(np.maximum(second_differences(p, tau, end), _TINY))
 
-    p: Any = fminbound(lambda p: difference(p).var(), 1.005, 2.995, xtol=1e-9)
+    p: Any = fminbound(lambda p: difference(p).var(), *_BOUNDS, xtol=1e-9)
     return float(p), float(difference(p).mean())

@@ -111,6 +111,15 @@ def test_fields_and_table(found):
     ) == repr(found)
 
 
+def test_a_second_estimate_at_its_bound_is_none():
+    """D = 1.7 is out of its reach: the table says so, and no warning calls it a disagreement."""
+    found = fj.identify(gaussian_profile(np.random.default_rng(0), 1.7, 2048), DX)
+    assert abs(found.D - 1.7) < 0.1
+    assert math.isnan(found.structure_function.D)
+    assert "D by structure function       none: " in repr(found) and "nan" not in repr(found)
+    assert not any("disagree" in line for line in found.warnings)
+
+
 def test_the_covariance_is_that_of_the_law(found):
     """D and ln G are functions of p and ln A; the profile formula gives the same spectrum."""
     law, h = found.law, 1e-5

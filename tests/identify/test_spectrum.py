@@ -14,7 +14,7 @@ from fractaljax._identify.spectrum import (
     profile_spectrum,
     theoretical_spectrum,
 )
-from fractaljax._identify.structure_function import second_differences
+from fractaljax._identify.structure_function import second_differences, structure_function
 from synthetic import DX, gaussian_map, gaussian_profile
 
 
@@ -56,6 +56,19 @@ def test_structure_function_is_the_integral_of_the_spectrum(p):
     # The mean of |1 - exp(i x)|^4 is 6: beyond `end` the cosines average out.
     missing = W - second_differences(p, np.array(tau), end)
     assert missing == pytest.approx(6 * end ** (1 - p) / (p - 1))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        np.sin(np.arange(4096) / 500),  # W as the fourth power of distance: D = 2 at most
+        np.random.default_rng(0).standard_normal(4096),  # the same at all distances
+    ],
+)
+def test_structure_function_at_its_bound_is_no_opinion(line):
+    """A fit that ends at D = 2.0025 or 2.9975 knows neither D nor its error."""
+    found = structure_function([line], DX, (1e4, 1e5), end=None)
+    assert math.isnan(found.D) and math.isnan(found.G) and math.isnan(found.D_standard_error)
 
 
 @pytest.mark.parametrize("D", [2.2, 2.8])
