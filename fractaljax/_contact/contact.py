@@ -2,13 +2,15 @@
 
 import abc
 from collections.abc import Callable
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, ScalarLike
+from jaxtyping import Array, ArrayLike, Float, ScalarLike
 
-from .._base.parts import Numbers, Part, Record
+from .._base.parts import Numbers, Part, Record, brief, number, substitute
+from .load_curve import LoadCurve, load_curve
 
 MU_M_MAX = 0.9  # Eq. 19, of the fractal law, ends there
 
@@ -34,9 +36,49 @@ class Contact(Part):
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """(K_n, K_t) [N/m] at the given static and smallest friction coefficient."""
 
+    @property
+    def opening_exponent(self) -> Numbers | float | None:
+        """alpha in K_n ~ P^alpha as the load vanishes, if the law has a load curve; else None.
+
+        It is from 0 to below 1: a joint opens at a finite approach.
+        """
+        return None
+
+    @property
+    def load_borders(self) -> tuple[float, ...] | None:
+        """The loads [N] between which K_n(P) is smooth; None where it is smooth everywhere."""
+        return None
+
+    def load_curve(self, mu_s: ScalarLike, mu_m: ScalarLike) -> LoadCurve | None:
+        """N/P over K_n(P) u/P; None for a law that has no load curve."""
+        return None if self.opening_exponent is None else _load_curve(self, mu_s, mu_m)
+
+    def load(self, u: ArrayLike, mu_s: ScalarLike = 0.0, mu_m: ScalarLike = 0.0) -> Numbers:
+        """Normal force N [N] at the approach u [m] from the pressed rest, of any shape.
+
+        dN/du = K_n(N) with N(0) = P, and 0 where the joint is open. The friction coefficients
+        matter where the stiffness depends on them.
+
+        **Raises:** `ValueError` for a law without a load curve.
+        """
+        law: Any = self
+        curve, u = law.load_curve(mu_s, mu_m), number("u", u)
+        if curve is None:
+            raise ValueError(f"load needs a contact law with a load curve, got {brief(law)}")
+        e = law.stiffness(mu_s, mu_m)[0] / law.P * u
+        return law.P * curve(e)
+
     def real_area(self, mu_m: ScalarLike) -> Float[Array, ""] | None:
         """Real contact area [m^2]; None where the law has none."""
         return None
+
+
+@jax.jit
+def _load_curve(law: Any, mu_s, mu_m) -> LoadCurve:
+    def K_n(P):
+        return substitute(law, {"P": P}).stiffness(mu_s, mu_m)[0]
+
+    return load_curve(K_n, law.P, law.opening_exponent, law.load_borders)
 
 
 def on_the_same_joint(law: Contact, contact: Contact) -> Contact:

@@ -18,7 +18,9 @@ class MeasuredContact(Contact):
 
     ln K_n is a monotone cubic of ln P between `loads` [N] (Fritsch and Carlson, SIAM J. Numer.
     Anal. 17, 238, 1980), with the `stiffnesses` [N/m] measured there; beyond the first and the last
-    load, the power law that it has there. The table is structure: it has no derivatives.
+    load, the power law that it has there. The table is structure: it has no derivatives. The joint
+    has a load curve if that power is from 0 to below 1 at the first load; else it would not open
+    at a finite gap.
 
     **Raises:** `ValueError` unless P > 0, stiffness_ratio >= 0, and the table has two rows or more,
     loads above 0 that rise, and as many stiffnesses above 0; `TypeError` for a traced table.
@@ -48,11 +50,24 @@ class MeasuredContact(Contact):
         self.P = number("P", P, above=0)
         self.stiffness_ratio = number("stiffness_ratio", stiffness_ratio, at_least=0)
 
-    def stiffness(self, mu_s, mu_m):
+    @property
+    def opening_exponent(self):
+        """That of the power law below the first load."""
+        slope = float(self._curve().derivative()(np.log(self.loads[0])))
+        return slope if 0 <= slope < 1 else None
+
+    @property
+    def load_borders(self):
+        return self.loads
+
+    def _curve(self):
+        """ln K_n over ln P."""
         from scipy.interpolate import PchipInterpolator
 
-        x, y = np.log(self.loads), np.log(self.stiffnesses)
-        curve = PchipInterpolator(x, y)
+        return PchipInterpolator(np.log(self.loads), np.log(self.stiffnesses))
+
+    def stiffness(self, mu_s, mu_m):
+        x, y, curve = np.log(self.loads), np.log(self.stiffnesses), self._curve()
         first, last = curve.derivative()(x[[0, -1]])
         # Columns are cubics of the distance from the left end of an interval.
         cubics = np.column_stack([[0, 0, first, y[0]], curve.c, [0, 0, last, y[-1]]])

@@ -113,6 +113,11 @@ class PerssonContact(Contact):
     def depends_on_friction(self) -> bool:
         return self.Q is not None
 
+    @property
+    def opening_exponent(self):
+        """1/(1 + H), H = 3 - D: the finite-size law."""
+        return 1 / (4 - self.surface.D)
+
     def stiffness(self, mu_s, mu_m):
         ratio, K_n = self.stiffness_ratio, self._stiffness(self.P)
         if ratio is None:

@@ -112,7 +112,13 @@ class DesignProblem(eqx.Module):
             for name, part in joints_of(x).items()
             if part.contact.fractal or name in self.contacts
         }
-        growth = growth_rate(_with_stiffness(x, states), self.friction_slope)
+        # The load curve of a joint is that of its own law.
+        known = {
+            name: state
+            for name, state in states.items()
+            if not joints_of(x)[name].follows_load_curve
+        }
+        growth = growth_rate(_with_stiffness(x, known), self.friction_slope)
         model, stiff = [], []
         for name, K_n_min in zip(self.contacts, self.K_n_min, strict=True):
             state = states[name]

@@ -130,11 +130,10 @@ class _Modes(eqx.Module):
         values, vectors = map(np.asarray, np.linalg.eig(A))
         T = np.eye(n) if system.T is None else np.asarray(system.T)
         rows = [T @ vectors[n:] / np.asarray(system.V)[:, None]]
-        loads = np.asarray(system.loads(equilibrium[:n]))
-        for faces, opens in zip(system.faces, system.opens, strict=True):
-            if opens:
-                i = faces[0]
-                rows.append(np.asarray(system.L)[i : i + 1] @ vectors[:n] / loads[i])
+        closures = np.asarray(system.closures(equilibrium[:n]))
+        normals = np.asarray(jax.jacfwd(system.closures)(equilibrium[:n]))
+        opens = list(system.opens)
+        rows.append(normals[opens] @ vectors[:n] / closures[opens, None])
         inverse, reach = np.linalg.inv(vectors), abs(np.concatenate(rows))
         arrays = values, vectors, inverse, reach, np.real(values).max() < 0
         return cls(equilibrium, *map(jnp.asarray, arrays), free=not system.excited)

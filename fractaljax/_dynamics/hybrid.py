@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, DTypeLike, Float
 
 from .._base.parts import concrete, number, require_kind, require_scalar
+from .._contact.load_curve import LoadTable, loaded_equilibrium, tabulated
 from .._friction import Friction
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.scene import Scene, stiffness
@@ -29,6 +30,7 @@ OPEN = 2
 # can open. The section is where t.u of the first face falls through 0, a maximum of t.x; of an
 # excited system it is the maximum of the excitation, once in each of its periods.
 SECTION, NONE, UNUSED = 0, -1, -2
+_SMOOTH = 1e-4  # of the way to the opening: nearer, what a load curve adds is below rounding
 _FEW = 4  # degrees of freedom up to which products are written out, which compile into one loop
 
 
@@ -47,6 +49,7 @@ class HybridSystem(eqx.Module):
     L: Float[Array, "f n"]  # the load on a face, which friction multiplies, is L x + P
     P: Float[Array, " f"]
     V: Float[Array, " f"]
+    curves: tuple[LoadTable | None, ...]  # of the joints whose load follows one, over (L x)/P
     faces: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # of each joint
     opens: tuple[bool, ...] = eqx.field(static=True)  # whether a joint can open
     # Whether the last degree of freedom is the phase of an excitation: excitation.py.
@@ -126,9 +129,45 @@ class HybridSystem(eqx.Module):
         """What forces (f, ...) on the faces accelerate (n, ...)."""
         return forces if self.B is None else self._times(self.B, forces)
 
+    def linear_loads(self, x) -> Array:
+        """The loads of the faces (f, ...) with springs of constant stiffness."""
+        return self._times(self.L, x) + self._leaf(self.P, x.ndim - 1)
+
     def loads(self, x) -> Array:
         """What the coefficient of friction multiplies (f, ...); sticking attracts where > 0."""
-        return self._times(self.L, x) + self._leaf(self.P, x.ndim - 1)
+        linear = self.linear_loads(x)
+        if not any(self.curves):
+            return linear
+        rows = list(linear)
+        for faces, force in zip(self.faces, self.normal_forces(linear), strict=True):
+            rows[faces[0]] = force
+        return jnp.stack(rows)
+
+    def normal_forces(self, linear) -> Array:
+        """Those of the joints (m, ...) whose faces have the loads (f, ...) by linear springs."""
+        found = []
+        for faces, curve in zip(self.faces, self.curves, strict=True):
+            load = linear[faces[0]]
+            if curve is not None:
+                P = self._leaf(self.P[faces[0]], load.ndim)
+                load = P * self._curve(curve, load.ndim)(load / P - 1)
+            found.append(load)
+        return jnp.stack(found)
+
+    def _curve(self, curve: LoadTable, lanes: int) -> LoadTable:
+        """A load curve with the axes of lanes."""
+        return jax.tree.map(lambda leaf: self._leaf(leaf, lanes), curve)
+
+    def closures(self, x) -> Array:
+        """What falls through 0 where a joint opens (m, ...), linear in x [load]."""
+        linear, found = self.linear_loads(x), []
+        for faces, curve in zip(self.faces, self.curves, strict=True):
+            load = linear[faces[0]]
+            if curve is not None:
+                P = self._leaf(self.P[faces[0]], load.ndim)
+                load = P + (load - P) / self._leaf(curve.opening, load.ndim)
+            found.append(load)
+        return jnp.stack(found)
 
     def sliding(self, u) -> Array:
         """Sliding velocity w of each face (f, ...)."""
@@ -152,9 +191,18 @@ class HybridSystem(eqx.Module):
     def _driven(self, y, friction, s=None) -> Array:
         """Acceleration (n, ...) with these friction forces, without those of sticking faces."""
         x, u = y[: self.n], y[self.n :]
+        if any(self.curves):
+            # K holds the spring of the preload: what the load curve lacks is added.
+            linear = self.linear_loads(x)
+            rows = list(friction)
+            joints = zip(self.faces, self.curves, self.normal_forces(linear), strict=True)
+            for faces, curve, force in joints:
+                if curve is not None:
+                    rows[faces[1]] = rows[faces[1]] + linear[faces[0]] - force
+            friction = jnp.stack(rows)
         if s is not None and any(self.opens):
             # An open joint has no springs: their forces, which K holds, are taken back.
-            loads = self.loads(x)
+            loads = self.linear_loads(x)
             taken = list(loads)
             for faces, opens in zip(self.faces, self.opens, strict=True):
                 if opens:
@@ -209,9 +257,9 @@ class HybridSystem(eqx.Module):
 
     def open_faces(self, y) -> Array:
         """The faces (f, ...) of joints that can open and whose normal force would pull."""
-        loads = self.loads(y[: self.n])
+        closures = self.closures(y[: self.n])
         opens = jnp.asarray(np.repeat(self.opens, [len(faces) for faces in self.faces]))
-        first = jnp.stack([loads[faces[0]] for faces in self.faces for _ in faces])
+        first = jnp.stack([closures[j] for j, faces in enumerate(self.faces) for _ in faces])
         return opens.reshape(-1, *(1,) * (y.ndim - 1)) & (first < 0)
 
     def section(self, y) -> Array:
@@ -225,7 +273,7 @@ class HybridSystem(eqx.Module):
         """Functions (k, ...) that are positive while contact state s lasts, and the section.
 
         Of a face in slip s w and a constant, in stick the distances of the friction force from
-        its two limits; of a joint that can open its normal force, or minus that while open.
+        its two limits; of a joint that can open its closure, or minus that while open.
         """
         x, u = y[: self.n], y[self.n :]
         w, loads = self.sliding(u), self.loads(x)
@@ -239,19 +287,21 @@ class HybridSystem(eqx.Module):
         upper = jnp.where(stick, limits + force, one)
         pairs = jnp.stack([lower, upper], axis=1).reshape(2 * len(w), *w.shape[1:])
         rows = [self.section(y)[None], pairs]
-        for faces, opens in zip(self.faces, self.opens, strict=True):
+        closures = self.closures(x)
+        for j, (faces, opens) in enumerate(zip(self.faces, self.opens, strict=True)):
             if opens:
-                load, state = loads[faces[0]], s[faces[0]]
-                rows.append(jnp.where(state == OPEN, -load, load)[None])
+                rows.append(jnp.where(s[faces[0]] == OPEN, -closures[j], closures[j])[None])
         return jnp.concatenate(rows)
 
-    def stiffness(self, y, s) -> Array:
-        """The largest rate (...) at which friction alone changes velocities of slipping faces.
+    def stiffness(self, y, s, closing: float = 1 / 16) -> Array:
+        """A rate (...) above which no step should be as long as its inverse, in addition to K's.
 
-        Far from equilibrium it exceeds every other rate. Zero for laws without slope.
+        The largest at which friction alone changes velocities of slipping faces: far from
+        equilibrium it exceeds every other rate. And that of load curves. Zero without both.
         """
+        of_curves = self._of_curves(y, s, closing)
         if not any(law.velocity_dependent for law in self.laws):
-            return jnp.zeros_like(y[0])
+            return of_curves
         w, loads = self.sliding(y[self.n :]), self.loads(y[: self.n])
         rates = self._each(
             lambda law, w, load: self.speed * law.slope(self.speed * w) * load, w, loads
@@ -259,7 +309,32 @@ class HybridSystem(eqx.Module):
         if self.T is not None and self.B is not None:
             own = jnp.sum(self.T * jnp.swapaxes(self.B, 0, 1), axis=1)
             rates = rates * self._leaf(own, y.ndim - 1)
-        return jnp.max(jnp.where(jnp.abs(s) == 1, jnp.abs(rates), 0), axis=0)
+        rates = jnp.where(jnp.abs(s) == 1, jnp.abs(rates), 0)
+        return jnp.maximum(jnp.max(rates, axis=0), of_curves)
+
+    def _of_curves(self, y, s, closing: float) -> Array:
+        """The largest rate (...) at which load curves change; 0 without any.
+
+        Half of what they add to the springs of the preload, and `closing` times the rate of
+        relative change of the way to the opening, where they are not smooth.
+        """
+        x, u = y[: self.n], y[self.n :]
+        linear, by_time, most = self.linear_loads(x), self._times(self.L, u), jnp.zeros_like(x[0])
+        for faces, curve in zip(self.faces, self.curves, strict=True):
+            if curve is None:
+                continue
+            tangential, normal = faces
+            load, lanes = linear[tangential], x.ndim - 1
+            P, of = self._leaf(self.P[tangential], lanes), self._curve(curve, lanes)
+            e = load / P - 1
+            _, slope = jax.jvp(of, (e,), (jnp.ones_like(e),))
+            away = jnp.zeros((len(linear), *e.shape), e.dtype).at[normal].set(1)
+            added = self._times(self.L, self._acceleration(away))[tangential] * (slope - 1)
+            stiffer = jnp.sqrt(jnp.where(added > 0, added, 0)) / 2
+            way = jnp.abs(e + of.opening) + _SMOOTH * of.opening
+            nearing = jnp.where(s[tangential] == OPEN, 0, jnp.abs(by_time[tangential] / P) / way)
+            most = jnp.maximum(most, jnp.maximum(stiffer, closing * nearing))
+        return most
 
     def switch(self, y, s, guard) -> tuple[Array, Array]:
         """State and contact state after the guard of that number has reached zero.
@@ -336,10 +411,14 @@ class HybridSystem(eqx.Module):
 
     def _without_load(self, x, tangential, normal, where) -> Array:
         """x moved along the normal of a joint to where its normal force is 0."""
-        load = self.loads(x)[tangential]
+        j = [faces[0] for faces in self.faces].index(tangential)
+        load = self.closures(x)[j]
         unit = jnp.zeros((len(self.P), *x.shape[1:]), x.dtype).at[normal].set(1)
         away = self._acceleration(unit)
         change = self._times(self.L, away)[tangential]
+        curve = self.curves[j]
+        if curve is not None:
+            change = change / self._leaf(curve.opening, change.ndim)
         return x - jnp.where(where, load / jnp.where(change == 0, 1, change), 0)[None] * away
 
     def contact_state(self, y) -> Array:
@@ -356,6 +435,17 @@ class HybridSystem(eqx.Module):
         B = jnp.eye(self.n, dtype=K.dtype) if self.B is None else self.B
         coupled = K - (B * mu[None]) @ self.L
         x = _solve(coupled, self.F + B @ (mu * self.P))
+        joints = zip(self.faces, self.curves, strict=True)
+        curved = [(faces, curve) for faces, curve in joints if curve is not None]
+        if curved:
+            first, normal = (np.array([faces[i] for faces, _ in curved]) for i in (0, 1))
+            P, curves = self.P[first], [curve for _, curve in curved]
+            # What each load lacks does not push along n, nor rub along t.
+            missing = (B[:, normal] - mu[first][None] * B[:, first]) * P[None]
+            by = jnp.linalg.solve(coupled, missing)
+            e = loaded_equilibrium(curves, self.L[first] @ x / P, self.L[first] @ by / P[:, None])
+            lacks = [1 + each - curve(each) for each, curve in zip(e, curves, strict=True)]
+            x = x + by @ jnp.stack(lacks)
         return jnp.concatenate([x, jnp.zeros_like(x)])
 
     @property
@@ -452,8 +542,11 @@ def _of_scene(scene: Scene) -> HybridSystem:
     unit, zero = o.m * omega * o.V, jnp.zeros_like(f)
     K = jnp.stack([a, b]) / omega**2
     P = zero if scene.normal_load is None else scene.normal_load / unit
+    law, curve = scene.friction, None
+    if scene.follows_load_curve:
+        curve = tabulated(scene.contact.load_curve(law.mu_s, law.mu_m))
     return HybridSystem(
-        laws=(scene.friction,),
+        laws=(law,),
         speed=o.V,
         omega=omega,
         force_unit=unit,
@@ -467,14 +560,16 @@ def _of_scene(scene: Scene) -> HybridSystem:
         ),
         P=jnp.stack([P, zero]),
         V=jnp.ones_like(K),
+        curves=(curve,),
         faces=((0, 1),),
-        opens=(scene.preload,),
+        opens=(bool(scene.preload),),
     )
 
 
 def _of_structure(structure: Structure) -> HybridSystem:
     n, dtype = structure.n, structure.M.dtype
     K, rows, weights, offsets, speeds, faces = structure.K, [], [], [], [], []
+    curves = []
     for name, joint in zip(structure.joint_names, structure.joints, strict=True):
         if joint.V is None:
             raise ValueError(f"joint {name}: V must be given, for the motion depends on it")
@@ -484,7 +579,10 @@ def _of_structure(structure: Structure) -> HybridSystem:
         rows.append(t)
         speeds.append(joint.V)
         faces.append((len(rows) - 1,))
-        P = joint.normal_load
+        P, law = joint.normal_load, joint.friction
+        followed = joint.follows_load_curve
+        curve = joint.contact.load_curve(law.mu_s, law.mu_m) if followed else None
+        curves.append(None if curve is None else tabulated(curve))
         offsets.append(jnp.zeros((), dtype) if P is None else P)
         if joint.normal is None:
             weights.append(jnp.zeros(n, dtype))
@@ -520,8 +618,9 @@ def _of_structure(structure: Structure) -> HybridSystem:
         L=L / omega**2,
         P=P / unit,
         V=V / speed,
+        curves=tuple(curves),
         faces=tuple(faces),
-        opens=tuple(joint.preload and joint.normal is not None for joint in structure.joints),
+        opens=tuple(bool(joint.preload) and joint.normal is not None for joint in structure.joints),
     )
 
 

@@ -180,7 +180,10 @@ def _limit_cycle(
     everything = jnp.concatenate([own, rows])
     low, high = extreme_values(system, closed, everything)
     offset = system.P[tangential][None]
-    forces = (jnp.stack([low, high])[:, 2 * n :] + offset) * system.force_unit
+    linear = jnp.zeros((len(system.P), 2), rows.dtype)
+    linear = linear.at[tangential].set((jnp.stack([low, high])[:, 2 * n :] + offset).T)
+    # A load curve rises, so that its extremes are where those of the approach are.
+    forces = system.normal_forces(linear).T * system.force_unit
     forces = jnp.where(np.array(system.opens)[None], jnp.maximum(forces, 0), forces)
     low, high = low[: 2 * n] * scale, high[: 2 * n] * scale
 

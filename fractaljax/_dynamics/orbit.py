@@ -177,7 +177,7 @@ def remesh(system: HybridSystem, steps: Segments, h, length: int) -> Segments:
 
     They are no longer than h, if so few suffice, and shorter where friction is stiff.
     """
-    weight = jnp.maximum(1, 2 * system.stiffness(steps.y, steps.s)) * steps.duration
+    weight = jnp.maximum(1, 2 * system.stiffness(steps.y, steps.s, 1 / 4)) * steps.duration
     weight = jnp.where(steps.used, weight, 0)
     ends_w, ends_t = cumulative(jnp.stack([weight, steps.duration]))
     # The first and last step of each phase, and its weight.

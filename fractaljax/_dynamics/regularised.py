@@ -193,9 +193,11 @@ def regularised_cycle(
     stuck = [
         share_below_zero(times, w[:, i] ** 2 - width**2, 2 * w[:, i] * change[:, i]) for i in shown
     ]
-    loads, changes = states[:, :n] @ system.L.T + system.P[None], rates[:, :n] @ system.L.T
-    below = [share_below_zero(times, loads[:, f[0]], changes[:, f[0]]) for f in system.faces]
+    moving = (states[:, :n].T,), (rates[:, :n].T,)
+    pairs = zip(*jax.jvp(system.closures, *moving), strict=True)
+    below = [share_below_zero(times, closure, change) for closure, change in pairs]
     below, opens = jnp.stack(below), np.array(system.opens)
+    loads, changes = (x.T for x in jax.jvp(system.loads, *moving))
     forces = extremes(times, loads, changes).T[np.array([f[0] for f in system.faces])]
     forces = jnp.where(opens[:, None], jnp.maximum(forces, 0), forces) * system.force_unit
 

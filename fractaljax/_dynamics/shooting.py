@@ -285,7 +285,7 @@ def resampled(x, window: Window, chain: Chain, lifted: Lifted, u, times, *, plac
     last = jnp.max(jnp.where(chain.share > 0, jnp.arange(len(h)), 0))
     k = jnp.minimum(jnp.searchsorted(ends, times, side="right"), last)
     y = flow(system, lifted.at(u)[:, k], times - (ends - h)[k], chain.s[:, k])
-    return y, system.stiffness(y, chain.s[:, k])
+    return y, system.stiffness(y, chain.s[:, k], 1 / 4)
 
 
 @jax.jit

@@ -31,6 +31,11 @@ JOINT_LAWS: Laws = {
     "of": LAWS,  # the law that a `Scaled` one scales
 }
 
+PRELOAD_NOTE = (
+    'false: friction acts on K_n x, "linear": on P + K_n x, true: on the load curve of the law, '
+    "if it has one"
+)
+
 Dof = int | str  # a degree of freedom, by index or name
 Direction = Dof | Sequence[Any] | Mapping[Any, float] | ArrayLike
 Stored = tuple[Any, ...]  # a direction as `stored_direction` gives it
@@ -53,6 +58,20 @@ def friction_for(contact: Contact, friction: Friction) -> Friction:
     return friction
 
 
+def preload_form(value: Any) -> bool | str:
+    """`preload` of a joint: True, False or "linear".
+
+    **Raises:** `TypeError` for anything else.
+    """
+    if isinstance(value, str) and value == "linear":
+        return value
+    try:
+        return flag("preload", value)
+    except TypeError:
+        wanted = f'preload must be True, False or "linear", got {brief(value)}'
+        raise TypeError(wanted) from None
+
+
 def require_load(contact: Contact, what: str) -> None:
     """Refuse a contact without a normal load P, which `what` needs.
 
@@ -72,10 +91,11 @@ class Joint(Part):
     positive t.x, as the belt does in Eq. 39. `V` is the sliding velocity; a law without slope needs
     none.
 
-    The normal force on which friction acts is K_n n.x, the source's form, or, with `preload`,
-    P + K_n n.x with the load P of the contact: x = 0 is the pressed rest. Without `normal` it is P,
-    constant, and neither a normal spring nor a friction face normal to the belt is there. In all
-    forms the tangential spring K_t stays.
+    The normal force on which friction acts is K_n n.x, the source's form. With `preload` it begins
+    with the load P of the contact, and x = 0 is the pressed rest: N(n.x) is the load curve of the
+    contact law, dN/du = K_n(N), or P + K_n n.x for a law that has none and with
+    `preload="linear"`. Without `normal` it is P, constant, and neither a normal spring nor a
+    friction face normal to the belt is there. In all forms the tangential spring K_t stays.
 
     **Raises:** `TypeError` for a part of the wrong kind; `ValueError` unless V > 0, for directions
     that are zero or have one degree of freedom twice, without a P where it is needed, and where
@@ -86,9 +106,7 @@ class Joint(Part):
     friction: Friction
     tangential: Stored = eqx.field(static=True)
     normal: Stored | None = eqx.field(static=True)
-    preload: bool = eqx.field(
-        static=True, metadata={"note": "true: friction acts on P + K_n n.x, false: on K_n n.x"}
-    )
+    preload: bool | str = eqx.field(static=True, metadata={"note": PRELOAD_NOTE})
     V: Numbers | None = quantity("m/s", "sliding velocity", log=True)
 
     def __init__(
@@ -98,13 +116,13 @@ class Joint(Part):
         tangential: Direction,
         normal: Direction | None = None,
         V: ArrayLike | None = None,
-        preload: bool = False,
+        preload: bool | str = False,
     ):
         self.contact = contact
         self.friction = friction_for(contact, friction)
         self.tangential = stored_direction("tangential", tangential)
         self.normal = None if normal is None else stored_direction("normal", normal)
-        self.preload = flag("preload", preload)
+        self.preload = preload_form(preload)
         if self.preload or self.normal is None:
             require_load(contact, "preload" if self.preload else "a joint without normal")
         if V is None and friction.velocity_dependent:
@@ -118,6 +136,11 @@ class Joint(Part):
         """P [N], if the normal force on which friction acts has it; None in the source's form."""
         return self.contact.P if self.preload or self.normal is None else None
 
+    @property
+    def follows_load_curve(self) -> bool:
+        """Whether the normal force is the load curve of the contact law."""
+        return self.normal is not None and follows_load_curve(self)
+
     def stiffness(self) -> tuple[Numbers, Numbers]:
         """(K_n, K_t) [N/m], scalars: Eqs. 30 and 36, or as given."""
         return self.contact.stiffness(self.friction.mu_s, self.friction.mu_m)
@@ -128,6 +151,11 @@ class Joint(Part):
         if self.V is None or not law.velocity_dependent:
             return law.mu_s
         return law.mu(self.V)
+
+
+def follows_load_curve(joint: Any) -> bool:
+    """Whether a scene, or a joint with a normal direction, follows its law's load curve."""
+    return joint.preload is True and joint.contact.opening_exponent is not None
 
 
 # --- directions --------------------------------------------------------------------------------

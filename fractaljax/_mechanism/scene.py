@@ -9,14 +9,21 @@ import jax
 from jaxtyping import Array, Float
 
 from .._base.files import write_whole
-from .._base.parts import Numbers, flag, quantities, rebuild, require_kind, require_scalar
+from .._base.parts import Numbers, quantities, rebuild, require_kind, require_scalar
 from .._base.toml import part_table, read_part, read_toml, write_toml
 from .._contact.contact import Contact
 from .._contact.fractal import FractalContact
 from .._contact.material import Material
 from .._friction import Friction, Stribeck
 from .._surface.surface import Surface
-from .joint import JOINT_LAWS, friction_for, require_load
+from .joint import (
+    JOINT_LAWS,
+    PRELOAD_NOTE,
+    follows_load_curve,
+    friction_for,
+    preload_form,
+    require_load,
+)
 from .mechanism import Mechanism
 from .oscillator import Oscillator
 
@@ -24,8 +31,10 @@ from .oscillator import Oscillator
 class Scene(Mechanism):
     """A mass on a belt, with its contact and friction, as one frozen pytree.
 
-    The friction along the belt acts on the normal force K_n x_2, the source's form, or with
-    `preload` on P + K_n x_2, with the load P of the contact: x = 0 is then the pressed rest.
+    The friction along the belt acts on the normal force K_n x_2, the source's form. With `preload`
+    it begins with the load P of the contact, and x = 0 is the pressed rest: N(x_2) is the load
+    curve of the contact law, dN/dx_2 = K_n(N), or P + K_n x_2 for a law that has none and with
+    `preload="linear"`.
 
     **Raises:** `TypeError` for a part of the wrong kind; `ValueError` if the contact is fractal
     and the smallest friction exceeds 0.9, where Eq. 19 ends, and for preload without a P.
@@ -34,22 +43,20 @@ class Scene(Mechanism):
     contact: Any  # a Contact; its kind decides what else it has
     friction: Friction
     oscillator: Oscillator
-    preload: bool = eqx.field(
-        static=True, metadata={"note": "true: friction acts on P + K_n x_2, false: on K_n x_2"}
-    )
+    preload: bool | str = eqx.field(static=True, metadata={"note": PRELOAD_NOTE})
 
     def __init__(
         self,
         contact: Contact,
         friction: Friction,
         oscillator: Oscillator,
-        preload: bool = False,
+        preload: bool | str = False,
     ):
         self.friction = friction_for(contact, friction)
         require_kind("oscillator", oscillator, Oscillator)
         self.contact = contact
         self.oscillator = oscillator
-        self.preload = flag("preload", preload)
+        self.preload = preload_form(preload)
         if self.preload:
             require_load(contact, "preload")
 
@@ -57,6 +64,11 @@ class Scene(Mechanism):
     def normal_load(self) -> Numbers | None:
         """P [N], if the normal force on which friction acts has it; None in the source's form."""
         return self.contact.P if self.preload else None
+
+    @property
+    def follows_load_curve(self) -> bool:
+        """Whether the normal force is the load curve of the contact law."""
+        return follows_load_curve(self)
 
     def _rebuilt(self, changes):
         return rebuild(self, changes)

@@ -19,7 +19,6 @@ from .._base.ranges import is_logarithmic
 from .._contact.contact import Regime
 from .._continuation import Continuation, Curve, CurveEnd, trace
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.oscillator import linearise
 from .._mechanism.quantities import (
     joints_of,
     own_quantities,
@@ -35,7 +34,7 @@ from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
 from .critical_friction import critical_frequency, hopf_test_function
 from .critical_pair import critical_pair
-from .linearise import assembled, with_equilibrium
+from .linearise import Pressed, assembled, linearised_at, pressed, with_equilibrium
 from .quadratic import solve
 from .quartic import rightmost_root
 
@@ -242,13 +241,9 @@ class _Plane(eqx.Module):
             attached = assembled(scene, self.friction_slope, refuse=False)
             pair = critical_pair(*attached.matrices, self.rigid)
             return _Point(*pair, attached.open, regimes, lowest)
-        friction = scene.friction
-        if states:
-            K_n, K_t = states[0].K_n, states[0].K_t
-        else:
-            K_n, K_t = scene.contact.stiffness(friction.mu_s, friction.mu_m)
-        load, slope = scene.normal_load, self.friction_slope
-        lin = linearise(scene.oscillator, friction, K_n, K_t, slope, load)
+        known = [Pressed(state.K_n, state.K_t, None) for state in states]
+        joint = known[0] if known else pressed(scene)
+        lin = linearised_at(scene, joint, self.friction_slope)
         damping = jnp.stack([lin.c_1, lin.c_2]) / jnp.sqrt(lin.a + lin.b)
         growth, frequency = rightmost_root(lin).real, critical_frequency(lin)
         test = hopf_test_function(lin)

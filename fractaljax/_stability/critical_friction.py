@@ -142,7 +142,8 @@ def _factor_of_structure(structure, friction_slope):
 
 @functools.partial(jax.jit, static_argnums=1)
 def _of_scene(scene: Scene, friction_slope: bool) -> Float[Array, ""]:
-    if scene.contact.depends_on_friction or (friction_slope and scene.friction.velocity_dependent):
+    sloping = friction_slope and scene.friction.velocity_dependent
+    if scene.contact.depends_on_friction or sloping or scene.follows_load_curve:
         factor, _ = _first_factor(scene, friction_slope)
         return jnp.where(factor == jnp.inf, jnp.inf, sliding_friction(scene) * _finite(factor))
     K_n, K_t = stiffness(scene)

@@ -1,13 +1,15 @@
 """The linearised equations about the sliding equilibrium: of a scene, and of a structure."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.parts import flag
+from .._contact.load_curve import LoadCurve, loaded_equilibrium
 from .._mechanism.oscillator import Linearised, linearise, static_normal_force
 from .._mechanism.quantities import sliding_friction
 from .._mechanism.scene import Scene, stiffness
@@ -24,19 +26,61 @@ NO_PRESSED_EQUILIBRIUM = (
 )
 
 
+class Pressed(NamedTuple):
+    """The joint of a scene as it is at the equilibrium."""
+
+    K_n: Array
+    K_t: Array
+    rest: tuple[Array, Array] | None  # x_01 and the normal force, where a load curve decides them
+
+
+def pressed(scene: Scene) -> Pressed:
+    """Stiffness at the equilibrium: the contact's own, or on a load curve its slope there."""
+    (K_n, K_t), P = stiffness(scene), scene.normal_load
+    if P is None or not scene.follows_load_curve:
+        return Pressed(K_n, K_t, None)
+    o, mu, curve = scene.oscillator, sliding_friction(scene), _curve_of(scene)
+    r_1, r_2 = 1 / (o.m * o.omega_1**2 + K_t), 1 / (o.m * o.omega_2**2 + K_n)
+    # A missing load does not push along x_2, nor rub along x_1.
+    by = K_n * r_2 * (1 + mu**2 * K_t * r_1) / (1 + mu**2 * K_n * r_2 * K_t * r_1)
+    linear = static_normal_force(o, K_n, K_t, mu, P) / P - 1
+    e = loaded_equilibrium([curve], linear[None], by[None, None])[0]
+    force, slope = _on_curve(curve, e)
+    x_01 = (o.F / jnp.sqrt(2.0) + mu * P * force) * r_1
+    return Pressed(K_n * slope, K_t, (x_01, P * force))
+
+
 def linearised(scene: Scene, friction_slope: bool) -> Linearised:
     """The characteristic polynomial of a scene (Eq. 43), with the stiffness of its contact."""
-    K_n, K_t = stiffness(scene)
-    return linearise(scene.oscillator, scene.friction, K_n, K_t, friction_slope, scene.normal_load)
+    return linearised_at(scene, pressed(scene), friction_slope)
+
+
+def linearised_at(scene: Scene, at: Pressed, friction_slope: bool) -> Linearised:
+    """As `linearised`, with a joint that is known already."""
+    load = scene.normal_load
+    o, law = scene.oscillator, scene.friction
+    return linearise(o, law, at.K_n, at.K_t, friction_slope, load, at.rest)
 
 
 def normal_force(scene: Scene) -> Float[Array, " 1"] | None:
-    """P + K_n x_02 [N] at the equilibrium, if the scene is preloaded; at most 0: it is open."""
+    """The normal force [N] at the equilibrium, if the scene is preloaded; at most 0: it is open."""
     if scene.normal_load is None:
         return None
-    friction = sliding_friction(scene)
-    K_n, K_t = stiffness(scene)
-    return static_normal_force(scene.oscillator, K_n, K_t, friction, scene.normal_load)[None]
+    K_n, K_t, rest = pressed(scene)
+    if rest is not None:
+        return rest[1][None]
+    mu, P = sliding_friction(scene), scene.normal_load
+    return static_normal_force(scene.oscillator, K_n, K_t, mu, P)[None]
+
+
+def _curve_of(joint: Any) -> LoadCurve:
+    """That of a scene or a joint which follows it."""
+    return joint.contact.load_curve(joint.friction.mu_s, joint.friction.mu_m)
+
+
+def _on_curve(curve: LoadCurve, e) -> tuple[Array, Array]:
+    """N/P and its slope."""
+    return jax.jvp(curve, (e,), (jnp.ones_like(e),))
 
 
 class Assembled(NamedTuple):
@@ -67,7 +111,8 @@ def assemble(
     With t and n the directions of a joint, Eq. 43 in vectors: K_t t t^T + K_n n n^T
     - mu K_n t n^T + mu K_t n t^T is added to K. The slope of the friction law adds
     mu' N_0 t t^T - mu' K_t (t.x_0) n n^T to C, where x_0 is the equilibrium and N_0 = K_n n.x_0.
-    With preload N_0 = P + K_n n.x_0, and the equilibrium is that under F and the friction mu P t.
+    With preload N_0 = P + K_n n.x_0, and the equilibrium is that under F and the friction mu P t;
+    of a load curve N_0 = N(n.x_0), and the tangent at N_0 takes the place of P + K_n n.x.
     C and K are NaN where such a joint is open, N_0 <= 0. A joint without normal has N_0 = P and no
     term with n.
 
@@ -103,9 +148,9 @@ def assembled(structure: Structure, friction_slope: bool, refuse: bool = True) -
     C, K = structure.C, structure.K
     F = jnp.zeros(structure.n, K.dtype) if structure.F is None else structure.F
     joints = []
-    for joint in structure.joints:
-        K_n, K_t = joint.stiffness()
-        mu, P = joint.coefficient(), joint.normal_load
+    tangents, F = _tangents(structure, F)
+    for joint, (K_n, K_t, P) in zip(structure.joints, tangents, strict=True):
+        mu = joint.coefficient()
         t = jnp.asarray(structure.direction(joint.tangential))
         n = None if joint.normal is None else jnp.asarray(structure.direction(joint.normal))
         K = K + K_t * jnp.outer(t, t)
@@ -158,6 +203,40 @@ def assembled(structure: Structure, friction_slope: bool, refuse: bool = True) -
         return found
     C, K = (jnp.where(found.open, jnp.nan, X) for X in (C, K))
     return found._replace(C=C, K=K)
+
+
+def _tangents(structure: Structure, F) -> tuple[list[tuple[Array, Array, Array | None]], Array]:
+    """(K_n, K_t, P) of each joint, with the tangent P + K_n n.x to a load curve at equilibrium.
+
+    And the external forces F with what keeps the joints' pressed rest at x = 0.
+    """
+    found = [(*joint.stiffness(), joint.normal_load) for joint in structure.joints]
+    curved = [i for i, joint in enumerate(structure.joints) if joint.follows_load_curve]
+    if not curved:
+        return found, F
+    K, pushes, total = structure.K, [], F
+    for joint, (K_n, K_t, P) in zip(structure.joints, found, strict=True):
+        mu, t = joint.coefficient(), jnp.asarray(structure.direction(joint.tangential))
+        n = np.zeros(structure.n) if joint.normal is None else structure.direction(joint.normal)
+        n = jnp.asarray(n, t.dtype)
+        K = K + K_t * jnp.outer(t + mu * n, t) + K_n * jnp.outer(n - mu * t, n)
+        total = total if P is None else total + mu * P * t
+        pushes.append((n, n - mu * t))
+    normals = jnp.stack([pushes[i][0] for i in curved])
+    K_n, P = (jnp.stack([jnp.asarray(found[i][k]) for i in curved])[:, None] for k in (0, 2))
+    # What the loads lack, one a column.
+    columns = jnp.stack([pushes[i][1] for i in curved], axis=1) * P.T
+    solved = jnp.linalg.solve(K, jnp.concatenate([total[:, None], columns], axis=1))
+    solved = K_n / P * normals @ solved
+    curves = [_curve_of(structure.joints[i]) for i in curved]
+    displaced = loaded_equilibrium(curves, solved[:, 0], solved[:, 1:])
+    for i, curve, e, n in zip(curved, curves, displaced, normals, strict=True):
+        own, K_t, load = found[i]
+        force, slope = _on_curve(curve, e)
+        tangent = load * (force - slope * e)
+        F = F + (load - tangent) * n
+        found[i] = own * slope, K_t, tangent
+    return found, F
 
 
 def with_equilibrium(structure: Structure, friction_slope: bool) -> Assembled:

@@ -16,10 +16,10 @@ from jaxtyping import Array, Complex, Float
 from .._base.parts import Record
 from .._mechanism.oscillator import Linearised
 from .._mechanism.quantities import sliding_friction
-from .._mechanism.scene import Scene, stiffness
+from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
 from . import quartic
-from .linearise import assembled, linearised, normal_force
+from .linearise import assembled, linearised, normal_force, pressed
 from .margin import damping_ratios, least_damping_ratio, margin_of
 from .quadratic import solve
 
@@ -42,7 +42,7 @@ class Stability(Record):
     has no sign. A rigid-body mode of a structure, with K x = 0 within rounding,
     has an eigenvalue and a damping ratio of exactly 0, and does not count in the margin.
 
-    `normal_force` is P + K_n n.x_0 of each joint, P without a normal direction, and NaN in the
+    `normal_force` is that of each joint under preload, P without a normal direction, and NaN in the
     source's form; None where no joint is preloaded. Where it is not above 0 the joint is open:
     there is no steady sliding, and all numbers are NaN.
     """
@@ -154,7 +154,7 @@ def stability(scene: Scene | Structure, friction_slope: bool = True) -> Stabilit
         s, x, error = s[order], x[order], error[order]
         margin, names = least_damping_ratio(s), scene.names
     else:
-        K_n, K_t = stiffness(scene)
+        K_n, K_t, _ = pressed(scene)
         lin, forces = linearised(scene, friction_slope), normal_force(scene)
         s = quartic.roots(lin)
         x = _displacements(lin, s, sliding_friction(scene) / scene.oscillator.m, K_n, K_t)
@@ -204,8 +204,10 @@ def require_computable(
         return
     force = modes.normal_force
     if force is not None and force[0] <= 0:
-        raise ValueError(f"the joint is open at its equilibrium: P + K_n x_2 is {force[0]:.6g} N")
-    K_n, K_t = stiffness(scene)
+        raise ValueError(
+            f"the joint is open at its equilibrium: the normal force is {force[0]:.6g} N"
+        )
+    K_n, K_t, _ = pressed(scene)
     lin = linearised(scene, friction_slope)
     found = {
         "K_n [N/m]": K_n,

@@ -135,8 +135,7 @@ def structure_table(structure: Structure, friction_slope: bool = True) -> str:
     for name, force in zip(structure.joint_names, _forces(attached), strict=False):
         if force <= 0:
             raise ValueError(
-                f"joint {name} is open at the equilibrium: its normal force P + K_n n.x is "
-                f"{force:.6g} N"
+                f"joint {name} is open at the equilibrium: its normal force is {force:.6g} N"
             )
     for name, X in zip("MCK", attached[:3], strict=True):
         if not np.isfinite(np.asarray(X)).all():

@@ -9,7 +9,13 @@ import pytest
 
 import fractaljax as fj
 from fractaljax._design.constraints import NormalStiffness
-from fractaljax._design.problem import DEFAULT_BOUNDS, _linearise, linearised, state_problem
+from fractaljax._design.problem import (
+    DEFAULT_BOUNDS,
+    _linearise,
+    describe,
+    linearised,
+    state_problem,
+)
 from fractaljax._design.tolerance import Tolerance
 from structures import fractal_joints
 from tools import primitives
@@ -131,3 +137,16 @@ def test_residuals_inform_on_both_sides_of_regime_boundaries():
     for u, jacobian in zip(us, jacobians, strict=True):
         reverse = jax.jacrev(lambda u: problem.at(u, problem.own_condition)[0])(jnp.asarray(u))
         np.testing.assert_allclose(jacobian, reverse, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("form", [True, "linear"])
+def test_load_curves_are_kept(form):
+    """A design of a joint that follows its load curve asks for the growth rate on that curve."""
+    brake = fj.brake_scene()
+    law = fj.PerssonContact(
+        brake.contact.surface, brake.contact.material, P=1907.3, area=1e-3, L=1e-2, L_s=1e-6
+    )
+    scene = fj.Scene(law, brake.friction, brake.oscillator, form).replace(F=800.0)
+    problem = stated(scene, {"D": (2.3, 2.6)}, K_n_min=None)
+    found = describe(problem, problem.scaled(scene)[None])
+    assert found["growth_rate"][0] == pytest.approx(float(fj.growth_rate(scene)), rel=1e-9)

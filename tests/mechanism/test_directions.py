@@ -99,7 +99,10 @@ NEEDS = "needs a contact with a normal load P, got FixedContact"
         (lambda: structure("x", contact=PLAIN), f"^preload {NEEDS}"),
         (lambda: structure("x", contact=PLAIN, preload=False), f"^a joint without normal {NEEDS}"),
         (lambda: fj.brake_scene().replace(contact=PLAIN, preload=True), f"^preload {NEEDS}"),
-        (lambda: structure("x", "y", preload=None), "^preload must be True or False, got None"),
+        (
+            lambda: structure("x", "y", preload=None),
+            '^preload must be True, False or "linear", got None',
+        ),
         (lambda: fj.FixedContact(1.0, 1.0, 0.0), "^P must be above 0, got 0.0$"),
         (lambda: structure(np.zeros(3)), "^tangential must not be zero"),
         (lambda: structure("x", {"y": 0.0}), "^normal must not be zero"),

@@ -194,7 +194,9 @@ def test_an_open_joint_has_no_number(which):
     for question in (fj.growth_rate, fj.margin):
         assert np.isnan(question(x)) and np.isnan(question(x, friction_slope=False))
     table = (stability_table, structure_table)[which]
-    with pytest.raises(ValueError, match=r"open at (its|the) equilibrium: .*P \+ K_n .* is -\d"):
+    with pytest.raises(
+        ValueError, match=r"open at (its|the) equilibrium: (the|its) normal force is -\d"
+    ):
         table(x)
     closed = x.replace(P=1e5)
     assert np.isfinite(fj.growth_rate(closed)) and "normal force [N]" in table(closed)

@@ -1,0 +1,235 @@
+"""The load curve of a joint: its normal force N as a function of the approach u of its bodies.
+
+dN/du = K_n(N) with N = P at u = 0, and N = 0 where the joint is open. In units of the load,
+n = N/P and e = K_n(P) u/P, the approach is an integral, e(n) = integral of K_n(P)/K_n(n P) dn from
+1 to n, and the curve its inverse.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+from numpy.polynomial import chebyshev
+
+from .._base.parts import Numbers
+
+_LEAST, _MOST = 1 / 256, 32.0  # loads over P between which pieces lie; one more begins at 0
+_BELOW, _ABOVE = 4, 4  # pieces on either side of P
+_STEEPEST = 8.0  # e-folds of load and stiffness above P, beyond which the curve is straight
+_SAMPLES = 32  # of the stiffness, on either side, for the borders of the pieces
+_DEGREE = 16  # of the series of e in each piece
+_NEWTON = 10  # steps to its inverse
+_ROWS, _POWERS = 512, 7  # of the table
+_FINEST = 1e-4  # of the way to the opening: rows there are no finer
+_SETTLING = 16  # Newton steps to an equilibrium
+
+
+def _nodes(degree: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes on (-1, 1), and the matrix from values there to a Chebyshev series."""
+    nodes = -np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
+    return nodes, np.linalg.inv(chebyshev.chebvander(nodes, degree))
+
+
+_NODES, _TO_SERIES = _nodes(_DEGREE)
+_INTEGRAL = chebyshev.chebint(np.eye(_DEGREE + 1), axis=0, lbnd=-1) / 2  # over half of (-1, 1)
+_ROW_NODES = _nodes(_POWERS)[0]
+_TO_POWERS = np.linalg.inv(np.vander(_ROW_NODES))  # highest first
+
+
+class LoadCurve(eqx.Module):
+    """N/P of a joint as a function of e = K_n(P) u/P: 1 with slope 1 at 0, 0 where it is open.
+
+    Pieces of n = N/P, in each of which the approach is a Chebyshev series: of ln n, but in the
+    first one, from n = 0, of n^(1/power), in which it is smooth.
+    """
+
+    power: Float[Array, ""]  # N/P begins as that power of the distance d = e + opening
+    logs: Float[Array, " p"]  # ln n where each piece ends
+    slopes: Float[Array, "p k"]  # of the approach by the share of the piece, Chebyshev series
+    approach: Float[Array, "p k+1"]  # within the piece
+    ends: Float[Array, " p"]  # d where each piece ends
+    opening: Float[Array, ""]  # the joint opens at e = -opening
+    top: Float[Array, ""]  # slope at the end of the last piece, and beyond
+
+    def __call__(self, e: Numbers) -> Numbers:
+        """N/P at e, of any shape."""
+        d = e.ravel() + self.opening
+        end = self.ends[-1]
+        inside = jnp.clip(d, jnp.finfo(d.dtype).eps ** 2 * end, end)
+        load = jnp.exp(self._log_load(inside)) + self.top * jnp.maximum(d - end, 0)
+        return jnp.where(d > 0, load, 0).reshape(e.shape)
+
+    def _log_load(self, d) -> Array:
+        """ln n at the distances d (j,), by Newton's method."""
+        piece = jnp.minimum(jnp.searchsorted(self.ends, d), len(self.ends) - 1)
+        start = jnp.where(piece > 0, self.ends[piece - 1], 0)
+        slopes, approach = self.slopes[piece], self.approach[piece]
+        width = jnp.sum(approach, axis=1)
+        share = (d - start) / width
+        least = jnp.where(piece > 0, -0.1, jnp.finfo(d.dtype).eps ** 2)
+
+        def closer(z, _):
+            T = _polynomials(2 * z - 1)
+            off = jnp.sum(approach * T, axis=1) / width - share
+            slope = jnp.sum(slopes * T[:, :-1], axis=1) / width
+            # Not at 0 and 1 exactly, where a border of two pieces would lose its derivative.
+            return jnp.clip(z - off / slope, least, 1.1), None
+
+        z, _ = jax.lax.scan(closer, share, length=_NEWTON)
+        low, high = self.logs[piece - 1], self.logs[piece]
+        return jnp.where(
+            piece > 0,
+            low + (high - low) * z,
+            high + self.power * jnp.log(jnp.where(piece > 0, 1, z)),
+        )
+
+
+class LoadTable(eqx.Module):
+    """A load curve for motions, which ask for it at every step: rows of polynomials.
+
+    Row i is for the distances d = e + opening at which q = ln((d + low)/(high - d)) + growth d is
+    from i to i + 1 times `step` above its value at d = 0. Leaves may have further axes, of lanes.
+    """
+
+    opening: Float[Array, ""]  # the joint opens at e = -opening
+    spacing: Float[Array, "4"]  # low, high, growth, step
+    table: Float[Array, "k r"]  # the middle of each row, its half width inverted, coefficients
+    last: Float[Array, "3"]  # d, N/P and its slope at the end of the last row
+
+    def __call__(self, e: Numbers) -> Numbers:
+        """N/P at e, a number for each lane."""
+        d, (end, load, slope) = e + self.opening, self.last
+        inside = jnp.clip(d, 0, end)
+        row = _row_number(jax.lax.stop_gradient(inside), self.spacing).astype(int)
+        row = jnp.clip(row, 0, _ROWS - 1)[None, None]
+        middle, scale, value, *others = jnp.take_along_axis(self.table, row, axis=1)[:, 0]
+        x = (inside - middle) * scale
+        for coefficient in others:
+            value = value * x + coefficient
+        value = jnp.where(d < end, jnp.maximum(value, 0), load + slope * (d - end))
+        return jnp.where(d > 0, value, 0)
+
+
+@jax.jit
+def tabulated(curve: LoadCurve) -> LoadTable:
+    """The table of a load curve; it departs from it by less than 1e-9 P."""
+    opening, end = jax.lax.stop_gradient((curve.opening, curve.ends[-1]))
+    spacing, at = _spaced(opening, end)
+    middle, half = (at[1:] + at[:-1]) / 2, (at[1:] - at[:-1]) / 2
+    d = middle[:, None] + half[:, None] * jnp.asarray(_ROW_NODES, at.dtype)[None]
+    load = curve(jnp.append(d.ravel(), end) - curve.opening)
+    powers = jnp.asarray(_TO_POWERS, at.dtype) @ load[:-1].reshape(d.shape).T
+    table = jnp.concatenate([middle[None], 1 / half[None], powers])
+    return LoadTable(curve.opening, spacing, table, jnp.stack([end, load[-1], curve.top]))
+
+
+def _row_number(d, spacing) -> Array:
+    """The place of a distance among the rows, from 0 on."""
+    low, high, growth, step = spacing
+    return (jnp.log((d + low) / (high - d) * (high / low)) + growth * d) / step
+
+
+def _spaced(opening, end) -> tuple[Array, Array]:
+    """The spacing of the rows between the distances 0 and `end`, and where they meet (r + 1,)."""
+    low, high, growth = _FINEST * opening, end + 0.01 * (end - opening), 12 / end
+    step = _row_number(end, (low, high, growth, 1)) / _ROWS
+    spacing = jnp.stack([low, high, growth, step])
+    wanted = jnp.arange(_ROWS + 1, dtype=end.dtype)
+
+    def halved(ends, _):
+        low, high = ends
+        middle = (low + high) / 2
+        above = _row_number(middle, spacing) > wanted
+        return (jnp.where(above, low, middle), jnp.where(above, middle, high)), None
+
+    start = jnp.zeros_like(wanted), jnp.full_like(wanted, end)
+    (at, _), _ = jax.lax.scan(halved, start, length=60)
+    return spacing, at.at[0].set(0).at[-1].set(end)
+
+
+def load_curve(
+    stiffness: Callable[[Numbers], Numbers],
+    P: Numbers,
+    opening_exponent: ArrayLike,
+    borders: Sequence[float] | None = None,
+) -> LoadCurve:
+    """The load curve of a law whose K_n(N) [N/m] is `stiffness`, under the load P [N], a scalar.
+
+    `opening_exponent` is alpha in K_n ~ N^alpha as N vanishes, from 0 to below 1: otherwise the
+    approach at which the joint opens would be infinite. `borders` are loads [N] between which K_n
+    is smooth; by default it is everywhere. Above 32 P, or where load and stiffness have grown by
+    e^8, the curve goes on straight.
+    """
+    own, dtype = stiffness(P), P.dtype
+
+    def relative(log_n):
+        """ln of K_n(n P)/K_n(P) for any shape."""
+        at = jax.vmap(stiffness)(jnp.exp(log_n.ravel()) * P)
+        return jnp.log(at / own).reshape(log_n.shape)
+
+    if borders is None:
+        logs = jax.lax.stop_gradient(_borders(relative, dtype))
+    else:
+        given = jnp.log(jnp.asarray(borders, dtype) / P)
+        logs = jnp.sort(jnp.append(given, 0))
+        logs = jnp.append(logs, logs[-1] + math.log(_MOST))
+    power = 1 / (1 - jnp.asarray(opening_exponent, dtype))
+    share = jnp.asarray((_NODES + 1) / 2, dtype)
+    # Pieces of ln n, but the first one, from n = 0, of n^(1/power): there e(n) is smooth.
+    spans = jnp.diff(logs)[:, None]
+    first, others = logs[0] + power * jnp.log(share), logs[:-1, None] + spans * share[None]
+    least = math.log(jnp.finfo(dtype).tiny) / 4
+    log_n = jnp.maximum(jnp.concatenate([first[None], others]), least)
+    by_share = jnp.concatenate([(power / share)[None], jnp.broadcast_to(spans, others.shape)])
+    slopes = by_share * jnp.exp(log_n - relative(log_n))
+    slopes = slopes @ jnp.asarray(_TO_SERIES.T, dtype)
+    approach = slopes @ jnp.asarray(_INTEGRAL.T, dtype)
+    ends = jnp.cumsum(jnp.sum(approach, axis=1))
+    opening = jnp.sum(jnp.where(logs <= 0, jnp.diff(ends, prepend=0), 0))
+    return LoadCurve(power, logs, slopes, approach, ends, opening, jnp.exp(relative(logs[-1])))
+
+
+def _polynomials(x) -> Array:
+    """Chebyshev polynomials (j, 18) at x (j,)."""
+
+    def following(carry, _):
+        one, two = carry
+        return (two, 2 * x * two - one), one
+
+    _, found = jax.lax.scan(following, (jnp.ones_like(x), x), length=_DEGREE + 2)
+    return found.T
+
+
+def _borders(relative, dtype) -> Array:
+    """ln n at the borders of the pieces: in each of them load and stiffness grow as much."""
+    found = []
+    for end, count in ((_LEAST, _BELOW), (_MOST, _ABOVE)):
+        x = jnp.linspace(0, math.log(end), _SAMPLES, dtype=dtype)
+        grown = jnp.abs(jnp.diff(x)) + jnp.abs(jnp.diff(relative(x)))
+        grown = jnp.append(jnp.zeros(1, dtype), jnp.cumsum(grown))
+        most = jnp.minimum(grown[-1], _STEEPEST) if end > 1 else grown[-1]
+        found.append(jnp.interp(most * jnp.arange(1, count + 1) / count, grown, x))
+    below, above = found
+    return jnp.concatenate([below[::-1], jnp.zeros(1, dtype), above])
+
+
+def loaded_equilibrium(curves: Sequence[LoadCurve | LoadTable], e: Array, W: Array) -> Array:
+    """e (m,) of joints with load curves at rest: e = `e` + W (1 + e - N/P), W (m, m).
+
+    `e` is that with linear springs, W what a missing load adds. N/P is convex, so Newton's method
+    comes down to the root from there.
+    """
+
+    def excess(at):
+        return jnp.stack([1 + x - curve(x) for curve, x in zip(curves, at, strict=True)])
+
+    def closer(at, _):
+        value, slope = jax.jvp(excess, (at,), (jnp.ones_like(at),))
+        matrix = jnp.eye(len(at), dtype=at.dtype) - W * slope[None]
+        return at - jnp.linalg.solve(matrix, at - e - W @ value), None
+
+    return jax.lax.scan(closer, e, length=_SETTLING)[0]

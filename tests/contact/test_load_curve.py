@@ -1,0 +1,146 @@
+"""The load curve dN/du = K_n(N): against its closed form for powers, and SciPy's integration."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import fractaljax as fj
+from fractaljax._contact.load_curve import tabulated
+from tools import both_modes
+
+MATERIAL = fj.Material(E=1.154e11, nu=0.3, sigma_y=3.55e8, H=9.94e8)
+P, K_N = 1907.3, 4e8
+TABLE = np.array([50.0, 300.0, 1200.0, 4000.0]), np.array([4e7, 1.6e8, 3e8, 7e8])
+
+
+def power_law(alpha):
+    loads = np.array([P / 10, 10 * P])
+    return fj.MeasuredContact(loads, K_N * (loads / P) ** alpha, P, 0.8)
+
+
+def persson(D: Any = 2.4, G: Any = 1.342e-10, load: Any = P, area: Any = 1e-3):
+    return fj.PerssonContact(fj.Surface(D, G), MATERIAL, load, area=area, L=1e-2, L_s=1e-6)
+
+
+@jax.jit
+def _at(law, N):
+    parts = {name: getattr(law, name) for name in ("surface", "material", "area", "L", "L_s")}
+    return fj.PerssonContact(P=N, **parts).stiffness(0.4, 0.3)[0]
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1 / 3, 0.5, 0.9])
+def test_powers(alpha):
+    """N = P (1 + (1 - alpha) e)^(1/(1 - alpha)): a constant spring, Hertz, and nearly exponential.
+
+    The slope is K_n(N), and the joint opens at u = -P/((1 - alpha) K_n).
+    """
+    law, opening = power_law(alpha), P / ((1 - alpha) * K_N)
+    loads = P * np.array([1e-4, 1e-2, 0.1, 0.5, 1.0, 2.0, 10.0, 30.0])
+    u = opening * ((loads / P) ** (1 - alpha) - 1)
+    np.testing.assert_allclose(law.load(u), loads, rtol=1e-9)
+    slopes = jax.vmap(jax.grad(law.load))(jnp.asarray(u))
+    np.testing.assert_allclose(slopes, K_N * (loads / P) ** alpha, rtol=1e-7)
+    np.testing.assert_array_equal(law.load(-opening * np.array([1.0000001, 1.5, 10.0])), 0.0)
+    assert float(law.load(0.0)) == pytest.approx(P, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("D", "G", "load", "area"),
+    [(2.1, 1e-10, P, 1e-3), (2.4, 1.342e-10, 1.0, 1e-3), (2.5, 1e-10, 1e5, 1e-3),
+     (2.7, 1e-10, P, 1e-4), (2.9, 1e-10, P, 1e-3), (2.4, 1.342e-10, 1e6, 1e-3)],
+)  # fmt: skip
+def test_persson(D, G, load, area):
+    """Beside SciPy's integration of du = dN/K_n from P, down to P/1000 and up to 8 P."""
+    law = persson(D, G, load, area)
+    logs = np.log(np.array([1e-3, 1e-2, 0.1, 0.5, 2.0, 5.0, 8.0]))
+
+    def by_log(log_n, u):
+        return [load * np.exp(log_n) / float(_at(law, load * np.exp(log_n)))]
+
+    for side in (logs[logs < 0][::-1], logs[logs > 0]):
+        found = solve_ivp(
+            by_log, (0.0, side[-1]), [0.0], "DOP853", t_eval=side, rtol=1e-11, atol=1e-25
+        )
+        np.testing.assert_allclose(
+            law.load(found.y[0]), load * np.exp(side), rtol=1e-8, atol=1e-8 * load
+        )
+
+
+@pytest.mark.parametrize("law", [persson(), persson(2.7, 1e-10, P, 1e-4), power_law(1 / 3)])
+def test_table(law):
+    """What motions look up: within 1e-9 P of the curve, its slope within 1e-8 K_n(P)."""
+    curve = law.load_curve(0.4, 0.3)
+    table = jax.tree.map(lambda leaf: leaf[..., None], tabulated(curve))
+    e = jnp.linspace(-1.2 * curve.opening, 6.0, 4001)
+    once = jnp.ones_like(e)
+    found, wanted = (jax.jvp(f, (e,), (once,)) for f in (table, curve))
+    np.testing.assert_allclose(found[0], wanted[0], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(found[1], wanted[1], rtol=1e-8, atol=1e-8)
+
+
+def test_measured_table():
+    """A table whose K_n has kinks at its loads; on one of them, between and beyond."""
+    for load in (1200.0, 700.0, 20.0, 9000.0):
+        law = fj.MeasuredContact(*TABLE, load, 0.8)
+        u = np.linspace(-1, 3, 9) * load / float(law.stiffness(0.4, 0.3)[0])
+
+        @jax.jit
+        def stiffness(N):
+            return fj.MeasuredContact(*TABLE, N, 0.8).stiffness(0.4, 0.3)[0]
+
+        for side in (u[u < 0][::-1], u[u > 0]):
+            found = solve_ivp(
+                lambda u, N: [float(stiffness(N[0]))], (0.0, side[-1]), [load], "DOP853",
+                t_eval=side, rtol=1e-11, atol=1e-10 * load, max_step=abs(side[-1]) / 100,
+            )  # fmt: skip
+            np.testing.assert_allclose(law.load(found.t), found.y[0], rtol=1e-6)
+
+
+def test_derivatives():
+    """By D, ln G, P, area and u in both modes, against differences of the load."""
+
+    def load(x):
+        law = persson(x[0], jnp.exp(x[1]), x[2], x[3])
+        return law.load(x[4])[None]
+
+    x = jnp.array([2.4, np.log(1.342e-10), P, 1e-3, -2e-7])
+    steps = np.array([1e-5, 1e-4, 1e-2, 1e-8, 1e-11])
+    program = jax.jit(lambda x: both_modes(load, x))
+    _, forward, reverse = program(x)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9)
+    for i, step in enumerate(steps):
+        ends = [float(program(x.at[i].add(sign * step))[0][0]) for sign in (1, -1)]
+        wanted = (ends[0] - ends[1]) / (2 * step)
+        np.testing.assert_allclose(forward[0, i], wanted, rtol=1e-6)
+
+
+def test_finite_everywhere():
+    """From 1 N to 1e6 N, D = 2.05 to 2.95: rising loads, finite with their derivatives."""
+    D, loads = jnp.array([2.05, 2.5, 2.95]), jnp.array([1.0, 1e3, 1e6])
+    e = jnp.linspace(-20.0, 40.0, 61)
+
+    def curve(D, load):
+        law = persson(D, 1e-11, load, 1e-3)
+        u = e * load / law.stiffness(0.4, 0.3)[0]
+        return law.load(u) / load
+
+    grid = jnp.meshgrid(D, loads)
+    values, slopes = jax.jit(jax.vmap(lambda D, P: (curve(D, P), jax.jacfwd(curve, (0, 1))(D, P))))(
+        *(x.ravel() for x in grid)
+    )
+    assert np.isfinite(values).all() and all(np.isfinite(x).all() for x in slopes)
+    assert (np.diff(values, axis=1) >= 0).all() and (values >= 0).all()
+
+
+def test_laws_without():
+    """The source's law, whose K_n ends above P = 0, and a table too steep to open."""
+    scene = fj.brake_scene()
+    for law in (scene.contact, power_law(1.2), fj.FixedContact(K_N, K_N, P)):
+        assert law.load_curve(0.4, 0.3) is None
+        with pytest.raises(ValueError, match="load needs a contact law with a load curve, got"):
+            law.load(1e-6)
+        assert not fj.Scene(law, scene.friction, scene.oscillator, True).follows_load_curve
