@@ -5,4 +5,4 @@ from pathlib import Path
 
 project = tomllib.loads(Path("pyproject.toml").read_text())["project"]
 needs = project["dependencies"] + project["optional-dependencies"]["test"]
-print(" ".join(need.replace(">=", "==") for need in needs))
+print(" ".join(need.split(";")[0].replace(">=", "==") for need in needs))
