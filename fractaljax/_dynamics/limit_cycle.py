@@ -12,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Float, ScalarLike
 from .._base.parts import concrete, number, raise_unless, require_kind, whole
 from .._base.quick import quick_jit
 from .._mechanism.mechanism import Mechanism
+from .._mechanism.quantities import joints_of
 from .._mechanism.scene import Scene
 from .._stability.stability import growth_rate
 from . import search
@@ -272,7 +273,8 @@ def limit_cycle(
     - `rtol`: relative tolerance of period and states, 1e-9 by default and at least 9.1e-13; in
       float32 both are 4.9e-4. It sets the number of segments.
     - `max_returns`: returns of the coarse run after which it gives up.
-    - `segments`: most pieces that the orbit is cut into, 64 by default; one return takes some 35.
+    - `segments`: most pieces that the orbit is cut into, 64 by default, and 512 where a joint
+      follows its load curve; one return takes some 35.
       Outside of compiled programs a longer period gets more; inside, the result says that it
       needs them.
     - `throw`: raise unless the result is `converged`. Otherwise `result` says what was found, and
@@ -289,6 +291,8 @@ def limit_cycle(
     tolerance = check_rtol(rtol, jnp.result_type(*jax.tree.leaves(given)))
     returns = jnp.asarray(whole("max_returns", max_returns, 1), float)
     count = _SEGMENTS if segments is None else whole("segments", segments, 16)
+    if segments is None and any(x.follows_load_curve for x in joints_of(mechanism).values()):
+        count *= 8  # towards an opening segments are short: less than a second compilation
     arguments = mechanism, start, excitation, returns
     cycle = _limit_cycle(*arguments, segments=count, rtol=tolerance)
     while segments is None and count < _MOST_SEGMENTS and _needs_more_segments(cycle, count):
