@@ -1,7 +1,7 @@
 """What every contact law gives, and what a joint asks of it."""
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -53,7 +53,9 @@ class Contact(Part):
         """N/P over K_n(P) u/P; None for a law that has no load curve."""
         return None if self.opening_exponent is None else _load_curve(self, mu_s, mu_m)
 
-    def load(self, u: ArrayLike, mu_s: ScalarLike = 0.0, mu_m: ScalarLike = 0.0) -> Numbers:
+    def load(
+        self, u: ArrayLike | Sequence[float], mu_s: ScalarLike = 0.0, mu_m: ScalarLike = 0.0
+    ) -> Numbers:
         """Normal force N [N] at the approach u [m] from the pressed rest, of any shape.
 
         dN/du = K_n(N) with N(0) = P, and 0 where the joint is open. The friction coefficients
@@ -62,7 +64,7 @@ class Contact(Part):
         **Raises:** `ValueError` for a law without a load curve.
         """
         law: Any = self
-        curve, u = law.load_curve(mu_s, mu_m), number("u", u)
+        curve, u = law.load_curve(mu_s, mu_m), number("u", jnp.asarray(u))
         if curve is None:
             raise ValueError(f"load needs a contact law with a load curve, got {brief(law)}")
         e = law.stiffness(mu_s, mu_m)[0] / law.P * u

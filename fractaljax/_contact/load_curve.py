@@ -17,9 +17,9 @@ from numpy.polynomial import chebyshev
 
 from .._base.parts import Numbers
 
-_LEAST, _MOST = 1 / 256, 32.0  # loads over P between which pieces lie; one more begins at 0
-_BELOW, _ABOVE = 4, 4  # pieces on either side of P
-_STEEPEST = 8.0  # e-folds of load and stiffness above P, beyond which the curve is straight
+_LEAST, _MOST = 1 / 256, 1024.0  # loads over P between which pieces lie; one more begins at 0
+_BELOW, _ABOVE = 4, 8  # pieces on either side of P
+_STEEPEST = 14.0  # e-folds of load and stiffness above P, beyond which the curve is straight
 _SAMPLES = 32  # of the stiffness, on either side, for the borders of the pieces
 _DEGREE = 16  # of the series of e in each piece
 _NEWTON = 10  # steps to its inverse
@@ -116,7 +116,7 @@ class LoadTable(eqx.Module):
 
 @jax.jit
 def tabulated(curve: LoadCurve) -> LoadTable:
-    """The table of a load curve; it departs from it by less than 1e-9 P."""
+    """The table of a load curve; it departs from it by less than 1e-11 of P or N."""
     opening, end = jax.lax.stop_gradient((curve.opening, curve.ends[-1]))
     spacing, at = _spaced(opening, end)
     middle, half = (at[1:] + at[:-1]) / 2, (at[1:] - at[:-1]) / 2
@@ -135,7 +135,7 @@ def _row_number(d, spacing) -> Array:
 
 def _spaced(opening, end) -> tuple[Array, Array]:
     """The spacing of the rows between the distances 0 and `end`, and where they meet (r + 1,)."""
-    low, high, growth = _FINEST * opening, end + 0.01 * (end - opening), 12 / end
+    low, high, growth = _FINEST * opening, end + 0.001 * (end - opening), 12 / end
     step = _row_number(end, (low, high, growth, 1)) / _ROWS
     spacing = jnp.stack([low, high, growth, step])
     wanted = jnp.arange(_ROWS + 1, dtype=end.dtype)
@@ -161,8 +161,8 @@ def load_curve(
 
     `opening_exponent` is alpha in K_n ~ N^alpha as N vanishes, from 0 to below 1: otherwise the
     approach at which the joint opens would be infinite. `borders` are loads [N] between which K_n
-    is smooth; by default it is everywhere. Above 32 P, or where load and stiffness have grown by
-    e^8, the curve goes on straight.
+    is smooth; by default it is everywhere. Above 1024 P, or where load and stiffness have grown by
+    e^14, the curve goes on straight.
     """
     own, dtype = stiffness(P), P.dtype
 
