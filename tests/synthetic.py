@@ -74,3 +74,12 @@ def traced(z, dx, radius):
         under = z[first + k : last + k] - (k * dx) ** 2 / (2 * radius)
         np.maximum(seen[first:last], under, out=seen[first:last])
     return seen
+
+
+def rough(shape, seed=0, rms=3e-7, slope=1.8):
+    """Heights [m] of random phases, periodic."""
+    noise = np.fft.rfft2(np.random.default_rng(seed).normal(size=shape))
+    x, y = np.fft.fftfreq(shape[0]) * shape[0], np.fft.rfftfreq(shape[1]) * shape[1]
+    q = np.hypot(x[:, None], y)
+    z = np.fft.irfft2(noise * np.where(q > 0, np.maximum(q, 1) ** -slope, 0), s=shape)
+    return z * rms / z.std()

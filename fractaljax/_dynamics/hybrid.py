@@ -9,7 +9,7 @@ or 2 (open, both faces of a joint together). Components are the first axis; lane
 
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -145,28 +145,25 @@ class HybridSystem(eqx.Module):
 
     def normal_forces(self, linear) -> Array:
         """Those of the joints (m, ...) whose faces have the loads (f, ...) by linear springs."""
-        found = []
-        for faces, curve in zip(self.faces, self.curves, strict=True):
-            load = linear[faces[0]]
-            if curve is not None:
-                P = self._leaf(self.P[faces[0]], load.ndim)
-                load = P * self._curve(curve, load.ndim)(load / P - 1)
-            found.append(load)
+        found = [linear[faces[0]] for faces in self.faces]
+        for j, P, e, curve in self._on_curves(linear):
+            found[j] = P * curve(e)
         return jnp.stack(found)
 
-    def _curve(self, curve: LoadTable, lanes: int) -> LoadTable:
-        """A load curve with the axes of lanes."""
-        return jax.tree.map(lambda leaf: self._leaf(leaf, lanes), curve)
+    def _on_curves(self, linear) -> Iterator[tuple[int, Array, Array, LoadTable]]:
+        """The joints that follow a load curve: number, P, e = (L x)/P, and the curve, by lanes."""
+        for j, (faces, curve) in enumerate(zip(self.faces, self.curves, strict=True)):
+            if curve is not None:
+                leaf = functools.partial(self._leaf, lanes=linear.ndim - 1)
+                P = leaf(self.P[faces[0]])
+                yield j, P, linear[faces[0]] / P - 1, jax.tree.map(leaf, curve)
 
     def closures(self, x) -> Array:
         """What falls through 0 where a joint opens (m, ...), linear in x [load]."""
-        linear, found = self.linear_loads(x), []
-        for faces, curve in zip(self.faces, self.curves, strict=True):
-            load = linear[faces[0]]
-            if curve is not None:
-                P = self._leaf(self.P[faces[0]], load.ndim)
-                load = P + (load - P) / self._leaf(curve.opening, load.ndim)
-            found.append(load)
+        linear = self.linear_loads(x)
+        found = [linear[faces[0]] for faces in self.faces]
+        for j, P, e, curve in self._on_curves(linear):
+            found[j] = P + P * e / curve.opening
         return jnp.stack(found)
 
     def sliding(self, u) -> Array:
@@ -195,10 +192,9 @@ class HybridSystem(eqx.Module):
             # K holds the spring of the preload: what the load curve lacks is added.
             linear = self.linear_loads(x)
             rows = list(friction)
-            joints = zip(self.faces, self.curves, self.normal_forces(linear), strict=True)
-            for faces, curve, force in joints:
-                if curve is not None:
-                    rows[faces[1]] = rows[faces[1]] + linear[faces[0]] - force
+            for j, P, e, curve in self._on_curves(linear):
+                tangential, normal = self.faces[j]
+                rows[normal] = rows[normal] + linear[tangential] - P * curve(e)
             friction = jnp.stack(rows)
         if s is not None and any(self.opens):
             # An open joint has no springs: their forces, which K holds, are taken back.
@@ -320,18 +316,13 @@ class HybridSystem(eqx.Module):
         """
         x, u = y[: self.n], y[self.n :]
         linear, by_time, most = self.linear_loads(x), self._times(self.L, u), jnp.zeros_like(x[0])
-        for faces, curve in zip(self.faces, self.curves, strict=True):
-            if curve is None:
-                continue
-            tangential, normal = faces
-            load, lanes = linear[tangential], x.ndim - 1
-            P, of = self._leaf(self.P[tangential], lanes), self._curve(curve, lanes)
-            e = load / P - 1
-            _, slope = jax.jvp(of, (e,), (jnp.ones_like(e),))
+        for j, P, e, curve in self._on_curves(linear):
+            tangential, normal = self.faces[j]
+            _, slope = jax.jvp(curve, (e,), (jnp.ones_like(e),))
             away = jnp.zeros((len(linear), *e.shape), e.dtype).at[normal].set(1)
             added = self._times(self.L, self._acceleration(away))[tangential] * (slope - 1)
             stiffer = jnp.sqrt(jnp.where(added > 0, added, 0)) / 2
-            way = jnp.abs(e + of.opening) + _SMOOTH * of.opening
+            way = jnp.abs(e + curve.opening) + _SMOOTH * curve.opening
             nearing = jnp.where(s[tangential] == OPEN, 0, jnp.abs(by_time[tangential] / P) / way)
             most = jnp.maximum(most, jnp.maximum(stiffer, closing * nearing))
         return most
@@ -355,16 +346,16 @@ class HybridSystem(eqx.Module):
         new = jnp.where(ended, after.astype(s.dtype), s)
         exact = ended | (s == 0) | (new == 0)
         k, x, u, parts = 1 + 2 * f, y[: self.n], y[self.n :], list(new)
-        for faces, opens in zip(self.faces, self.opens, strict=True):
+        for j, (faces, opens) in enumerate(zip(self.faces, self.opens, strict=True)):
             if opens:
-                tangential, normal = faces
+                tangential = faces[0]
                 closes = (guard == k) & (s[tangential] == OPEN)
                 changes = guard == k
                 w = self.sliding(u)
                 for i in faces:
                     slips = jnp.where(closes, jnp.where(w[i] < 0, -1, 1), OPEN)
                     parts[i] = jnp.where(changes, slips.astype(s.dtype), parts[i])
-                x = self._without_load(x, tangential, normal, changes)
+                x = self._without_load(x, j, changes)
                 k += 1
         new = jnp.stack(parts)
         # To rounding, the velocity of a face that sticks or starts to slip is the belt's.
@@ -409,9 +400,9 @@ class HybridSystem(eqx.Module):
 
         return jax.lax.while_loop(going, pivot, (s, jnp.array(True), 0))[0]
 
-    def _without_load(self, x, tangential, normal, where) -> Array:
+    def _without_load(self, x, j: int, where) -> Array:
         """x moved along the normal of a joint to where its normal force is 0."""
-        j = [faces[0] for faces in self.faces].index(tangential)
+        tangential, normal = self.faces[j]
         load = self.closures(x)[j]
         unit = jnp.zeros((len(self.P), *x.shape[1:]), x.dtype).at[normal].set(1)
         away = self._acceleration(unit)

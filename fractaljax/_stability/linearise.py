@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.parts import flag
@@ -62,15 +61,14 @@ def linearised_at(scene: Scene, at: Pressed, friction_slope: bool) -> Linearised
     return linearise(o, law, at.K_n, at.K_t, friction_slope, load, at.rest)
 
 
-def normal_force(scene: Scene) -> Float[Array, " 1"] | None:
+def normal_force(scene: Scene, at: Pressed) -> Float[Array, " 1"] | None:
     """The normal force [N] at the equilibrium, if the scene is preloaded; at most 0: it is open."""
     if scene.normal_load is None:
         return None
-    K_n, K_t, rest = pressed(scene)
-    if rest is not None:
-        return rest[1][None]
+    if at.rest is not None:
+        return at.rest[1][None]
     mu, P = sliding_friction(scene), scene.normal_load
-    return static_normal_force(scene.oscillator, K_n, K_t, mu, P)[None]
+    return static_normal_force(scene.oscillator, at.K_n, at.K_t, mu, P)[None]
 
 
 def _curve_of(joint: Any) -> LoadCurve:
@@ -153,10 +151,7 @@ def assembled(structure: Structure, friction_slope: bool, refuse: bool = True) -
         mu = joint.coefficient()
         t = jnp.asarray(structure.direction(joint.tangential))
         n = None if joint.normal is None else jnp.asarray(structure.direction(joint.normal))
-        K = K + K_t * jnp.outer(t, t)
-        if n is not None:
-            K = K + K_n * jnp.outer(n, n)
-            K = K - mu * K_n * jnp.outer(t, n) + mu * K_t * jnp.outer(n, t)
+        K = _with_joint(K, K_n, K_t, mu, t, n)
         if P is not None:
             F = F + mu * P * t
         slopes = sloping and joint.friction.velocity_dependent
@@ -205,6 +200,15 @@ def assembled(structure: Structure, friction_slope: bool, refuse: bool = True) -
     return found._replace(C=C, K=K)
 
 
+def _with_joint(K, K_n, K_t, mu, t, n) -> Array:
+    """K (n, n) with the springs of a joint and their friction."""
+    K = K + K_t * jnp.outer(t, t)
+    if n is None:
+        return K
+    K = K + K_n * jnp.outer(n, n)
+    return K - mu * K_n * jnp.outer(t, n) + mu * K_t * jnp.outer(n, t)
+
+
 def _tangents(structure: Structure, F) -> tuple[list[tuple[Array, Array, Array | None]], Array]:
     """(K_n, K_t, P) of each joint, with the tangent P + K_n n.x to a load curve at equilibrium.
 
@@ -217,15 +221,14 @@ def _tangents(structure: Structure, F) -> tuple[list[tuple[Array, Array, Array |
     K, pushes, total = structure.K, [], F
     for joint, (K_n, K_t, P) in zip(structure.joints, found, strict=True):
         mu, t = joint.coefficient(), jnp.asarray(structure.direction(joint.tangential))
-        n = np.zeros(structure.n) if joint.normal is None else structure.direction(joint.normal)
-        n = jnp.asarray(n, t.dtype)
-        K = K + K_t * jnp.outer(t + mu * n, t) + K_n * jnp.outer(n - mu * t, n)
+        n = None if joint.normal is None else jnp.asarray(structure.direction(joint.normal))
+        K = _with_joint(K, K_n, K_t, mu, t, n)
         total = total if P is None else total + mu * P * t
-        pushes.append((n, n - mu * t))
-    normals = jnp.stack([pushes[i][0] for i in curved])
+        pushes.append(None if n is None else (n, n - mu * t))
+    normals, lacking = (jnp.stack(x) for x in zip(*(pushes[i] for i in curved), strict=True))
     K_n, P = (jnp.stack([jnp.asarray(found[i][k]) for i in curved])[:, None] for k in (0, 2))
     # What the loads lack, one a column.
-    columns = jnp.stack([pushes[i][1] for i in curved], axis=1) * P.T
+    columns = (lacking * P).T
     solved = jnp.linalg.solve(K, jnp.concatenate([total[:, None], columns], axis=1))
     solved = K_n / P * normals @ solved
     curves = [_curve_of(structure.joints[i]) for i in curved]

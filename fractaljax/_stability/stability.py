@@ -19,7 +19,7 @@ from .._mechanism.quantities import sliding_friction
 from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
 from . import quartic
-from .linearise import assembled, linearised, normal_force, pressed
+from .linearise import assembled, linearised, linearised_at, normal_force, pressed
 from .margin import damping_ratios, least_damping_ratio, margin_of
 from .quadratic import solve
 
@@ -154,10 +154,10 @@ def stability(scene: Scene | Structure, friction_slope: bool = True) -> Stabilit
         s, x, error = s[order], x[order], error[order]
         margin, names = least_damping_ratio(s), scene.names
     else:
-        K_n, K_t, _ = pressed(scene)
-        lin, forces = linearised(scene, friction_slope), normal_force(scene)
-        s = quartic.roots(lin)
-        x = _displacements(lin, s, sliding_friction(scene) / scene.oscillator.m, K_n, K_t)
+        joint = pressed(scene)
+        lin, forces = linearised_at(scene, joint, friction_slope), normal_force(scene, joint)
+        s, mobility = quartic.roots(lin), sliding_friction(scene) / scene.oscillator.m
+        x = _displacements(lin, s, mobility, joint.K_n, joint.K_t)
         error, margin, names = quartic.resolutions(lin, s), margin_of(lin), ("x1", "x2")
     largest = jnp.abs(jax.lax.stop_gradient(x)).argmax(axis=1)
     return Stability(
@@ -207,11 +207,11 @@ def require_computable(
         raise ValueError(
             f"the joint is open at its equilibrium: the normal force is {force[0]:.6g} N"
         )
-    K_n, K_t, _ = pressed(scene)
-    lin = linearised(scene, friction_slope)
+    joint = pressed(scene)
+    lin = linearised_at(scene, joint, friction_slope)
     found = {
-        "K_n [N/m]": K_n,
-        "K_t [N/m]": K_t,
+        "K_n [N/m]": joint.K_n,
+        "K_t [N/m]": joint.K_t,
         "the friction at V": sliding_friction(scene),
         "(K_t/m + omega_1^2) [1/s^2]": lin.a,
         "(K_n/m + omega_2^2) [1/s^2]": lin.b,

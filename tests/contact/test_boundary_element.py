@@ -10,21 +10,13 @@ import pytest
 from scipy.optimize import minimize
 
 import fractaljax as fj
+from synthetic import rough
 
 MATERIAL = fj.Material(E=1.154e11, nu=0.3, sigma_y=3.55e8, H=9.94e8)
 E, H = float(MATERIAL.E), float(MATERIAL.H)
 DX = 1e-5
 KINDS = fj.BoundaryElementResult
 tight = partial(fj.boundary_element, rtol=1e-12)
-
-
-def rough(shape, seed=0, rms=3e-7, slope=1.8):
-    """Heights [m] of random phases."""
-    noise = np.fft.rfft2(np.random.default_rng(seed).normal(size=shape))
-    x, y = np.fft.fftfreq(shape[0]) * shape[0], np.fft.rfftfreq(shape[1]) * shape[1]
-    q = np.hypot(x[:, None], y)
-    z = np.fft.irfft2(noise * np.where(q > 0, np.maximum(q, 1) ** -slope, 0), s=shape)
-    return z * rms / z.std()
 
 
 def load(heights, fraction):

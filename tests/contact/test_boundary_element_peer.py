@@ -6,20 +6,12 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
+from synthetic import rough
 
 tamaas: Any = pytest.importorskip("tamaas", reason="Tamaas has wheels for Linux on x86-64 alone")
 
 MATERIAL = fj.Material(E=1.154e11, nu=0.3, sigma_y=3.55e8, H=9.94e8)
 DX, E = 1e-5, 1.154e11
-
-
-def rough(shape, seed=0):
-    """Heights [m] of random phases."""
-    noise = np.fft.rfft2(np.random.default_rng(seed).normal(size=shape))
-    x, y = np.fft.fftfreq(shape[0]) * shape[0], np.fft.rfftfreq(shape[1]) * shape[1]
-    q = np.hypot(x[:, None], y)
-    z = np.fft.irfft2(noise * np.where(q > 0, np.maximum(q, 1) ** -1.8, 0), s=shape)
-    return z * 3e-7 / z.std()
 
 
 def peer(heights, mean):

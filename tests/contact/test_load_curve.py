@@ -9,6 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import fractaljax as fj
+from fractaljax._base.parts import substitute
 from fractaljax._contact.load_curve import tabulated
 from tools import both_modes
 
@@ -28,8 +29,7 @@ def persson(D: Any = 2.4, G: Any = 1.342e-10, load: Any = P, area: Any = 1e-3):
 
 @jax.jit
 def _at(law, N):
-    parts = {name: getattr(law, name) for name in ("surface", "material", "area", "L", "L_s")}
-    return fj.PerssonContact(P=N, **parts).stiffness(0.4, 0.3)[0]
+    return substitute(law, {"P": N}).stiffness(0.4, 0.3)[0]
 
 
 @pytest.mark.parametrize("alpha", [0.0, 1 / 3, 0.5, 0.9])
@@ -89,13 +89,9 @@ def test_measured_table():
         law = fj.MeasuredContact(*TABLE, load, 0.8)
         u = np.linspace(-1, 3, 9) * load / float(law.stiffness(0.4, 0.3)[0])
 
-        @jax.jit
-        def stiffness(N):
-            return fj.MeasuredContact(*TABLE, N, 0.8).stiffness(0.4, 0.3)[0]
-
         for side in (u[u < 0][::-1], u[u > 0]):
             found = solve_ivp(
-                lambda u, N: [float(stiffness(N[0]))], (0.0, side[-1]), [load], "DOP853",
+                lambda u, N, law=law: [float(_at(law, N[0]))], (0.0, side[-1]), [load], "DOP853",
                 t_eval=side, rtol=1e-11, atol=1e-10 * load, max_step=abs(side[-1]) / 100,
             )  # fmt: skip
             np.testing.assert_allclose(law.load(found.t), found.y[0], rtol=1e-6)
