@@ -1,7 +1,7 @@
-"""The `fractaljax` command: design, stability, cycle, map, contact, identify, scene."""
+"""The `fractaljax` command and its list of commands."""
 
 import contextlib
-import logging
+import gc
 import os
 import signal
 import sys
@@ -11,17 +11,20 @@ from ._cli.commands import add_cycle, add_scene, add_stability
 from ._cli.compiled import keep_compiled
 from ._cli.contact import add_contact
 from ._cli.design import add_design
+from ._cli.explore import add_explore
 from ._cli.identify import add_identify
 from ._cli.map import add_map
 from ._cli.parsing import Parser, reason, refuse
+from ._cli.reduce import add_reduce
+from ._cli.validate import add_validate
 from ._version import __version__
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; returns its exit status.
 
-    0, or 1 for an infeasible design, no limit cycle or a surface that is not fractal, or 2 for bad
-    input, or 128 plus the number of the signal that ended it.
+    0, or 1 for an infeasible design, no limit cycle, a surface that is not fractal or a published
+    number that is not met, or 2 for bad input, or 128 plus the number of the signal that ended it.
     """
     parser = Parser(prog="fractaljax", description="From a machined surface to a stable mechanism.")
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
@@ -30,21 +33,23 @@ def main(argv: list[str] | None = None) -> int:
         add_design,
         add_stability,
         add_cycle,
+        add_reduce,
         add_map,
+        add_explore,
         add_contact,
         add_identify,
+        add_validate,
         add_scene,
     ):
         add(commands)
     arguments = parser.parse_args(argv)
     import jax
 
+    # A tenth of a command was a search for garbage among the modules, which stay.
+    gc.set_threshold(50_000, 20, 50)
     jax.config.update("jax_enable_x64", True)
-    keep_compiled()
-    # A failed check of a compiled program is reported below; JAX would log its traceback too.
-    logging.getLogger("jax._src.callback").setLevel(logging.CRITICAL)
     try:
-        with _terminable():
+        with keep_compiled(), _terminable():
             status = arguments.run(arguments)
         if sys.stdout is not None:  # None where it was closed from the start
             sys.stdout.flush()

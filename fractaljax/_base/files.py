@@ -15,7 +15,10 @@ def read_bounded(path: str | os.PathLike, most: int = 10_000_000) -> bytes:
     **Raises:** `OSError` if it cannot be read; `ValueError` if there is more: /dev/zero never ends.
     """
     with open(path, "rb") as file:
-        content = file.read(most + 1) if os.fstat(file.fileno()).st_size <= most else None
+        size = os.fstat(file.fileno()).st_size  # 0 of a pipe
+        content = file.read(size + 1) if size <= most else None
+        if content is not None and len(content) > size:
+            content += file.read(most + 1 - len(content))  # which takes that memory at once
     if content is None or len(content) > most:
         raise ValueError(f"the file is larger than {most / 1e6:g} MB, the most that is read")
     return content

@@ -41,8 +41,16 @@ def read_npy(content: bytes, name: str) -> np.ndarray:
 def read_npz(content: bytes, most: int) -> dict[str, np.ndarray]:
     """The arrays in the bytes of a .npz file, by name, of at most `most` bytes in total.
 
-    **Raises:** `ValueError` as `read_npy`, and if the archive is damaged, encrypted, too large or
-    holds two arrays of one name.
+    **Raises:** `ValueError` as `read_npy` and `read_members`.
+    """
+    return {name: read_npy(member, name) for name, member in read_members(content, most).items()}
+
+
+def read_members(content: bytes, most: int) -> dict[str, bytes]:
+    """The .npy files in the bytes of a .npz file, by name, of at most `most` bytes in total.
+
+    **Raises:** `ValueError` if the archive is damaged, encrypted, too large or holds two arrays of
+    one name.
     """
     members = {}
     try:
@@ -65,7 +73,7 @@ def read_npz(content: bytes, most: int) -> dict[str, np.ndarray]:
         raise
     except Exception as error:  # each decompressor has its own kind
         raise _unsound(error) from None
-    return {name: read_npy(member, name) for name, member in members.items()}
+    return members
 
 
 def _unsound(error: Exception) -> ValueError:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 Numbers = Float[Array, "..."]  # of one scene, or of a batch of any shape
 _PartT = TypeVar("_PartT", bound="Part")
@@ -34,7 +34,7 @@ def number(
     """`value` as a floating-point array of any shape, checked against its domain.
 
     `above` and `below` are strict. NaN and infinity are always refused. A concrete value raises
-    with its name, the bound and the value; a traced one raises when the compiled program runs.
+    with its name, the bound and the value; a traced one becomes NaN (`nan_where`).
 
     **Raises:** `TypeError` unless `value` is real and numeric; `ValueError` outside the domain.
     """
@@ -54,7 +54,7 @@ def number(
 
     values = concrete(array)
     if values is None:
-        return eqx.error_if(array, outside(array), f"{name} must be {wanted}")
+        return nan_where(outside(array), array)
     bad = values[outside(values)]
     if bad.size:
         raise ValueError(f"{name} must be {wanted}, got {bad.flat[0].item()!r}")
@@ -90,7 +90,8 @@ def ordered(name: str, value: Numbers, other_name: str, other: Numbers) -> Numbe
     """`value`, refused as in `number` unless it is at least `other` everywhere."""
     values, others = concrete(value), concrete(other)
     if values is None or others is None:
-        return eqx.error_if(value, value < other, f"{name} must be at least {other_name}")
+        below = value < other
+        return nan_where(below if below.shape == value.shape else below.any(), value)
     values, others = np.broadcast_arrays(values, others)
     if (below := values < others).any():
         got, bound = values[below][0].item(), others[below][0].item()
@@ -132,11 +133,40 @@ def concrete(array: jax.Array) -> np.ndarray | None:
     return None if isinstance(primal, Tracer) else np.asarray(primal)
 
 
+def nan_where(bad: Bool[ArrayLike, "..."], tree: Any) -> Any:
+    """`tree` with NaN for its numbers where they are `bad`; one by one if that has their shape.
+
+    So a traced value is refused. Raising would take a callback to the host, at which a GPU stops
+    whenever the program runs, and one bad member would end a whole batch.
+    """
+
+    def spoilt(x):
+        if not eqx.is_inexact_array(x):
+            return x
+        # A product, so that derivatives are NaN too: those of a choice would be 0.
+        factor = jnp.where(bad, jnp.nan, 1).astype(x.real.dtype)
+        if jnp.iscomplexobj(x):
+            return jax.lax.complex(x.real * factor, x.imag * factor)
+        return x * factor
+
+    return jax.tree.map(spoilt, tree)
+
+
+def refused(tree: Any) -> Bool[Array, ""] | None:
+    """Whether a traced number in it was refused, and is NaN; None if nothing is traced."""
+    traced = [x for x in jax.tree.leaves(tree) if isinstance(x, Tracer) and concrete(x) is None]
+    found = [jnp.isnan(x).any() for x in traced if eqx.is_inexact_array(x)]
+    return functools.reduce(operator.or_, found) if found else None
+
+
 def raise_unless(wanted: Any, outcome: Any) -> Any:
-    """`outcome` if its `result` is the member `wanted`; else `RuntimeError` with its message."""
+    """`outcome` if its `result` is the member `wanted`; else `RuntimeError` with its message.
+
+    Of a traced one the numbers become NaN, and `result` stays.
+    """
     result = outcome.result
     if concrete(result._value) is None:
-        return result.error_if(outcome, result != wanted)
+        return nan_where(result != wanted, outcome)
     if bool(result != wanted):
         raise RuntimeError(result._enumeration[result])
     return outcome

@@ -2,11 +2,11 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.core import Tracer
+
+from .kept import is_traced, kept
 
 # Of XLA on CPU. A program that runs many times is slower with them, by up to two thirds.
 _OPTIONS = {
@@ -28,15 +28,25 @@ def _available() -> bool:
     return True
 
 
-def quick_jit(function: Callable, **given: Any) -> Callable:
+def quick_jit(function: Callable, static_argnames: str | tuple[str, ...] = ()) -> Callable:
     """`jax.jit`, compiled quickly where it is the outermost program: only there JAX has options."""
-    plain = jax.jit(function, **given)
-    quick = jax.jit(function, compiler_options=_OPTIONS, **given)
+    plain, outermost = _jitted(function, static_argnames)
 
-    @functools.wraps(function)
+    @functools.wraps(plain)
     def call(*args, **kwargs):
-        within = any(isinstance(x, Tracer) for x in jax.tree.leaves((args, kwargs)))
-        within = within or isinstance(jnp.zeros(()), Tracer)
-        return (quick if not within and _available() else plain)(*args, **kwargs)
+        return (plain if is_traced(args, kwargs) else outermost())(*args, **kwargs)
 
-    return call
+    return kept(call, static_argnames, outermost)
+
+
+def command_jit(function: Callable, static_argnames: str | tuple[str, ...] = ()) -> Callable:
+    """`jax.jit`; a command, which runs the program a few times, compiles it quickly."""
+    plain, outermost = _jitted(function, static_argnames)
+    return kept(plain, static_argnames, outermost)
+
+
+def _jitted(function, static_argnames) -> tuple[Callable, Callable[[], Callable]]:
+    """The function jitted, and what gives the same compiled quickly, where options allow it."""
+    plain = jax.jit(function, static_argnames=static_argnames)
+    quick = jax.jit(function, static_argnames=static_argnames, compiler_options=_OPTIONS)
+    return plain, lambda: quick if _available() else plain

@@ -1,6 +1,8 @@
-"""Ranges of a quantity, and the axis they are sampled and shown on."""
+"""Ranges of a quantity, the axis they are sampled and shown on, and points that fill them."""
 
 from typing import Any
+
+import numpy as np
 
 
 def is_logarithmic(low: float, high: float) -> bool:
@@ -16,3 +18,16 @@ def within(low: float, high: float, at: Any) -> Any:
     if is_logarithmic(low, high):
         return low ** (1 - at) * high**at
     return low * (1 - at) + high * at
+
+
+def low_discrepancy(count: int, dimensions: int) -> np.ndarray:
+    """Points (count, dimensions) that fill the unit cube evenly: a lattice of one generator.
+
+    Its steps are powers of 1/g with g^dimensions = g + 1, as in R. Roberts' sequence; in the plane
+    it is the Fibonacci lattice.
+    """
+    i, g = np.arange(count), 2.0
+    for _ in range(50):
+        g = (1 + g) ** (1 / dimensions)
+    steps = [1, *np.round(count * g ** -np.arange(1.0, dimensions))]
+    return np.stack([(step * i % count + 0.5) / count for step in steps], axis=1)

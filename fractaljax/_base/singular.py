@@ -1,6 +1,7 @@
 """Functions with a removable or a genuine singular point, safe there in value and derivative.
 
 Each takes any shape, and is jitted so that a program that calls one many times traces it once.
+NaN, which a traced value outside its domain becomes, stays NaN: hence `~(x <= 0)`.
 """
 
 import math
@@ -59,7 +60,7 @@ def positive_cbrt(x: Numbers) -> Numbers:
 
     The true derivative is infinite at 0 from above: it grows without bound as x -> 0+.
     """
-    inside = x > 0
+    inside = ~(x <= 0)
     x = jnp.where(inside, x, 1)
     root = jnp.cbrt(x)
     # Compiled as exp(log(x)/3) it loses two digits far from 1; one Newton step restores them.
@@ -68,7 +69,7 @@ def positive_cbrt(x: Numbers) -> Numbers:
 
 @jax.jit
 def _positive_cbrt_slope(x):
-    inside = x > 0
+    inside = ~(x <= 0)
     x = jnp.where(inside, x, 1)
     return jnp.where(inside, positive_cbrt(x) / x / 3, 0)
 
@@ -79,7 +80,7 @@ positive_cbrt.defjvps(lambda dx, value, x: dx * _positive_cbrt_slope(x))
 @jax.jit
 def positive_sqrt(x: Numbers) -> Numbers:
     """Square root of max(x, 0); value and derivative are exactly 0 for x <= 0."""
-    inside = x > 0
+    inside = ~(x <= 0)
     return jnp.where(inside, jnp.sqrt(jnp.where(inside, x, 1)), 0)
 
 

@@ -11,13 +11,16 @@ FIRST_QUIET_JAX = (0, 10, 2)
 _FOLDER = "jax_compilation_cache_dir"  # the setting
 
 
-def keep_compiled() -> None:
+@contextlib.contextmanager
+def keep_compiled():
     """Let JAX cache compiled programs in the user's cache folder, or in JAX_COMPILATION_CACHE_DIR.
 
-    Without a folder that can be written, or with a JAX before 0.10.2, there is no cache. That is
-    never an error.
+    Within the context whole programs are kept there too (`kept.py`). Without a folder that can be
+    written, or with a JAX before 0.10.2, there is no cache. That is never an error.
     """
     import jax
+
+    from .._base.kept import keep_in
 
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
     if getattr(jax.config, _FOLDER) is None and jax.__version_info__ >= FIRST_QUIET_JAX:
@@ -27,6 +30,14 @@ def keep_compiled() -> None:
             if os.access(folder, os.W_OK | os.X_OK):
                 jax.config.update(_FOLDER, str(folder))
                 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    given = getattr(jax.config, _FOLDER)
+    if given is not None and jax.__version_info__ >= FIRST_QUIET_JAX:
+        with contextlib.suppress(OSError):
+            keep_in(Path(given) / "programs")
+    try:
+        yield
+    finally:
+        keep_in(None)
 
 
 def _cache_folder() -> Path:

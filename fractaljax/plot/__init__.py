@@ -1,35 +1,11 @@
 """Pictures: each function takes a result and an optional Axes, and returns the Axes.
 
 Without an Axes it makes a new figure, outside pyplot and its global state: `ax.figure`, which
-Jupyter shows as the last expression of a cell. `cycle`, `cycles`, `modes`, `stiffness`, `laws` and
-`topographies` fill a figure of their own and return it.
+Jupyter shows as the last expression of a cell. `cycle`, `cycles`, `modes`, `mode_tracks`,
+`stiffness`, `laws`, `topographies` and `validation` fill a figure of their own and return it.
 """
 
-from .axes import new_figure as new_figure
-from .basin import basin as basin
-from .bifurcation import bifurcation_map as bifurcation_map
-from .boundary import boundary as boundary
-from .branch import branch as branch
-from .curves import (
-    curves as curves,
-    stiffness as stiffness,
-    stiffness_curves as stiffness_curves,
-)
-from .cycle import cycle as cycle, phase_portrait as phase_portrait, spectrum as spectrum
-from .cycles import amplitudes as amplitudes, cycles as cycles
-from .design import design as design, stability_map as stability_map
-from .distribution import distribution as distribution
-from .identification import (
-    identification as identification,
-    power_spectrum as power_spectrum,
-)
-from .laws import law_curves as law_curves, laws as laws
-from .maps import frequency_map as frequency_map, growth_map as growth_map
-from .modes import (
-    mode_lines as mode_lines,
-    mode_surfaces as mode_surfaces,
-    modes as modes,
-)
-from .pareto import pareto as pareto
-from .topography import topographies as topographies, topography as topography
-from .trajectory import trajectory as trajectory
+from .._base.lazy import make_lazy
+
+make_lazy(__name__)
+del make_lazy

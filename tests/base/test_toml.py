@@ -33,7 +33,7 @@ def test_every_value_is_read_back():
         ("D = 2.4", "D = inf", "[contact.surface] D must be above 2"),
         ("D = 2.4", "", "[contact.surface] lacks the key 'D'"),
         ("D = 2.4", "D = 2.4\nE = 1.0", "[contact.surface] has the unknown key 'E'; known are D"),
-        ('law = "fractal"', 'law = "hertz"', '[contact] law must be "fractal" or "persson" or'),
+        ('law = "fractal"', 'law = "hertz"', '[contact] law must be "fractal" or "asperity" or'),
         ('law = "fractal"', "law = [1]", '[contact] law must be "fractal" or'),
         ('law = "fractal"', "", '[contact] law must be "fractal" or'),
         (

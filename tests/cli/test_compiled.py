@@ -6,6 +6,7 @@ import stat
 import jax
 import pytest
 
+from fractaljax._base import kept
 from fractaljax._cli.compiled import FIRST_QUIET_JAX, keep_compiled
 
 SETTINGS = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
@@ -25,12 +26,15 @@ def unset(monkeypatch):
 
 def test_private_folder_of_the_user(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    keep_compiled()
     folder = tmp_path / "cache" / "fractaljax" / "compiled"
+    with keep_compiled():
+        assert kept._folder == folder / "programs"
+    assert kept._folder is None  # of a process that does more than one command
     assert [getattr(jax.config, name) for name in SETTINGS] == [str(folder), 0]
     assert stat.S_IMODE(os.stat(folder).st_mode) == 0o700
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))  # one that is set stays
-    keep_compiled()
+    with keep_compiled():
+        assert kept._folder == tmp_path / "programs"
     assert getattr(jax.config, SETTINGS[0]) == str(tmp_path)
 
 
@@ -46,5 +50,5 @@ def test_no_folder(tmp_path, monkeypatch, why):
         monkeypatch.setattr("pathlib.Path.home", nowhere)
     if why.startswith("a JAX"):
         monkeypatch.setattr("jax.__version_info__", (0, 10, 1))
-    keep_compiled()
-    assert getattr(jax.config, SETTINGS[0]) is None
+    with keep_compiled():
+        assert getattr(jax.config, SETTINGS[0]) is None is kept._folder

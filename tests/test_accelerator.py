@@ -1,0 +1,152 @@
+"""What a GPU would run: it lowers for CUDA, and nowhere calls back to the host."""
+
+import inspect
+import re
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import export
+
+import fractaljax as fj
+from fractaljax._design import problem
+from fractaljax._dynamics import basin, itinerary
+from fractaljax._stability import boundary, tracks
+from fractaljax._sweep import batches
+from programs import BRAKE, PROGRAMS, STRUCTURE
+from tools import primitives
+
+# Calls of libraries of NVIDIA's, which stay on the device.
+ON_DEVICE = {
+    "cu_lu_pivots_to_permutation",
+    "cublas_trsm_ffi",
+    "cusolver_getrf_ffi",
+    "cusolver_potrf_ffi",
+    "cusolver_syevd_ffi",
+    "cu_threefry2x32_ffi",
+}
+# LAPACK on the host: JAX has left eigenvectors nowhere else. The one round trip, of structures.
+EIG = "cuhybrid_eig_real"
+
+
+def slowly(name):
+    return pytest.param(name, marks=[pytest.mark.slow] if PROGRAMS[name].slow else [])
+
+
+def called(jitted: Any, *arguments: Any) -> set[str]:
+    """What a program calls that XLA does not compile, on CUDA; refuses callbacks.
+
+    Nothing is compiled, so that no GPU is needed.
+    """
+    jaxpr = jitted.trace(*arguments).jaxpr.jaxpr
+    assert not [name for name in primitives(jaxpr) if "callback" in name or "feed" in name]
+    unchecked = [export.DisabledSafetyCheck.custom_call(name) for name in (EIG, *ON_DEVICE)]
+    lowered = export.export(jitted, platforms=["cuda"], disabled_checks=unchecked)(*arguments)
+    assert all(x.dtype.itemsize != 4 or x.dtype.kind not in "fc" for x in lowered.out_avals)
+    found = set(re.findall(r"custom_call @([\w.]+)", lowered.mlir_module()))
+    return {name for name in found if not name.startswith("mhlo.")}  # operations of XLA's own
+
+
+@pytest.mark.parametrize("name", [slowly(name) for name in PROGRAMS])
+def test_public_programs_lower_for_cuda(name):
+    """In float64, without a callback; only eigenvalues of structures are found on the host."""
+    program = PROGRAMS[name]
+    found = called(jax.jit(program.function), jnp.asarray(program.value))
+    assert found - {EIG} <= ON_DEVICE
+    assert EIG not in found or "structure" in name or "batch" in name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_what_is_invalid_is_nan(name):
+    """Never a number that one could believe; the same program gives numbers for what is valid."""
+    program = PROGRAMS[name]
+    compiled = jax.jit(program.function)
+    good, bad = (compiled(jnp.asarray(x, float)) for x in (program.value, program.invalid))
+    moved = compiled(jnp.asarray(program.value * (1 + 1e-6)))
+    leaves = [[np.asarray(x) for x in jax.tree.leaves(tree)] for tree in (good, moved, bad)]
+    depending = 0
+    for one, other, refused in zip(*leaves, strict=True):
+        if one.dtype.kind in "fc" and (one != other).any():
+            depending += 1
+            assert np.isnan(refused[one != other]).all()
+    assert depending
+
+
+def recorded(monkeypatch, module, *names):
+    """Calls of jitted functions of a module from here on: the functions with their arguments."""
+    calls = []
+    for name in names:
+        jitted = getattr(module, name)
+
+        def call(*arguments, jitted=jitted):
+            calls.append((jitted, arguments))
+            return jitted(*arguments)
+
+        monkeypatch.setattr(module, name, call)
+    return calls
+
+
+def belt():
+    joint = fj.Joint(
+        fj.FixedContact(1.0, 0.0, P=1.0),
+        fj.ExponentialStribeck(mu_s=1.0, mu_d=0.5, v_0=0.5),
+        tangential=[1.0],
+        V=1.0,
+    )
+    return fj.Structure(M=[[1.0]], C=[[0.1]], K=[[1.0]], joints=[joint])
+
+
+WINDOW = {"x": ("D", 2.35, 2.45), "y": ("mu", 0.3, 0.4), "lines": 4}
+DRIVERS = {
+    "sweep": (
+        batches,
+        ["_batch"],
+        lambda: fj.sweep(fj.growth_rate, BRAKE, progress=False, D=[2.4]),
+    ),
+    "design": (
+        problem,
+        ["_linearise"],
+        lambda: fj.design(BRAKE, {"D": (2.39, 2.41)}, starts=1, progress=False),
+    ),
+    "basin": (
+        basin,
+        ["_first", "_run"],
+        lambda: fj.basin(BRAKE, radius=1.0, starts=2, progress=False),
+    ),
+    "track_modes": (tracks, ["_states"], lambda: fj.track_modes(STRUCTURE, "D", [2.4, 2.41])),
+    "hopf_boundary": (boundary, ["_at", "_tests"], lambda: fj.hopf_boundary(BRAKE, **WINDOW)),
+    "continue_cycle": (
+        itinerary,
+        ["condensed", "lowest"],
+        lambda: fj.continue_cycle(belt(), "V", (1.0, 1.1)),
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", DRIVERS)
+def test_programs_inside_of_drivers_lower_for_cuda(monkeypatch, name):
+    """What Python loops call again and again: one of each."""
+    module, names, run = DRIVERS[name]
+    calls = recorded(monkeypatch, module, *names)
+    run()
+    seen = {}
+    for jitted, arguments in calls:
+        seen.setdefault(jitted, arguments)
+    assert len(seen) == len(names)
+    for jitted, arguments in seen.items():
+        jitted = inspect.unwrap(jitted, stop=lambda function: hasattr(function, "trace"))
+        assert called(jitted, *arguments) - {EIG} <= ON_DEVICE
+
+
+def test_the_test_sees_a_callback():
+    """One that does nothing counts: at it a GPU stops."""
+
+    def program(x):
+        return jax.pure_callback(lambda x: x, jax.ShapeDtypeStruct((), float), x)
+
+    with pytest.raises(AssertionError, match="pure_callback"):
+        called(jax.jit(lambda x: jax.lax.cond(x > 0, program, jnp.sin, x)), jnp.asarray(1.0))
