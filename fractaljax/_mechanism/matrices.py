@@ -1,5 +1,6 @@
-"""The matrices of a structure: read, checked, and in coordinates of unit mass."""
+"""The matrices of a structure: read, checked, summed, and in coordinates of unit mass."""
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -10,9 +11,105 @@ from jax import Array
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Float
 
-from .._base.parts import Numbers, concrete, number
+from .._base.parts import Numbers, concrete, nan_where, number
+from .coefficient import Parameters, coefficient_of, evaluated
 
 MatrixLike = Any  # an array, a nested list, or a sparse matrix of SciPy's
+LARGEST_DENSE = 2000  # degrees of freedom; sparse matrices of more stay sparse
+
+
+class Sparse:
+    """A large sparse matrix of SciPy's, outside of JAX: two are the same if they are one object."""
+
+    def __init__(self, matrix: Any):
+        self.matrix = matrix.tocsr()
+
+
+class MatrixSum(eqx.Module):
+    """A matrix as a sum of matrices (n, n), each times a coefficient: sum_i c_i(p) X_i.
+
+    Large sparse matrices are no leaves of the pytree: only a reduction can use them.
+    """
+
+    arrays: tuple[Numbers, ...]
+    sparse: tuple[Sparse, ...] = eqx.field(static=True)  # in place of arrays, all or none
+    coefficients: tuple[Callable | None, ...] = eqx.field(static=True)  # None for 1
+
+    @property
+    def matrices(self) -> list[Any]:
+        """The matrix of each term, an array or sparse, without its coefficient."""
+        return [each.matrix for each in self.sparse] or list(self.arrays)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """That of the sum, with the axes of a batch before its two."""
+        return self.matrices[0].shape
+
+    def at(self, p: Parameters) -> Any:
+        """The sum at parameters p: an array, or a sparse matrix."""
+        total = None
+        for coefficient, X in zip(self.coefficients, self.matrices, strict=True):
+            value = evaluated(coefficient, p)
+            if value is not None:
+                X = X * (float(value) if self.sparse else value)
+            total = X if total is None else total + X
+        return total
+
+    def projected(self, left: np.ndarray, right: np.ndarray) -> "MatrixSum":
+        """left^T X right of every term, left and right (n, r)."""
+        held = self.matrices if self.sparse else map(np.asarray, self.arrays)
+        arrays = tuple(jnp.asarray(left.T @ (X @ right)) for X in held)
+        return MatrixSum(arrays, (), self.coefficients)
+
+
+def matrix_sum(
+    name: str, given: Any, p: Parameters, fit: Callable[[str, MatrixLike], Any]
+) -> MatrixSum:
+    """A matrix, or a sequence of (coefficient, matrix), each matrix checked by `fit`.
+
+    A coefficient that is a number is multiplied in.
+
+    **Raises:** as `fit` and `coefficient_of`, naming the term.
+    """
+    terms = given if is_sum(given) else [(None, given)]
+    arrays, coefficients = [], []
+    for i, (coefficient, X) in enumerate(terms, start=1):
+        term = f"{name}, term {i}" if terms is given else name
+        X = fit(term, X)
+        if coefficient is not None:
+            coefficient = coefficient_of(f"the coefficient of {term}", coefficient, p)
+        if coefficient is not None and not callable(coefficient):
+            X, coefficient = (
+                X * (np.asarray(coefficient).item() if is_sparse(X) else coefficient),
+                None,
+            )
+        arrays.append(X)
+        coefficients.append(coefficient)
+    if any(map(is_sparse, arrays)):
+        from scipy.sparse import csr_array
+
+        kept = [Sparse(X if is_sparse(X) else csr_array(np.asarray(X))) for X in arrays]
+        return MatrixSum((), tuple(kept), tuple(coefficients))
+    return MatrixSum(tuple(arrays), (), tuple(coefficients))
+
+
+def is_sum(given: Any) -> bool:
+    """Whether it is a sequence of (coefficient, matrix), and not a nested list of numbers."""
+
+    def is_matrix(x):
+        if isinstance(x, (list, tuple)):
+            return bool(x) and isinstance(x[0], (list, tuple))
+        return len(getattr(x, "shape", ())) == 2
+
+    pairs = isinstance(given, Sequence) and not isinstance(given, str) and len(given) > 0
+    return pairs and all(
+        isinstance(each, (list, tuple)) and len(each) == 2 and is_matrix(each[1]) for each in given
+    )
+
+
+def is_sparse(X: Any) -> bool:
+    """Whether it is a sparse matrix of SciPy's."""
+    return hasattr(X, "toarray")
 
 
 def array_of(name: str, value: MatrixLike) -> Numbers:
@@ -20,7 +117,7 @@ def array_of(name: str, value: MatrixLike) -> Numbers:
 
     **Raises:** `TypeError` for anything else; `ValueError` for NaN and infinity.
     """
-    value = value.toarray() if hasattr(value, "toarray") else value
+    value = value.toarray() if is_sparse(value) else value
     kind = f"{value.dtype} numbers" if hasattr(value, "dtype") else type(value).__name__
     wrong = TypeError(f"{name} must be an array of real numbers, got {kind}")
     if isinstance(value, (list, tuple)):
@@ -52,15 +149,52 @@ def fitting(name: str, value: MatrixLike, shape: tuple[int, ...]) -> Numbers:
     return array
 
 
+def square_or_sparse(name: str, value: MatrixLike) -> Any:
+    """As `square`, but a large sparse matrix stays sparse, checked likewise."""
+    if not is_sparse(value) or value.ndim != 2 or max(value.shape) <= LARGEST_DENSE:
+        return square(name, value)
+    if value.shape[0] != value.shape[1]:
+        raise ValueError(f"{name} must be a square matrix, got shape {value.shape}")
+    if value.dtype.kind not in "fiu":
+        raise TypeError(f"{name} must be an array of real numbers, got {value.dtype} numbers")
+    if not np.isfinite(value.data).all():
+        raise ValueError(f"{name} must be finite")
+    return value.astype(float)
+
+
+def fitting_or_sparse(name: str, value: MatrixLike, shape: tuple[int, ...]) -> Any:
+    """As `fitting`, but a large sparse matrix stays sparse."""
+    value = square_or_sparse(name, value) if is_sparse(value) else value
+    if not is_sparse(value):
+        return fitting(name, value, shape)
+    if value.shape != shape:
+        raise ValueError(f"{name} must have shape {shape} as M demands, got {value.shape}")
+    return value
+
+
+def require_mass_matrix(M: Any) -> None:
+    """Refuse a sparse M that is not symmetric to 1e-6, or with a diagonal that is not positive."""
+    diagonal = M.diagonal()
+    if diagonal.min() <= 0:
+        got = f"{diagonal.min()} on its diagonal at {diagonal.argmin()}"
+        raise ValueError(f"M must be positive definite, got {got}")
+    if abs(M - M.T).max() > 1e-6 * abs(M).max():
+        raise ValueError("M must be symmetric")
+
+
 def mass_matrix(M: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """M (n, n) made exactly symmetric.
 
-    **Raises:** `ValueError` unless M is symmetric to 1e-6 and positive definite.
+    **Raises:** `ValueError` unless M is symmetric to 1e-6 and positive definite; NaN if it is
+    traced.
     """
     values, half = concrete(M), (M + M.T) / 2
     if values is None:
-        bad = ~jnp.isfinite(jnp.linalg.cholesky(half)).all()
-        return eqx.error_if(half, bad, "M must be positive definite")
+        units = jnp.sqrt(jnp.diagonal(half))
+        unit = jax.lax.stop_gradient(M / units[:, None] / units[None])
+        pivot = jnp.diagonal(jnp.linalg.cholesky((unit + unit.T) / 2)).min() ** 2
+        good = (jnp.abs(unit - unit.T).max() <= 1e-6) & (pivot > _least_pivot(unit))
+        return nan_where(~good, half)
     diagonal = np.diagonal(values)
     i = int(diagonal.argmin())
     if diagonal[i] <= 0:
@@ -76,9 +210,14 @@ def mass_matrix(M: Float[Array, "n n"]) -> Float[Array, "n n"]:
         pivot = np.diagonal(np.linalg.cholesky((unit + unit.T) / 2)).min() ** 2
     except np.linalg.LinAlgError:
         pivot = 0.0
-    if pivot <= len(unit) * np.finfo(unit.dtype).eps:
+    if pivot <= _least_pivot(unit):
         raise ValueError("M must be positive definite: some motion would have no kinetic energy")
     return half
+
+
+def _least_pivot(unit) -> float:
+    """Of a mass matrix with ones on its diagonal, all digits of which are not lost."""
+    return len(unit) * float(np.finfo(unit.dtype).eps)
 
 
 def mass_normalised(L: Float[Array, "n n"], X: Float[Array, "n n"]) -> Float[Array, "n n"]:

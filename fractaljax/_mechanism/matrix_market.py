@@ -5,11 +5,11 @@ are given twice, and crashes on some damaged files (SciPy 1.17).
 """
 
 import re
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
-_BANNER = b"%%MatrixMarket"
+BANNER = b"%%MatrixMarket"
 _HEADER = re.compile(rb"([^\n]*)\n((?:[^\S\n]*(?:%[^\n]*)?\n)*+)([^\n]*)\n?")
 _WORDS = {
     "object": ("matrix",),
@@ -17,9 +17,11 @@ _WORDS = {
     "field": ("real", "double", "integer", "complex"),
     "symmetry": ("general", "symmetric", "skew-symmetric", "hermitian"),
 }
+MOST_DENSE = 16_000_000  # numbers of a matrix that is given dense
+_PIECE = 2**22  # bytes of text turned into numbers at a time
 # As C and Fortran write them: 1, -1.5, .5, 1e6, 1.0D+06, and 1.0+100 for want of room.
-_REAL = rb"[+-]?(?:\d++\.?\d*+|\.\d++)(?:[eEdDqQ][+-]?\d++|[+-]\d++)?"
-_WHOLE = rb"[+-]?\d++"
+REAL = rb"[+-]?(?:\d++\.?\d*+|\.\d++)(?:[eEdDqQ][+-]?\d++|[+-]\d++)?"
+WHOLE = rb"[+-]?\d++"
 
 
 def read_matrix_market(file: BinaryIO, largest: int) -> np.ndarray:
@@ -29,9 +31,22 @@ def read_matrix_market(file: BinaryIO, largest: int) -> np.ndarray:
 
     **Raises:** `ValueError` to follow the name of the file, with the line that is wrong.
     """
-    start = file.read(len(_BANNER))  # alone: /dev/zero never ends
-    most = 32 * largest**2
-    text = file.read(most + 1) if start.lower() == _BANNER.lower() else b""
+    shape, i, j, values = read_entries(file, largest, 32 * largest**2)
+    matrix = np.zeros(shape, values.dtype)
+    matrix[i, j] = values
+    return matrix
+
+
+def read_entries(
+    file: BinaryIO, largest: int, most: int
+) -> tuple[tuple[int, int], np.ndarray, np.ndarray, np.ndarray]:
+    """The shape, the rows and columns from 0, and the values of the entries of an open file.
+
+    Like `read_matrix_market`, of at most `most` bytes. Both triangles of a symmetric matrix are
+    given, and no entry twice.
+    """
+    start = file.read(len(BANNER))  # alone: /dev/zero never ends
+    text = file.read(most + 1) if start.lower() == BANNER.lower() else b""
     if len(text) > most:
         raise ValueError(f"is larger than {most / 1e6:g} MB")
     header = _HEADER.match(text)
@@ -44,75 +59,96 @@ def read_matrix_market(file: BinaryIO, largest: int) -> np.ndarray:
     _, layout, field, symmetry = words
     before = header[2].count(b"\n") + 2  # lines of the header
     columns = ["row", "column"] * (layout == "coordinate")
-    shape, stored, count = _size(header[3], before, bool(columns), symmetry, largest)
+    shape, count = _size(header[3], before, bool(columns), symmetry, largest)
     parts = 2 if field == "complex" else 1
-    tokens = [rb"\d++"] * len(columns) + [_WHOLE if field == "integer" else _REAL] * parts
-    numbers = _numbers(body := text[header.end() :], before, tokens, columns + ["number"] * parts)
-
-    def refuse(wrong, what: str) -> None:
-        """Refuse the first line, blank ones not counted, of which `wrong` is true."""
-        if wrong.any():
-            lines = enumerate(body.split(b"\n"), before + 1)
-            number, line = [(n, line) for n, line in lines if line.strip()][wrong.argmax()]
-            raise _wrong(number, line, what)
-
+    tokens = [rb"\d++"] * len(columns) + [WHOLE if field == "integer" else REAL] * parts
+    wanted = columns + ["number"] * parts
+    numbers = numbers_of(body := text[header.end() :], before, tokens, wanted)
     late = np.arange(len(numbers)) >= count
-    refuse(late, f"must not be there, after all of {count} numbers")
+    refuse_line(late, body, before, f"must not be there, after all of {count} numbers")
     if len(numbers) < count:
         raise ValueError(f"ends after {len(numbers)} of {count} numbers")
-    refuse(~np.isfinite(numbers).all(axis=1), "must be finite")
+    refuse_line(~np.isfinite(numbers).all(axis=1), body, before, "must be finite")
+    lowest = {"general": -shape[1], "skew-symmetric": 1}.get(symmetry, 0)  # i - j in the file
     if columns:
         i, j = numbers[:, :2].T - 1
         outside = (i < 0) | (j < 0) | (i >= shape[0]) | (j >= shape[1])
-        refuse(outside, f"must be inside {shape[0]} x {shape[1]}, counted from 1")
+        inside = f"must be inside {shape[0]} x {shape[1]}, counted from 1"
+        refuse_line(outside, body, before, inside)
         i, j = i.astype(int), j.astype(int)
-        refuse(~stored[i, j], f"must lie below the diagonal, the matrix being {symmetry}")
+        below = f"must lie below the diagonal, the matrix being {symmetry}"
+        refuse_line(i - j < lowest, body, before, below)
         again = np.ones(len(numbers), bool)
         again[np.unique(i * shape[1] + j, return_index=True)[1]] = False
-        refuse(again, "must not give an entry twice")
+        refuse_line(again, body, before, "must not give an entry twice")
     else:
-        j, i = np.nonzero(stored.T)
+        j, i = np.nonzero(np.tri(*shape, -lowest, dtype=bool).T)
     values = numbers[:, -2:] @ [1, 1j] if parts == 2 else numbers[:, -1]
-    matrix = np.zeros(shape, values.dtype)
-    matrix[i, j] = values
+    values = values if np.imag(values).any() else np.real(values)
     if symmetry != "general":
-        mirrored = matrix.conj().T if symmetry == "hermitian" else matrix.T
-        matrix = np.where(stored, matrix, -mirrored if symmetry == "skew-symmetric" else mirrored)
-    return matrix if np.imag(matrix).any() else np.real(matrix).copy()
+        off, sign = i != j, -1 if symmetry == "skew-symmetric" else 1
+        mirrored = values[off].conj() if symmetry == "hermitian" else sign * values[off]
+        i, j = np.concatenate([i, j[off]]), np.concatenate([j, i[off]])
+        values = np.concatenate([values, mirrored])
+    return shape, i, j, values
 
 
 def _size(
     line: bytes, number: int, coordinates: bool, symmetry: str, largest: int
-) -> tuple[tuple[int, int], np.ndarray, int]:
-    """The shape, where the file may give numbers, and how many it gives."""
+) -> tuple[tuple[int, int], int]:
+    """The shape, and how many numbers the file gives."""
     wanted, sizes = 3 if coordinates else 2, line.split()
     if len(sizes) != wanted or not all(re.fullmatch(rb"\d{1,15}", size) for size in sizes):
-        raise _wrong(number, line, f"must have the {wanted} whole numbers of the size")
+        raise wrong_line(number, line, f"must have the {wanted} whole numbers of the size")
     rows, columns, *entries = map(int, sizes)
     if max(rows, columns) > largest:
         raise ValueError(f"holds {rows} x {columns} numbers; reduce the model to {largest} at most")
+    if not coordinates and rows * columns > MOST_DENSE:
+        raise ValueError(f"holds {rows} x {columns} numbers; as a dense array at most {MOST_DENSE}")
     if min(rows, columns) < 1 or (symmetry != "general" and rows != columns):
-        raise _wrong(number, line, f"must have the size of a matrix that is {symmetry}")
-    highest = {"general": columns, "skew-symmetric": -1}.get(symmetry, 0)
-    stored = np.tri(rows, columns, highest, dtype=bool)
-    most = int(stored.sum())
+        raise wrong_line(number, line, f"must have the size of a matrix that is {symmetry}")
+    most = rows * columns
+    if symmetry != "general":
+        most = (most + (-rows if symmetry == "skew-symmetric" else rows)) // 2
     if entries and entries[0] > most:
-        raise _wrong(number, line, f"must have the number of entries, at most {most}")
-    return (rows, columns), stored, entries[0] if entries else most
+        raise wrong_line(number, line, f"must have the number of entries, at most {most}")
+    return (rows, columns), entries[0] if entries else most
 
 
-def _numbers(body: bytes, before: int, tokens: list[bytes], wanted: list[str]) -> np.ndarray:
-    """The numbers (lines, tokens) of the lines that are not blank, each checked as a text."""
+def numbers_of(body: bytes, before: int, tokens: list[bytes], wanted: list[str]) -> np.ndarray:
+    """The numbers (lines, tokens) of the lines that are not blank, each checked as a text.
+
+    `tokens` are the patterns of the numbers of a line, `wanted` what to call them, and `before`
+    the lines of the file before `body`.
+    """
     line = rb"[^\S\n]++".join(tokens)
     bad = re.compile(rb"^(?![^\S\n]*+(?:" + line + rb")?[^\S\n]*+$).*", re.MULTILINE).search(body)
     if bad:
         number = before + body.count(b"\n", 0, bad.start()) + 1
-        raise _wrong(number, bad[0], f"must be '{' '.join(wanted)}' and nothing else")
-    plain = body.translate(bytes.maketrans(b"dDqQ", b"eeee"))
-    plain = re.sub(rb"[+-](?<=[\d.][+-])", rb"e\g<0>", plain)
-    return np.array(plain.split(), float).reshape(-1, len(tokens))
+        raise wrong_line(number, bad[0], f"must be '{' '.join(wanted)}' and nothing else")
+    return as_floats(body).reshape(-1, len(tokens))
 
 
-def _wrong(number: int, line: bytes, what: str) -> ValueError:
+def as_floats(text: bytes) -> np.ndarray:
+    """Numbers between blanks that match `REAL`, as floats (n,)."""
+    pieces, start = [np.empty(0)], 0
+    while start < len(text):  # in pieces, for the texts of numbers take ten times their memory
+        end = text.find(b"\n", start + _PIECE) % (len(text) + 1)  # -1 is the end
+        plain = text[start:end].translate(bytes.maketrans(b"dDqQ", b"eeee"))
+        plain = re.sub(rb"[+-](?<=[\d.][+-])", rb"e\g<0>", plain)
+        pieces.append(np.array(plain.split(), float))
+        start = end
+    return np.concatenate(pieces)
+
+
+def refuse_line(wrong: Any, body: bytes, before: int, what: str) -> None:
+    """Refuse the first line of `body`, blank ones not counted, of which `wrong` is true."""
+    if wrong.any():
+        lines = enumerate(body.split(b"\n"), before + 1)
+        number, line = [(n, line) for n, line in lines if line.strip()][wrong.argmax()]
+        raise wrong_line(number, line, what)
+
+
+def wrong_line(number: int, line: bytes, what: str) -> ValueError:
     shown = line.strip()[:40].decode("ascii", "backslashreplace")
     return ValueError(f"line {number} {what}, got {shown!r}")

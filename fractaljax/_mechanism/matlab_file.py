@@ -1,0 +1,107 @@
+"""Matrices of numbers in MATLAB's files of version 5 to 7.
+
+`scipy.io.loadmat` cannot serve: damaged sparse matrices crash the interpreter (SciPy 1.17), and a
+small file may unpack to any amount.
+"""
+
+import struct
+import zlib
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from .matrix_entries import check_size
+
+_ORDERS = {b"\0\1IM": "<", b"\1\0MI": ">"}
+_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4"}
+_TYPES |= {7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+_MATRIX, _COMPRESSED = 14, 15
+_NUMBERS, _SPARSE, _COMPLEX = range(5, 16), 5, 0x800  # classes, and a flag
+
+
+def read_matlab(content: bytes, most: int) -> dict[str, Any]:
+    """The matrices of a .mat file by name, arrays or sparse, of at most `most` bytes in total.
+
+    **Raises:** `ValueError` if the file is damaged, too large or holds anything else.
+    """
+    if content.startswith(b"MATLAB 7.3"):
+        raise ValueError("it is of MATLAB's version 7.3; save it with -v7")
+    order = _ORDERS.get(content[124:128])
+    if order is None:
+        raise ValueError("it is no file of MATLAB's version 5 to 7")
+    found = {}
+    for kind, element in _elements(content[128:], order, padded=False):
+        most -= len(element)
+        if kind == _COMPRESSED:
+            element = _unpacked(element, most)
+            most -= len(element)
+            kind, element = next(_elements(element, order), (0, b""))
+        if kind != _MATRIX:
+            raise ValueError(f"it is damaged: a variable was to begin, not {kind}")
+        name, value = _variable(list(_elements(element, order)), order)
+        if name in found:
+            raise ValueError(f"it holds {name} twice")
+        found[name] = value
+    return found
+
+
+def _unpacked(element: bytes, most: int) -> bytes:
+    inflate = zlib.decompressobj()
+    try:
+        content = inflate.decompress(element, max(most, 0) + 1)
+    except zlib.error:
+        raise ValueError("it is damaged: a variable cannot be unpacked") from None
+    if len(content) > most:
+        raise ValueError("it unpacks to more than is read")
+    if not inflate.eof:
+        raise ValueError("it ends within a variable")
+    return content
+
+
+def _elements(content: bytes, order: str, padded: bool = True) -> Iterator[tuple[int, bytes]]:
+    """The type and the bytes of each element; those of variables are padded to 8 bytes."""
+    place = 0
+    while place < len(content):
+        tag = content[place : place + 8].ljust(8, b"\0")
+        kind, size = struct.unpack(f"{order}2I", tag)
+        start = place + 8
+        if kind >> 16:  # a small one, with its bytes in the tag
+            kind, size, start = kind & 0xFFFF, kind >> 16, place + 4
+        end = start + size
+        if end > len(content) or (start == place + 4 and size > 4):
+            raise ValueError("it ends within a variable")
+        yield kind, content[start:end]
+        place = end + (place - end) % 8 if padded else end
+
+
+def _variable(parts: list[tuple[int, bytes]], order: str) -> tuple[str, Any]:
+    import scipy.sparse
+
+    if len(parts) < 3 or len(parts[0][1]) != 8:
+        raise ValueError("it is damaged: a variable lacks its header")
+    flags = struct.unpack(f"{order}2I", parts[0][1])[0]
+    name = parts[2][1].decode("ascii", "backslashreplace")
+    if flags & 0xFF not in _NUMBERS or flags & _COMPLEX:
+        kind = "complex ones" if flags & _COMPLEX else f"MATLAB's class {flags & 0xFF}"
+        raise ValueError(f"{name} must be real numbers, got {kind}")
+    sparse = flags & 0xFF == _SPARSE
+    arrays = []
+    for kind, data in [parts[1], *parts[3:]]:
+        dtype = np.dtype(order + _TYPES.get(kind, "f8"))
+        if kind not in _TYPES or len(data) % dtype.itemsize:
+            raise ValueError(f"{name} is damaged: it has numbers of type {kind}")
+        arrays.append(np.frombuffer(data, dtype).astype(dtype.newbyteorder("=")))
+    shape = tuple(arrays[0].tolist())
+    if len(arrays) != (4 if sparse else 2) or min(shape, default=-1) < 0:
+        raise ValueError(f"{name} is damaged: it has {len(arrays) - 1} arrays")
+    try:
+        if not sparse:
+            return name, arrays[1].reshape(shape, order="F")
+        check_size(name, shape)
+        _, i, begun, values = arrays  # with room for more entries, which SciPy lets go
+        matrix = scipy.sparse.csc_array((values, i, begun), shape=shape)
+        matrix.check_format(full_check=True)
+        return name, matrix
+    except (ValueError, IndexError, OverflowError) as error:
+        raise ValueError(f"{name} is damaged: {' '.join(str(error).split())}") from None

@@ -1,0 +1,159 @@
+"""Sparse matrices from the entries that text files give, of Abaqus and in Harwell-Boeing form."""
+
+import re
+from typing import Any
+
+import numpy as np
+
+from .matrix_market import REAL, WHOLE, as_floats, numbers_of, refuse_line, wrong_line
+
+LARGEST = 1_000_000  # degrees of freedom
+_LARGEST_LABEL = 2**40  # of a node; its degree of freedom is below 2**20
+_FORMAT = re.compile(rb"\((?:\d*P,?)?(\d*)([IEDFG])(\d+)(?:\.\d+(?:E\d+)?)?\)")
+_KINDS = {b"r": "real", b"i": "integer"}
+_SYMMETRIES = {b"u": 0, b"r": 0, b"s": 1, b"z": -1}  # rectangular, symmetric, skew
+
+
+def assemble(name: str, shape: tuple[int, int], i: Any, j: Any, values: Any, mirror: int = 0):
+    """The sparse matrix of `shape` with `values` (n,) in rows i and columns j, counted from 0.
+
+    `mirror` 1 makes a triangle symmetric and -1 skew. An entry that is given twice is refused, for
+    none of the formats says whether to add.
+
+    **Raises:** `ValueError` naming the entry.
+    """
+    import scipy.sparse
+
+    check_size(name, shape)
+    i, j, values = np.asarray(i, np.int64), np.asarray(j, np.int64), np.asarray(values, float)
+    if mirror:
+        off = i != j
+        i, j = np.concatenate([i, j[off]]), np.concatenate([j, i[off]])
+        values = np.concatenate([values, mirror * values[off]])
+    place = np.sort(i * shape[1] + j)
+    again = place[1:][place[1:] == place[:-1]]
+    if again.size:
+        row, column = divmod(int(again[0]), shape[1])
+        both = ", or above and below the diagonal" * bool(mirror)
+        raise ValueError(f"{name} gives row {row + 1}, column {column + 1} twice{both}")
+    return scipy.sparse.coo_array((values, (i, j)), shape=shape).tocsr()
+
+
+def check_size(name: str, shape: tuple[int, ...]) -> None:
+    """**Raises:** `ValueError` for a shape that is too large or empty."""
+    if not 1 <= min(shape) <= max(shape) <= LARGEST:
+        raise ValueError(f"{name} must have from 1 to {LARGEST} rows and columns, got {shape}")
+
+
+def label_dofs(node: np.ndarray, dof: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+    """The place (n,) of each (node, dof) among all of them in order, and the names "node.dof"."""
+    if max(np.abs(node).max(initial=0) / _LARGEST_LABEL, dof.max(initial=0) / 2**20) >= 1:
+        raise ValueError("a node or a degree of freedom has too large a number")
+    labels, place = np.unique(node * 2**20 + dof, return_inverse=True)
+    return place, tuple(f"{label >> 20}.{label % 2**20}" for label in labels.tolist())
+
+
+def read_abaqus(name: str, content: bytes):
+    """The matrix of an .mtx file of Abaqus, and the names of its degrees of freedom.
+
+    Lines of row node, dof, column node, dof and value (FORMAT=MATRIX INPUT and LABELS), or of row,
+    column and value (COORDINATE), which have no names.
+
+    **Raises:** `ValueError` with the line that is wrong.
+    """
+    body = re.sub(rb"(?m)^[^\S\n]*\*\*.*", b"", content).replace(b",", b" ")
+    first = len((re.search(rb"\S[^\n]*", body) or [b""])[0].split())
+    if first not in (3, 5):
+        raise ValueError("it is neither a Matrix Market file nor a matrix of Abaqus")
+    wanted = ["row", "column"] if first == 3 else ["node", "dof", "node", "dof"]
+    whole = rb"\d{1,15}+" if first == 3 else rb"-?\d{1,15}+"  # internal nodes are negative
+    numbers = numbers_of(body, 0, [whole] * (first - 1) + [REAL], [*wanted, "number"])
+    refuse_line(~np.isfinite(numbers[:, -1]), body, 0, "must be finite")
+    index, values = numbers[:, :-1].astype(np.int64), numbers[:, -1]
+    names = None
+    if first == 3:
+        refuse_line((index < 1).any(axis=1), body, 0, "must be counted from 1")
+        i, j = index.T - 1
+        size = int(index.max())
+    else:
+        refuse_line((index[:, 1::2] < 0).any(axis=1), body, 0, "must have dofs from 0")
+        place, names = label_dofs(index[:, ::2].T.ravel(), index[:, 1::2].T.ravel())
+        (i, j), size = place.reshape(2, -1), len(names)
+    # The file does not say whether it gives one triangle. An unsymmetric matrix of finite elements
+    # is full on both sides of the diagonal, so a file without any pair gives a triangle.
+    off = i != j
+    paired = np.isin(i[off] * size + j[off], j[off] * size + i[off]).any()
+    return assemble(name, (size, size), i, j, values, 0 if paired else 1), names
+
+
+def read_harwell_boeing(name: str, content: bytes):
+    """The matrix of a Harwell-Boeing or Rutherford-Boeing file in ASCII; right sides are left out.
+
+    `scipy.io.hb_read` cannot serve: it refuses symmetric files and those with a right side, which
+    are what Ansys writes.
+
+    **Raises:** `ValueError` with the line that is wrong.
+    """
+    lines = content.rstrip().split(b"\n")
+    unlike = ValueError("it is no Harwell-Boeing file in ASCII")
+    if len(lines) < 5 or b"\0" in content[:4096]:
+        raise unlike
+    cards, kind = lines[1].split(), lines[2][:3].lower()
+    sizes, formats = lines[2][3:].split(), _FORMAT.findall(lines[3].upper().replace(b" ", b""))
+    if not all(x.isdigit() for x in cards + sizes) or len(cards) < 4 or len(sizes) < 3:
+        raise unlike
+    if not re.fullmatch(rb"[ir][ursz]a", kind):
+        raise wrong_line(3, lines[2], "must have the type RUA, RSA, RZA, RRA or their like of I")
+    if len(formats) < 3 or [x[1] for x in formats[:2]] != [b"I", b"I"]:
+        raise wrong_line(4, lines[3], "must have the formats of pointers, rows and values")
+    rows, columns, entries = map(int, sizes[:3])
+    if int(cards[0]) + 4 > len(lines):
+        raise ValueError(f"it ends after {len(lines)} lines of {int(cards[0]) + 4}")
+    start = 5 if len(cards) > 4 and int(cards[4]) else 4  # a line more for right sides
+    found = []
+    for (each, letter, width), count in zip(formats, (columns + 1, entries, entries), strict=False):
+        pattern = WHOLE if letter == b"I" else REAL
+        layout = (int(each or 1), int(width))
+        numbers, start = fixed_fields(lines, start, count, layout, pattern)
+        found.append(numbers)
+    pointers, index, values = found
+    steps = np.diff(pointers)
+    if pointers[0] != 1 or (steps < 0).any() or pointers[-1] != entries + 1:
+        raise ValueError("its column pointers are damaged")
+    if entries and not (index.min() >= 1 and index.max() <= rows):
+        raise ValueError(f"its row indices must be from 1 to {rows}")
+    j = np.repeat(np.arange(columns), steps.astype(int))
+    if _SYMMETRIES[kind[1:2]] and rows != columns:
+        raise ValueError(f"it holds {rows} x {columns} numbers and calls them symmetric")
+    return assemble(name, (rows, columns), index - 1, j, values, _SYMMETRIES[kind[1:2]])
+
+
+def fixed_fields(
+    lines: list[bytes], start: int, count: int, layout: tuple[int, int], pattern: bytes = REAL
+) -> tuple[np.ndarray, int]:
+    """`count` numbers (count,) from the lines from `start` on, and where the next line is.
+
+    `layout` is how many there are in a line and how wide each is, for they need not stand apart.
+    """
+    each, width = layout
+    if not each * width:
+        raise ValueError("a format in it has no width")
+    after = start - -count // each
+    if after > len(lines):
+        raise ValueError(f"it ends before {count} numbers from line {start + 1} on")
+    used = [line.rstrip() for line in lines[start:after]]
+    text = b"\n".join(used)
+    apart = rb"(?m)^(?![^\S\n]*+(?:" + pattern + rb"(?:[^\S\n]++|$))*+$)"
+    # SciPy writes fields that stand apart but are narrower than it says.
+    if not re.search(apart, text) and len(values := as_floats(text)) == count:
+        return values, after
+    for number, line in enumerate(used, start + 1):
+        if len(line) > each * width:
+            raise wrong_line(number, line, f"must have at most {each} fields of {width}")
+    padded = b"".join(line.ljust(each * width) for line in used)
+    text = b"\n".join(np.char.strip(np.frombuffer(padded, f"S{width}")[:count]).tolist())
+    bad = re.search(rb"(?m)^(?!(?:" + pattern + rb")$).*", text) if count else None
+    if bad:
+        number = start + text.count(b"\n", 0, bad.start()) // each
+        raise wrong_line(number + 1, lines[number], "must be numbers in their fields")
+    return as_floats(text), after
