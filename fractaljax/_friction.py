@@ -15,6 +15,7 @@ from ._base.parts import (
     Numbers,
     Part,
     concrete,
+    nan_where,
     number,
     ordered,
     quantity,
@@ -67,7 +68,7 @@ class Friction(Part):
     either name replaces it.
 
     **Raises:** `ValueError` unless mu(0) > 0 and a field mu_s is mu(0), and for a name of a law
-    that another has.
+    that another has. Of a traced law every number is NaN instead.
     """
 
     velocity_dependent: ClassVar[bool] = True  # if False, neither slope nor speed is traced
@@ -100,9 +101,22 @@ class Friction(Part):
         static = concrete(number("mu(0)", self.mu(jnp.zeros((), _dtype(self))), above=0))
         stored = concrete(jnp.asarray(self.mu_s))
         if static is None or stored is None:
+            self._refuse_traced()
             return
         if not np.allclose(stored, static, rtol=8 * float(jnp.finfo(stored.dtype).eps), atol=0):
             raise ValueError(f"mu_s must be mu(0) = {static}, got {stored}")
+
+    def _refuse_traced(self) -> None:
+        """NaN for the numbers of a traced law of the user's where its mu(0) is wrong."""
+        static = self.mu(jnp.zeros((), _dtype(self)))
+        stored = jnp.asarray(self.mu_s)
+        bad = ~(static > 0) | ~jnp.isclose(
+            stored, static, rtol=8 * float(jnp.finfo(stored.dtype).eps), atol=0
+        )
+        for field in dataclasses.fields(self):
+            if not field.metadata.get("static", False):
+                value = nan_where(bad, getattr(self, field.name))
+                object.__setattr__(self, field.name, value)
 
     @abc.abstractmethod
     def mu(self, speed: ArrayLike) -> Numbers:

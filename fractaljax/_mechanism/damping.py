@@ -5,7 +5,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import ArrayLike, Float
 
-from .._base.parts import concrete, number, scalar
+from .._base.parts import concrete, nan_where, number, scalar
 from .matrices import MatrixLike, fitting, mass_matrix, mass_normalised, square
 
 
@@ -39,7 +39,9 @@ def modal_damping(M: MatrixLike, K: MatrixLike, ratio: ArrayLike) -> Float[Array
             f"damping_ratio must be a scalar or have shape {K.shape[:1]}, got shape {ratio.shape}"
         )
     values = concrete(K)
-    if values is not None and np.abs(values - values.T).max() > 1e-6 * np.abs(values).max():
+    if values is None:
+        K = nan_where(jnp.abs(K - K.T).max() > 1e-6 * jnp.abs(K).max(), K)
+    elif np.abs(values - values.T).max() > 1e-6 * np.abs(values).max():
         raise ValueError("damping_ratio needs a symmetric K: others have no real modes")
     L = jnp.linalg.cholesky(M)
     squares, X = jnp.linalg.eigh(mass_normalised(L, K))

@@ -5,13 +5,25 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.core import Tracer
 from jaxtyping import ArrayLike
 
-from .._base.parts import Numbers, Part, brief, concrete, flag, number, quantity, require_kind
+from .._base.parts import (
+    Numbers,
+    Part,
+    brief,
+    concrete,
+    flag,
+    nan_where,
+    number,
+    quantity,
+    require_kind,
+)
 from .._base.toml import Laws
+from .._contact.asperity import AsperityContact
 from .._contact.contact import MU_M_MAX, Contact
 from .._contact.fixed import FixedContact
 from .._contact.fractal import FractalContact
@@ -23,6 +35,7 @@ from .._friction import LAWS, Friction
 JOINT_LAWS: Laws = {
     "contact": {
         "fractal": FractalContact,
+        "asperity": AsperityContact,
         "persson": PerssonContact,
         "measured": MeasuredContact,
         "fixed": FixedContact,
@@ -44,17 +57,17 @@ Stored = tuple[Any, ...]  # a direction as `stored_direction` gives it
 def friction_for(contact: Contact, friction: Friction) -> Friction:
     """The friction law of a joint, checked against its contact.
 
-    **Raises:** `TypeError` for a part of the wrong kind; `ValueError` if the contact is fractal
+    **Raises:** `TypeError` for a part of the wrong kind; `ValueError` if the contact yields
     and the smallest friction exceeds 0.9, where Eq. 19 ends.
     """
     require_kind("contact", contact, Contact)
     require_kind("friction", friction, Friction)
-    if not contact.fractal:
+    if not contact.yields:
         return friction
     number(friction.lowest, friction.mu_m, at_most=MU_M_MAX)
     if concrete(friction.mu_m) is None:
-        wanted = f"{friction.lowest} must be at most {MU_M_MAX}"
-        friction = eqx.error_if(friction, ~(friction.mu_m <= MU_M_MAX), wanted)
+        # The stiffness depends on mu_m alone: it counts as refused with what is above it.
+        friction = nan_where(~(friction.mu_m <= MU_M_MAX) | jnp.isnan(friction.mu_s), friction)
     return friction
 
 

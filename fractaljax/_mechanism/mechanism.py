@@ -29,8 +29,11 @@ class Mechanism(Part):
         replaced; `replace(D=2.5)` changes every joint that has a D, and
         `replace(**{"left.D": 2.5})` the joint named left, also beside a D for all.
 
+        Under a trace (`jit`, `vmap`) a value outside its domain becomes NaN, and with it all that
+        depends on it.
+
         **Raises:** `ValueError` for a name unknown after the change, listing the known ones, and
-        for values outside their domain.
+        for values outside their domain that are known.
         """
         new = self._rebuilt(changes)
         for name in changes:

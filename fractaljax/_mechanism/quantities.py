@@ -31,7 +31,7 @@ from .._base.parts import (
 )
 from .mechanism import Mechanism
 from .scene import Scene, stiffness
-from .structure import Structure, require_single
+from .structure import Structure, require_single, too_large
 
 _CHECKED_AT_ONCE = 1 << 16  # points of a grid
 STIFFNESS_RATIO, FREQUENCY_RATIO, FRICTION = "K_t/K_n", "omega_1/omega_2", "mu"
@@ -41,6 +41,8 @@ def require_one(name: str, x: Any) -> None:
     """Refuse, as argument `name`, what is no mechanism, and one that holds a batch."""
     if isinstance(x, Structure):
         require_single(x)
+        if x.is_sparse:
+            raise ValueError(too_large(x))
     elif isinstance(x, Scene):
         require_scalar(x)
     else:
@@ -70,7 +72,10 @@ def own_quantities(x: Part | Structure) -> dict[str, Quantity]:
         for name, joint in zip(x.joint_names, x.joints, strict=True):
             own = own_quantities(joint)
             found = own | found | {f"{name}.{plain}": own[plain] for plain in own}
-        return found
+        parameters = {
+            name: Quantity(value, "-", "parameter", False) for name, value in x.parameters.items()
+        }
+        return parameters | found
     for field in dataclasses.fields(x):
         value, meant = getattr(x, field.name), field.metadata
         if isinstance(value, Part):
@@ -114,7 +119,7 @@ def moved_by(x: Mechanism, name: str) -> set[str]:
             law = own_quantities(x.friction)
             moved |= {each for each in law if law[each].unit == "-"}
         return moved
-    if isinstance(x, Structure) and "." not in name:
+    if isinstance(x, Structure) and "." not in name and name not in x.parameters:
         return {f"{joint}.{name}" for joint in x.joint_names if f"{joint}.{name}" in own}
     return {name}
 
@@ -143,7 +148,7 @@ def value_of(x: Mechanism, name: str) -> Float[Array, ""]:
 def replaced(x: Mechanism, values: Mapping[str, ArrayLike]) -> Any:
     """The scene or structure with these quantities changed, of any shape, as by its `replace`.
 
-    **Raises:** `ValueError` for values outside their domain; under `jit` when it runs.
+    **Raises:** `ValueError` for values outside their domain; traced ones become NaN.
     """
     derived = _derived(x)
     own = own_quantities(x)
@@ -200,7 +205,9 @@ def _substitute(x, values):
         plain = {key: value for key, value in values.items() if key in own.values()}
         named = {own[key]: value for key, value in values.items() if key in own}
         joints.append(substitute(joint, plain | named))
-    return eqx.tree_at(lambda s: s.joints, x, tuple(joints))
+    x = eqx.tree_at(lambda s: s.joints, x, tuple(joints))
+    own = {name: values[name] for name in x.parameters if name in values}
+    return eqx.tree_at(lambda s: s.parameters, x, x.parameters | own) if own else x
 
 
 def with_optional(x: Mechanism, names: Sequence[str]) -> Any:
@@ -246,13 +253,20 @@ def unit(x: Mechanism, name: str) -> str:
     return own[name].unit if name in own else "-"
 
 
+def meaning(x: Mechanism, name: str) -> str:
+    """What a quantity is, in words."""
+    own = own_quantities(x)
+    if name not in own:
+        return _DERIVED[name].meaning
+    return own[name].meaning.split(";")[0].split(",")[0]
+
+
 def label(x: Mechanism, name: str) -> str:
     """Meaning, symbol and unit of a quantity, as axes show them."""
     own = own_quantities(x)
     if name not in own:
-        return f"{_DERIVED[name].meaning} [-]"
-    meaning = own[name].meaning.split(";")[0].split(",")[0]
-    return f"{meaning} {name} [{own[name].unit}]"
+        return f"{meaning(x, name)} [-]"
+    return f"{meaning(x, name)} {name} [{own[name].unit}]"
 
 
 # --- friction at the velocity of the belt -------------------------------------------------

@@ -1,5 +1,6 @@
 """A mechanism of many degrees of freedom, given by its matrices, with joints attached to it."""
 
+import functools
 import os
 import re
 from collections import Counter
@@ -13,10 +14,29 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from .._base.files import read_bounded, write_together
-from .._base.parts import number, quantities, rebuild, require_scalar
+from .._base.parts import (
+    brief,
+    concrete,
+    nan_where,
+    number,
+    quantities,
+    rebuild,
+    require_scalar,
+    scalar,
+)
 from .._base.toml import naming, read_toml
 from .joint import Direction, Dof, Joint, stored_direction
-from .matrices import MatrixLike, fitting, mass_matrix, square
+from .matrices import (
+    MatrixLike,
+    MatrixSum,
+    fitting,
+    fitting_or_sparse,
+    is_sum,
+    mass_matrix,
+    matrix_sum,
+    require_mass_matrix,
+    square_or_sparse,
+)
 from .mechanism import Mechanism
 from .scene import Scene
 from .structure_file import npz_bytes, read_structure, structure_text
@@ -26,7 +46,8 @@ class Structure(Mechanism):
     """M x'' + C x' + K x = F with joints: a reduced finite-element model of n degrees of freedom.
 
     `M` (n, n) [kg] is symmetric and positive definite. `K` (n, n) [N/m] and `C` (n, n) [N s/m],
-    zero where None, are of any kind. SciPy's sparse matrices are welcome; rotations have their own
+    zero where None, are of any kind. Sparse matrices of SciPy's are welcome; with more than 2000
+    rows they stay sparse, for `reduce` to make a small structure of. Rotations have their own
     units. `joints` is one `Joint`, a sequence of them (named joint_1, joint_2, ...) or a mapping
     from names. `F` (n,) [N], or a mapping from degrees of freedom to forces, presses the joints
     together: the slope of a friction law acts through the static equilibrium under it. `names` of
@@ -36,9 +57,8 @@ class Structure(Mechanism):
     positive definite, which degree of freedom is unknown, or which joint is wrong.
     """
 
-    M: Float[Array, "n n"]
-    C: Float[Array, "n n"]
-    K: Float[Array, "n n"]
+    sums: dict[str, MatrixSum]  # of "M", "C" and "K"
+    parameters: dict[str, Float[Array, ""]]  # of the coefficients in them
     F: Float[Array, " n"] | None
     joints: tuple[Joint, ...]
     joint_names: tuple[str, ...] = eqx.field(static=True)
@@ -53,10 +73,29 @@ class Structure(Mechanism):
         F: ArrayLike | Sequence[float] | Mapping[Any, ArrayLike] | None = None,
         names: Iterable[str] | None = None,
     ):
-        self.M = mass_matrix(square("M", M))
-        n = len(self.M)
-        self.K = fitting("K", K, (n, n))
-        self.C = jnp.zeros_like(self.K) if C is None else fitting("C", C, (n, n))
+        self._fill({"M": M, "C": C, "K": K}, {}, joints, F, names)
+
+    def _fill(self, given, parameters, joints, F, names):
+        self.parameters = parameters
+        mass = matrix_sum("M", given["M"], parameters, square_or_sparse)
+        # Each term symmetric to the last bit, if their sum is a mass matrix.
+        if mass.sparse:
+            require_mass_matrix(mass.at(parameters))
+        elif len(mass.arrays) == 1 and mass.coefficients[0] is None:
+            mass = eqx.tree_at(lambda x: x.arrays, mass, (mass_matrix(mass.arrays[0]),))
+        else:
+            whole = mass_matrix(mass.at(parameters))
+            halves = tuple((X + X.T) / 2 for X in mass.arrays)
+            if concrete(whole) is None:
+                halves = nan_where(jnp.isnan(whole).any(), halves)
+            mass = eqx.tree_at(lambda x: x.arrays, mass, halves)
+        n = mass.shape[-1]
+        fit = functools.partial(fitting_or_sparse, shape=(n, n))
+        stiffness = matrix_sum("K", given["K"], parameters, fit)
+        damping = given["C"]
+        if damping is None:
+            damping = 0 * abs(stiffness.at(parameters))
+        self.sums = {"M": mass, "C": matrix_sum("C", damping, parameters, fit), "K": stiffness}
         self.names = _names(names, n)
         self.joints, self.joint_names = _joints(joints)
         self._check_joints()
@@ -84,7 +123,42 @@ class Structure(Mechanism):
     @property
     def n(self) -> int:
         """The number of degrees of freedom."""
-        return self.M.shape[-1]
+        return self.sums["M"].shape[-1]
+
+    @property
+    def M(self) -> Float[Array, "n n"]:
+        """The mass matrix [kg]. **Raises:** `ValueError` if it is large and sparse."""
+        return self._matrix("M")
+
+    @property
+    def C(self) -> Float[Array, "n n"]:
+        """The damping matrix without the joints [N s/m]; errors as of `M`."""
+        return self._matrix("C")
+
+    @property
+    def K(self) -> Float[Array, "n n"]:
+        """The stiffness matrix without the joints [N/m]; errors as of `M`."""
+        return self._matrix("K")
+
+    @property
+    def band(self) -> tuple[float, float] | None:
+        """Where eigenvalues are those of the structure, in |Im s| [rad/s]; None: everywhere."""
+        return None
+
+    @property
+    def is_sparse(self) -> bool:
+        """Whether the matrices are large and sparse: then `reduce` comes first."""
+        return any(held.sparse for held in self.sums.values())
+
+    def _matrix(self, name: str) -> Float[Array, "n n"]:
+        if self.sums[name].sparse:
+            raise ValueError(too_large(self))
+        return self.sums[name].at(self.parameters)
+
+    @property
+    def _dtype(self):
+        arrays = self.sums["M"].arrays
+        return arrays[0].dtype if arrays else jnp.result_type(float)
 
     def index(self, dof: Dof | np.integer) -> int:
         """The index of a degree of freedom given by index or name.
@@ -108,9 +182,9 @@ class Structure(Mechanism):
         if isinstance(stored[0], float):
             if len(stored) != self.n:
                 raise ValueError(f"a direction must have {self.n} weights, got {len(stored)}")
-            return np.array(stored, self.M.dtype)
+            return np.array(stored, self._dtype)
         pairs = stored if isinstance(stored[0], tuple) else zip(stored, (1.0, -1.0), strict=False)
-        weights, d = {}, np.zeros(self.n, self.M.dtype)
+        weights, d = {}, np.zeros(self.n, self._dtype)
         for dof, weight in pairs:
             place = self.index(dof)
             if place in weights:
@@ -119,11 +193,20 @@ class Structure(Mechanism):
         d[list(weights)] = list(weights.values())
         return d
 
+    def _touched(self) -> np.ndarray | None:
+        """How much the directions of each joint move each degree of freedom (m, n), where known."""
+        moved = [np.abs(self._directions(joint)).sum(axis=0) for joint in self.joints]
+        return np.array(moved).reshape(len(moved), self.n)
+
+    def _directions(self, joint: Joint) -> list[np.ndarray]:
+        """The tangential and, where there is one, the normal direction (n,) of a joint."""
+        given = (joint.tangential, joint.normal)
+        return [self.direction(each) for each in given if each is not None]
+
     def _check_joints(self) -> None:
         for name, joint in zip(self.joint_names, self.joints, strict=True):
-            given = (joint.tangential, *([] if joint.normal is None else [joint.normal]))
             try:
-                directions = [self.direction(each) for each in given]
+                directions = self._directions(joint)
             except ValueError as error:
                 raise ValueError(f"joint {name}: {error}") from None
             if len(directions) == 2 and _parallel(*directions):
@@ -146,28 +229,57 @@ class Structure(Mechanism):
             here = f"{name}."
             mine = {key.removeprefix(here): changes[key] for key in changes if key.startswith(here)}
             joints[name] = rebuild(joint, changes | mine)
-        own = {name: getattr(self, name) for name in ("M", "C", "K", "F")}
-        if changes.keys() & own.keys():
-            own |= {name: changes[name] for name in own if name in changes}
-            return Structure(**own, joints=joints, names=self.names)
+        parameters = self.parameters | {
+            name: number(name, changes[name]) for name in self.parameters if name in changes
+        }
+        if changes.keys() & {*self.sums, "F"}:
+            own = {name: changes.get(name, self._terms(name)) for name in self.sums}
+            more = joints, changes.get("F", self.F), self.names
+            if not self.parameters:
+                return Structure(**own, joints=more[0], F=more[1], names=more[2])
+            return ParametricStructure(**own, joints=more[0], parameters=parameters, F=more[1])
         # The matrices are as they were: there is nothing to check or factorise again.
         new = eqx.tree_at(lambda structure: structure.joints, self, tuple(joints.values()))
         new._check_joints()
+        if changes.keys() & parameters.keys():
+            new = eqx.tree_at(lambda structure: structure.parameters, new, parameters)
+            _check_coefficients(new)
         return new
 
+    def _terms(self, name: str) -> list[tuple[Any, Any]]:
+        """The matrix of a name as it was given, less its numbers."""
+        held = self.sums[name]
+        return list(zip(held.coefficients, held.matrices, strict=True))
+
     def _known(self):
-        known = ["M", "C", "K", "F"]
+        known = ["M", "C", "K", "F", *self.parameters]
         for name, joint in zip(self.joint_names, self.joints, strict=True):
             known += [*quantities(joint), *(f"{name}.{plain}" for plain in quantities(joint))]
         return list(dict.fromkeys(known))
 
     def _shown(self):
         yield f"n={self.n}"
+        yield from (f"{name}={value}" for name, value in self.parameters.items())
         yield from (f"{name}={j!r}" for name, j in zip(self.joint_names, self.joints, strict=True))
 
     @classmethod
     def _from_document(cls, document, folder):
-        return cls(**read_structure(document, folder))
+        given = read_structure(document, folder)
+        if "reduced" in given:
+            from .reduced import ReducedStructure
+
+            return ReducedStructure.from_file(given)
+        if "parameters" in given or any(is_sum(given[name]) for name in "MCK"):
+            return ParametricStructure(**given)
+        return Structure(**given)
+
+    def _more_tables(self) -> dict[str, Any]:
+        """Tables of its TOML file beyond those of every structure."""
+        return {}
+
+    def _more_arrays(self) -> dict[str, np.ndarray]:
+        """Arrays of its .npz file beyond those of every structure."""
+        return {}
 
     def save(self, path: str | os.PathLike) -> None:
         """Write a TOML file, and beside it the matrices as a .npz file of the same name.
@@ -196,6 +308,66 @@ class Structure(Mechanism):
         return {matrices: npz_bytes(self), path: text}
 
 
+class ParametricStructure(Structure):
+    """A structure whose matrices depend on named parameters: rotation, friction, temperature, ...
+
+    `M`, `C` and `K` are a matrix or a list of (coefficient, matrix), of which the sum counts. A
+    coefficient is a number, a function of the parameters, `lambda p: p["Omega"] ** 2 - 1`, or the
+    same as text, "Omega**2 - 1", with + - * / **, pi, sqrt, exp, log, sin, cos and tan, which a
+    file can hold. So gyroscopic terms are ("Omega", G) in C, circulatory ones ("mu", N) in K.
+    `parameters` maps names to numbers. `replace(Omega=...)`, sweeps and designs know them by name,
+    and derivatives go to each. All else is as in `Structure`.
+
+    **Raises:** as `Structure`; `ValueError` for a coefficient that is not finite or asks for an
+    unknown parameter, and for a parameter whose name another quantity has.
+    """
+
+    def __init__(
+        self,
+        M: Any,
+        C: Any,
+        K: Any,
+        joints: Joint | Sequence[Joint] | Mapping[str, Joint] = (),
+        parameters: Mapping[str, ArrayLike] | None = None,
+        F: ArrayLike | Sequence[float] | Mapping[Any, ArrayLike] | None = None,
+        names: Iterable[str] | None = None,
+    ):
+        if not isinstance(parameters or {}, Mapping):
+            raise TypeError(f"parameters must be a mapping, got {brief(parameters)}")
+        held = {name: number(str(name), value) for name, value in (parameters or {}).items()}
+        self._fill({"M": M, "C": C, "K": K}, held, joints, F, names)
+        taken = {"M", "C", "K", "F", "pi"}.union(*map(quantities, self.joints))
+        for name in held:
+            if not (isinstance(name, str) and name.isidentifier()):
+                raise ValueError(f"a parameter's name must be like Omega or k_1, got {name!r}")
+            if name in taken:
+                raise ValueError(f"the parameter {name} has the name of another quantity")
+
+
+def too_large(structure: Structure) -> str:
+    """What is said where a structure must be reduced first."""
+    return (
+        f"the structure is sparse with {structure.n} degrees of freedom, too many for this: "
+        "take reduce(structure, ...) in its place"
+    )
+
+
+def _check_coefficients(structure: Structure) -> None:
+    """Refuse parameters, if they are known numbers, at which a coefficient is not finite."""
+    known = {name: concrete(value) for name, value in structure.parameters.items()}
+    if any(value is None or value.ndim for value in known.values()):
+        return
+    p = {name: jnp.asarray(value) for name, value in known.items()}
+    for name, held in structure.sums.items():
+        for coefficient in held.coefficients:
+            if coefficient is not None:
+                at = ", ".join(f"{key} = {value:g}" for key, value in p.items())
+                scalar(f"a coefficient of {name} at {at}", coefficient(p))
+    mass = structure.sums["M"]
+    if not mass.sparse and any(mass.coefficients) and concrete(mass.arrays[0]) is not None:
+        mass_matrix(mass.at(p))
+
+
 def _names_matrices(path: Path, matrices: str) -> bool:
     """Whether `path` is a structure's TOML file that has its matrices in the file `matrices`."""
     try:
@@ -218,9 +390,11 @@ def load(path: str | os.PathLike) -> Scene | Structure:
 
 def require_single(structure: Structure) -> None:
     """Refuse a structure that holds a batch: `jax.vmap` takes many."""
-    if structure.M.ndim != 2 or (structure.F is not None and structure.F.ndim != 1):
+    shape = structure.sums["M"].shape
+    batch = len(shape) != 2 or any(value.ndim for value in structure.parameters.values())
+    if batch or (structure.F is not None and structure.F.ndim != 1):
         raise ValueError(
-            f"M must have two dimensions, got shape {structure.M.shape}; "
+            f"M must have two dimensions and parameters none, got shape {shape} of M; "
             "use jax.vmap for many structures"
         )
     for joint in structure.joints:

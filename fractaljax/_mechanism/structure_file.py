@@ -1,11 +1,8 @@
 """Structures as files: a TOML file for the joints, and the matrices it names."""
 
-import bz2
-import gzip
 import io
 import re
-import struct
-import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +13,20 @@ from .._base.files import read_bounded
 from .._base.numpy_file import read_npz
 from .._base.parts import brief
 from .._version import __version__
+from .coefficient import Expression
 from .damping import modal_damping, rayleigh_damping
 from .joint import JOINT_LAWS, Joint
-from .matrix_market import read_matrix_market
+from .matrices import MatrixSum, is_sparse
+from .matrix_file import read_matrices
 
-_LARGEST = 4000  # degrees of freedom; a sparse matrix of more is no reduced model
-_LARGEST_FILE = 4 * 8 * _LARGEST**2
-_ARRAYS = ("M", "C", "K", "F")
+_LARGEST_FILE = 2**30
+_MATRICES, _BASES = ("M", "C", "K"), ("V", "W", "residuals")
+_TABLES = ("structure", "parameters", "joints", "reduction", "reduced")
+_SPARSE = ("data", "indices", "indptr", "shape")  # of a matrix in compressed rows
+_WANTED = "the name of a file or of a matrix, or a list of {coefficient = ..., matrix = ...}"
 _KEYS = {  # of [structure]: what each may be
-    **dict.fromkeys(("matrices", "M", "C", "K"), (str, "the name of a file")),
+    "matrices": (str, "the name of a file"),
+    **dict.fromkeys(_MATRICES, ((str, list), _WANTED)),
     "F": ((list, dict, str), "a list, a table or a file's name"),
     "rayleigh": (list, "[alpha, beta]"),
     "damping_ratio": ((float, int, list), "a number or a list of one a mode"),
@@ -32,26 +34,88 @@ _KEYS = {  # of [structure]: what each may be
 }
 
 
+class _Source:
+    """Matrices that the file of a structure names, and names of degrees of freedom with them."""
+
+    def __init__(self, table: dict[str, Any], folder: Path):
+        self.folder, self.names = folder, table.get("names")
+        self.held: dict[str, Any] = {}
+        self.used: set[str] = set()
+        self.file = table.get("matrices")
+        if self.file is not None:
+            path = folder / self.file
+            # Arrays of NumPy's stay dense.
+            self.held = _npz(path) if path.suffix.lower() == ".npz" else self._read(path)
+
+    def matrix(self, key: str, value: str) -> Any:
+        """The matrix of a name in the file of matrices, or in a file of its own."""
+        if value in self.held:
+            self.used.add(value)
+            return self.held[value]
+        found = self._read(self.folder / value)
+        if len(found) == 1:
+            return next(iter(found.values()))
+        if key not in found:
+            raise ValueError(f"{value} must hold {key} or one matrix; it holds {', '.join(found)}")
+        return found[key]
+
+    def sum(self, key: str, value: Any) -> Any:
+        """What `Structure` takes as M, C or K."""
+        if isinstance(value, str):
+            return self.matrix(key, value)
+        terms = []
+        for term in value:
+            if not isinstance(term, dict):
+                raise ValueError(f"[structure] {key} must be {_WANTED}, got {brief(term)}")
+            toml.refuse_unknown(f"a term of [structure] {key}", term, ("coefficient", "matrix"))
+            if not isinstance(term.get("matrix"), str):
+                raise ValueError(f"a term of [structure] {key} lacks the key 'matrix'")
+            terms.append((term.get("coefficient"), self.matrix(key, term["matrix"])))
+        return terms
+
+    def refuse_unused(self) -> None:
+        """Refuse arrays in the file of matrices that nothing asks for."""
+        if self.file is not None and self.file.lower().endswith(".npz"):
+            known = [*_MATRICES, "F", *_BASES]
+            rest = [name for name in self.held if name not in self.used]
+            toml.refuse_unknown(self.file, rest, known)
+
+    def _read(self, path: Path) -> dict[str, Any]:
+        found = read_matrices(path)
+        self.names = self.names or found.names
+        return found.matrices
+
+
 def read_structure(document: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """The arguments of the `Structure` in a TOML file that lies in `folder`.
+    """The arguments of the structure in a TOML file that lies in `folder`, by name.
+
+    With `parameters` and `reduced`, those of its reduction, where the file has them.
 
     **Raises:** `ValueError` naming the table and the key that is unknown, missing or of the wrong
     kind, or the file whose matrix is wrong; `OSError` if one cannot be read.
     """
-    toml.refuse_unknown("the file", document, ("structure", "joints"))
-    table, joints = toml.table_at(document, "structure"), toml.table_at(document, "joints")
+    toml.refuse_unknown("the file", document, _TABLES)
+    table = toml.table_at(document, "structure")
+    joints, parameters = (
+        toml.table_at(document, key) if key in document else {} for key in ("joints", "parameters")
+    )
+    if not parameters and "reduced" not in document:
+        toml.table_at(document, "joints")  # a plain structure says that it has none
     toml.refuse_unknown("[structure]", table, _KEYS)
     for key, value in table.items():
         kinds, wanted = _KEYS[key]
         if not isinstance(value, kinds):
             raise ValueError(f"[structure] {key} must be {wanted}, got {brief(value)}")
-    names = table.get("names")
-    given: dict[str, Any] = _npz(folder / table["matrices"]) if "matrices" in table else {}
-    for name in _ARRAYS:
-        if name in table and name in given:
+    source = _Source(table, folder)
+    given: dict[str, Any] = {}
+    for name in (*_MATRICES, "F"):
+        if name in table and name in source.held and not _among(table[name], source.held):
             raise ValueError(f"[structure] gives {name} twice: in matrices and as {name}")
-        if isinstance(table.get(name), str):
-            given[name] = _matrix_market(folder / table[name])
+        if name in source.held and name not in table:
+            given[name] = source.held[name]
+        elif name in table and (name != "F" or isinstance(table[name], str)):
+            given[name] = source.sum(name, table[name])
+    source.refuse_unused()
     for name in ("M", "K"):
         if name not in given:
             raise ValueError(f"[structure] lacks the matrix {name}, or matrices that has it")
@@ -61,12 +125,14 @@ def read_structure(document: dict[str, Any], folder: Path) -> dict[str, Any]:
     if "rayleigh" in table:
         if len(table["rayleigh"]) != 2:
             raise ValueError(f"[structure] rayleigh must be [alpha, beta], got {table['rayleigh']}")
-        given["C"] = rayleigh_damping(given["M"], given["K"], *table["rayleigh"])
+        given["C"] = _rayleigh(given["M"], given["K"], *table["rayleigh"])
     if "damping_ratio" in table:
         ratio = table["damping_ratio"]
         ratio = np.asarray(ratio) if isinstance(ratio, list) else ratio
-        given["C"] = modal_damping(given["M"], given["K"], ratio)
+        given["C"] = modal_damping(_one("M", given), _one("K", given), ratio)
+    names = source.names
     F = given.get("F", table.get("F"))
+    F = np.asarray(F.toarray()) if F is not None and is_sparse(F) else F
     if isinstance(F, dict):
         F = {_dof(key, names or ()): force for key, force in F.items()}
     elif isinstance(F, np.ndarray) and 1 in F.shape:
@@ -78,7 +144,36 @@ def read_structure(document: dict[str, Any], folder: Path) -> dict[str, Any]:
             if isinstance(joint.get(which), dict):
                 joint[which] = {_dof(key, names or ()): x for key, x in joint[which].items()}
         attached[name] = toml.read_part(Joint, joint, JOINT_LAWS, f"joints.{name}")
-    return {"C": None, **given, "F": F, "joints": attached, "names": names}
+    found = {"C": None, **given, "F": F, "joints": attached, "names": names}
+    if "reduced" in document:
+        bases = {name: source.held.get(name) for name in _BASES}
+        found["reduced"] = {**toml.table_at(document, "reduced"), **bases}
+    return found | ({"parameters": parameters} if parameters else {})
+
+
+def _among(value: Any, held: Mapping[str, Any]) -> bool:
+    """Whether a matrix or all of its terms are named in the file of matrices."""
+    terms = value if isinstance(value, list) else [{"matrix": value}]
+    return all(isinstance(term, dict) and term.get("matrix") in held for term in terms)
+
+
+def _one(name: str, given: Mapping[str, Any]) -> Any:
+    if isinstance(given[name], list):
+        raise ValueError(f"[structure] damping_ratio needs {name} as one matrix: give C")
+    return given[name]
+
+
+def _rayleigh(M: Any, K: Any, alpha: Any, beta: Any) -> Any:
+    """alpha M + beta K, of sums and of sparse matrices too."""
+    if not isinstance(M, list) and not isinstance(K, list) and not is_sparse(M):
+        return rayleigh_damping(M, K, alpha, beta)
+    terms = []
+    for factor, X in ((alpha, M), (beta, K)):
+        for coefficient, matrix in X if isinstance(X, list) else [(None, X)]:
+            number = 1.0 if coefficient is None else coefficient
+            scaled = f"{factor!r} * ({number})" if isinstance(number, str) else factor * number
+            terms.append((scaled, matrix))
+    return terms
 
 
 def _dof(key: str, names) -> int | str:
@@ -86,31 +181,39 @@ def _dof(key: str, names) -> int | str:
     return int(key) if key not in names and re.fullmatch("0|[1-9][0-9]{0,8}", key) else key
 
 
-def _npz(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a .npz file."""
+def _npz(path: Path) -> dict[str, Any]:
+    """The arrays of a .npz file, sparse ones from their parts: "K.data", "K.indices", ..."""
     with toml.naming(path.name):
-        arrays = read_npz(read_bounded(path, _LARGEST_FILE), _LARGEST_FILE)
-    toml.refuse_unknown(path.name, arrays, _ARRAYS)
+        arrays: dict[str, Any] = read_npz(read_bounded(path, _LARGEST_FILE), _LARGEST_FILE)
+        for name in [key.removesuffix(".data") for key in arrays if key.endswith(".data")]:
+            parts = [arrays.pop(f"{name}.{part}", None) for part in _SPARSE]
+            arrays[name] = _compressed(name, *parts)
     return arrays
 
 
-def _matrix_market(path: Path) -> np.ndarray:
-    """The matrix in a Matrix Market file, which may be compressed: .mtx.gz, .mtx.bz2."""
-    opener = {".gz": gzip.open, ".bz2": bz2.open}.get(path.suffix, open)
+def _compressed(name: str, data, indices, indptr, shape) -> Any:
+    from scipy.sparse import csr_array
+
     try:
-        with opener(path, "rb") as file:
-            return read_matrix_market(file, _LARGEST)
-    except ValueError as error:
-        raise ValueError(f"{path.name} {error}") from None
-    except (zlib.error, struct.error, EOFError, OSError) as error:
-        if getattr(error, "errno", None) is not None:  # of the system, not of the decompressor
-            raise
-        raise ValueError(f"{path.name} is damaged") from None
+        matrix = csr_array((data, indices, indptr), shape=tuple(shape))
+        matrix.check_format(full_check=True)
+    except (ValueError, TypeError):
+        raise ValueError(f"{name} is no sound sparse matrix") from None
+    return matrix
 
 
 def structure_text(structure: Any, matrices: str) -> str:
-    """The TOML text of a structure whose matrices are in the file `matrices` beside it."""
+    """The TOML text of a structure whose matrices are in the file `matrices` beside it.
+
+    **Raises:** `ValueError` for a coefficient that is a function.
+    """
     table = {"matrices": toml.Noted(matrices, "M, C, K and perhaps F"), "names": structure.names}
+    for name, held in structure.sums.items():
+        if held.coefficients != (None,):
+            table[name] = [
+                _term(name, i, coefficient)
+                for i, coefficient in enumerate(held.coefficients, start=1)
+            ]
     joints = {}
     for name, joint in zip(structure.joint_names, structure.joints, strict=True):
         directions = {
@@ -119,7 +222,20 @@ def structure_text(structure: Any, matrices: str) -> str:
         }
         joints[name] = toml.part_table(joint, JOINT_LAWS) | directions
     comment = f"A fractaljax structure, in SI units; written by fractaljax {__version__}."
-    return toml.write_toml(comment, {"structure": table, "joints": joints})
+    document = {"structure": table, "parameters": structure.parameters, "joints": joints}
+    document = {name: x for name, x in document.items() if x or name != "parameters"}
+    return toml.write_toml(comment, document | structure._more_tables())
+
+
+def _term(name: str, i: int, coefficient: Any) -> dict[str, str]:
+    if coefficient is None:
+        return {"matrix": f"{name}_{i}"}
+    if not isinstance(coefficient, Expression):
+        raise ValueError(
+            f"the coefficient of {name}, term {i} is a function, which no file can hold: give it "
+            'as text, such as "Omega**2 - 1"'
+        )
+    return {"coefficient": coefficient.text, "matrix": f"{name}_{i}"}
 
 
 def _written(direction: tuple[Any, ...] | None, names: tuple[str, ...]) -> Any:
@@ -136,8 +252,23 @@ def _written(direction: tuple[Any, ...] | None, names: tuple[str, ...]) -> Any:
 
 def npz_bytes(structure: Any) -> bytes:
     """The matrices of a structure as the content of a .npz file."""
+    arrays: dict[str, Any] = dict(structure._more_arrays())
+    for name, held in structure.sums.items():
+        arrays |= _arrays_of(name, held)
+    if structure.F is not None:
+        arrays["F"] = np.asarray(structure.F)
     content = io.BytesIO()
-    arrays = {name: getattr(structure, name) for name in _ARRAYS}
-    held: dict[str, Any] = {name: np.asarray(x) for name, x in arrays.items() if x is not None}
-    np.savez(content, **held)
+    np.savez(content, **arrays)
     return content.getvalue()
+
+
+def _arrays_of(name: str, held: MatrixSum) -> dict[str, np.ndarray]:
+    one = held.coefficients == (None,)
+    found = {}
+    for i, X in enumerate(held.matrices, start=1):
+        key = name if one else f"{name}_{i}"
+        if is_sparse(X):
+            found |= {f"{key}.{part}": np.asarray(getattr(X, part)) for part in _SPARSE}
+        else:
+            found[key] = np.asarray(X)
+    return found

@@ -239,7 +239,7 @@ class _Plane(eqx.Module):
         lowest = tuple(law.mu_m for law in laws)
         if isinstance(scene, Structure):
             attached = assembled(scene, self.friction_slope, refuse=False)
-            pair = critical_pair(*attached.matrices, self.rigid)
+            pair = critical_pair(*attached.matrices, self.rigid, scene.band)
             return _Point(*pair, attached.open, regimes, lowest)
         known = [Pressed(state.K_n, state.K_t, None) for state in states]
         joint = known[0] if known else pressed(scene)

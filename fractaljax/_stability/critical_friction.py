@@ -11,13 +11,13 @@ with the test function of `critical_pair.py`.
 import functools
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._base.parts import brief, concrete, flag
+from .._base.parts import brief, concrete, flag, nan_where
+from .._base.quick import command_jit
 from .._base.singular import positive_sqrt, safe_divide
 from .._contact.contact import MU_M_MAX
 from .._mechanism.oscillator import (
@@ -93,7 +93,8 @@ def critical_friction(
     The derivative is that of the root, and 0 where it is 0 or infinite.
 
     **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`; for a structure without
-    joints, a `joint` that it does not have, or none where friction differs between them.
+    joints, a `joint` that it does not have, or none where friction differs between them (NaN under
+    a trace).
     """
     require_one("scene", scene)
     sloping = flag("friction_slope", friction_slope)
@@ -124,7 +125,7 @@ def _coefficient(structure: Structure, name: str | None) -> Array:
     for other in others:
         values = concrete(first), concrete(other)
         if values[0] is None or values[1] is None:
-            first = eqx.error_if(first, first != other, wanted)
+            first = nan_where(first != other, first)
         elif values[0] != values[1]:
             raise ValueError(wanted)
     return first
@@ -133,14 +134,14 @@ def _coefficient(structure: Structure, name: str | None) -> Array:
 _sliding = jax.jit(Joint.coefficient)
 
 
-@functools.partial(jax.jit, static_argnums=1)
+@functools.partial(command_jit, static_argnames="friction_slope")
 def _factor_of_structure(structure, friction_slope):
     # Beyond a static divergence there is an equilibrium again: it is looked for before.
     least = assembled(with_friction_times(structure, 1e-3), friction_slope)
     return _first_factor(structure, friction_slope)[0] + 0 * least.C[0, 0]
 
 
-@functools.partial(jax.jit, static_argnums=1)
+@functools.partial(command_jit, static_argnames="friction_slope")
 def _of_scene(scene: Scene, friction_slope: bool) -> Float[Array, ""]:
     sloping = friction_slope and scene.friction.velocity_dependent
     if scene.contact.depends_on_friction or sloping or scene.follows_load_curve:
@@ -177,7 +178,7 @@ def _test(x, factor, friction_slope, rigid):
     """The Hopf test function with each friction law times a factor."""
     if isinstance(x, Structure):
         attached = assembled(with_friction_times(x, factor), friction_slope, refuse=False)
-        return critical_pair(*attached.matrices, rigid).test
+        return critical_pair(*attached.matrices, rigid, x.band).test
     return hopf_test_function(linearised(with_friction_times(x, factor), friction_slope))
 
 
@@ -197,7 +198,7 @@ def _signs(x, factors, friction_slope, rigid):
 
     modes, attached = jax.vmap(solved)(factors)
     rigid = jnp.where(rigid < 0, (modes.s[0] == 0).sum(), rigid)
-    values = jax.vmap(least_test, (0, 0, None))(modes, attached.C, rigid)
+    values = jax.vmap(least_test, (0, 0, None, None))(modes, attached.C, rigid, x.band)
     return values, jax.vmap(lambda found: found.open)(attached), rigid
 
 
@@ -207,7 +208,7 @@ def _lattice(x):
     share = (jnp.arange(_FACTORS, dtype=dtype) + 0.5) / _FACTORS
     factors = share / (1 - share)
     for part in joints_of(x).values():
-        if part.contact.fractal:
+        if part.contact.yields:
             lowest = part.friction.mu_m
             most = safe_divide(MU_M_MAX, lowest, jnp.full_like(lowest, jnp.inf))
             factors = jnp.minimum(factors, most)
@@ -272,6 +273,7 @@ def _first_factor_jvp(friction_slope, primals, tangents):
     _, linear = jax.linearize(test, x, at)
     change = linear(dx, jnp.zeros_like(at))
     slope = linear(jax.tree.map(jnp.zeros_like, dx), jnp.ones_like(at))
-    moved = -jnp.where(inside, safe_divide(change, slope, jnp.zeros_like(slope)), 0)
-    none = None if rigid is None else np.zeros(rigid.shape, jax.dtypes.float0)
-    return (factor, rigid), (moved, none)
+    none = jnp.where(jnp.isnan(factor), jnp.nan, 0)
+    moved = -jnp.where(inside, safe_divide(change, slope, jnp.zeros_like(slope)), none)
+    fixed = None if rigid is None else np.zeros(rigid.shape, jax.dtypes.float0)
+    return (factor, rigid), (moved, fixed)

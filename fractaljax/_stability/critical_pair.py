@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
+from .band import in_band
 from .quadratic import Modes, solve
 
 _NODES = 32  # on the circle
@@ -52,18 +53,20 @@ def critical_pair(
     K: Float[Array, "n n"],
     C_error: Float[Array, "n n"] | None,
     rigid: Int[Array, ""],
+    band: tuple[float, float] | None = None,
 ) -> CriticalPair:
     """T of the mode where it is least, the `rigid` eigenvalues of least modulus left out.
 
-    Those of rigid-body modes are 0 at any friction; another one that is 0 means divergence.
+    Those of rigid-body modes are 0 at any friction; another one that is 0 means divergence. With
+    a `band` only modes in it count.
     """
     s = solve(M, C, K, C_error).s
     fixed = jax.lax.stop_gradient(s)
-    chosen = _choice(fixed, rigid, ~(C != 0).any())
+    chosen = _choice(fixed, rigid, ~(C != 0).any(), band)
     i = jnp.argmin(chosen.test)
     j, alone, undamped = (x[i] for x in (chosen.partner, chosen.alone, chosen.undamped))
     sigma, delta = _mean_and_spread(M, C, K, s, i, j)
-    test = jnp.where(alone, _alone(s[i].real, jnp.abs(fixed[i])), _test(sigma, delta, undamped))
+    test = jnp.where(alone, _alone(s[i].real, jnp.abs(fixed[i])), hopf_test(sigma, delta, undamped))
     apart = _quotient(delta.imag, 2 * -sigma.real, undamped)
     imaginary = jnp.where(alone, fixed[i].imag, sigma.imag + apart)
     real = (fixed[j] == fixed[i].conj()) | ((fixed[i].imag == 0) & (fixed[j].imag == 0))
@@ -80,15 +83,20 @@ def critical_pair(
     )
 
 
-def least_test(modes: Modes, C: Float[Array, "n n"], rigid: Int[Array, ""]) -> Float[Array, ""]:
+def least_test(
+    modes: Modes,
+    C: Float[Array, "n n"],
+    rigid: Int[Array, ""],
+    band: tuple[float, float] | None = None,
+) -> Float[Array, ""]:
     """T [1/s^2] as `critical_pair` has it, without derivatives; 0 for what rounding may decide."""
-    test = _choice(modes.s, rigid, ~(C != 0).any()).test
+    test = _choice(modes.s, rigid, ~(C != 0).any(), band).test
     unresolved = jnp.abs(modes.s.real) <= modes.error
     test = jnp.where(unresolved, jnp.maximum(test, 0), test).min()
     return jnp.where(jnp.isnan(modes.s).any(), jnp.nan, test)
 
 
-def _choice(s: Complex[Array, " k"], rigid, conservative) -> _Choice:
+def _choice(s: Complex[Array, " k"], rigid, conservative, band) -> _Choice:
     place, size = jnp.arange(len(s)), jnp.abs(s)
     smaller = (size[None] < size[:, None]) | (
         (size[None] == size[:, None]) & (place[None] < place[:, None])
@@ -102,7 +110,8 @@ def _choice(s: Complex[Array, " k"], rigid, conservative) -> _Choice:
     # Exactly 0 where C = 0, but for neighbours of which one grows alone.
     undamped = jnp.abs(sigma.real) <= jnp.where(conservative, eps**0.5, _UNDAMPED * eps) * size
     alone = (s.imag > 0) & (s[partner] == s.conj()) & ~(undamped & conservative)
-    test = jnp.where(alone, _alone(s.real, size), _test(sigma, delta, undamped))
+    test = jnp.where(alone, _alone(s.real, size), hopf_test(sigma, delta, undamped))
+    counted &= in_band(s, band)
     test = jnp.where(counted & (s.imag >= 0), test, jnp.inf)
     return _Choice(test, counted, partner, alone, undamped)
 
@@ -112,8 +121,11 @@ def _alone(growth, size):
     return (_UNDAMPED * jnp.finfo(size.dtype).eps * size - growth) * size
 
 
-def _test(sigma, delta, undamped):
-    """T, and -|T| where p < 0: both modes grow."""
+def hopf_test(sigma, delta, undamped):
+    """T of two modes with mean and spread sigma and delta, -|T| where p < 0: both modes grow.
+
+    Where they are `undamped`, that of p = 0 with equal damping.
+    """
     p = -sigma.real
     ratio = _quotient(delta.imag, 2 * p, undamped)
     # Without damping T is that of equal damping, which vanishes where the modes coalesce.

@@ -1,13 +1,14 @@
 """The linearised equations about the sliding equilibrium: of a scene, and of a structure."""
 
+import math
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._base.parts import flag
+from .._base.lapack import solve
+from .._base.parts import concrete, flag
 from .._contact.load_curve import LoadCurve, loaded_equilibrium
 from .._mechanism.oscillator import Linearised, linearise, static_normal_force
 from .._mechanism.quantities import sliding_friction
@@ -89,11 +90,17 @@ class Assembled(NamedTuple):
     K: jax.Array
     C_error: jax.Array | None  # bound on the rounding error of C due to the equilibrium
     normal_force: jax.Array | None  # (m,) [N], as `Stability` has it
+    supported: jax.Array | None  # whether there is an equilibrium, where one is needed
 
     @property
     def open(self) -> jax.Array:
         """Whether a preloaded joint is."""
         return jnp.zeros((), bool) if self.normal_force is None else (self.normal_force <= 0).any()
+
+    @property
+    def lost(self) -> jax.Array:
+        """Whether there is no steady sliding: a joint is open, or there is no equilibrium."""
+        return self.open if self.supported is None else self.open | ~self.supported
 
     @property
     def matrices(self) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array | None]:
@@ -111,16 +118,37 @@ def assemble(
     mu' N_0 t t^T - mu' K_t (t.x_0) n n^T to C, where x_0 is the equilibrium and N_0 = K_n n.x_0.
     With preload N_0 = P + K_n n.x_0, and the equilibrium is that under F and the friction mu P t;
     of a load curve N_0 = N(n.x_0), and the tangent at N_0 takes the place of P + K_n n.x.
-    C and K are NaN where such a joint is open, N_0 <= 0. A joint without normal has N_0 = P and no
-    term with n.
+    C and K are NaN where such a joint is open, N_0 <= 0, and under `jit` where there is no
+    equilibrium. A joint without normal has N_0 = P and no term with n.
 
-    **Raises:** `ValueError` for a batch, and where a slope needs F and there is none.
+    **Raises:** `ValueError` for a batch, where a slope needs F and there is none, and if there is
+    no equilibrium: a rigid-body mode is free.
     """
-    return assembled(structure, friction_slope)[:3]
+    return with_equilibrium(structure, friction_slope)[:3]
 
 
-class _Attached(NamedTuple):
-    """A joint with all that the matrices need of it."""
+class Attachment(NamedTuple):
+    """What one joint adds to the matrices, by its directions t and n."""
+
+    K_n: jax.Array
+    K_t: jax.Array
+    mu: jax.Array
+    c_t: jax.Array  # of t t^T in C
+    c_n: jax.Array  # of n n^T in C
+
+
+class Attachments(NamedTuple):
+    """The joints of a structure at its sliding equilibrium."""
+
+    each: list[Attachment]
+    errors: list[tuple[jax.Array, jax.Array] | None]  # of c_t and c_n, by the equilibrium
+    forces: list[jax.Array]  # the normal forces [N], NaN in the source's form
+    loaded: bool  # whether any joint is preloaded
+    supported: jax.Array | None  # whether there is an equilibrium, where one is needed
+
+
+class _Joint(NamedTuple):
+    """A joint with what the equilibrium needs of it."""
 
     K_n: jax.Array
     K_t: jax.Array
@@ -128,6 +156,7 @@ class _Attached(NamedTuple):
     slope: jax.Array | None  # of the friction law, where it counts
     t: jax.Array
     n: jax.Array | None
+    mu: jax.Array
 
     @property
     def of_equilibrium(self) -> bool:
@@ -135,15 +164,11 @@ class _Attached(NamedTuple):
         return self.n is not None and (self.P is not None or self.slope is not None)
 
 
-def assembled(structure: Structure, friction_slope: bool, refuse: bool = True) -> Assembled:
-    """As `assemble`, with a bound on the rounding error of C, and the normal forces.
-
-    Without `refuse` there are numbers where a joint is open as well, and no error where the
-    equilibrium is lost to rounding: near a static divergence.
-    """
+def attachments(structure: Structure, friction_slope: bool) -> Attachments:
+    """What the joints add to the matrices at the sliding equilibrium."""
     require_single(structure)
     sloping = flag("friction_slope", friction_slope)
-    C, K = structure.C, structure.K
+    K = structure.K
     F = jnp.zeros(structure.n, K.dtype) if structure.F is None else structure.F
     joints = []
     tangents, F = _tangents(structure, F)
@@ -151,7 +176,6 @@ def assembled(structure: Structure, friction_slope: bool, refuse: bool = True) -
         mu = joint.coefficient()
         t = jnp.asarray(structure.direction(joint.tangential))
         n = None if joint.normal is None else jnp.asarray(structure.direction(joint.normal))
-        K = _with_joint(K, K_n, K_t, mu, t, n)
         if P is not None:
             F = F + mu * P * t
         slopes = sloping and joint.friction.velocity_dependent
@@ -162,41 +186,65 @@ def assembled(structure: Structure, friction_slope: bool, refuse: bool = True) -
                 "friction_slope=False"
             )
         slope = joint.friction.slope(joint.V) if slopes and joint.V is not None else None
-        joints.append(_Attached(K_n, K_t, P, slope, t, n))
+        joints.append(_Joint(K_n, K_t, P, slope, t, n, mu))
     loaded = any(joint.P is not None for joint in joints)
     places = [i for i, joint in enumerate(joints) if joint.of_equilibrium]
-    displaced = {}  # by joint: t.x_0 and n.x_0, and their errors
+    displaced, supported = {}, None  # by joint: t.x_0 and n.x_0, and their errors
     if places:
+        for joint in joints:
+            K = _with_joint(K, joint.K_n, joint.K_t, joint.mu, joint.t, joint.n)
         directions = jnp.stack([d for i in places for d in (joints[i].t, joints[i].n)])
-        why = NO_PRESSED_EQUILIBRIUM if loaded else NO_EQUILIBRIUM
-        along, errors = _equilibrium(F, K, directions, why if refuse else None)
+        along, errors, supported = _equilibrium(F, K, directions)
         displaced = {
             i: (along[2 * k : 2 * k + 2], errors[2 * k : 2 * k + 2]) for k, i in enumerate(places)
         }
-    forces, error = [], jnp.zeros_like(C)
+    zero = jnp.zeros((), K.dtype)
+    each, found_errors, forces = [], [], []
     for i, joint in enumerate(joints):
-        N, N_error = joint.P, 0.0
+        N, N_error, t_x, t_error = joint.P, 0.0, zero, zero
         if i in displaced:
             (t_x, n_x), (t_error, n_error) = displaced[i]
             N = joint.K_n * n_x if N is None else N + joint.K_n * n_x
             N_error = joint.K_n * n_error
-        forces.append(jnp.full((), jnp.nan, C.dtype) if joint.P is None else N)
-        if joint.slope is None:
+        forces.append(jnp.full((), jnp.nan, K.dtype) if joint.P is None else N)
+        c_t, c_n, error = zero, zero, None
+        if joint.slope is not None:
+            c_t, by_t = joint.slope * N, joint.slope * joint.K_t
+            c_n = zero if joint.n is None else -by_t * t_x
+            error = jnp.abs(joint.slope) * N_error, jnp.abs(by_t) * t_error
+            error = error if i in displaced else None
+        each.append(Attachment(joint.K_n, joint.K_t, joint.mu, c_t, c_n))
+        found_errors.append(error)
+    return Attachments(each, found_errors, forces, loaded, supported)
+
+
+def assembled(structure: Structure, friction_slope: bool, refuse: bool = True) -> Assembled:
+    """As `assemble`, with a bound on the rounding error of C, and the normal forces.
+
+    C and K are NaN where a joint is open and where there is no equilibrium; without `refuse` they
+    are numbers there as well. Inside a compiled program nothing is raised.
+    """
+    attached = attachments(structure, friction_slope)
+    C, K = structure.C, structure.K
+    error = jnp.zeros_like(C)
+    for joint, by, uncertain in zip(structure.joints, attached.each, attached.errors, strict=True):
+        t = jnp.asarray(structure.direction(joint.tangential))
+        n = None if joint.normal is None else jnp.asarray(structure.direction(joint.normal))
+        K = _with_joint(K, by.K_n, by.K_t, by.mu, t, n)
+        if not (friction_slope and joint.friction.velocity_dependent):
             continue
-        tt = jnp.outer(joint.t, joint.t)
-        C, error = C + joint.slope * N * tt, error + jnp.abs(joint.slope * tt) * N_error
-        if joint.n is not None:
-            nn = joint.slope * joint.K_t * jnp.outer(joint.n, joint.n)
-            C, error = C - t_x * nn, error + t_error * jnp.abs(nn)
-    error = (
-        jax.lax.stop_gradient(error) if any(joints[i].slope is not None for i in places) else None
-    )
-    if not loaded:
-        return Assembled(structure.M, C, K, error, None)
-    found = Assembled(structure.M, C, K, error, jnp.stack(forces))
-    if not refuse:
+        directions = [(t, by.c_t)] if n is None else [(t, by.c_t), (n, by.c_n)]
+        for k, (d, c) in enumerate(directions):
+            dd = jnp.outer(d, d)
+            C = C + c * dd
+            error = error if uncertain is None else error + uncertain[k] * jnp.abs(dd)
+    uncertain = any(each is not None for each in attached.errors)
+    error = jax.lax.stop_gradient(error) if uncertain else None
+    forces = jnp.stack(attached.forces) if attached.loaded else None
+    found = Assembled(structure.M, C, K, error, forces, attached.supported)
+    if not refuse or (forces is None and attached.supported is None):
         return found
-    C, K = (jnp.where(found.open, jnp.nan, X) for X in (C, K))
+    C, K = (jnp.where(found.lost, jnp.nan, X) for X in (C, K))
     return found._replace(C=C, K=K)
 
 
@@ -229,7 +277,7 @@ def _tangents(structure: Structure, F) -> tuple[list[tuple[Array, Array, Array |
     K_n, P = (jnp.stack([jnp.asarray(found[i][k]) for i in curved])[:, None] for k in (0, 2))
     # What the loads lack, one a column.
     columns = (lacking * P).T
-    solved = jnp.linalg.solve(K, jnp.concatenate([total[:, None], columns], axis=1))
+    solved = solve(K, jnp.concatenate([total[:, None], columns], axis=1))
     solved = K_n / P * normals @ solved
     curves = [_curve_of(structure.joints[i]) for i in curved]
     displaced = loaded_equilibrium(curves, solved[:, 0], solved[:, 1:])
@@ -243,32 +291,43 @@ def _tangents(structure: Structure, F) -> tuple[list[tuple[Array, Array, Array |
 
 
 def with_equilibrium(structure: Structure, friction_slope: bool) -> Assembled:
-    """As `assembled`, outside compiled programs.
+    """As `assembled`.
 
-    **Raises:** `ValueError` in a line if the structure has no equilibrium.
+    **Raises:** `ValueError` in a line if the structure has no equilibrium, unless it is traced.
     """
-    try:
-        return assembled(structure, friction_slope)
-    except RuntimeError:  # a message of many lines from inside a compiled program
+    found = assembled(structure, friction_slope)
+    supported = None if found.supported is None else concrete(found.supported)
+    if supported is not None and not supported:
         loaded = any(joint.normal_load is not None for joint in structure.joints)
-        raise ValueError(NO_PRESSED_EQUILIBRIUM if loaded else NO_EQUILIBRIUM) from None
+        raise ValueError(NO_PRESSED_EQUILIBRIUM if loaded else NO_EQUILIBRIUM)
+    return found
 
 
-def _equilibrium(F, K, directions, otherwise: str | None) -> tuple[jax.Array, jax.Array]:
+def require_equilibrium(x: Any, friction_slope: bool, found: Array) -> None:
+    """Refuse a structure without equilibrium, if that is why what was `found` of it is NaN.
+
+    Under `jit` and `vmap` it stays NaN: a check of a batch would call back to Python.
+
+    **Raises:** `ValueError` as `with_equilibrium`.
+    """
+    values = concrete(found) if isinstance(x, Structure) else None
+    if values is not None and values.ndim == 0 and math.isnan(values):
+        with_equilibrium(x, friction_slope)
+
+
+def _equilibrium(F, K, directions) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Eq. 40: d.x_0 [m] along each of the `directions` (k, n), and a bound on its rounding error.
 
-    x_0 (n,) solves K x_0 = F, the joints being in K and their friction under preload in F. The
-    error where there is none says `otherwise`, if that is given.
+    x_0 (n,) solves K x_0 = F, the joints being in K and their friction under preload in F. Last,
+    whether there is an x_0 to rounding.
     """
-    x_0 = jnp.linalg.solve(K, F)
+    x_0 = solve(K, F)
     along = directions @ x_0
     # K dx = -dK x_0 with |dK| <= eps |K| entry by entry, so that d.dx = -(K^-T d).(dK x_0).
     K, x_0, F, size = jax.lax.stop_gradient((K, jnp.abs(x_0), F, jnp.abs(along)))
     eps = jnp.finfo(K.dtype).eps
-    through = jnp.abs(jnp.linalg.solve(K.T, directions.T))
+    through = jnp.abs(solve(K.T, directions.T))
     errors = _ROUNDING * eps * (jnp.abs(K) @ x_0) @ through
     supported = eps * jnp.abs(K).max() * x_0.max() <= 0.01 * jnp.abs(F).max()
     supported |= errors.max() <= 0.01 * size.max()
-    if otherwise is not None:
-        along = eqx.error_if(along, ~supported, otherwise)
-    return along, errors
+    return along, errors, supported

@@ -15,16 +15,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float, ScalarLike
 
 from .._base.singular import positive_sqrt
+from .._mechanism.mechanism import Mechanism
 from .._mechanism.oscillator import Linearised, dimensionless
-from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
-from .linearise import assembled, linearised
+from .band import among
+from .linearise import assembled, linearised, require_equilibrium
 from .quadratic import solve
 
 
-@functools.partial(jax.jit, static_argnames="friction_slope")
 def margin(
-    scene: Scene | Structure, shift: ScalarLike = 0.0, friction_slope: bool = True
+    scene: Mechanism, shift: ScalarLike = 0.0, friction_slope: bool = True
 ) -> Float[Array, ""]:
     """Margin of stability [-], a scalar: above 0 exactly where growth_rate < shift [1/s].
 
@@ -40,14 +40,21 @@ def margin(
 
     `friction_slope` as in `growth_rate`; NaN where that is.
 
-    **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`; `TypeError` for a `shift`
-    that is no number.
+    **Raises:** as `growth_rate`; `TypeError` for a `shift` that is no number.
     """
     kind = jnp.dtype(bool) if shift is None else jnp.result_type(shift)
     if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
         raise TypeError(f"shift must be a real number, got {kind}; friction_slope comes third")
+    found = _margin(scene, shift, friction_slope)
+    require_equilibrium(scene, friction_slope, found)
+    return found
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _margin(scene, shift, friction_slope):
     if isinstance(scene, Structure):
-        return least_damping_ratio(solve(*assembled(scene, friction_slope).matrices).s - shift)
+        s = solve(*assembled(scene, friction_slope).matrices).s
+        return least_damping_ratio(among(s - shift, scene.band))
     return margin_of(linearised(scene, friction_slope), shift)
 
 

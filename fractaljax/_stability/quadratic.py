@@ -13,9 +13,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float
 
+from .._base.lapack import one_by_one
 from .._mechanism.matrices import mass_normalised
+from .band import in_band
 
 _ROUNDING = 16.0  # of a sum of n products, in units of eps
 _NO_EXPONENT = -2000  # below that of any number
@@ -27,6 +29,15 @@ class Modes(NamedTuple):
     s: Complex[Array, " k"]  # exactly 0 for a rigid-body mode
     x: Complex[Array, "k n"]  # of any length
     error: Float[Array, " k"]  # how far rounding of the matrices can move s
+    y: Complex[Array, "k n"]  # left vectors, y (2 s M + C) x = 1
+
+
+class Leading(NamedTuple):
+    """The modes that grow most, each with the mode nearest to it."""
+
+    s: Complex[Array, " count"]
+    neighbour: Complex[Array, " count"]  # equal to s of a mode that is alone
+    first: Bool[Array, " count"]  # whether it grows at least as fast as its neighbour
 
 
 def solve(
@@ -52,7 +63,45 @@ def solve(
     C_error = None if C_error is None else C_error / omega
     found = _modes(M, C / omega, K / omega / omega, C_error)
     s = omega * jnp.where(found.rigid, 0, found.z)
-    return Modes(s, found.X.T * units[None], omega * found.error)
+    return Modes(s, found.X.T * units[None], omega * found.error, found.Y / omega * units[None])
+
+
+def leading(
+    M: Float[Array, "n n"],
+    C: Float[Array, "n n"],
+    K: Float[Array, "n n"],
+    count: int,
+    band: tuple[float, float] | None = None,
+) -> Leading:
+    """The `count` eigenvalues with the largest real parts, one of each conjugate pair.
+
+    With first derivatives only: those of a few take far less work than those of all, as `solve`
+    gives them. In a `band` if there is one; where there are fewer, -band[1] fills up,
+    critically damped.
+    """
+    fixed = jax.tree.map(jax.lax.stop_gradient, (M, C, K))
+    found = jax.tree.map(jax.lax.stop_gradient, solve(*fixed))
+    sought = (found.s.imag >= 0) & in_band(found.s, band)
+    order = jnp.argsort(jnp.where(sought, -found.s.real, jnp.inf))
+    places, rank = order[:count], jnp.argsort(order)
+    others = (sought & (found.s.imag > 0))[None] & (rank[None] != rank[places][:, None])
+    apart = jnp.where(others, jnp.abs(found.s[places][:, None] - found.s[None]), jnp.inf)
+    nearest = jnp.argmin(apart, axis=1)
+    paired = (apart.min(axis=1) < jnp.inf) & (found.s[places].imag > 0)
+    dM, dC, dK = (X - at for X, at in zip((M, C, K), fixed, strict=True))  # 0, with derivatives
+
+    def moved(places):
+        s, x, y = found.s[places], found.x[places], found.y[places]
+        return s - s**2 * _between(y, dM, x) - s * _between(y, dC, x) - _between(y, dK, x)
+
+    s = jnp.where(sought[places], moved(places), -1 if band is None else -band[1])
+    neighbour = jnp.where(paired & sought[places], moved(nearest), s)
+    return Leading(s, neighbour, jnp.where(paired, rank[nearest] > rank[places], True))
+
+
+def _between(y, X, x) -> jax.Array:
+    """y_i X x_i of every i."""
+    return (y * (x @ X.T.astype(x.dtype))).sum(axis=1)
 
 
 def _row_sum(X) -> jax.Array:
@@ -112,6 +161,7 @@ def _size(x) -> jax.Array:
     return jnp.abs(x.real) + jnp.abs(x.imag)
 
 
+@one_by_one
 def _lapack(M, C, K):
     """Eigenvalues (2n,), right vectors (n, 2n) and left vectors (2n, n), uncorrected.
 

@@ -75,7 +75,9 @@ def _alpha(p, q, e):
     # One Newton step doubles the three digits that either formula has.
     value = ((square + 2 * p) * square + e) * square - q**2
     slope = (3 * square + 4 * p) * square + e
-    return positive_sqrt(square - safe_divide(value, slope, jnp.zeros_like(value)))
+    square = square - safe_divide(value, slope, jnp.zeros_like(value))
+    # Heavy damping may leave the range of numbers here, and needs no start.
+    return positive_sqrt(jnp.where(jnp.isnan(square), 0, square))
 
 
 class _Division(eqx.Module):

@@ -5,21 +5,31 @@ A scene takes the closed form of `quartic.py`, a structure LAPACK's route of `qu
 
 import functools
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float
 
 from .._base.parts import Record
+from .._base.quick import command_jit
+from .._mechanism.mechanism import Mechanism
 from .._mechanism.oscillator import Linearised
 from .._mechanism.quantities import sliding_friction
 from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
 from . import quartic
-from .linearise import assembled, linearised, linearised_at, normal_force, pressed
+from .band import among, in_band
+from .linearise import (
+    assembled,
+    linearised,
+    linearised_at,
+    normal_force,
+    pressed,
+    require_equilibrium,
+)
 from .margin import damping_ratios, least_damping_ratio, margin_of
 from .quadratic import solve
 
@@ -45,6 +55,9 @@ class Stability(Record):
     `normal_force` is that of each joint under preload, P without a normal direction, and NaN in the
     source's form; None where no joint is preloaded. Where it is not above 0 the joint is open:
     there is no steady sliding, and all numbers are NaN.
+
+    Of a structure that `reduce` made only the eigenvalues in its band count: they come first, and
+    the others are none of the structure's.
     """
 
     eigenvalues: Complex[Array, " 2*n"]  # [1/s], largest real part first
@@ -54,7 +67,8 @@ class Stability(Record):
     margin: Float[Array, ""]  # > 0 exactly where all modes decay, see `margin`
     resolutions: Float[Array, " 2*n"]  # [1/s]
     shapes: Complex[Array, "2*n n"]  # displacements, the largest of each 1
-    normal_force: Float[Array, " m"] | None  # of each preloaded joint at the equilibrium [N]
+    normal_force: Any  # (m,), of each preloaded joint at the equilibrium [N]; else None
+    counted: Bool[Array, " 2*n"]  # of a reduced structure, whether it lies in the band
     names: tuple[str, ...] | None = eqx.field(static=True)  # of the degrees of freedom
 
     @property
@@ -103,9 +117,9 @@ class Stability(Record):
     def _modes(self) -> list[Mode]:
         if self.eigenvalues.ndim != 1:
             raise ValueError(f"modes are listed of one result, got {self.eigenvalues.shape}")
-        modes, columns = [], map(np.asarray, (self.eigenvalues, self.resolutions, self.shapes))
-        for s, resolution, shape in zip(*columns, strict=True):
-            if s.imag >= 0:
+        modes, given = [], (self.eigenvalues, self.resolutions, self.shapes, self.counted)
+        for s, resolution, shape, counted in zip(*map(np.asarray, given), strict=True):
+            if counted and s.imag >= 0:
                 largest = int(np.abs(shape).argmax())
                 mode = Mode(
                     growth_rate=float(s.real),
@@ -124,41 +138,56 @@ class Stability(Record):
         yield f"eigenvalues: {self.eigenvalues.shape}"
 
 
-@functools.partial(jax.jit, static_argnames="friction_slope")
-def growth_rate(scene: Scene | Structure, friction_slope: bool = True) -> Float[Array, ""]:
+def growth_rate(scene: Mechanism, friction_slope: bool = True) -> Float[Array, ""]:
     """Largest real part of the eigenvalues [1/s], a scalar; above 0 the scene squeals.
 
     `friction_slope=False` leaves out the slope of the friction law, as the source's Eq. 43 does.
     Towards coalescing eigenvalues the derivative grows without bound. Exactly there it is infinite,
     and some finite number is returned. NaN where the numbers leave the range in which a sign can
     be told (`dimensionless`), and where a preloaded joint is open at its equilibrium
-    (`Stability.normal_force`).
+    (`Stability.normal_force`). Of a structure also, under `jit` and `vmap`, where there is no
+    equilibrium.
 
-    **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`; or if a structure without F
-    has friction with a slope.
+    **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`; if a structure without F
+    has friction with a slope; and if one has no equilibrium.
     """
+    found = _growth_rate(scene, friction_slope)
+    require_equilibrium(scene, friction_slope, found)
+    return found
+
+
+@functools.partial(command_jit, static_argnames="friction_slope")
+def _growth_rate(scene, friction_slope):
     if isinstance(scene, Structure):
         s = solve(*assembled(scene, friction_slope).matrices).s
         # An argmax: sorting would double the time to compile.
-        return s.real[jnp.argmax(s.real)]
+        return s.real[jnp.argmax(_rank(s, scene.band))]
     return quartic.rightmost_root(linearised(scene, friction_slope)).real
 
 
-@functools.partial(jax.jit, static_argnames="friction_slope")
-def stability(scene: Scene | Structure, friction_slope: bool = True) -> Stability:
+def stability(scene: Mechanism, friction_slope: bool = True) -> Stability:
     """Eigenvalues of Eq. 43 and what follows from them; arguments and errors as `growth_rate`."""
+    found = _stability(scene, friction_slope)
+    require_equilibrium(scene, friction_slope, found.growth_rate)
+    return found
+
+
+@functools.partial(command_jit, static_argnames="friction_slope")
+def _stability(scene, friction_slope):
     if isinstance(scene, Structure):
         attached = assembled(scene, friction_slope)
-        forces, (s, x, error) = attached.normal_force, solve(*attached.matrices)
-        order = jnp.lexsort((-s.imag, -s.real))
+        forces, (s, x, error, _) = attached.normal_force, solve(*attached.matrices)
+        order = jnp.lexsort((-s.imag, -_rank(s, scene.band)))
         s, x, error = s[order], x[order], error[order]
-        margin, names = least_damping_ratio(s), scene.names
+        counted = in_band(s, scene.band)
+        margin, names = least_damping_ratio(among(s, scene.band)), scene.names
     else:
         joint = pressed(scene)
         lin, forces = linearised_at(scene, joint, friction_slope), normal_force(scene, joint)
         s, mobility = quartic.roots(lin), sliding_friction(scene) / scene.oscillator.m
         x = _displacements(lin, s, mobility, joint.K_n, joint.K_t)
         error, margin, names = quartic.resolutions(lin, s), margin_of(lin), ("x1", "x2")
+        counted = jnp.ones(s.shape, bool)
     largest = jnp.abs(jax.lax.stop_gradient(x)).argmax(axis=1)
     return Stability(
         eigenvalues=s,
@@ -170,7 +199,13 @@ def stability(scene: Scene | Structure, friction_slope: bool = True) -> Stabilit
         shapes=x / jnp.take_along_axis(x, largest[:, None], axis=1),
         names=names,
         normal_force=forces,
+        counted=counted,
     )
+
+
+def _rank(s, band):
+    """The real part, those outside of the band last."""
+    return s.real if band is None else jnp.where(in_band(s, band), s.real, -jnp.inf)
 
 
 def _displacements(lin: Linearised, s, mobility, K_n, K_t) -> Complex[Array, "4 2"]:

@@ -146,6 +146,7 @@ def structure_table(structure: Structure, friction_slope: bool = True) -> str:
     unstable, unresolved = modes.unstable(), modes.unresolved()
     whole = {
         "degrees of freedom": f"{structure.n}",
+        **{name: f"{value:.6g}" for name, value in structure.parameters.items()},
         "unstable modes": f"{len(unstable)}  ({_structure_verdict(modes, unstable, unresolved)})",
         "growth rate [1/s]": f"{modes.growth_rate:+.6g}  (to +-{modes.resolution:.1g})",
         "least damping ratio": f"{modes.margin:+.6g}",

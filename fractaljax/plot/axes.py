@@ -72,6 +72,11 @@ def geometric(values: Float[np.ndarray, " n"]) -> bool:
     return bool(low > 0 and np.median(values) < (np.sqrt(low * high) + (low + high) / 2) / 2)
 
 
+def frequency_unit(frequencies: Any) -> tuple[float, str]:
+    """The factor from Hz, and the unit, in which frequencies are readable."""
+    return (1e-3, "kHz") if np.nanmax(frequencies, initial=0) >= 1e3 else (1.0, "Hz")
+
+
 class Coordinate(NamedTuple):
     """What a picture shows of a motion: a displacement row @ x."""
 

@@ -55,6 +55,51 @@ def frequency_map(result: Sweep, ax: Axes | None = None, *, mode: int = 1) -> Ax
     return _finish(result, ax, growth, handles, f"frequency of mode {mode} [kHz]")
 
 
+def stability_chart(result: Sweep, ax: Axes | None = None) -> Axes:
+    """The number of unstable modes over one or two quantities, from a sweep of `stability`.
+
+    Over two with labelled contours of the growth rate [1/s] and the stability boundary, as in
+    `growth_map`; over one with the growth rate and its zero. A real part within rounding of 0 is
+    not unstable. The measure of the sweep may be any object with the `growth_rate`, `eigenvalues`,
+    `resolutions` and `counted` of a `Stability`.
+
+    **Raises:** `ValueError` for a sweep of anything else, and unless it has one or two axes, each
+    with two values or more.
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    count = unstable_modes(result)
+    if count.ndim == 1:
+        ax, ((name, x),) = given_or_new(ax), result.axes.items()
+        if len(x) < 2:
+            raise ValueError("a chart needs two values or more, got one")
+        growth = np.asarray(result.values.growth_rate)
+        _count(ax, x, np.array([0.0, 1.0]), np.stack([count, count]), ax.get_xaxis_transform())
+        ax.axhline(0, color="k", lw=0.8)
+        ax.plot(x, growth, color="k", lw=2)
+        over_quantity(ax, "x", result.scene, name, x)
+        ax.set_ylabel("growth rate [1/s]")
+        return ax
+    ax, growth, handles = _start(result, ax)
+    growth = np.ma.masked_invalid(growth)
+    x, y = result.points
+    _count(ax, x, y, count.T, ax.transData)
+    levels = MaxNLocator(8).tick_values(growth.min(), growth.max())
+    _label(result, ax, growth, levels[levels != 0], linestyles=None)
+    return _finish(result, ax, growth, handles, "growth rate [1/s]")
+
+
+def unstable_modes(result: Sweep) -> np.ma.MaskedArray:
+    """The number of modes that grow, (*grid), masked where there is no steady sliding."""
+    needed = "growth_rate", "eigenvalues", "resolutions", "counted"
+    if not all(hasattr(result.values, name) for name in needed):
+        raise ValueError("a chart needs a sweep of stability")
+    found: Any = [np.asarray(getattr(result.values, name)) for name in needed]
+    growth, s, error, counted = found
+    grows = counted & (s.imag >= 0) & (s.real > error)
+    return np.ma.masked_where(np.isnan(growth), grows.sum(axis=-1))
+
+
 def vibration_modes(result: Sweep) -> tuple[np.ndarray, np.ndarray]:
     """Real part [1/s] and frequency [Hz] of the n modes, (*grid, n), the lowest frequency first.
 
@@ -114,6 +159,24 @@ def _fill(result, ax, values, levels, name, skip=0):
     colours = mpl.colormaps[name](np.linspace(0.05, 0.6, len(levels) - 1))
     ax.contourf(*result.points, values.T, levels, colors=colours)
     _label(result, ax, values, levels[skip:], linestyles="solid")
+
+
+def _count(ax, x, y, count, transform):
+    """Colours of a number of modes (y, x), and their scale."""
+    import matplotlib as mpl
+    from matplotlib.colors import BoundaryNorm, ListedColormap
+
+    top = max(1, int(count.max()))
+    colours = mpl.colormaps["YlOrBr"](np.linspace(0.12, 0.6, top))
+    # White where it is stable.
+    cmap = ListedColormap([(1.0, 1.0, 1.0, 1.0), *colours]).with_extremes(bad="0.8")
+    norm = BoundaryNorm(np.arange(top + 2) - 0.5, top + 1)
+    mesh = ax.pcolormesh(
+        x, y, count, norm=norm, cmap=cmap, shading="nearest", transform=transform, zorder=0
+    )
+    mesh.set_rasterized(True)
+    ticks = range(0, top + 1, 1 + top // 10)
+    ax.figure.colorbar(mesh, ax=ax, ticks=ticks, pad=0.02).set_label("unstable modes")
 
 
 def _label(result, ax, values, levels, linestyles):

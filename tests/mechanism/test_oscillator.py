@@ -171,11 +171,10 @@ def test_no_damping_and_a_force_that_lifts_are_inside():
     assert [float(x) for x in (oscillator.xi_1, oscillator.xi_2, oscillator.F)] == [0, 0, -3]
 
 
-def test_a_traced_value_outside_the_domain_raises_when_run():
+def test_a_traced_value_outside_the_domain_is_nan():
     run = jax.jit(lambda m: fj.Oscillator(**(OSCILLATOR | {"m": m})).m)
     assert float(run(2.0)) == 2.0
-    with pytest.raises(Exception, match="m must be above 0"):
-        run(-1.0).block_until_ready()
+    assert np.isnan(run(-1.0))
 
 
 def test_pytree_round_trip_and_frozen():

@@ -232,11 +232,10 @@ def test_values_outside_their_domain_are_refused(scene, values, message):
         replaced(scene, values)
 
 
-def test_values_outside_their_domain_are_refused_when_compiled():
+def test_values_outside_their_domain_are_nan_when_compiled():
     place = jax.jit(lambda ratio: replaced(CONSTANT, {"omega_1/omega_2": ratio}))
     assert place(2.0).oscillator.omega_1 == 2 * CONSTANT.oscillator.omega_2
-    with pytest.raises(Exception, match="omega_1/omega_2 must be above 0"):
-        place(-1.0)
+    assert np.isnan(place(-1.0).oscillator.omega_1)
 
 
 def test_single_precision_stays():

@@ -17,7 +17,6 @@ import scipy.io
 import scipy.sparse
 
 import fractaljax as fj
-from fractaljax._mechanism.structure import load
 from fractaljax._mechanism.structure_file import _npz
 from structures import matrices, two_joints
 from tools import run_command
@@ -114,7 +113,7 @@ def written(folder, structure, joints=JOINT, names='names = ["x", "y", "z"]'):
 def test_matrices_from_every_kind_of_file(files, text):
     joint = fj.Joint(fj.FixedContact(3e6, 1e6), fj.Coulomb(0.4), ("x", "y"), "z", V=0.2)
     expected = fj.Structure(M, C, K, {"pad": joint}, [1.0, 2.0, 3.0], ("x", "y", "z"))
-    found = load(written(files, text))
+    found = fj.load(written(files, text))
     assert isinstance(found, fj.Structure)
     equal(found, expected)
 
@@ -166,7 +165,7 @@ def test_a_pipe_is_read_once(tmp_path):
     scene = fj.brake_scene()
     writer = threading.Thread(target=(tmp_path / "pipe").write_text, args=[scene.to_toml()])
     writer.start()
-    found = load(tmp_path / "pipe")
+    found = fj.load(tmp_path / "pipe")
     writer.join()
     assert isinstance(found, fj.Scene)
     assert found.to_toml() == scene.to_toml()
@@ -274,22 +273,21 @@ BAD = [
     ('matrices = "text.npz"', "text.npz: M must be real numbers, got <U1"),
     ('matrices = "scalar.npz"', "M must be a square matrix, got shape ()"),
     ('matrices = "encrypted.npz"', "encrypted.npz: M is encrypted"),
-    ('matrices = "bomb.npz"', "bomb.npz: it unpacks to 4000000000 bytes, at most 512000000"),
+    ('matrices = "bomb.npz"', "bomb.npz: it unpacks to 4000000000 bytes, at most 1073741824"),
     ('matrices = "twice.npz"', "twice.npz: it holds two arrays of one name"),
     ('matrices = "liar.npz"', "liar.npz: M is damaged: 8000000000000 bytes"),
     ('matrices = "cut.npz"', "cut.npz: it is no sound file of numbers"),
     ('matrices = "no.npz"', "no.npz: it is no sound file of numbers"),
-    ('matrices = "M.mtx"', "M.mtx: it is no sound file of numbers"),
-    ('matrices = "/dev/zero"', "zero: the file is larger than"),
+    ('matrices = "M.mtx"', "[structure] lacks the matrix K"),
+    ('matrices = "/dev/zero"', "zero: of unknown format; known are .npz, .mat, .mtx"),
     ('matrices = "missing.npz"', "missing.npz"),
-    ('M = "no.mtx"\nK = "K.mtx"', "no.mtx is not a Matrix Market file"),
-    ('M = "two.npz"\nK = "K.mtx"', "two.npz is not a Matrix Market file"),
-    ('M = "/dev/zero"\nK = "K.mtx"', "zero is not a Matrix Market file"),
-    ('M = "huge.mtx"\nK = "K.mtx"', "huge.mtx holds 100000 x 100000 numbers; reduce the model"),
-    (MTX + '"complex.mtx"', "K must be an array of real numbers, got complex128"),
-    (MTX + '"F.mtx"', "K must have shape (3, 3) as M demands, got (3, 1)"),
-    *((MTX + f'"{name}"', f"{name} is damaged") for name in ("cut.mtx.gz", "cut.mtx.bz2")),
-    *((MTX + f'"{name}"', f"{name} is damaged") for name in ("no.mtx.gz", "no.mtx.bz2")),
+    ('M = "no.mtx"\nK = "K.mtx"', "no.mtx: it is neither a Matrix Market file nor"),
+    ('M = "/dev/zero"\nK = "K.mtx"', "zero: of unknown format"),
+    ('M = "huge.mtx"\nK = "K.mtx"', "K must have shape (100000, 100000) as M demands"),
+    (MTX + '"complex.mtx"', "complex.mtx: it must be real numbers, got complex ones"),
+    (MTX + '"F.mtx"', "K must be a square matrix, got shape (3, 1)"),
+    *((MTX + f'"{name}"', f"{name}: it is damaged") for name in ("cut.mtx.gz", "cut.mtx.bz2")),
+    *((MTX + f'"{name}"', f"{name}: it is damaged") for name in ("no.mtx.gz", "no.mtx.bz2")),
     ('matrices = "all.npz"\nM =', "not a TOML file"),
 ]
 BAD_JOINTS = [
@@ -320,7 +318,7 @@ BAD_JOINTS = [
 )
 def test_bad_files_are_refused_in_one_line(files, text, joints, message):
     with pytest.raises((ValueError, FileNotFoundError)) as caught:
-        load(written(files, text, joints))
+        fj.load(written(files, text, joints))
     error = str(caught.value)
     assert message in error and "\n" not in error
     assert "brake.toml: " in error or isinstance(caught.value, FileNotFoundError)

@@ -124,7 +124,9 @@ def _digits():
 PROBLEMS = {**{f"scene, F = {F:g}": (lambda F=F: scene(F)) for F in PULLS}, "structure": structure}
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize(
+    "name", [*list(PROBLEMS)[:-1], pytest.param("structure", marks=pytest.mark.slow)]
+)
 def test_eigenvalues_and_normal_forces(name):
     x = PROBLEMS[name]()
     wanted, forces = Oracle(x).modes()

@@ -13,6 +13,7 @@ import scipy.linalg
 import scipy.optimize
 
 import fractaljax as fj
+from fractaljax._stability.quadratic import leading
 from structures import (
     DIGITS,
     beam,
@@ -576,7 +577,18 @@ def test_slope_without_force_or_support():
     K = 1e6 * np.kron(np.eye(2), [[1, -1], [-1, 1]])
     joint = fj.Joint(fj.FixedContact(1e5, 5e4), fj.Stribeck(0.4, 0.2, 0.5), (0, 1), (2, 3), V=0.1)
     free = fj.Structure(np.eye(4), None, K, joint, F=[0, 0, 1.0, 2.0])
-    with pytest.raises(RuntimeError, match="F has no static equilibrium"):
-        fj.assemble(free)
+    for question in (fj.assemble, fj.growth_rate, fj.stability, fj.margin):
+        with pytest.raises(ValueError, match="F has no static equilibrium"):
+            question(free)
+    many = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), free)
+    assert np.isnan(jax.vmap(fj.growth_rate)(many)).all()
+    assert "callback" not in str(jax.make_jaxpr(fj.growth_rate)(STRUCTURE))
     for held, slope in ((free, False), (free.replace(K=K + 1e3 * np.eye(4)), True)):
         assert all(np.isfinite(X).all() for X in arrays_of(held, slope))
+
+
+def test_leading_modes_of_a_band():
+    """Modes that are not there are more damped than any in the band."""
+    M, C, K = jnp.eye(3), jnp.diag(jnp.array([6.0, 4.0, 2.0])), jnp.diag(jnp.array([1e4, 4e4, 1e6]))
+    np.testing.assert_allclose(leading(M, C, K, 3, (50.0, 500.0)).s.real, [-2, -3, -500], rtol=1e-9)
+    np.testing.assert_allclose(leading(M, C, K, 3).s.real, [-1, -2, -3], rtol=1e-9)

@@ -1,0 +1,76 @@
+"""`fractaljax reduce`: a finite-element model to few degrees of freedom."""
+
+from pathlib import Path
+from typing import Any
+
+from .output import output
+from .parsing import numbers, pairs_of, reduction_of
+
+_FORM = "NAME=LOW:HIGH"
+_FILE = "reduced.toml"
+
+
+def add_reduce(commands) -> None:
+    """Add `fractaljax reduce`."""
+    parser = commands.add_parser(
+        "reduce",
+        help="reduce a finite-element model to few degrees of freedom",
+        description=_run.__doc__,
+    )
+    parser.add_argument("structure", type=Path, help="a file with a table [structure]")
+    parser.add_argument("--out", type=Path, default=Path("fractaljax-reduced"), metavar="FOLDER")
+    parser.add_argument(
+        "--band",
+        metavar="LOW:HIGH",
+        help="of the eigenvalues to keep, in rad/s; else that of the file's table [reduction]",
+    )
+    parser.add_argument(
+        "--over",
+        nargs="+",
+        metavar=_FORM,
+        help="quantities and the ranges in which the reduction holds; else those of the file",
+    )
+    parser.add_argument("--tol", type=float, help="largest error, of |s|; default 1e-8")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+    parser.set_defaults(run=_run)
+
+
+def _run(arguments) -> int:
+    """Keep the eigenvalues of a structure in a band, over ranges of its quantities.
+
+    Writes reduced.toml and reduced.npz, which go wherever a structure goes.
+    """
+    from .._base.table import table
+    from .._mechanism.structure import Structure, load
+    from .._stability.reduction import reduce
+    from .._stability.summary import structure_table
+
+    options: dict[str, Any] = reduction_of(arguments.structure)
+    if arguments.band is not None:
+        options["band"] = numbers("--band", arguments.band, ":")
+    if arguments.tol is not None:
+        options["tol"] = arguments.tol
+    if arguments.over is not None:
+        given = pairs_of("--over", arguments.over, _FORM)
+        options["over"] = {
+            name: numbers(f"--over {name}", text, ":") for name, text in given.items()
+        }
+    if "band" not in options:
+        raise ValueError("--band must be LOW:HIGH in rad/s: the file has no table [reduction]")
+    structure = load(arguments.structure)
+    if not isinstance(structure, Structure):
+        raise ValueError(f"{arguments.structure}: a scene has two directions, which are few enough")
+    with output(arguments.out) as write:
+        reduced = reduce(structure, **options, progress=not arguments.quiet)
+        files = reduced._files(arguments.out / _FILE)
+        written = write({path.name: content for path, content in files.items()})
+    of = reduced.reduction
+    rows = {
+        "degrees of freedom": f"{reduced.n} of {structure.n}",
+        "band [rad/s]": f"{of.band[0]:g} to {of.band[1]:g}",
+        **{f"over {name}": f"{low:g} to {high:g}" for name, (low, high) in of.over.items()},
+        "largest error, of |s|": f"{of.error:.2g}",
+        "points with eigenvectors": f"{len(of.points)}",
+    }
+    print(f"{table([''], [rows])}\n\n{structure_table(reduced, of.friction_slope)}\n{written}")
+    return 0

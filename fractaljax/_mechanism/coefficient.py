@@ -1,0 +1,105 @@
+"""Coefficients of matrices: numbers, and functions or texts of a structure's parameters."""
+
+import ast
+import math
+import operator
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from .._base.parts import brief, scalar
+
+Parameters = Mapping[str, Float[Array, ""]]
+_CONSTANTS = {"pi": math.pi}
+_FUNCTIONS = {name: getattr(jnp, name) for name in ("sqrt", "exp", "log", "sin", "cos", "tan")}
+_OPERATORS: dict[type, Callable] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Pow: operator.pow,
+    ast.USub: operator.neg,
+    ast.UAdd: operator.pos,
+}
+_LONGEST = 500  # characters
+
+
+class Expression(NamedTuple):
+    """A coefficient as text, "Omega**2 - 1": the one kind of function that a file can hold."""
+
+    text: str
+
+    def __call__(self, p: Parameters) -> Any:
+        return _value(_parsed(self.text), p)
+
+
+def coefficient_of(name: str, given: Any, parameters: Parameters) -> Callable | ArrayLike:
+    """A number, or a function of the parameters; a text becomes an `Expression`.
+
+    **Raises:** `ValueError` or `TypeError`, calling it `name`, for anything else, and for a
+    function that does not give a finite number of these parameters.
+    """
+    if isinstance(given, str):
+        given = Expression(given)
+    if not callable(given):
+        return scalar(name, given)
+    try:
+        value: Any = given(parameters)
+    except (KeyError, NameError) as error:
+        raise ValueError(
+            f"{name} needs the parameter {error.args[0]!r}; given are {_listed(parameters)}"
+        ) from None
+    scalar(name, value)
+    return given
+
+
+def evaluated(coefficient: Callable | None, p: Parameters) -> Any:
+    """The value of a coefficient; of None, which stands for 1, None."""
+    return None if coefficient is None else coefficient(p)
+
+
+def _parsed(text: str) -> ast.expr:
+    wrong = ValueError(
+        f"a coefficient must be a formula of parameters, numbers, pi, + - * / ** and "
+        f"{', '.join(_FUNCTIONS)}, got {brief(text)}"
+    )
+    if len(text) > _LONGEST:
+        raise wrong
+    try:
+        tree = ast.parse(text.strip(), mode="eval").body
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        raise wrong from None
+    for node in ast.walk(tree):
+        known = (ast.BinOp, ast.UnaryOp, ast.Name, ast.Load, *_OPERATORS)
+        number = isinstance(node, ast.Constant) and type(node.value) in (int, float)
+        if isinstance(node, ast.Call):
+            function = node.func
+            known_call = isinstance(function, ast.Name) and function.id in _FUNCTIONS
+            if not known_call or len(node.args) != 1 or node.keywords:
+                raise wrong
+        elif not (number or isinstance(node, known)):
+            raise wrong
+    return tree
+
+
+def _value(node: Any, p: Parameters) -> Any:
+    match node:
+        case ast.Constant():
+            return node.value
+        case ast.Name():
+            if node.id in p:
+                return p[node.id]
+            if node.id in _CONSTANTS:
+                return _CONSTANTS[node.id]
+            raise NameError(node.id)
+        case ast.UnaryOp():
+            return _OPERATORS[type(node.op)](_value(node.operand, p))
+        case ast.Call(func=ast.Name(id=function)):
+            return _FUNCTIONS[function](_value(node.args[0], p))
+    return _OPERATORS[type(node.op)](_value(node.left, p), _value(node.right, p))
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(names) or "none"

@@ -1,0 +1,126 @@
+"""A structure of few degrees of freedom in the place of a large one."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike
+
+from .._base.parts import Numbers, brief
+from .structure import ParametricStructure
+
+
+class Reduction:
+    """How a reduced structure was made; two are the same if they are one object."""
+
+    def __init__(
+        self,
+        V: np.ndarray,
+        W: np.ndarray,
+        names: tuple[str, ...] | None,
+        over: dict[str, tuple[float, float]],
+        band: tuple[float, float],
+        tol: float,
+        friction_slope: bool,
+        residuals: np.ndarray,
+        error: float,
+        points: Sequence[dict[str, float]] = (),
+        touched: np.ndarray | None = None,
+    ):
+        self.V = V  # (n, r): x = V q
+        self.W = W  # (n, r)
+        self.names = names  # of the n degrees of freedom
+        self.over = over
+        self.band = band  # [rad/s]
+        self.tol = tol
+        self.friction_slope = friction_slope
+        self.residuals = residuals  # L^T Q^-1 R of the residuals of all terms, see `_Space`
+        self.points = list(points)  # where eigenvectors were taken
+        self.touched = touched  # (m, n), `Structure._touched` of the large one; not in files
+        self.error = error  # the largest found at candidates and fresh points, of |s|
+
+
+class ReducedStructure(ParametricStructure):
+    """A structure of few degrees of freedom q (r,), as `reduce` makes it: x = V q.
+
+    It has the parameters and the joints of the large one and goes wherever a structure goes. Only
+    eigenvalues in `band` are those of the large structure, and only they count in its stability.
+    `replace` of a matrix gives a plain structure.
+    """
+
+    reduction: Reduction = eqx.field(static=True)
+
+    def __init__(self, M, C, K, joints, parameters, F, reduction: Reduction):
+        super().__init__(M, C, K, joints, parameters, F)
+        self.reduction = reduction
+
+    @property
+    def band(self) -> tuple[float, float]:
+        """Where eigenvalues are those of the large structure, in |Im s| [rad/s]."""
+        return self.reduction.band
+
+    def _touched(self) -> np.ndarray | None:
+        return self.reduction.touched
+
+    def full(self, q: ArrayLike) -> Numbers:
+        """Displacements or velocities (..., n) of all degrees of freedom from those of q (..., r).
+
+        A state (..., 2r) gives a state (..., 2n). Shapes of modes may be complex.
+
+        **Raises:** `ValueError` for another size.
+        """
+        q, V = jnp.asarray(q), jnp.asarray(self.reduction.V)
+        if q.ndim == 0 or q.shape[-1] not in (self.n, 2 * self.n):
+            raise ValueError(f"q must have {self.n} or {2 * self.n} numbers, got shape {q.shape}")
+        halves = q.reshape(*q.shape[:-1], -1, self.n)
+        return (halves @ V.T.astype(halves.dtype)).reshape(*q.shape[:-1], -1)
+
+    @classmethod
+    def from_file(cls, given: dict[str, Any]) -> "ReducedStructure":
+        """That of a file, from what `read_structure` found."""
+        about: dict[str, Any] = dict(given.pop("reduced"))
+        keys = ("V", "W", "residuals", "over", "band", "tol", "friction_slope", "error")
+        missing = [key for key in keys if about.get(key) is None]
+        if missing:
+            raise ValueError(f"[reduced] or its file of matrices lacks {', '.join(missing)}")
+        names = about.pop("names", None)
+        about["over"] = {name: tuple(ends) for name, ends in about["over"].items()}
+        about["band"] = tuple(about["band"])
+        about["residuals"] = about["residuals"][0] + 1j * about["residuals"][1]
+        about["names"] = None if names is None else tuple(names)
+        try:
+            reduction = Reduction(**about)
+        except TypeError:
+            raise ValueError(f"[reduced] has an unknown key among {brief(list(about))}") from None
+        given = {key: x for key, x in given.items() if key != "names"}
+        return cls(**{"parameters": {}, **given}, reduction=reduction)
+
+    def _more_tables(self):
+        of = self.reduction
+        return {
+            "reduced": {
+                "band": of.band,
+                "tol": of.tol,
+                "error": of.error,
+                "friction_slope": of.friction_slope,
+                "names": of.names,
+                "points": of.points,
+                "over": of.over,
+            }
+        }
+
+    def _more_arrays(self):
+        of = self.reduction
+        return {
+            "V": of.V,
+            "W": of.W,
+            "residuals": np.stack([np.real(of.residuals), np.imag(of.residuals)]),
+        }
+
+    def _shown(self):
+        yield f"n={self.n} of {len(self.reduction.V)}"
+        yield f"error={self.reduction.error:.2g}"
+        yield from (f"{name}={value}" for name, value in self.parameters.items())
+        yield from self.joint_names

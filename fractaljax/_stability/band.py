@@ -1,0 +1,23 @@
+"""Which eigenvalues count: all, or those in the band of a reduction."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Complex
+
+MOST_DAMPED = 0.3  # damping ratio of the modes that a reduction looks for
+
+
+def in_band(s: Complex[Array, " k"], band: tuple[float, float] | None) -> Bool[Array, " k"]:
+    """Which eigenvalues a reduction to the band (low, high) [rad/s] gives: low < |Im s| <= high.
+
+    Not those with |Re s| > 0.3 |s|, which it does not look for.
+    """
+    if band is None:
+        return jnp.ones(s.shape, bool)
+    frequency = jnp.abs(s.imag)
+    sought = jnp.abs(s.real) <= MOST_DAMPED * jnp.sqrt(s.real**2 + frequency**2)
+    return (frequency > band[0]) & (frequency <= band[1]) & sought
+
+
+def among(s: Complex[Array, " k"], band: tuple[float, float] | None) -> Complex[Array, " k"]:
+    """The eigenvalues in the band, and -1, critically damped, in the place of the others."""
+    return s if band is None else jnp.where(in_band(s, band) | jnp.isnan(s), s, -1)

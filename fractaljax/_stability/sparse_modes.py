@@ -1,0 +1,95 @@
+"""Eigenvalues of large sparse matrices in a band of frequencies, with their vectors.
+
+(s^2 M + s C + K) x = 0 is inverted about a shift by one sparse LU factorisation of the size of M,
+and ARPACK finds the nearest eigenvalues (R. B. Lehoucq, D. C. Sorensen and C. Yang, 1998). Left
+vectors are those of the transposed problem, by the same factors. SciPy, outside of JAX.
+"""
+
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+
+_NEAREST = 40  # eigenvalues sought about one shift
+_BEYOND = 1.05  # the disc about a shift reaches so far beyond its part of the band
+_NARROWEST = 1e-6  # of the band: there are more eigenvalues in it than can be told apart
+_TOLERANCE = 1e-11
+
+
+class BandModes(NamedTuple):
+    """Modes with |Im s| in a band, one of each conjugate pair."""
+
+    s: np.ndarray  # (k,) [1/s]
+    right: np.ndarray  # (n, k), vectors in columns
+    left: np.ndarray  # (n, k): left^T (s^2 M + s C + K) = 0, each with the s of its place
+
+
+class Factors:
+    """Q = s^2 M + s C + K at a shift s, factorised: solves Q x = b and Q^T x = b."""
+
+    def __init__(self, matrices: tuple[Any, Any, Any], shift: complex):
+        from scipy.sparse.linalg import splu
+
+        M, C, K = matrices
+        self.shift = shift
+        self._lu = splu((shift**2 * M + shift * C + K).tocsc())
+
+    def solve(self, b: np.ndarray, transposed: bool = False) -> np.ndarray:
+        """x (n,) or (n, k) for right-hand sides of that shape, complex."""
+        b = np.ascontiguousarray(b, complex) if b.ndim == 1 else np.asfortranarray(b, complex)
+        return self._lu.solve(b, "T" if transposed else "N")
+
+
+def band_modes(matrices: tuple[Any, Any, Any], band: tuple[float, float]) -> BandModes:
+    """All modes of (M, C, K), sparse (n, n), with Im s in the band (low, high) [rad/s].
+
+    Those that are damped beyond a ratio of about 0.3 may be missed: they are far from the shifts.
+
+    **Raises:** `ValueError` if more eigenvalues crowd together than can be found.
+    """
+    low, high = band
+    found = _within(matrices, low, high, high - low)
+    s, right, left = (np.concatenate([each[i] for each in found], axis=-1) for i in range(3))
+    order = np.argsort(np.imag(s))
+    return BandModes(s[order], right[:, order], left[:, order])
+
+
+def _within(matrices, low, high, width) -> list[BandModes]:
+    half = (high - low) / 2
+    # Not on the axis, where lightly damped eigenvalues are.
+    factors = Factors(matrices, half * 1e-3 + 1j * (low + high) / 2)
+    n = matrices[0].shape[0]
+    count = min(_NEAREST, 2 * n - 2)
+    s, right = _nearest(matrices, factors, count, transposed=False)
+    if np.abs(s - factors.shift).max() < _BEYOND * half and count == _NEAREST:
+        if half < _NARROWEST * width:
+            raise ValueError(f"too many eigenvalues near {high:g} rad/s: choose a narrower band")
+        middle = (low + high) / 2
+        parts = (low, middle), (middle, high)
+        return [each for part in parts for each in _within(matrices, *part, width)]
+    z, left = _nearest(matrices, factors, count, transposed=True)
+    # The low end of a band at 0 has no mode of its own: real eigenvalues do not oscillate.
+    inside = (s.imag > low) & (s.imag <= high)
+    s, right = s[inside], right[:, inside]
+    place = [int(np.abs(z - each).argmin()) for each in s]
+    return [BandModes(s, right, left[:, place])]
+
+
+def _nearest(matrices, factors: Factors, count: int, transposed: bool):
+    """The eigenvalues (k,) nearest to the shift, and their vectors (n, k)."""
+    from scipy.sparse.linalg import LinearOperator, eigs
+
+    M, C, _ = (X.T.tocsr() for X in matrices) if transposed else matrices
+    n, shift, unit = M.shape[0], factors.shift, abs(factors.shift)
+    moving = (C + shift * M).tocsr()
+
+    # Of states (x, s x/unit): halves of one size.
+    def inverse(state):
+        x, v = state[:n], state[n:]
+        y = factors.solve(-(unit * (M @ v) + moving @ x), transposed)
+        return np.concatenate([y, (x + shift * y) / unit])
+
+    start = np.random.default_rng(0).standard_normal(2 * n) + 0j
+    linear, arpack = cast(Any, LinearOperator), cast(Any, eigs)
+    operator = linear((2 * n, 2 * n), inverse, dtype=complex)
+    found, states = arpack(operator, count, which="LM", v0=start, tol=_TOLERANCE)
+    return shift + 1 / found, states[:n]

@@ -1,0 +1,267 @@
+"""Every mode of a mechanism over one quantity, followed through crossing, veering and coalescence.
+
+Modes at two values are compared as states (x, x'), with left and right eigenvectors: a left state
+of eigenvalue s is w = (y (s M + C), y M), a right one v = (x, s x), and w v = 1. Of modes i and j,
+
+    B_ij = (w_i v_j') (w_j' v_i),    sum_j B_ij = sum_i B_ij = 1,
+
+where the prime marks the second value and the sums are over all 2n states. Without damping and
+friction B is the modal assurance criterion |x_i^T M x_j|^2 of unit modal masses (R. J. Allemang,
+Sound and Vibration 37 (2003) 14), and in general the product of two such with left vectors. Where
+right vectors alone become parallel, as at a coalescence, it still tends to the identity as the step
+becomes small.
+"""
+
+import functools
+import itertools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike, Complex, Float
+
+from .._base.parts import Record, flag
+from .._mechanism.quantities import (
+    axis_values,
+    require_inside,
+    require_one,
+    substituted,
+    with_optional,
+)
+from .._mechanism.scene import Scene
+from .._mechanism.structure import Structure
+from .band import in_band
+from .linearise import assembled
+from .quadratic import solve
+
+_SURE = 0.8  # a MAC from which on two modes are the same
+_HALVINGS = 12  # of a step, at most
+_PART = 0.48  # of a step, its first "half": a round number would meet the places of coalescence
+_INDEPENDENT = 1e4  # condition of shapes below which they are no single one
+_NONE = complex(np.nan, np.nan)
+_TIE = 0.1  # overlaps of two ways to pair modes that differ by less do not decide
+
+
+class ModeTracks(Record):
+    """Modes over p values of one quantity, as `track_modes` returns them: one in each column.
+
+    k is the number of modes that are there at any value, the lowest frequency first. NaN stands
+    where a mode is not: outside of the band of a reduced structure, where its joint is open, and
+    for the second of two real eigenvalues where the two are still one conjugate pair.
+    """
+
+    name: str = eqx.field(static=True)
+    values: Float[np.ndarray, " p"]
+    eigenvalues: Complex[np.ndarray, "p k"]  # [1/s], in the upper half plane
+    shapes: Complex[np.ndarray, "p k n"]  # displacements, the largest of each 1
+    mac: Float[np.ndarray, "p-1 k"]  # the least within each step; below 0.8 it is no certain match
+    x: Any = eqx.field(repr=False)  # the Scene or Structure
+
+    @property
+    def growth_rates(self) -> Float[np.ndarray, "p k"]:
+        """[1/s]"""
+        return np.real(self.eigenvalues)
+
+    @property
+    def frequencies(self) -> Float[np.ndarray, "p k"]:
+        """[Hz]"""
+        return np.imag(self.eigenvalues) / (2 * np.pi)
+
+    @property
+    def damping_ratios(self) -> Float[np.ndarray, "p k"]:
+        """-Re/|s| of each eigenvalue s."""
+        return -np.real(self.eigenvalues) / np.abs(self.eigenvalues)
+
+    def _shown(self):
+        yield f"{self.name}: {len(self.values)} values"
+        yield f"modes: {self.eigenvalues.shape[1]}"
+        unstable = (self.growth_rates > 0).any(axis=0).sum()
+        yield f"with positive growth rate: {unstable}"
+
+
+def track_modes(
+    x: Scene | Structure,
+    name: str,
+    values: ArrayLike | Sequence[float],
+    *,
+    friction_slope: bool = True,
+) -> ModeTracks:
+    """Eigenvalues and shapes of all modes over the values (p,) of a quantity, each mode a column.
+
+    Neighbours are paired by the modal assurance criterion of left and right eigenvectors
+    (`tracks.py`), MAC = max(0, 1 - |1 - B|), in the best way for all modes together. A step in
+    which a MAC is below 0.8 is halved, up to twelve times, and so is one in which two modes swap
+    their order: a veering wider than 1/2000 of the step is followed, and a narrower one is a
+    crossing. Equal eigenvalues with independent shapes, as in an exact crossing, get the shapes
+    that continue those of the value before.
+
+    Where two modes coalesce exactly, no continuation is better than the other: all MACs are at
+    most 1/2. Then the mode with the higher frequency goes on as the one that grows faster, and that
+    one as the higher frequency where they part. With any difference in damping, modes pass the
+    coalescence at some distance, and their own continuation decides. `mac` tells which it was.
+
+    Rigid-body modes, with s = 0, are left out.
+
+    **Raises:** `ValueError` for an unknown quantity, values outside its domain or not a list, and a
+    structure that is large and sparse; `TypeError` for what is neither a scene nor a structure.
+    """
+    require_one("x", x)
+    flag("friction_slope", friction_slope)
+    grid = np.asarray(axis_values(x, name, values), float)
+    require_inside(x, {name: grid})
+    whole = with_optional(x, [name])
+
+    def at(value):
+        return _Modes(value, *map(np.asarray, _states(whole, name, value, friction_slope)))
+
+    modes, steps, last = [], [], None
+    for value in grid:
+        found, mac = at(value), np.nan
+        if np.isfinite(found.s).all():
+            if last is None:
+                found = _aligned(found, found)
+            else:
+                found, mac = _step(last, found, at, _HALVINGS)
+            # Where modes have just coalesced nothing tells them apart: the next step passes over.
+            unsure = _shown(found) & (np.asarray(mac) < _SURE)
+            together = np.triu(_equal(found.s[unsure], 100), 1).any()
+            last = last if last is not None and together else found
+        modes.append(found)
+        steps.append(np.broadcast_to(mac, found.s.shape))
+    s: Any = np.stack([each.s for each in modes])
+    there = np.stack([_shown(each) for each in modes])
+    first = there.argmax(axis=0), np.arange(s.shape[1])
+    columns = np.argsort(np.where(there.any(axis=0), s[first].imag, np.inf), kind="stable")
+    columns = columns[: there.any(axis=0).sum()]
+    s, there = s[:, columns], there[:, columns]
+    n = modes[0].right.shape[1] // 2
+    shapes = np.stack([each.right[columns, :n] for each in modes])
+    shapes = np.where(there[..., None], shapes, 1)
+    largest = np.abs(shapes).argmax(axis=2)[..., None]
+    shapes = shapes / np.take_along_axis(shapes, largest, axis=2)
+    return ModeTracks(
+        name=name,
+        values=grid,
+        eigenvalues=np.where(there, s, _NONE),
+        shapes=np.where(there[..., None], shapes, _NONE),
+        mac=np.where(there[1:] & there[:-1], np.stack(steps)[1:, columns], np.nan),
+        x=x,
+    )
+
+
+@functools.partial(jax.jit, static_argnames=("name", "friction_slope"))
+def _states(x: Scene | Structure, name: str, value: Any, friction_slope: bool):
+    """Eigenvalues, right and left states, and which are counted, at a value of the quantity."""
+    x = substituted(x, {name: value})
+    x = Structure.from_scene(x) if isinstance(x, Scene) else x
+    M, C, K, C_error = assembled(x, friction_slope).matrices
+    found = solve(M, C, K, C_error)
+    s, Y = found.s[:, None], found.y
+    left = jnp.concatenate([s * (Y @ M) + Y @ C, Y @ M], axis=1)
+    right = jnp.concatenate([found.x, s * found.x], axis=1)
+    return found.s, right, left, in_band(found.s, x.band)
+
+
+class _Modes(NamedTuple):
+    """All 2n states at a value, in the order of the tracks."""
+
+    value: Any
+    s: Any  # (2n,)
+    right: np.ndarray  # (2n, 2n), one a row
+    left: np.ndarray  # (2n, 2n) likewise; left @ right.T is the identity
+    counted: np.ndarray  # (2n,)
+
+    def ordered(self, order: np.ndarray) -> "_Modes":
+        return _Modes(self.value, *(each[order] for each in self[1:]))
+
+
+def _step(a: _Modes, b: _Modes, at: Any, halvings: int) -> tuple[_Modes, np.ndarray]:
+    """b in the order of a, and the MAC of each mode, with as many values between as it takes."""
+    following, mac = _matched(a, b, last=halvings == 0)
+    if halvings == 0 or not _doubtful(a, following, mac):
+        return following, mac
+    between = at(a.value + _PART * (b.value - a.value))
+    if not np.isfinite(between.s).all():
+        return _matched(a, b, last=True)
+    between, first = _step(a, between, at, halvings - 1)
+    following, second = _step(between, b, at, halvings - 1)
+    return following, np.minimum(first, second)
+
+
+def _doubtful(a: _Modes, b: _Modes, mac: np.ndarray) -> bool:
+    """Whether a mode that is shown has no sure partner, or passes another one."""
+    shown = _shown(a) | _shown(b)
+    if (mac[shown] < _SURE).any():
+        return True
+    before, after = (each.s[shown, None] - each.s[None, shown] for each in (a, b))
+    passes = np.real(before.conj() * after) < 0
+    # Of equal eigenvalues, the order is rounding's.
+    return bool((passes & ~_equal(a.s[shown]) & ~_equal(b.s[shown])).any())
+
+
+def _shown(modes: _Modes) -> np.ndarray:
+    return modes.counted & (modes.s.imag >= 0) & (modes.s != 0)
+
+
+def _equal(s: np.ndarray, factor: float = 1) -> np.ndarray:
+    """Which eigenvalues (k, k) are the same, but for rounding; none of rigid bodies is."""
+    size = np.abs(s)
+    least = np.minimum(size[:, None], size[None])
+    return (np.abs(s[:, None] - s[None]) <= factor * _rounding(s) * least) & (least > 0)
+
+
+def _rounding(s: np.ndarray) -> float:
+    return float(np.sqrt(np.finfo(s.dtype).eps))
+
+
+def _matched(a: _Modes, b: _Modes, last: bool) -> tuple[_Modes, np.ndarray]:
+    """b in the order of a, and the MAC of each mode; at last by the rule where nothing decides."""
+    from scipy.optimize import linear_sum_assignment
+
+    weight = np.minimum(1, np.abs(_overlaps(a, b)))
+    b = _aligned(a, b.ordered(linear_sum_assignment(weight, maximize=True)[1]))
+    overlaps, order = _overlaps(a, b), np.arange(len(b.s))
+    mac = np.maximum(0, 1 - np.abs(1 - overlaps))
+    if last:
+        weight = np.minimum(1, np.abs(overlaps))
+        unsure = np.flatnonzero(np.diagonal(mac) < _SURE)
+        # Two modes that coalesce have one real part before and one imaginary part after it, or the
+        # other way round: the sum orders both.
+        ranks = [each.s.real + each.s.imag for each in (a, b)]
+        for i, j in itertools.combinations(unsure, 2):
+            here, there = weight[i, i] + weight[j, j], weight[i, j] + weight[j, i]
+            tie = there > _SURE and abs(here - there) < _TIE
+            if tie and (ranks[0][i] > ranks[0][j]) != (ranks[1][i] > ranks[1][j]):
+                order[[i, j]] = order[[j, i]]
+    return b.ordered(order), mac[np.arange(len(order)), order]
+
+
+def _overlaps(a: _Modes, b: _Modes) -> np.ndarray:
+    """B (2n, 2n), rows of a and columns of b."""
+    return (a.left @ b.right.T) * (a.right @ b.left.T)
+
+
+def _aligned(a: _Modes, b: _Modes) -> _Modes:
+    """b with those shapes, among all that equal eigenvalues have, that continue the ones of a."""
+    from scipy.sparse.csgraph import connected_components
+
+    equal = _equal(b.s)
+    if not np.triu(equal, 1).any():
+        return b
+    right, left = b.right.copy(), b.left.copy()
+    labels = connected_components(equal)[1]
+    for label in np.flatnonzero(np.bincount(labels) > 1):
+        (group,) = np.nonzero(labels == label)
+        # A defective pair has one shape only.
+        length = np.linalg.norm(right[group], axis=1, keepdims=True)
+        if np.linalg.cond(right[group] / length) > _INDEPENDENT:
+            continue
+        # LAPACK's left vectors of equal eigenvalues do not belong to its right ones.
+        dual = np.linalg.pinv(left[group] @ right[group].T) @ left[group]
+        turn = a.right[group] @ dual.T  # rows: modes of a in the space of the group
+        if np.linalg.cond(turn) < _INDEPENDENT:
+            right[group], left[group] = turn @ right[group], np.linalg.inv(turn).T @ dual
+    return b._replace(right=right, left=left)

@@ -1,0 +1,158 @@
+"""Complex shapes of modes: at one phase, and in motion over a period."""
+
+import os
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import ArrayLike, Complex, Float
+
+from .._base.parts import whole
+from .._stability.stability import Stability
+from .animation import animated, animation_path
+from .axes import Axes, frequency_unit, given_or_new
+from .mesh import Mesh, draw_mesh
+
+if TYPE_CHECKING:
+    from matplotlib.animation import FuncAnimation
+
+_NAMED = 24  # degrees of freedom named below their bars
+
+
+def complex_mode(
+    mode: Stability | ArrayLike,
+    index: int = 0,
+    ax: Any = None,
+    *,
+    points: ArrayLike | None = None,
+    dofs: ArrayLike | None = None,
+    cells: ArrayLike | None = None,
+    phase: float = 0.0,
+    scale: float | None = None,
+) -> Axes:
+    """The displacement Re(shape exp(i phase)) of a mode: a deformed mesh coloured by amplitude.
+
+    `mode` is a shape (n,), or a `Stability` whose shape `index` is taken; of a reduced structure,
+    `reduced.full(modes.shapes[index])`. `points` (nodes, 2) or (nodes, 3) [m] are the places of the
+    nodes, `dofs`, of the same shape, the degree of freedom of each displacement, -1 where it is
+    held, and `cells` (cells, 3) or (cells, 4) the nodes of triangles or quadrilaterals, the outer
+    ones of a solid. `ax` of a solid has to be 3D. `scale` is the factor of the displacements, by
+    default that which draws the largest amplitude as 3 % of the size of the mesh. The
+    colour is the greatest displacement of the nodes over a period, divided by the largest of all.
+
+    Without `points` there is a bar for each degree of freedom, coloured by its phase, within a pale
+    one that shows its amplitude.
+
+    **Raises:** `ValueError` for a batch, an index that is not there, and a mesh that does not fit.
+    """
+    ax, draw = _picture(mode, index, ax, points, dofs, cells, scale)
+    draw(phase)
+    return ax
+
+
+def animate_mode(
+    mode: Stability | ArrayLike,
+    index: int = 0,
+    *,
+    points: ArrayLike | None = None,
+    dofs: ArrayLike | None = None,
+    cells: ArrayLike | None = None,
+    scale: float | None = None,
+    frames: int = 24,
+    fps: int = 12,
+    path: str | os.PathLike | None = None,
+) -> "FuncAnimation":
+    """One period of a mode in motion, Re(shape exp(i omega t)), as matplotlib's animation.
+
+    Frame j has the phase omega t = 2 pi j/frames; growth is left out. Other arguments and errors
+    are as of `complex_mode`. `path` ends in .gif for a picture, or in .html for one page with its
+    frames and buttons inside, which needs no network.
+
+    **Raises:** `ValueError` for another ending; `OSError` if the file cannot be written.
+    """
+    frames, fps, path = whole("frames", frames, 2), whole("fps", fps, 1), animation_path(path)
+    ax, draw = _picture(mode, index, None, points, dofs, cells, scale)
+    return animated(ax.figure, lambda share: draw(2 * np.pi * share), frames, fps, path)
+
+
+# --- drawing --------------------------------------------------------------------------------
+
+
+def _amplitudes(motion: Complex[np.ndarray, "nodes dim"]) -> Float[np.ndarray, " nodes"]:
+    """The greatest displacements over a period: the long half axes of ellipses."""
+    squares = (np.abs(motion) ** 2).sum(axis=1), np.abs((motion**2).sum(axis=1))
+    return np.sqrt(sum(squares) / 2)
+
+
+def _picture(
+    mode: Any, index: int, ax: Any, points: Any, dofs: Any, cells: Any, scale: float | None
+) -> tuple[Any, Callable[[float], Any]]:
+    """Axes, and a function that draws a phase on them."""
+    shape, words, names = _shape_of(mode, index)
+    if points is None:
+        ax, move = _bars(shape, names, given_or_new(ax))
+    else:
+        if dofs is None or cells is None:
+            raise ValueError("points need dofs and cells beside them")
+        ax, move = _deformed(Mesh.of(points, dofs, cells, len(shape)), shape, ax, scale)
+
+    def draw(phase: float) -> Any:
+        move(np.exp(1j * phase))
+        angle = f"phase {np.degrees(phase):.0f}°"
+        ax.set_title(", ".join([*words, angle]), fontsize="medium", loc="left")
+        return ()
+
+    return ax, draw
+
+
+def _shape_of(mode: Any, index: int) -> tuple[np.ndarray, list[str], Any]:
+    """A shape (n,), what is known of its mode, and the names of its degrees of freedom."""
+    if not isinstance(mode, Stability):
+        shape = np.asarray(mode)
+        if shape.ndim != 1 or shape.dtype.kind not in "fciu":
+            raise ValueError(f"a shape must have one number a degree of freedom, got {shape.shape}")
+        return shape, [], None
+    s, shapes = np.asarray(mode.eigenvalues), np.asarray(mode.shapes)
+    if s.ndim != 1:
+        raise ValueError(f"a picture shows one result, got a batch {s.shape[:-1]}")
+    index = whole("index", index, 0, len(s) - 1)
+    frequency = abs(s[index].imag) / (2 * np.pi)
+    factor, hertz = frequency_unit(frequency)
+    words = [f"{factor * frequency:.4g} {hertz}", f"growth rate {s[index].real:.3g} 1/s"]
+    return shapes[index], words, mode.names
+
+
+def _deformed(
+    mesh: Mesh, shape: np.ndarray, ax: Any, scale: float | None
+) -> tuple[Any, Callable[[complex], Any]]:
+    motion = mesh.displacements(shape)
+    amplitudes = _amplitudes(motion)
+    largest = float(amplitudes.max()) or 1.0
+    factor = mesh.scale(largest) if scale is None else scale
+    ax, drawn, move = draw_mesh(mesh, ax, factor * largest, amplitudes / largest, 1.0)
+    bar = ax.figure.colorbar(drawn, ax=ax, location="bottom", shrink=0.6, aspect=40)
+    bar.set_label("amplitude, of the largest [-]")
+    return ax, lambda turn: move(factor * (motion * turn).real)
+
+
+def _bars(shape: Any, names: Any, ax: Axes) -> tuple[Axes, Callable[[complex], Any]]:
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    x, amplitude = np.arange(len(shape)), np.abs(shape)
+    unit = shape / (amplitude.max() or 1.0)
+    colours = ScalarMappable(Normalize(-180, 180), "hsv")
+    ax.bar(x, 2 * np.abs(unit), 0.8, -np.abs(unit), color="0.92", edgecolor="0.7", linewidth=0.5)
+    bars = ax.bar(x, unit.real, 0.5, color=colours.to_rgba(np.angle(unit, deg=True)))
+    ax.axhline(0, color="k", lw=0.8)
+    ax.set(ylim=(-1.1, 1.1), xlabel="degree of freedom", ylabel="displacement, of the largest [-]")
+    if len(x) <= _NAMED:
+        ax.set_xticks(x, names or [str(i) for i in x], rotation=0 if names is None else 90)
+    bar = ax.figure.colorbar(colours, ax=ax, pad=0.02, ticks=range(-180, 181, 90))
+    bar.set_label("phase of the shape [°]")
+
+    def move(turn: complex) -> None:
+        for each, height in zip(bars, (unit * turn).real, strict=True):
+            each.set_height(height)
+
+    return ax, move

@@ -1,0 +1,43 @@
+"""Modes followed over a quantity."""
+
+import numpy as np
+
+from .._stability.tracks import ModeTracks
+from .axes import Figure, frequency_unit, legend_above, lines, new_figure, over_quantity
+
+_ROUNDING = 1e-9  # of |s|: a smaller growth rate has no sign
+_NAMED = 9  # modes in the legend
+
+
+def mode_tracks(tracks: ModeTracks) -> Figure:
+    """Growth rate [1/s] and frequency of all modes over the quantity; returns the figure.
+
+    A mode is drawn thick where it is unstable. Of more than nine modes only those that are unstable
+    somewhere have a colour, and the axes show their range; the others are grey.
+    """
+    x, growth = tracks.values, tracks.growth_rates
+    unstable = growth > _ROUNDING * np.abs(tracks.eigenvalues)
+    chosen = np.flatnonzero(unstable.any(axis=0) | (len(growth.T) <= _NAMED))
+    factor, hertz = frequency_unit(tracks.frequencies)
+    figure = new_figure(8.4, 8.0)
+    panels = figure.subplots(2, 1, sharex=True)
+    layers = {"growth rate [1/s]": growth, f"frequency [{hertz}]": tracks.frequencies * factor}
+    handles = []
+    for ax, (words, values) in zip(panels, layers.items(), strict=True):
+        over_quantity(ax, "x", tracks.x, tracks.name, x)
+        ax.plot(x, np.delete(values, chosen, axis=1), color="0.75", lw=0.8)
+        mine = values[:, chosen].T
+        handles = lines(ax, x, mine, [f"mode {i + 1}" for i in chosen])
+        for line, row, where in zip(handles, mine, unstable[:, chosen].T, strict=True):
+            ax.plot(x, np.where(where, row, np.nan), color=line.get_color(), lw=4, alpha=0.6)
+        if mine.size:
+            low, high = np.nanmin(mine), np.nanmax(mine)
+            aside = 0.15 * ((high - low) or abs(high) or 1.0)
+            ax.set_ylim(low - aside, high + aside)
+        ax.set_ylabel(words)
+    panels[0].axhline(0, color="k", lw=0.8)
+    panels[0].set_xlabel("")
+    if handles:
+        legend_above(panels[0], handles[:_NAMED])
+    figure.align_ylabels()
+    return figure
