@@ -42,15 +42,15 @@ def _run(arguments) -> int:
 
     from .. import plot
     from .._contact.compare import compare_laws
-    from .._contact.persson import PerssonContact
 
     scene = load_given(arguments.scene)
     law, friction = scene.contact, scene.friction
     if not law.has_surface:
         raise ValueError(f"{arguments.scene}: the law of its contact takes no surface")
     options: dict[str, Any] = {}
-    if isinstance(law, PerssonContact):
-        options = {"area": law.area, "L": law.L, "L_s": law.L_s}
+    for name in ("area", "L", "L_s"):
+        if (own := getattr(law, name, None)) is not None:
+            options[name] = own
     for name in ("area", "L", "L_s", "n", "seeds"):
         if (given := getattr(arguments, name)) is not None:
             options[name] = given

@@ -81,7 +81,8 @@ def boundary_element(
     derivative is 0. There are no second derivatives, and none at all with `plastic`.
 
     **Raises:** `ValueError` unless heights are (nx, ny) and finite, dx > 0, P > 0 and
-    0 < rtol < 1; `RuntimeError` if `throw` and the solution has not converged.
+    0 < rtol < 1; `RuntimeError` if `throw` and the solution has not converged. Under a trace
+    (`jit`, `vmap`) everything is NaN instead.
     """
     heights = number("heights", heights)
     if heights.ndim != 2 or min(heights.shape) < 2:

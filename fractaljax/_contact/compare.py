@@ -23,6 +23,7 @@ from .._base.parts import (
 from .._base.table import aligned
 from .._surface.surface import Surface
 from .._surface.topography import topography
+from .asperity import AsperityContact
 from .boundary_element import boundary_element
 from .contact import MU_M_MAX, Contact
 from .fractal import FractalContact
@@ -92,15 +93,15 @@ def compare_laws(
 ) -> LawComparison:
     """Stiffness and real area of a joint by every contact law, and by boundary elements.
 
-    At loads (k,) [N] on the nominal area [m^2]: the source's `FractalContact`, `PerssonContact`,
-    and other `laws` by name, each with P replaced by the loads. Boundary elements press `seeds`
-    periodic surfaces of the same D and G, of n x n points, drawn from `key`: K_n and real area are
-    means over the seeds, K_n a geometric one, and alpha is the slope of that mean from load to
-    load. They are elastic and without friction.
+    At loads (k,) [N] on the nominal area [m^2]: the source's `FractalContact`,
+    `AsperityContact`, `PerssonContact`, and other `laws` by name, each with P replaced by the
+    loads. Boundary elements press `seeds` periodic surfaces of the same D and G, of n x n points,
+    drawn from `key`: K_n and real area are means over the seeds, K_n a geometric one, and alpha is
+    the slope of that mean from load to load. They are elastic and without friction.
 
     Wavelengths run from L, by default the side of the area, down to L_s [m], by default 4 L/n; no
     wave is longer than the side. On a larger area than L^2 surfaces lie side by side. `mu_s` and
-    `mu_m` are the friction that the fractal law takes, by default the reference brake's. With no
+    `mu_m` are the friction that laws with yield take, by default the reference brake's. With no
     `seeds` there are no boundary elements.
 
     **Raises:** `ValueError` unless loads rise and are above 0, area > 0, 2 L/n <= L_s <= L,
@@ -125,6 +126,7 @@ def compare_laws(
     mu_s = ordered("mu_s", scalar("mu_s", mu_s, above=0), "mu_m", mu_m)
     known: dict[str, Contact] = {
         "fractal": FractalContact(surface, material, loads[0]),
+        "asperity": AsperityContact(surface, material, loads[0], L_s),
         "Persson": PerssonContact(surface, material, loads[0], area, L, L_s),
     }
     for name, law in (laws or {}).items():

@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float, ScalarLike
 from .._base.parts import Numbers, Part, Record, brief, number, substitute
 from .load_curve import LoadCurve, load_curve
 
-MU_M_MAX = 0.9  # Eq. 19, of the fractal law, ends there
+MU_M_MAX = 0.9  # Eq. 19 ends there
 
 
 class Contact(Part):
@@ -24,11 +24,12 @@ class Contact(Part):
 
     has_surface: ClassVar[bool] = False  # its stiffness is that of a `Surface`
     fractal: ClassVar[bool] = False  # the source's law: there is a `ContactState`
+    yields: ClassVar[bool] = False  # friction lowers its pressure at yield: Eq. 19, to mu_m = 0.9
 
     @property
     def depends_on_friction(self) -> bool:
         """Whether the stiffness does."""
-        return self.fractal
+        return self.yields
 
     @abc.abstractmethod
     def stiffness(
@@ -101,7 +102,8 @@ def partial_slip(K_n: Callable[[Numbers], Numbers], P: Numbers, Q: Numbers, mu_s
     doi:10.1115/1.2791944; Jaeger, Arch. Appl. Mech. 68, 583, 1998).
     """
     stuck = P - Q / mu_s
-    return jnp.where(stuck > 0, K_n(jnp.where(stuck > 0, stuck, P)), 0)
+    some = ~(stuck <= 0)  # NaN stays NaN
+    return jnp.where(some, K_n(jnp.where(some, stuck, P)), 0)
 
 
 class Regime(eqx.Enumeration):

@@ -50,7 +50,7 @@ def area_moment(p: float, D: Numbers, log_a_e: Numbers, t: Numbers) -> Numbers:
     (D-1)/2 a_l^p (1 - e^(-rt))/r, in which no power of a_e alone can overflow. Exactly 0 for
     t <= 0, where nothing is elastic.
     """
-    elastic = t > 0
+    elastic = ~(t <= 0)  # NaN stays NaN
     # Deep in the plastic regime a_e overflows: the unused branch must not see it.
     log_a_e, t = jnp.where(elastic, log_a_e, 0), jnp.where(elastic, t, 1)
     r = p + (1 - D) / 2
@@ -105,6 +105,7 @@ class FractalContact(Contact):
 
     has_surface: ClassVar[bool] = True
     fractal: ClassVar[bool] = True
+    yields: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -209,7 +210,7 @@ def contact_load(
     D, k_mu = surface.D, friction_correction(number("mu_m", mu_m, at_least=0, at_most=MU_M_MAX))
     log_a_e = log_critical_area(surface, material, k_mu)
     t = jnp.log((3 - D) / (D - 1) * A_r) - log_a_e
-    elastic = t > 0
+    elastic = ~(t <= 0)  # NaN stays NaN
     t = jnp.where(elastic, t, 1)
     # Over the load H A_r of an all-plastic joint with the same area.
     log_share = log_load(t, D, critical_pressure_ratio(material, k_mu)) - t

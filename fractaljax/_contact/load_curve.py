@@ -61,7 +61,7 @@ class LoadCurve(eqx.Module):
         end = self.ends[-1]
         inside = jnp.clip(d, jnp.finfo(d.dtype).eps ** 2 * end, end)
         load = jnp.exp(self._log_load(inside)) + self.top * jnp.maximum(d - end, 0)
-        return jnp.where(d > 0, load, 0).reshape(e.shape)
+        return jnp.where(d <= 0, 0, load).reshape(e.shape)  # NaN stays NaN
 
     def _log_load(self, d) -> Array:
         """ln n at the distances d (j,), by Newton's method."""
@@ -111,7 +111,7 @@ class LoadTable(eqx.Module):
         for coefficient in others:
             value = value * x + coefficient
         value = jnp.where(d < end, jnp.maximum(value, 0), load + slope * (d - end))
-        return jnp.where(d > 0, value, 0)
+        return jnp.where(d <= 0, 0, value)  # NaN stays NaN
 
 
 @jax.jit

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, ScalarLike
 
+from .._base.kept import kept_jit
 from .._base.memory import require_memory
 from .._base.parts import (
     concrete,
@@ -128,7 +129,7 @@ def _known(name: str, value: jax.Array) -> np.ndarray:
     return values
 
 
-@functools.partial(jax.jit, static_argnames="n")
+@functools.partial(kept_jit, static_argnames="n")
 def _sum(surface, L, phases, directions, coarse, fine, lengths, n):
     """Eq. 13 on the grid (n, n): phases (n_max + 1, M), coarse and fine (2, n_max + 1, M).
 

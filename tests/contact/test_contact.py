@@ -575,8 +575,6 @@ def state_of(P: Any = 1907.3, mu_s: Any = 0.4, mu_m: Any = 0.25):
         (lambda: state_of(P=np.array([1.0, 2.0])), r"^P must be a scalar, .*jax\.vmap"),
         (lambda: state_of(mu_s=np.array([0.5, 0.6])), "^mu_s must be a single number"),
         (lambda: state_of(mu_m="0.2"), "^mu_m must be a number, got '0.2'$"),
-        (lambda: jax.jit(state_of)(-1.0), "P must be above 0"),
-        (lambda: jax.jit(lambda mu: state_of(mu_m=mu))(0.95), "mu_m must be at least 0"),
         (lambda: jax.grad(lambda P: state_of(P).K_n)(-1.0), r"^P must be above 0, got -1\.0"),
         (lambda: fj.contact_load(SURFACE, MATERIAL, 0.0, mu_m=0.2), "^A_r must be above 0"),
         (lambda: fj.contact_load(SURFACE, MATERIAL, 1e-6, mu_m=1.0), "^mu_m must be"),
@@ -589,7 +587,6 @@ def state_of(P: Any = 1907.3, mu_s: Any = 0.4, mu_m: Any = 0.25):
         ),
         (lambda: fj.FixedContact(-1.0, 1e8), "^K_n must be at least 0, got -1.0$"),
         (lambda: fj.FixedContact(1e8, np.inf), "^K_t must be at least 0, got inf$"),
-        (lambda: jax.jit(fj.FixedContact)(1e8, -1.0), "K_t must be at least 0"),
         (lambda: fj.dimensionless_normal_stiffness(**STAR | {"D": 3.0}), "^D must be above 2"),
         (lambda: fj.dimensionless_normal_stiffness(**STAR | {"A_r": -1.0}), "^A_r must be above"),
         (lambda: fj.dimensionless_normal_stiffness(**STAR | {"a_e": 0.0}), "^a_e must be above 0"),
@@ -605,9 +602,21 @@ def state_of(P: Any = 1907.3, mu_s: Any = 0.4, mu_m: Any = 0.25):
     ],
 )
 def test_refusals(call, message):
-    """The argument, the bound and the value; in a compiled program, without the value."""
-    with pytest.raises((ValueError, TypeError, RuntimeError), match=message):
-        jax.block_until_ready(call())
+    """The argument, the bound and the value."""
+    with pytest.raises((ValueError, TypeError), match=message):
+        call()
+
+
+def test_under_a_trace_what_depends_on_it_is_nan():
+    """Also where a law of 0 or a limit would hide it."""
+    state = jax.vmap(state_of)(jnp.array([-1.0, 1907.3, jnp.inf]))
+    for value in (state.K_n, state.K_t, state.a_l, state.Q_e, state.plastic_share):
+        np.testing.assert_array_equal(np.isnan(np.asarray(value)), [True, False, True])
+    assert np.isnan(jax.jit(lambda mu: state_of(mu_m=mu).K_n)(0.95))
+    load = jax.jit(lambda A_r: fj.contact_load(SURFACE, MATERIAL, A_r, mu_m=0.2))
+    assert np.isnan(load(-1e-6)) and load(1e-6) > 0
+    fixed = jax.jit(fj.FixedContact)(1e8, -1.0)
+    assert fixed.K_n == 1e8 and np.isnan(fixed.K_t)
 
 
 def test_the_closed_ends():

@@ -32,6 +32,16 @@ def _at(law, N):
     return substitute(law, {"P": N}).stiffness(0.4, 0.3)[0]
 
 
+@jax.jit
+def _load(law, u):
+    return law.load(u)
+
+
+@jax.jit
+def _slopes(law, u):
+    return jax.vmap(jax.grad(law.load))(u)
+
+
 @pytest.mark.parametrize("alpha", [0.0, 1 / 3, 0.5, 0.9])
 def test_powers(alpha):
     """N = P (1 + (1 - alpha) e)^(1/(1 - alpha)): a constant spring, Hertz, and nearly exponential.
@@ -41,10 +51,10 @@ def test_powers(alpha):
     law, opening = power_law(alpha), P / ((1 - alpha) * K_N)
     loads = P * np.array([1e-4, 1e-2, 0.1, 0.5, 1.0, 2.0, 10.0, 30.0])
     u = opening * ((loads / P) ** (1 - alpha) - 1)
-    np.testing.assert_allclose(law.load(u), loads, rtol=1e-9)
-    slopes = jax.vmap(jax.grad(law.load))(jnp.asarray(u))
+    np.testing.assert_allclose(_load(law, u), loads, rtol=1e-9)
+    slopes = _slopes(law, u)
     np.testing.assert_allclose(slopes, K_N * (loads / P) ** alpha, rtol=1e-7)
-    np.testing.assert_array_equal(law.load(-opening * np.array([1.0000001, 1.5, 10.0])), 0.0)
+    np.testing.assert_array_equal(_load(law, -opening * np.array([1.0000001, 1.5, 10.0])), 0.0)
     assert float(law.load(0.0)) == pytest.approx(P, rel=1e-14)
 
 
@@ -66,19 +76,23 @@ def test_persson(D, G, load, area):
             by_log, (0.0, side[-1]), [0.0], "DOP853", t_eval=side, rtol=1e-11, atol=1e-25
         )
         np.testing.assert_allclose(
-            law.load(found.y[0]), load * np.exp(side), rtol=1e-8, atol=1e-8 * load
+            _load(law, found.y[0]), load * np.exp(side), rtol=1e-8, atol=1e-8 * load
         )
+
+
+@jax.jit
+def _table_and_curve(curve, share):
+    """Value and slope of the table of a load curve, and of the curve."""
+    table = jax.tree.map(lambda leaf: leaf[..., None], tabulated(curve))
+    e = share * jnp.where(share < 0, curve.opening, curve.ends[-1] - curve.opening)
+    return [jax.jvp(f, (e,), (jnp.ones_like(e),)) for f in (table, curve)]
 
 
 @pytest.mark.parametrize("law", [persson(), persson(2.7, 1e-10, P, 1e-4), power_law(1 / 3)])
 def test_table(law):
     """What motions look up: within 1e-11 of P or N, its slope within 1e-8, up to full contact."""
     curve = law.load_curve(0.4, 0.3)
-    table = jax.tree.map(lambda leaf: leaf[..., None], tabulated(curve))
-    share = jnp.linspace(-1.2, 1.1, 4001)
-    e = share * jnp.where(share < 0, curve.opening, curve.ends[-1] - curve.opening)
-    once = jnp.ones_like(e)
-    found, wanted = (jax.jvp(f, (e,), (once,)) for f in (table, curve))
+    found, wanted = _table_and_curve(curve, jnp.linspace(-1.2, 1.1, 4001))
     np.testing.assert_allclose(found[0], wanted[0], rtol=1e-11, atol=1e-11)
     np.testing.assert_allclose(found[1], wanted[1], rtol=1e-8, atol=1e-8)
 
@@ -94,7 +108,7 @@ def test_measured_table():
                 lambda u, N, law=law: [float(_at(law, N[0]))], (0.0, side[-1]), [load], "DOP853",
                 t_eval=side, rtol=1e-11, atol=1e-10 * load, max_step=abs(side[-1]) / 100,
             )  # fmt: skip
-            np.testing.assert_allclose(law.load(found.t), found.y[0], rtol=1e-6)
+            np.testing.assert_allclose(_load(law, found.t), found.y[0], rtol=1e-6)
 
 
 def test_derivatives():
@@ -115,6 +129,7 @@ def test_derivatives():
         np.testing.assert_allclose(forward[0, i], wanted, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_finite_everywhere():
     """From 1 N to 1e6 N, D = 2.05 to 2.95: rising loads, finite with their derivatives."""
     D, loads = jnp.array([2.05, 2.5, 2.95]), jnp.array([1.0, 1e3, 1e6])
