@@ -2,11 +2,13 @@
 
 import inspect
 from pathlib import Path
+from typing import Any
 
 from .output import csv_text, npy, output, picture
 from .parsing import (
     add_constant_friction,
     add_scene_file,
+    envelope_of,
     kick_size,
     load_given,
     number,
@@ -41,7 +43,10 @@ _SEVERAL = {
         "NAME=LOW:HIGH",
         "ranges, or NAME=V1,V2,V3 measured together, that the design withstands",
     ),
-    "tolerance": ("NAME=SIGMA", "standard deviations as machined, of D and lnG, say"),
+    "tolerance": (
+        "NAME=SIGMA",
+        "standard deviations as machined, of D and lnG, say; or a tolerance.toml of `identify`",
+    ),
 }
 
 
@@ -107,7 +112,8 @@ def _run(arguments) -> int:
     from .._mechanism.structure import Structure
 
     if arguments.repeat is None:
-        x, options = load_given(arguments.scene, structures=True), _options(arguments)
+        options = _options(arguments)
+        x = load_given(arguments.scene, True, options["bounds"], arguments.quiet)
     else:
         given = [name for name in arguments.own if getattr(arguments, name) not in (None, False)]
         if given:
@@ -138,23 +144,27 @@ def _run(arguments) -> int:
             heights = [f"topography.npy: {side} x {side} heights in m, dx = {dx:g} m"]
         written = write(files)
     *table, promise = str(best).splitlines()
-    rests = [] if isinstance(x, Structure) else _verdict(best, arguments.area)
+    rests = [] if isinstance(x, Structure) else _verdict(x, best, arguments.area)
     print("\n".join([*table, *_remarks(x, options), *rests, written, *heights, promise]))
     return 1 if best.violated else 0
 
 
-def _verdict(best, area) -> list[str]:
-    """What the designed scene rests on."""
-    from .._design.verdict import verdict
+def _verdict(x, best, area) -> list[str]:
+    """What the designed scene rests on; where no surface is quiet, what else makes x quiet."""
+    from .._design.verdict import suggest, verdict
 
     keys = ("laws", "tolerance", "envelope", "friction_slope", "seed")
     asked = {name: best.options[name] for name in keys}
-    return ["", *str(verdict(best.scene, area=area, **asked)).splitlines(), ""]
+    found = verdict(best.scene, area=area, **asked)
+    lines = ["", *str(found).splitlines(), ""]
+    if found.incurable and best.violated:
+        cure = suggest(x, target=best.options["target"], friction_slope=asked["friction_slope"])
+        lines += [*str(cure).splitlines(), ""]
+    return lines
 
 
 def _options(arguments) -> dict:
     """The arguments of `design` that a command asks for."""
-    from .._design.envelope import Envelope
     from .._design.problem import DEFAULT_BOUNDS
 
     options = {name: getattr(arguments, name) for name in _OPTIONS}
@@ -175,22 +185,22 @@ def _options(arguments) -> dict:
         kind, _, value = arguments.risk.partition(":")
         options["risk"] = (kind, number("--risk", value)) if value else kind
     if arguments.envelope is not None:
-        ranges, samples = {}, {}
-        for name, text in pairs_of("--envelope", arguments.envelope, "NAME=LOW:HIGH").items():
-            into, separator = (ranges, ":") if ":" in text else (samples, ",")
-            into[name] = numbers(f"--envelope {name}", text, separator)
-            if len(into[name]) < 2:
-                raise ValueError(
-                    f"--envelope {name} must be LOW:HIGH or at least two samples, got {text!r}"
-                )
-        options["envelope"] = Envelope(ranges, samples)
+        options["envelope"] = envelope_of(arguments.envelope)
     if arguments.tolerance is not None:
-        pairs = pairs_of("--tolerance", arguments.tolerance, "NAME=SIGMA")
-        options["tolerance"] = {
-            f"ln {name[2:]}" if name.startswith("ln") else name: number("--tolerance", text)
-            for name, text in pairs.items()
-        }
+        options["tolerance"] = _tolerance(arguments.tolerance)
     return options
+
+
+def _tolerance(given: list[str]) -> Any:
+    """Standard deviations by name, or the file of them that `fractaljax identify` writes."""
+    from .._design.design_file import read_tolerance
+
+    if len(given) == 1 and "=" not in given[0] and given[0].endswith(".toml"):
+        return read_tolerance(given[0])
+    return {
+        f"ln {name[2:]}" if name.startswith("ln") else name: number("--tolerance", text)
+        for name, text in pairs_of("--tolerance", given, "NAME=SIGMA").items()
+    }
 
 
 def _constraints(arguments) -> list:

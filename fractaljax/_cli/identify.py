@@ -4,7 +4,7 @@ import shlex
 from pathlib import Path
 
 from .output import output, picture
-from .parsing import load_given
+from .parsing import envelope_of, load_given
 
 _FOLDER = Path("fractaljax-identification")
 _MANY = 5  # warnings, with which a surface is not worth a design
@@ -35,6 +35,11 @@ _OPTIONS = {
         "type": float,
         "help": "nominal area [m^2] of the joint, for a verdict by Persson's law too",
     },
+    "--envelope": {
+        "nargs": "+",
+        "metavar": "NAME=LOW:HIGH",
+        "help": "ranges that the probability of squeal counts, or NAME=V1,V2,V3 measured together",
+    },
     "--force": {
         "action": "store_true",
         "help": "write a scene even where the warnings leave D and G no meaning",
@@ -55,7 +60,7 @@ def add_identify(commands) -> None:
 
 
 def _run(arguments) -> int:
-    """Find D and G of a measured surface; write identification.png and scene.toml."""
+    """Find D and G of a measured surface; write identification.png, scene.toml, tolerance.toml."""
     from .. import plot
     from .._base.parts import scalar
     from .._identify.files import read_measurement
@@ -66,6 +71,9 @@ def _run(arguments) -> int:
         raise ValueError(f"{arguments.scene}: the law of its contact takes no surface")
     if arguments.area is not None:
         scalar("--area", arguments.area, above=0)
+    envelope = None if arguments.envelope is None else envelope_of(arguments.envelope)
+    if envelope is not None:
+        envelope.check(base, ())
     names = ("dx", "dy", "unit", "position_unit", "channel")
     read = read_measurement(arguments.file, **{name: getattr(arguments, name) for name in names})
     given = {name: getattr(arguments, name) for name in ("resolution", "stylus_radius")}
@@ -83,7 +91,8 @@ def _run(arguments) -> int:
         rests: list[str] = []
         try:
             files["scene.toml"] = _scene_text(base, read, found, arguments.force).encode()
-            rests = _joint(base, found, arguments.area)
+            files["tolerance.toml"] = _tolerance_text(read, found).encode()
+            rests = _joint(base, found, arguments.area, envelope)
         except ValueError as error:
             failure = error
         written = write(files)
@@ -118,7 +127,16 @@ def _scene_text(base, read, found, force) -> str:
     return "\n".join([*(f"# {' '.join(line.split())}" for line in comments), scene.to_toml()])
 
 
-def _joint(base, found, area) -> list[str]:
+def _tolerance_text(read, found) -> str:
+    """The errors of D and ln G, for `fractaljax design --tolerance`."""
+    from .._design.design_file import tolerance_text
+    from .._design.tolerance import Tolerance
+
+    source = " ".join(read.source.split())
+    return tolerance_text(Tolerance.of(found), f"errors of D and ln G identified from {source}")
+
+
+def _joint(base, found, area, envelope) -> list[str]:
     """The joint of the measured surface, with the errors of D and G, and what it rests on."""
     import jax
     import jax.numpy as jnp
@@ -142,7 +160,7 @@ def _joint(base, found, area) -> list[str]:
     shown = zip(names, values, errors, strict=True)
     lines = [name.format(f"{value:.4g} +- {error:.2g}") for name, value, error in shown]
     try:
-        said = str(verdict(scene, tolerance=found, area=area))
+        said = str(verdict(scene, tolerance=found, area=area, envelope=envelope))
     except ValueError as error:  # errors so large that they leave the domain of the model
         said = f"no verdict: {error}"
     return [", ".join(lines), "", *said.splitlines(), ""]

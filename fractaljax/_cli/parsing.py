@@ -5,6 +5,7 @@ import contextlib
 import re
 import sys
 import warnings
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -64,9 +65,6 @@ def reason(error: Exception) -> str | None:
             return f"a number is out of range: {text}"
         case ValueError() | TypeError():
             return text
-    # Raised by a compiled program: one line of JAX's long account of it.
-    if checked := re.search(r"EquinoxRuntimeError: (.+)", text):
-        return checked[1]
     return f"not enough memory: {text}" if text.startswith("RESOURCE_EXHAUSTED") else None
 
 
@@ -97,14 +95,54 @@ def add_constant_friction(parser) -> None:
     )
 
 
-def load_given(path: Path | None, structures: bool = False) -> Any:
-    """The scene, or also a structure, in the file that is given; else the reference brake."""
+def load_given(
+    path: Path | None,
+    structures: bool = False,
+    over: Mapping[str, Sequence[float]] | None = None,
+    quiet: bool = False,
+) -> Any:
+    """The scene, or also a structure, in the file that is given; else the reference brake.
+
+    A large sparse structure is reduced as the table [reduction] of its file says, and `over`
+    ranges of quantities besides.
+
+    **Raises:** `ValueError` if it has no such table.
+    """
     from .._mechanism.scene import Scene, brake_scene
     from .._mechanism.structure import load
 
     if path is None:
         return brake_scene()
-    return load(path) if structures else Scene.load(path)
+    found = load(path) if structures else Scene.load(path)
+    if isinstance(found, Scene) or not found.is_sparse:
+        return found
+    from .._stability.reduction import reduce
+
+    wanted = reduction_of(path)
+    if "band" not in wanted:
+        raise ValueError(
+            f"{path}: {found.n} degrees of freedom need a reduction: run `fractaljax reduce`, or "
+            "add a table [reduction] with band = [low, high] in rad/s"
+        )
+    wanted["over"] = wanted.get("over", {}) | dict(over or {})
+    return reduce(found, **wanted, progress=not quiet)
+
+
+def reduction_of(path: Path) -> dict[str, Any]:
+    """The table [reduction] of a structure's file: band, tol and over, if it has them.
+
+    **Raises:** `ValueError` for another key.
+    """
+    from .._base.files import read_bounded
+    from .._base.toml import naming, read_toml, refuse_unknown, table_at
+
+    with naming(path):
+        document = read_toml(read_bounded(path))
+        table = table_at(document, "reduction") if "reduction" in document else {}
+        refuse_unknown("[reduction]", table, ("band", "tol", "over"))
+        if "over" in table:
+            table_at(table, "over", "reduction.")
+    return table
 
 
 def pairs_of(option: str, texts: list[str], form: str) -> dict[str, str]:
@@ -131,6 +169,32 @@ def number(option: str, text: str) -> float:
 def numbers(option: str, text: str, separator: str) -> list[float]:
     """The numbers that `option` was given as one text."""
     return [number(option, value) for value in text.split(separator)]
+
+
+def envelope_of(texts: list[str]) -> Any:
+    """The `Envelope` of --envelope: NAME=LOW:HIGH, or NAME=V1,V2,V3 measured together."""
+    from .._design.envelope import Envelope
+
+    ranges, samples = {}, {}
+    for name, text in pairs_of("--envelope", texts, "NAME=LOW:HIGH").items():
+        into, separator = (ranges, ":") if ":" in text else (samples, ",")
+        into[name] = numbers(f"--envelope {name}", text, separator)
+        if len(into[name]) < 2:
+            raise ValueError(
+                f"--envelope {name} must be LOW:HIGH or at least two samples, got {text!r}"
+            )
+    return Envelope(ranges, samples)
+
+
+def windows_of(option: str, texts: list[str], form: str) -> dict[str, tuple[float, float]]:
+    """Several NAME=LOW:HIGH by name; `form` is how the message writes one."""
+    found = {}
+    for name, ends in pairs_of(option, texts, form).items():
+        window = numbers(f"{option} {name}", ends, ":")
+        if len(window) != 2:
+            raise ValueError(f"{option} must be {form}, got '{name}={ends}'")
+        found[name] = (window[0], window[1])
+    return found
 
 
 def kick_size(option: str, text: str) -> float | list[float]:

@@ -224,7 +224,9 @@ class DampingRatio(Constraint):
         self.friction_slope = flag("friction_slope", friction_slope)
 
     def measure(self, scene):
-        return least_damping_ratio(stability(scene, self.friction_slope).eigenvalues)
+        modes = stability(scene, self.friction_slope)
+        s = modes.eigenvalues
+        return least_damping_ratio(jnp.where(modes.counted | jnp.isnan(s), s, -1))
 
     def below(self, value):
         return jnp.arcsinh((self.at_least - value) / 1e-3)  # the size that they have at squeal
@@ -253,9 +255,10 @@ class Frequency(Constraint):
 
     def measure(self, scene):
         """The lowest and the highest frequency (2,) [Hz]; 0 for an overdamped mode."""
-        modes = stability(scene, self.friction_slope).eigenvalues
-        ordered = jnp.sort(jnp.abs(modes.imag)) / (2 * math.pi)
-        return jnp.stack([ordered[0], ordered[-1]])
+        modes = stability(scene, self.friction_slope)
+        found = jnp.abs(modes.eigenvalues.imag) / (2 * math.pi)
+        lowest = jnp.where(modes.counted, found, jnp.inf).min()
+        return jnp.stack([lowest, jnp.where(modes.counted, found, 0).max()])
 
     def below(self, value):
         return super().below(value[0])

@@ -46,8 +46,9 @@ from .tolerance import Tolerance, squeal_probability
 
 _STARTS, _FOLLOWED = 12, 1  # the latter where cycles are followed
 # Designs a side that are screened, in one variable and in more, and what memory holds of them.
-_LATTICE = {False: (1024, 48), True: (256, 24)}  # whether under many conditions
+_LATTICE = {False: (1024, 48), True: (256, 24)}  # whether a design takes long
 _LATTICE_MAX = 1_000_000, 1000
+_STARTS_OF_STRUCTURES = 8
 _STARTS_MAX = 10_000
 _SEED_MAX = 2**63 - 1  # of a JAX key
 _ACTIVE = 1e-4  # a requirement met by less than this is called active
@@ -247,6 +248,11 @@ def design(
     another cycle behind, suddenly, so that no slope leads there. They take no envelope and no
     tolerance.
 
+    The growth rate of a structure, as objective and as requirement, is that of each of its modes
+    which may grow: those with the largest real parts, two more than grow in any of a few designs.
+    The largest alone has kinks where modes change places. `reduce` a structure of more than about
+    a hundred degrees of freedom first, over the bounds.
+
     The requirements: growth rate <= `target` [1/s], by default minus half the least damping rate
     without friction (min xi_i omega_i of a scene); every function of a scene in `constraints` <= 0,
     of order one, as those of `fractaljax.constraints` are; and the bounds. Of every fractal contact
@@ -274,10 +280,11 @@ def design(
     It needs a V of every joint, and takes no envelope and no tolerance.
 
     `solver(objective, constraints, start, bounds)`, by default SciPy's SLSQP (see `slsqp`), lands
-    from `starts` designs, by default 12: those given, the most promising of `lattice` a side (48,
-    or 24 with an envelope or a tolerance; 1024 or 256 in one variable; lattice^2 designs of a
-    low-discrepancy set in more than two variables), and an even spread. The same arguments give
-    the same design. A request that cannot be met is a result, not an error: see `Design.result`.
+    from `starts` designs, by default 12, or 8 of a structure: those given, the most promising of
+    `lattice` a side (48, or 24 of a structure, with an envelope or a tolerance; 1024 or 256 in one
+    variable; lattice^2 designs of a low-discrepancy set in more than two variables), and an even
+    spread. The same arguments give the same design. A request that cannot be met is a result, not
+    an error: see `Design.result`.
 
     **Raises:** `ValueError` for bounds on what `x` lacks, empty, inverted or without its own value,
     for an envelope of what it lacks or the design moves, and for options outside their domain.
@@ -329,10 +336,12 @@ def screened(problem: DesignProblem, starts: int | None, lattice: int | None):
     """How many designs to start from, and those (n, v) to choose them from."""
     variables = len(problem.names)
     if lattice is None:
-        lattice = _LATTICE[problem.robust][min(variables, 2) - 1]
+        many = problem.robust or problem.modes > 0  # each design takes long
+        lattice = _LATTICE[many][min(variables, 2) - 1]
     lattice = whole("lattice", lattice, 1, _LATTICE_MAX[min(variables, 2) - 1])
     count = lattice ** min(variables, 2)
-    default = _STARTS if problem.cycles is None else _FOLLOWED
+    default = _STARTS_OF_STRUCTURES if problem.modes else _STARTS
+    default = default if problem.cycles is None else _FOLLOWED
     starts = whole("starts", min(default, count) if starts is None else starts, 1, _STARTS_MAX)
     if starts > count:
         raise ValueError(f"starts must be at most the {count} of the lattice, got {starts}")

@@ -69,10 +69,7 @@ def design_files(best: Any, path: Path) -> dict[Path, bytes]:
     if (envelope := options["envelope"]) is not None:
         options["envelope"] = {"ranges": envelope.ranges, "samples": envelope.samples}
     if (tolerance := options["tolerance"]) is not None:
-        options["tolerance"] = {
-            "names": tolerance.names,
-            "covariance": np.asarray(tolerance.covariance, float).tolist(),
-        }
+        options["tolerance"] = _tolerance_table(tolerance)
     tables = {
         "options": {name: options[name] for name in OPTIONS},
         "result": {"outcome": best.outcome}
@@ -102,6 +99,32 @@ def read_design(
     if others := versions_differ(document):
         warnings.warn(f"{path} was {others}: digits may differ", stacklevel=3)
     return found
+
+
+def tolerance_text(tolerance: Tolerance, comment: str) -> str:
+    """The text of a file that `read_tolerance` reads."""
+    return write_toml(comment, {"tolerance": _tolerance_table(tolerance)})
+
+
+def read_tolerance(path: str | os.PathLike) -> Tolerance:
+    """The scatter in a file of a [tolerance]. **Raises:** `OSError`; `ValueError` naming it."""
+    with naming(path):
+        document = read_toml(read_bounded(path))
+        refuse_unknown("the file", document, ("tolerance",))
+        return _with_arguments(Tolerance, table_at(document, "tolerance"), "[tolerance]")
+
+
+def _tolerance_table(tolerance: Tolerance) -> dict[str, Any]:
+    covariance = np.asarray(tolerance.covariance, float).tolist()
+    return {"names": tolerance.names, "covariance": covariance}
+
+
+def _with_arguments(kind: type, table: Mapping[str, Any], where: str) -> Any:
+    refuse_unknown(where, table, inspect.signature(kind).parameters)
+    for name in ("names", "covariance") if kind is Tolerance else ():
+        if name not in table:
+            raise ValueError(f"{where} lacks {name!r}")
+    return kind(**table)
 
 
 def _beside(path: Path, name: str) -> Path:
@@ -142,9 +165,7 @@ def _options(table, functions) -> dict[str, Any]:
     for name, kind in (("envelope", Envelope), ("tolerance", Tolerance)):
         if name in options:
             given = table_at(options, name, "options.")
-            known = inspect.signature(kind).parameters
-            refuse_unknown(f"[options.{name}]", given, known)
-            options[name] = kind(**given)
+            options[name] = _with_arguments(kind, given, f"[options.{name}]")
     if isinstance(options["risk"], list):
         options["risk"] = tuple(options["risk"])
     laws = table_at(options, "laws", "options.") if "laws" in options else {}

@@ -14,9 +14,9 @@ import numpy as np
 
 from .._base.quick import quick_jit
 from .._dynamics.cycle import CycleResult
-from .._dynamics.hybrid import check_rtol, hybrid_system
 from .._dynamics.limit_cycle import extreme_values, limit_cycle
 from .._dynamics.orbit import Segments, mean_square, orbit, solve_periodic_orbit
+from .._dynamics.scaled import check_rtol, hybrid_system
 from .._dynamics.search import admissible, attracts
 from .._stability.stability import growth_rate
 from .constraints import CycleConstraint
@@ -44,7 +44,7 @@ class FollowedCycles:
 
     def fill(self, problem, us: np.ndarray, rows: np.ndarray, jacobians: np.ndarray) -> None:
         """Write what is asked of the cycles into rows (n, 1 + k) and Jacobians (n, 1 + k, v)."""
-        first = rows.shape[1] - len(problem.constraints)
+        first = 1 + len(problem.residual_names) - len(problem.constraints)
         first -= 0 if problem.cuts is None else len(problem.cuts.reach)
         columns: list[tuple[int, Any, Any]] = [
             (first + i, asked, lambda asked, value: asked.above(value))

@@ -20,9 +20,10 @@ from jaxtyping import Array, Float
 from .._base.batches import in_batches
 from .._base.parts import brief, flag, require_kind, require_scalar, scalar, substitute
 from .._base.quick import quick_jit
+from .._base.ranges import low_discrepancy
 from .._contact.contact import Contact, on_the_same_joint
 from .._contact.fixed import FixedContact
-from .._dynamics.hybrid import degrees_of_freedom, hybrid_system
+from .._dynamics.scaled import degrees_of_freedom, hybrid_system
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import (
     joints_of,
@@ -38,7 +39,10 @@ from .._mechanism.quantities import (
 )
 from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
+from .._stability.linearise import assembled
+from .._stability.quadratic import leading
 from .._stability.stability import growth_rate
+from .coalescence import of_neighbours, of_scene
 from .constraints import Constraint, CycleConstraint, Plain
 from .cuts import Cuts
 from .envelope import Envelope
@@ -47,7 +51,10 @@ from .tolerance import Tolerance, nodes, quantile
 
 DEFAULT_BOUNDS: dict[str, tuple[float, float]] = {"D": (2.1, 2.9), "G": (1e-12, 1e-8)}
 
+_LOOKED_AT = 15  # designs, besides the given one, in which growing modes are counted
+_MODES_MOST = 16  # that requirements are made of
 _BATCH = 32  # designs, each at one condition, evaluated at once
+_BATCH_OF_STRUCTURES = 8  # which take so long that filling up a batch costs more than a call
 
 
 class Scatter(eqx.Module):
@@ -82,6 +89,9 @@ class DesignProblem(eqx.Module):
     objective: Callable[[Any], Any] | None = eqx.field(static=True)
     friction_slope: bool = eqx.field(static=True)
     conditions: tuple[str, ...] = eqx.field(static=True)  # quantities of the envelope
+    modes: int = eqx.field(static=True, default=0)  # that a structure must keep from growing
+    # Whether rows end with what solvers follow in the place of growth rates.
+    smooth: bool = eqx.field(static=True, default=False)
     cuts: Cuts | None = None
     cycles: FollowedCycles | None = None  # where a requirement or the objective is of a cycle
 
@@ -118,7 +128,26 @@ class DesignProblem(eqx.Module):
             for name, state in states.items()
             if not joints_of(x)[name].follows_load_curve
         }
-        growth = growth_rate(_with_stiffness(x, known), self.friction_slope)
+        stiff_x = _with_stiffness(x, known)
+        smooth = []
+        if self.modes:
+            # The rates are NaN where there is no steady sliding; LAPACK gets numbers even so.
+            attached = assembled(stiff_x, self.friction_slope, refuse=False)
+            found = leading(*attached[:3], self.modes, x.band)
+            rates = list(jnp.where(attached.lost, jnp.nan, found.s.real))
+            smooth = list(
+                jnp.arcsinh(found.s.real / self.growth_scale)
+                if self.least_growth
+                else of_neighbours(found, self.target, self.growth_scale)
+            )
+        else:
+            rates = []
+            for each in (stiff_x, *(under(x, law) for law in self.laws)):
+                rates.append(growth_rate(each, self.friction_slope))
+                smooth += of_scene(
+                    each, self.friction_slope, rates[-1], self.target, self.growth_scale
+                )
+        growth = rates[0]
         model, stiff = [], []
         for name, K_n_min in zip(self.contacts, self.K_n_min, strict=True):
             state = states[name]
@@ -127,7 +156,6 @@ class DesignProblem(eqx.Module):
             if state.slip_ratio is not None:
                 model.append(10 * (state.slip_ratio - self.slip_ratio_max))
             stiff.append((K_n_min - state.K_n) / jnp.where(K_n_min > 0, K_n_min, 1))
-        rates = [growth, *(growth_rate(under(x, law), self.friction_slope) for law in self.laws)]
         pressing = [jnp.arcsinh((rate - self.target) / self.growth_scale) for rate in rates]
         # Cycles are followed outside of this program.
         own = [
@@ -136,7 +164,10 @@ class DesignProblem(eqx.Module):
         ]
         if self.cuts is not None:
             own += list(self.cuts.residuals(u))
-        value = jnp.sum((u - self.start) ** 2) if self.objective is None else self.objective(x)
+        if self.objective is None:
+            value = jnp.sum((u - self.start) ** 2)
+        else:
+            value = growth if self.least_growth else self.objective(x)
         numbers = {}
         if "" in states and x.contact.has_surface:  # of a scene
             numbers |= {"D": x.contact.surface.D, "G": x.contact.surface.G}
@@ -145,9 +176,8 @@ class DesignProblem(eqx.Module):
             for key in ("K_n", "K_t", "log_area_ratio", "slip_ratio"):
                 if getattr(state, key) is not None:
                     numbers[_dot(name) + key] = getattr(state, key)
-        return jnp.stack(
-            [jnp.asarray(value, growth.dtype), *model, *pressing, *stiff, *own]
-        ), numbers
+        row = [jnp.asarray(value, growth.dtype), *model, *pressing, *stiff, *own]
+        return jnp.stack(row + smooth * self.smooth), numbers
 
     def at(self, u: Float[Array, " v"], condition: Float[Array, " c"]):
         """As `_row`; quantiles, and no more than the row, where quantities scatter.
@@ -166,6 +196,24 @@ class DesignProblem(eqx.Module):
     def robust(self) -> bool:
         """Whether there is an envelope or a tolerance."""
         return bool(self.conditions) or self.scatter is not None
+
+    @property
+    def least_growth(self) -> bool:
+        """Whether the objective is the growth rate of a structure, the largest of many modes'."""
+        return self.modes > 0 and self.objective is growth_rate
+
+    @property
+    def growth_columns(self) -> slice:
+        """Where in a row the growth rates are, of the modes or by the laws."""
+        first = 1 + self.model_residuals
+        return slice(first, first + max(self.modes, 1 + len(self.laws)))
+
+    @property
+    def asked(self) -> np.ndarray:
+        """Which columns (1 + k,) of a row are the objective and the requirements by name."""
+        named = 1 + len(self.residual_names)
+        smooth = self.smooth * (self.modes or 2 * (1 + len(self.laws)))
+        return np.arange(named + smooth) < named
 
     @property
     def rounding(self) -> float:
@@ -190,7 +238,8 @@ class DesignProblem(eqx.Module):
         if self.cuts is not None:
             own += [f"cut {k}" for k in range(len(self.cuts.reach))]
         growing = [f"growth_rate <= target by {type(law).__name__}" for law in self.laws]
-        return [*model, "growth_rate <= target", *growing, *stiff, *own]
+        others = [f"growth_rate of mode {i} <= target" for i in range(2, self.modes + 1)]
+        return [*model, "growth_rate <= target", *others, *growing, *stiff, *own]
 
     def scaled(self, x: Mechanism) -> np.ndarray:
         """The scaled variables (v,) of a scene or structure."""
@@ -231,7 +280,8 @@ def _in_batches(program, problem, us, conditions):
     problem = dataclasses.replace(problem, cycles=None)
     dtype = problem.low.dtype
     pairs = np.asarray(us, dtype), np.asarray(conditions, dtype)
-    return in_batches(functools.partial(program, problem), _BATCH, *pairs)
+    batch = _BATCH_OF_STRUCTURES if problem.modes else _BATCH
+    return in_batches(functools.partial(program, problem), batch, *pairs)
 
 
 def linearised(problem: DesignProblem, us, conditions):
@@ -355,6 +405,7 @@ def state_problem(
     area_ratio_min: float,
     slip_ratio_max: float,
     friction_slope: bool,
+    risk: Any = "worst",
     laws: Sequence[Contact] = (),
     **_: Any,
 ) -> DesignProblem:
@@ -433,11 +484,30 @@ def state_problem(
         conditions=conditions,
         cycles=cycles,
     )
+    if isinstance(x, Structure):
+        problem = dataclasses.replace(problem, modes=_modes_to_keep(problem))
+    # An average or a quantile of smooth residuals is not that of the growth rates.
+    smooth = problem.least_growth or (scatter is None and risk == "worst")
+    problem = dataclasses.replace(problem, smooth=smooth)
     if K_n_min is not None or not contacts:
         return problem
     given = describe(problem, np.asarray(problem.start)[None])
     own = tuple(jnp.asarray(given[_dot(name) + "K_n"][0], dtype) for name in contacts)
     return dataclasses.replace(problem, K_n_min=own)
+
+
+def _modes_to_keep(problem: DesignProblem) -> int:
+    """How many modes may grow: two more than grow in any of a few designs."""
+    designs = np.concatenate(
+        [np.asarray(problem.start)[None], low_discrepancy(_LOOKED_AT, len(problem.names))]
+    )
+    modes = max(2, min(_MODES_MOST, problem.x.n))
+    looking = dataclasses.replace(problem, scatter=None, modes=modes)
+    own = np.broadcast_to(
+        np.asarray(problem.own_condition), (len(designs), len(problem.conditions))
+    )
+    rows = _in_batches(_evaluate, looking, designs, own)[:, looking.growth_columns]
+    return min(int((rows > 0).sum(axis=1).max()) + 2, modes)
 
 
 def _followed(x) -> float:

@@ -19,7 +19,7 @@ import numpy as np
 from .._dynamics.basin import Basin, basin, ellipsoid, kick_size
 from .._dynamics.branch import BranchEvent, continue_cycle
 from .._dynamics.cycle import LimitCycle
-from .._dynamics.hybrid import degrees_of_freedom, hybrid_system
+from .._dynamics.scaled import degrees_of_freedom, hybrid_system
 from .._mechanism.mechanism import Mechanism
 from .._stability.stability import growth_rate
 from .cuts import Cuts

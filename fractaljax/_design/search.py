@@ -16,14 +16,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._base.parts import brief, scalar
+from .._base.ranges import low_discrepancy
 from .envelope import ALONE, Envelope
 from .problem import DesignProblem, evaluate, linearise
-from .tolerance import low_discrepancy
 
 Solver = Callable[[Callable, Callable, np.ndarray, np.ndarray], np.ndarray]
 
 _LIKELY = 8  # conditions of a first guess at the worst
 _ROUNDS = 12  # of the exchange
+_FEW = 2  # variables, in which a lattice of starts leaves nothing to restore
+_RESTORING = 30  # steps from a start to where all requirements are met
 _NEW = 1e-7  # by which a condition must be worse than the working ones
 _NEAR = 0.05  # a requirement met by more than this on the grid is met between its points
 _UNKNOWN = 1e3  # stands for a residual without a number
@@ -108,12 +110,13 @@ class Evaluator:
         """Objective and residuals (n, 1 + k) of us (n, v), roughly: to choose starts by."""
         # Cycles are followed from the starts only.
         rough = dataclasses.replace(self, problem=dataclasses.replace(self.problem, cycles=None))
-        return rough._at_all(us, self.likely).max(axis=1)
+        return rough._at_all(us, self.likely).max(axis=1)[:, self.problem.asked]
 
     def evaluate(self, us: np.ndarray) -> Evaluation:
         """Designs us (n, v), over all conditions."""
         grid = self.envelope.grid()
         each = self._at_all(us, self.envelope.values(grid))
+        each = each[:, :, self.problem.asked]
         places, rows = grid[each.argmax(axis=1)], each.max(axis=1)
         near = rows > -_NEAR
         near[:, 0] = self.problem.objective is not None
@@ -136,6 +139,7 @@ class Evaluator:
         found, new = self.evaluate(us), []
         counts = [len(conditions) for conditions in working]
         known = self._at(np.repeat(us, counts, axis=0), np.concatenate(working))
+        known = known[:, self.problem.asked]
         pieces = np.split(known, np.cumsum(counts)[:-1])
         for rows, places, piece in zip(found.rows, found.places, pieces, strict=True):
             worse = rows > piece.max(axis=0) + _NEW
@@ -288,7 +292,7 @@ class _Functions:
     rows_at: Callable
     aim: np.ndarray  # (1 + k,), whether a column is
     limited: np.ndarray
-    slack: float
+    slack: float | np.ndarray  # (1 + k,)
     scale: float  # of the objective
     extra: bool
     seen: list[np.ndarray] = dataclasses.field(default_factory=list)  # where rows were asked for
@@ -316,9 +320,10 @@ class _Functions:
     def constraints(self, z):
         """Residuals and their Jacobian, compressed where they are not of order one."""
         (rows, jacobians), v = self.at(z), len(z) - self.extra
-        c, slopes = rows[:, self.limited].ravel(), jacobians[:, self.limited].reshape(-1, v)
-        size = np.maximum(np.abs(c + self.slack), 1)
-        c = np.where(size > 1, np.sign(c) * (1 + np.log(size)), c + self.slack)
+        c = (rows + self.slack)[:, self.limited].ravel()
+        slopes = jacobians[:, self.limited].reshape(-1, v)
+        size = np.maximum(np.abs(c), 1)
+        c = np.where(size > 1, np.sign(c) * (1 + np.log(size)), c)
         slopes = slopes / size[:, None]
         if self.extra:
             aimed, aim_slopes = rows[:, self.aim].ravel(), jacobians[:, self.aim].reshape(-1, v)
@@ -326,6 +331,21 @@ class _Functions:
             by_t = np.append(np.zeros(len(slopes)), -np.ones(len(aimed)))
             slopes = np.column_stack([np.concatenate([slopes, aim_slopes]), by_t])
         return c, slopes
+
+
+def _least_violated(functions: _Functions, start: np.ndarray) -> np.ndarray:
+    """A design (v,) near `start` with the least sum of squares of its unmet requirements."""
+    from scipy.optimize import least_squares
+
+    def unmet(u):
+        return np.maximum(functions.constraints(u)[0], 0)
+
+    def slopes(u):
+        residuals, jacobian = functions.constraints(u)
+        return jacobian * (residuals > 0)[:, None]
+
+    more: Any = {"jac": slopes, "bounds": (0, 1), "max_nfev": _RESTORING}
+    return least_squares(unmet, np.clip(start, 1e-3, 1 - 1e-3), **more).x
 
 
 def in_lockstep(tasks: Sequence[Callable], answer: Callable[[list], list]) -> list:
@@ -375,13 +395,15 @@ class Search:
     scale: float = 1.0  # of the objective
 
     @property
-    def slack(self) -> float:
-        """By how much requirements are overfulfilled, so that rounding cannot undo them.
+    def slack(self) -> np.ndarray:
+        """By how much (1 + k,) requirements are overfulfilled, so that rounding cannot undo them.
 
         Nor can a condition between those that an envelope was searched at.
         """
         problem = self.evaluator.problem
-        return max(1e-6 if problem.robust else 1e-9, problem.rounding)
+        slack = max(1e-6 if problem.robust else 1e-9, problem.rounding)
+        # What stands for a growth rate far below the frequency varies with the square of both.
+        return np.where(problem.asked, slack, 0.01 * slack)
 
     def best(self, starts: np.ndarray, progress: bool):
         """The way (s, v) to the best end of all, what it is, and how many starts (n, v) failed.
@@ -410,11 +432,18 @@ class Search:
         Where none meets every requirement they end inside the model, if that is possible, and
         there as close as can be to all the rest.
         """
+        problem = self.evaluator.problem
         paths = self._land([start[None] for start in starts], progress=progress)
         found = self._ends(paths)
+        lost = np.flatnonzero(found.worst > 0)
+        if len(lost) and len(problem.names) > _FEW:
+            # Far from many requirements a solver may stop: first to where all are met.
+            landed = self._land([starts[i][None] for i in lost], restored=True)
+            for i, path in zip(lost, landed, strict=True):
+                paths[i] = path
+            found = self._ends(paths)
         if (found.worst <= 0).any():
             return paths, found
-        problem = self.evaluator.problem
         model = np.arange(len(problem.residual_names)) < problem.model_residuals
         # Into the model, on to the rest of the requirements, and if they hold to the objective.
         for violated in (model, ~model, None):
@@ -430,27 +459,37 @@ class Search:
     def _ends(self, paths) -> Evaluation:
         return self.evaluator.evaluate(np.array([path[-1] for path in paths]))
 
-    def _land(self, paths, violated=None, progress=False):
+    def _land(self, paths, violated=None, progress=False, restored=False):
         """Ways (s, v) continued to the least objective that meets every requirement.
 
         With some requirements (k,) marked as violated, to the least of their largest residual that
-        meets those before them.
+        meets those before them. If `restored`, by the nearest design that violates all the least.
         """
         from tqdm import tqdm
 
-        columns = np.arange(1 + len(self.evaluator.problem.residual_names))
-        aim = columns == 0 if violated is None else np.append(False, violated)
-        limited = columns > 0 if violated is None else (columns > 0) & (columns < aim.argmax())
+        problem = self.evaluator.problem
+        asked = problem.asked
+        columns = np.arange(len(asked))
+        growing = np.isin(columns, columns[problem.growth_columns])
+        aim, limited = columns == 0, columns > 0
+        if violated is not None:
+            aim[asked] = np.append(False, violated)
+            limited &= asked & (columns < aim.argmax())
+        elif problem.least_growth:
+            # The largest of many modes has kinks where they change places; each has none.
+            aim, limited = ~asked, limited & asked
+        elif problem.smooth:
+            limited &= ~growing
         with tqdm(total=len(paths), desc="design", unit="start", disable=not progress) as bar:
 
             def task(path, ask):
-                found = self._continued(path, aim, limited, ask)
+                found = self._continued(path, aim, limited, ask, restored)
                 bar.update()
                 return found
 
             return in_lockstep([functools.partial(task, path) for path in paths], self._answer)
 
-    def _continued(self, path, aim, limited, ask):
+    def _continued(self, path, aim, limited, ask, restored):
         """One way, continued by a solver that asks for rows and for new conditions."""
         path, working = list(path), self.evaluator.working
         extra = not aim[0] or self.evaluator.minimax
@@ -461,6 +500,8 @@ class Search:
 
             functions = _Functions(rows_at, aim, limited, self.slack, self.scale, extra)
             start, bounds = path[-1], np.tile([0.0, 1.0], (len(path[-1]), 1))
+            if restored:
+                start = _least_violated(dataclasses.replace(functions, extra=False), start)
             if extra:
                 largest = functions.at(np.append(start, 0))[0][:, aim].max()
                 start = np.append(start, largest)

@@ -17,6 +17,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from .._base.batches import in_batches
 from .._base.parts import Record, brief, number, scalar
+from .._base.ranges import low_discrepancy
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import known_quantities, replaced, substituted, value_of, with_optional
 from .._mechanism.structure import Structure
@@ -135,19 +136,6 @@ class Tolerance(Record):
             name: values[name] + by if name == given else values[name] * jnp.exp(by)
             for name, given, by in zip(self.quantities, self.names, shift, strict=True)
         }
-
-
-def low_discrepancy(count: int, dimensions: int) -> np.ndarray:
-    """Points (count, dimensions) that fill the unit cube evenly: a lattice of one generator.
-
-    Its steps are powers of 1/g with g^dimensions = g + 1, as in R. Roberts' sequence; in the plane
-    it is the Fibonacci lattice.
-    """
-    i, g = np.arange(count), 2.0
-    for _ in range(50):
-        g = (1 + g) ** (1 / dimensions)
-    steps = [1, *np.round(count * g ** -np.arange(1.0, dimensions))]
-    return np.stack([(step * i % count + 0.5) / count for step in steps], axis=1)
 
 
 def nodes(dimensions: int) -> tuple[np.ndarray, np.ndarray]:

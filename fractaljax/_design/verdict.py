@@ -13,6 +13,7 @@ from jaxtyping import ScalarLike
 from .._base.parts import Record, flag, require_kind, require_scalar, scalar, substitute
 from .._base.quick import quick_jit
 from .._base.table import table
+from .._contact.asperity import AsperityContact
 from .._contact.contact import Contact
 from .._contact.fixed import FixedContact
 from .._contact.fractal import FractalContact
@@ -47,6 +48,7 @@ class Verdict(Record):
 
     questions: tuple[Question, ...]
     incurable: bool  # whether the slope of the friction feeds in more than all damping takes out
+    not_asked: tuple[str, ...] = ()  # what `verdict` would ask with other arguments, in brackets
 
     @property
     def rests_on(self) -> tuple[str, ...]:
@@ -56,7 +58,7 @@ class Verdict(Record):
 
     @property
     def quiet(self) -> bool:
-        """Whether it is quiet in all."""
+        """Whether it is quiet in all that was asked."""
         return all(question.quiet for question in self.questions)
 
     def __repr__(self) -> str:
@@ -74,11 +76,13 @@ class Verdict(Record):
                 "takes out. See `suggest`."
             )
         if self.quiet:
-            lines.append("Quiet in all.")
+            lines.append("Quiet in all that was asked." if self.not_asked else "Quiet in all.")
         elif self.questions[0].quiet:
             lines.append(f"Quiet, but it rests on: {'; '.join(self.rests_on)}.")
         else:
             lines.append("Not quiet.")
+        if self.not_asked:
+            lines.append(f"Not asked: {', '.join(self.not_asked)}.")
         return "\n".join(lines)
 
 
@@ -98,11 +102,11 @@ def verdict(
 
     Its growth rate [1/s] as it is; with the load P in the friction, or without it where it is
     there; under every other of the contact `laws`, with its surface, material and load, and by
-    `PerssonContact` if the nominal `area` [m^2] is given, with wavelengths from its side down to a
-    hundredth of it; and with K_t/K_n between its own, the fractal law's and Mindlin's, the worst of
-    65 values. With a `tolerance` or an `Identification`, and an `envelope`, the probability of
-    squeal (see `squeal_probability`), quiet below 5 percent; with `quiet_within` (see `design`) the
-    largest kick survived.
+    `AsperityContact` and `PerssonContact` if the nominal `area` [m^2] is given, with wavelengths
+    from its side down to a hundredth of it; and with K_t/K_n between its own, the fractal law's
+    and Mindlin's, the worst of 65 values. With a `tolerance` or an `Identification`, and an
+    `envelope`, the probability of squeal (see `squeal_probability`), quiet below 5 percent; with
+    `quiet_within` (see `design`) the largest kick survived. What no argument asks for is named.
 
     **Raises:** `ValueError` for a scene that holds arrays, and as those functions.
     """
@@ -113,7 +117,7 @@ def verdict(
     for i, law in enumerate(laws):
         require_kind(f"laws[{i}]", law, Contact)
     if area is not None:
-        laws.append(_persson(scene, scalar("area", area, above=0)))
+        laws += _laws_of(scene, scalar("area", area, above=0))
     own, slope = type(scene.contact).__name__, friction_slope
     questions = [_of("", f"as it is ({own})", scene, slope)]
     if getattr(scene.contact, "P", None) is not None:
@@ -135,7 +139,12 @@ def verdict(
         questions.append(Question("smaller kicks", name, found, survived >= asked))
     # The sum of the growth rates is minus the trace of the damping, whatever the stiffness.
     incurable = bool(stability(scene, friction_slope).eigenvalues.real.sum() > 0)
-    return Verdict(tuple(questions), incurable)
+    others = "area" if scene.contact.has_surface else "laws"
+    asked = {f"other contact laws ({others})": laws, "scatter (tolerance)": tolerance is not None}
+    asked["kicks (quiet_within)"] = quiet_within is not None
+    return Verdict(
+        tuple(questions), incurable, tuple(name for name, was in asked.items() if not was)
+    )
 
 
 def _of(assumed: str, name: str, scene: Scene, friction_slope: bool) -> Question:
@@ -144,12 +153,13 @@ def _of(assumed: str, name: str, scene: Scene, friction_slope: bool) -> Question
     return Question(assumed, name, found, growth < 0)
 
 
-def _persson(scene: Scene, area) -> PerssonContact:
+def _laws_of(scene: Scene, area) -> tuple[Contact, ...]:
+    """The other laws of the surface on a nominal area."""
     contact = scene.contact
     if not contact.has_surface:
         raise ValueError(f"area needs a contact with a surface, got a {type(contact).__name__}")
-    L = jnp.sqrt(area)
-    return PerssonContact(contact.surface, contact.material, contact.P, area, L, L / _WAVES)
+    L, joint = jnp.sqrt(area), (contact.surface, contact.material, contact.P)
+    return AsperityContact(*joint, L / _WAVES), PerssonContact(*joint, area, L, L / _WAVES)
 
 
 def _stiffness_ratios(scene: Scene, friction_slope: bool) -> Iterator[Question]:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
-from fractaljax._cli.design import _LIMITS, _OPTIONS, _remarks
+from fractaljax._cli.design import _LIMITS, _OPTIONS, _remarks, _tolerance
+from fractaljax._design.design_file import tolerance_text
 from tools import run_command as run
 
 _WRITTEN = ["design.png", "design.toml", "history.csv", "run.toml"]
@@ -24,7 +25,8 @@ _ROWS += [
     "friction on P + K_n x2",
     "K_t/K_n from 0.355 to 0.824",
 ]
-_ROWS += ["Quiet, but it rests on: friction on K_n x2; K_t/K_n = 0.355.", ""]
+_ROWS += ["Quiet, but it rests on: friction on K_n x2; K_t/K_n = 0.355."]
+_ROWS += ["Not asked: other contact laws (area), scatter (tolerance), kicks (quiet_within).", ""]
 _ROWS += ["written to fractaljax-design: ", "topography.npy: 1024 x 1024 heights in m, dx = "]
 _ROWS += ["stable against small disturbances; a larger kick may still end in squeal"]
 
@@ -60,6 +62,46 @@ def test_design_without_arguments(capsys, tmp_path):
         assert (folder / picture).read_bytes().startswith(b"\x89PNG")
     z = fj.topography(scene.contact.surface, 1e-3, 1024, key=jax.random.key(0))
     np.testing.assert_allclose(np.load(folder / "topography.npy"), z, rtol=0, atol=1e-18)
+
+
+@pytest.mark.slow
+def test_what_no_surface_cures_ends_with_what_else_does(capsys):
+    """A slope of the friction beyond all damping: `suggest` of the scene as it was given."""
+    scene = fj.brake_scene()
+    scene = fj.Scene(scene.contact, scene.friction, scene.oscillator, preload=True)
+    scene.save("loaded.toml")
+    few = ("--starts", 4, "--lattice", 4, "--quiet", "--target", -1.0)
+    status, out, _ = run(capsys, "design", "loaded.toml", *few)
+    assert status == 1 and "No surface cures this" in out
+    cure = fj.suggest(scene, target=-1.0)
+    assert str(cure) in out and cure.values["xi_1"] is not None
+
+
+def test_a_tolerance_comes_from_the_file_of_an_identification():
+    """Correlated, as `identify` writes it, where NAME=SIGMA is independent."""
+    covariance = np.array([[1e-4, 9e-4], [9e-4, 1e-2]])
+    given = fj.Tolerance(("D", "ln G"), covariance)
+    Path("mine.toml").write_text(tolerance_text(given, "errors"))
+    found = _tolerance(["mine.toml"])
+    assert found.names == given.names
+    np.testing.assert_array_equal(found.covariance, given.covariance)
+    assert _tolerance(["D=0.01", "lnG=0.1"]) == {"D": 0.01, "ln G": 0.1}
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "the table [tolerance] is missing"),
+        ('[tolerance]\nnames = ["D"]', "[tolerance] lacks 'covariance'"),
+        ("[tolerance]\nsigma = 1", "[tolerance] has the unknown key 'sigma'"),
+        ('[tolerance]\nnames = ["D"]\ncovariance = [[1, 2]]', "tolerance must name the rows"),
+    ],
+)
+def test_a_damaged_tolerance_is_refused(capsys, text, said):
+    Path("mine.toml").write_text(text)
+    status, out, err = run(capsys, "design", "--tolerance", "mine.toml", "--quiet")
+    assert (status, out) == (2, "") and err.startswith("fractaljax: mine.toml: ")
+    assert said in err and err.count("\n") == 1
 
 
 def test_infeasible_design_is_no_success(capsys):
@@ -202,6 +244,7 @@ def test_failure_writes_nothing(capsys, tmp_path, monkeypatch, where, error, sta
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_files_of_a_structure_are_written_together(capsys):
     """The structure, its design and all matrices; or nothing, where one of them cannot be."""
     fj.Structure.from_scene(fj.brake_scene()).save("belt.toml")

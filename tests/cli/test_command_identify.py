@@ -10,6 +10,7 @@ import pytest
 import fractaljax as fj
 import instrument_files as files
 from fractaljax._cli.identify import _bounds
+from fractaljax._design.design_file import read_tolerance
 from fractaljax._identify.warnings import DISQUALIFYING
 from synthetic import gaussian_map, gaussian_profile
 from tools import run_command as run
@@ -41,15 +42,20 @@ def test_identify_a_profile(capsys):
         "mine.csv: text of 4096 lines and 2 columns",
         "profile of 4096 heights, 40 missing, dx = 1e-06 m",
     ]
-    assert "written to fractaljax-identification: identification.png, scene.toml" in lines
+    written = "identification.png, scene.toml, tolerance.toml"
+    assert f"written to fractaljax-identification: {written}" in lines
     assert lines[-1] == f"next: fractaljax design {SCENE}"
     assert sorted(path.name for path in SCENE.parent.iterdir()) == [
         "identification.png",
         "scene.toml",
+        "tolerance.toml",
     ]
     assert (SCENE.parent / "identification.png").read_bytes().startswith(b"\x89PNG")
     found, scene = fj.identify(z, DX), fj.Scene.load(SCENE)
     assert f"{found}" in out
+    errors = read_tolerance(SCENE.parent / "tolerance.toml")
+    assert errors.names == ("D", "ln G")
+    np.testing.assert_allclose(errors.covariance, found.covariance, rtol=1e-9)
     surface = scene.contact.surface
     np.testing.assert_allclose([surface.D, surface.G], [found.D, found.G], rtol=1e-9)
     assert abs(found.D - D) < 3 * found.D_standard_error
@@ -212,6 +218,11 @@ def test_the_joint_of_the_measured_surface_and_what_it_rests_on(capsys):
     found = fj.identify(np.load("map.npy"), DX)
     assert status == 0 and str(fj.verdict(scene, tolerance=found, area=1e-4)) in out
     assert "by PerssonContact" in out and "D and ln G scatter" in out
+    over = ("--envelope", "P=1500:2500", "V=0.1,0.15")
+    status, ranged, _ = run(capsys, "identify", *arguments, *over)
+    envelope = fj.Envelope({"P": (1500, 2500)}, {"V": (0.1, 0.15)})
+    assert status == 0 and str(fj.verdict(scene, tolerance=found, envelope=envelope)) in ranged
+    assert "D and ln G scatter over P" in ranged
     (line,) = (line for line in out.splitlines() if line.startswith("K_n = "))
     shown, _, _ = line.removeprefix("K_n = ").partition(" N/m")
     value, error = map(float, shown.split("+-"))

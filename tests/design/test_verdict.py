@@ -30,7 +30,7 @@ def growth(scene):
 
 
 def test_every_question_is_the_growth_rate_of_the_scene_that_it_means(found):
-    as_is, loaded, law, ratio, scatter = found.questions
+    as_is, loaded, revised, law, ratio, scatter = found.questions
     assert float(as_is.found) == pytest.approx(growth(DESIGNED), rel=1e-5) and as_is.quiet
     preloaded = fj.Scene(DESIGNED.contact, DESIGNED.friction, DESIGNED.oscillator, preload=True)
     assert float(loaded.found) == pytest.approx(growth(preloaded), rel=1e-5)
@@ -39,6 +39,10 @@ def test_every_question_is_the_growth_rate_of_the_scene_that_it_means(found):
     contact = fj.PerssonContact(surface, DESIGNED.contact.material, 1907.3, 1e-4, 1e-2, 1e-4)
     assert float(law.found) == pytest.approx(growth(DESIGNED.replace(contact=contact)), rel=1e-5)
     assert law.name == "by PerssonContact" and not law.quiet
+    contact = fj.AsperityContact(surface, DESIGNED.contact.material, 1907.3, 1e-4)
+    expected = growth(DESIGNED.replace(contact=contact))
+    assert float(revised.found) == pytest.approx(expected, rel=1e-5)
+    assert revised.name == "by AsperityContact" and not revised.quiet
     # The worst of the stiffness ratios between the scene's own and Mindlin's.
     K_n, K_t = fj.stiffness(DESIGNED)
     rates = [
@@ -57,7 +61,8 @@ def test_what_it_rests_on_is_said(found):
     assert found.rests_on[:2] == ("friction on K_n x2", "FractalContact")
     lines = repr(found).splitlines()
     assert lines[0].split() == ["growth", "rate", "[1/s]"]
-    assert lines[-1].startswith("Quiet, but it rests on: friction on K_n x2; FractalContact; K_t")
+    assert lines[-2].startswith("Quiet, but it rests on: friction on K_n x2; FractalContact; K_t")
+    assert lines[-1] == "Not asked: kicks (quiet_within)."
 
 
 def test_a_law_takes_surface_material_and_load_from_the_scene(found):
@@ -67,14 +72,18 @@ def test_a_law_takes_surface_material_and_load_from_the_scene(found):
         law.surface, fj.Material(1e10, 0.1, 1e8, 1e9), 1.0, 1e-4, law.L, law.L_s
     )
     (_, _, asked, _) = fj.verdict(DESIGNED, laws=[law]).questions
-    assert asked == found.questions[2]
+    assert asked == found.questions[3]
 
 
 def test_quiet_in_all():
     quiet = motionless_scene()
     found = fj.verdict(quiet, laws=[fj.FixedContact(1e7, 5e6)])
     assert found.quiet and found.rests_on == ()
-    assert repr(found).splitlines()[-1] == "Quiet in all."
+    assert repr(found).splitlines()[-2:] == [
+        "Quiet in all that was asked.",
+        "Not asked: scatter (tolerance), kicks (quiet_within).",
+    ]
+    assert fj.verdict(quiet).not_asked[0] == "other contact laws (laws)"
     assert [question.name for question in found.questions] == [
         "as it is (FixedContact)",
         "by FixedContact",
@@ -96,7 +105,9 @@ def test_a_slope_that_no_damping_meets_is_incurable():
 @pytest.mark.slow
 def test_largest_kick_survived():
     scene = motionless_scene()
-    found = fj.verdict(scene, quiet_within=0.5, progress=False)
+    law, scatter = [fj.FixedContact(1e7, 5e6)], {"mu": 1e-3}
+    found = fj.verdict(scene, laws=law, tolerance=scatter, quiet_within=0.5, progress=False)
+    assert found.not_asked == () and repr(found).splitlines()[-1] == "Quiet in all."
     assert found.questions[-1] == (
         "smaller kicks",
         "kicks within 0.5",
