@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from .output import csv_text, output, picture
-from .parsing import add_scene_file, kick_size, load_given, numbers, pairs_of
+from .parsing import add_scene_file, kick_size, load_given, windows_of
 
 _FORM = "NAME=LOW:HIGH"
 _AROUND = {"D": (-0.05, 0.05), "G": (0.5, 2.0)}  # of the default window: added, and a factor
@@ -42,7 +42,7 @@ def _run(arguments) -> int:
     from .. import plot
     from .._dynamics.bifurcation import bifurcation_map
 
-    x = load_given(arguments.scene, structures=True)
+    x = load_given(arguments.scene, structures=True, quiet=arguments.quiet)
     windows = [_window(x, which, getattr(arguments, which)) for which in ("x", "y")]
     options: dict[str, Any] = {}
     if arguments.radius is not None:
@@ -69,11 +69,8 @@ def _window(x, which: str, text: str | None) -> tuple[str, float, float]:
         if name == "G":
             return name, own * low, own * high
         return name, max(2.001, own + low), min(2.999, own + high)
-    ((name, ends),) = pairs_of(f"--{which}", [text], _FORM).items()
-    window = numbers(f"--{which} {name}", ends, ":")
-    if len(window) != 2:
-        raise ValueError(f"--{which} must be {_FORM}, got {text!r}")
-    return name, window[0], window[1]
+    ((name, window),) = windows_of(f"--{which}", [text], _FORM).items()
+    return name, *window
 
 
 def _text(found) -> str:

@@ -12,8 +12,8 @@ from .._base.parts import number
 from .._mechanism.mechanism import Mechanism
 from .cycle import CycleResult, LimitCycle
 from .excitation import Excitation
-from .hybrid import degrees_of_freedom, hybrid_system
 from .limit_cycle import limit_cycle
+from .scaled import degrees_of_freedom, hybrid_system
 
 
 def attractors(

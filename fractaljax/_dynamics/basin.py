@@ -24,9 +24,10 @@ from .._mechanism.mechanism import Mechanism
 from .cycle import CycleResult, LimitCycle
 from .events import step
 from .excitation import Excitation, excited_system
-from .hybrid import NONE, SECTION, HybridSystem, check_rtol, degrees_of_freedom
+from .hybrid import NONE, SECTION, HybridSystem
 from .limit_cycle import limit_cycle
 from .orbit import next_start
+from .scaled import check_rtol, degrees_of_freedom
 from .search import SearchOptions
 
 _MOST_STARTS = 1_000_000

@@ -20,9 +20,10 @@ from .._mechanism.quantities import (
 from .._mechanism.scene import Scene
 from .cycle import LimitCycle, Orbit
 from .follow import SMALL, BranchEnd, Follower
-from .hybrid import NONE, SECTION, check_rtol, degrees_of_freedom
+from .hybrid import NONE, SECTION
 from .itinerary import Family, Phase, Shooting, Solution, solution_of
 from .limit_cycle import limit_cycle
+from .scaled import check_rtol, degrees_of_freedom
 from .sensitivity import event_value
 from .shooting import Chain, Lifted, Window, linearised
 

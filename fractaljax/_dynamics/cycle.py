@@ -1,5 +1,6 @@
 """A limit cycle: its numbers, its orbit, its spectrum and its switches."""
 
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from .._base.kept import kept_jit
 from .._base.parts import Record, concrete
 from .hybrid import OPEN, UNUSED, HybridSystem
 from .orbit import Segments, flow, mean_square
@@ -15,6 +17,7 @@ from .orbit import Segments, flow, mean_square
 _SQUARINGS = 40  # of a monodromy matrix
 _SAMPLES = 1024  # of a smooth orbit, for a mean
 VELOCITY_REFERENCE = 1e-9  # [m/s], of levels
+STATE_NAMES = {1: "+", -1: "-", 0: "stick", OPEN: "open"}  # of contact states, in a `Switch`
 
 
 class CycleResult(eqx.Enumeration):
@@ -82,14 +85,18 @@ class Orbit(eqx.Module):
 
     def at(self, system: HybridSystem, times) -> Float[Array, "4 n"]:
         """Scaled states at scaled times (n,) within one period."""
-        segments = self.segments
-        ends = jnp.cumsum(segments.duration)
-        k = jnp.searchsorted(
-            jax.lax.stop_gradient(ends), jax.lax.stop_gradient(times), side="right"
-        )
-        k = jnp.minimum(k, len(ends) - 1)
-        after = times - (ends - segments.duration)[k]
+        segments, k = self.segments, self._segment(times)
+        after = times - (jnp.cumsum(segments.duration) - segments.duration)[k]
         return flow(system, segments.y[:, k], after, segments.s[:, k])
+
+    def states_at(self, times) -> Float[Array, "f n"]:
+        """Contact states from scaled times (n,) on."""
+        return self.segments.s[:, self._segment(times)]
+
+    def _segment(self, times) -> Int[Array, " n"]:
+        ends = jax.lax.stop_gradient(jnp.cumsum(self.segments.duration))
+        k = jnp.searchsorted(ends, jax.lax.stop_gradient(times), side="right")
+        return jnp.minimum(k, len(ends) - 1)
 
 
 class LimitCycle(Record):
@@ -151,12 +158,8 @@ class LimitCycle(Record):
         return 20 * jnp.log10(self.velocity_rms / VELOCITY_REFERENCE)
 
     def orbit(self, n: int = 512) -> tuple[Float[Array, " n"], Float[Array, "n 2dofs"]]:
-        """Times [s] and states [x, v] [m, m/s], evenly spaced over one period from `state`."""
-        system = self._system
-        share = jnp.arange(n) / n
-        y = self._orbit.at(system, share * self.period * system.omega)
-        y = jnp.where(jnp.isfinite(self.period), y, jnp.nan)
-        return share * self.period, (system.own(y) * system.units[:, None]).T
+        """Times [s] and states [x, v] in m and m/s, evenly spaced over one period from `state`."""
+        return _sampled(self._orbit, self._system, self.period, n=n)
 
     def spectrum(self, n: int = 512) -> tuple[Float[Array, " n/2"], Float[Array, "n/2 dofs"]]:
         """Harmonics: frequencies [Hz] and peak amplitudes [m] of the degrees of freedom.
@@ -173,6 +176,19 @@ class LimitCycle(Record):
         harmonics = jnp.arange(1, n // 2 + 1)
         return harmonics / self.period, lines[1 : n // 2 + 1]
 
+    def contact_states(self, n: int = 512) -> Float[Array, "n f"]:
+        """From the times of `orbit(n)` on: +1, -1 slip forward, backward, 0 stick, 2 open.
+
+        As of a `Trajectory`: of each direction of friction, the tangential one of a joint first.
+
+        **Raises:** `ValueError` for the regularised law, which has none.
+        """
+        if not isinstance(self._orbit, Orbit):
+            raise ValueError("a regularised cycle has no contact states: leave regularisation out")
+        system, share = self._system, jnp.arange(n) / n
+        states = self._orbit.states_at(share * self.period * system.omega).T
+        return jnp.where(jnp.isfinite(self.period), states, jnp.nan)
+
     def switches(self) -> list[Switch]:
         """Every change of contact state in one period, in order, with its time.
 
@@ -183,7 +199,7 @@ class LimitCycle(Record):
             raise ValueError("switches() needs one cycle, outside of jit: index the batch first")
         if not isinstance(self._orbit, Orbit):
             raise ValueError("a regularised cycle has no switches")
-        segments, names = self._orbit.segments, {1: "+", -1: "-", 0: "stick", OPEN: "open"}
+        segments, names = self._orbit.segments, STATE_NAMES
         used = np.asarray(segments.guard) != UNUSED
         states = np.asarray(segments.s)[:, used].astype(int)
         times = np.cumsum(np.asarray(segments.duration)[used]) / float(self._system.omega)
@@ -193,3 +209,11 @@ class LimitCycle(Record):
             for i in np.flatnonzero(before != after):
                 found.append(Switch(float(time), int(i) + 1, names[before[i]], names[after[i]]))
         return found
+
+
+@functools.partial(kept_jit, static_argnames="n")
+def _sampled(orbit, system: HybridSystem, period, n: int):
+    share = jnp.arange(n) / n
+    y = orbit.at(system, share * period * system.omega)
+    y = jnp.where(jnp.isfinite(period), y, jnp.nan)
+    return share * period, (system.own(y) * system.units[:, None]).T

@@ -5,7 +5,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
-from .hybrid import NONE, SECTION, HybridSystem, first_least, row_numbers
+from .hybrid import NONE, SECTION, HybridSystem
+from .lanes import first_least, row_numbers
 
 
 class Cubic(eqx.Module):

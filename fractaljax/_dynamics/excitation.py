@@ -17,7 +17,8 @@ from .._base.parts import Numbers, Record, number, require_kind
 from .._mechanism.joint import Dof
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.structure import Structure
-from .hybrid import HybridSystem, hybrid_system
+from .hybrid import HybridSystem
+from .scaled import hybrid_system
 
 _NAMES = "x1", "x2"  # of a scene's degrees of freedom
 

@@ -8,22 +8,17 @@ or 2 (open, both faces of a joint together). Components are the first axis; lane
 """
 
 import functools
-import itertools
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, DTypeLike, Float
+from jaxtyping import Array, Float
 
-from .._base.parts import concrete, number, require_kind, require_scalar
-from .._contact.load_curve import LoadTable, loaded_equilibrium, tabulated
+from .._contact.load_curve import LoadTable, loaded_equilibrium
 from .._friction import Friction
-from .._mechanism.mechanism import Mechanism
-from .._mechanism.scene import Scene, stiffness
-from .._mechanism.structure import Structure, require_single
+from .lanes import first_least, row_numbers, rows, solve, solve_positive
 
 OPEN = 2
 # Guards, by number: the section of the Poincare map, two for each face, one for each joint that
@@ -37,7 +32,7 @@ _FEW = 4  # degrees of freedom up to which products are written out, which compi
 class HybridSystem(eqx.Module):
     """M x'' + C x' + K x = F + joints (Eq. 39 and its generalisation), in scaled units."""
 
-    laws: tuple[Friction, ...]  # one a joint
+    laws: tuple[Friction, ...]  # of one joint, or with an axis over the faces of several
     speed: Float[Array, ""]  # unit of velocity [m/s]
     omega: Float[Array, ""]  # unit of 1/time [1/s]
     force_unit: Float[Array, ""]  # of the loads [N]
@@ -51,6 +46,7 @@ class HybridSystem(eqx.Module):
     V: Float[Array, " f"]
     curves: tuple[LoadTable | None, ...]  # of the joints whose load follows one, over (L x)/P
     faces: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # of each joint
+    sharing: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # the joints of each of the laws
     opens: tuple[bool, ...] = eqx.field(static=True)  # whether a joint can open
     # Whether the last degree of freedom is the phase of an excitation: excitation.py.
     excited: bool = eqx.field(static=True, default=False)
@@ -138,14 +134,17 @@ class HybridSystem(eqx.Module):
         linear = self.linear_loads(x)
         if not any(self.curves):
             return linear
-        rows = list(linear)
+        found = list(linear)
         for faces, force in zip(self.faces, self.normal_forces(linear), strict=True):
-            rows[faces[0]] = force
-        return jnp.stack(rows)
+            found[faces[0]] = force
+        return jnp.stack(found)
 
     def normal_forces(self, linear) -> Array:
         """Those of the joints (m, ...) whose faces have the loads (f, ...) by linear springs."""
-        found = [linear[faces[0]] for faces in self.faces]
+        found = rows(linear, self._first)
+        if not any(self.curves):
+            return found
+        found = list(found)
         for j, P, e, curve in self._on_curves(linear):
             found[j] = P * curve(e)
         return jnp.stack(found)
@@ -161,7 +160,10 @@ class HybridSystem(eqx.Module):
     def closures(self, x) -> Array:
         """What falls through 0 where a joint opens (m, ...), linear in x [load]."""
         linear = self.linear_loads(x)
-        found = [linear[faces[0]] for faces in self.faces]
+        found = rows(linear, self._first)
+        if not any(self.curves):
+            return found
+        found = list(found)
         for j, P, e, curve in self._on_curves(linear):
             found[j] = P + P * e / curve.opening
         return jnp.stack(found)
@@ -172,14 +174,26 @@ class HybridSystem(eqx.Module):
 
     def _each(self, function, *arrays) -> Array:
         """function(law, *rows) of each face, with the law of its joint."""
-        joints = zip(self.laws, self.faces, strict=True)
-        one = (
-            jax.vmap(functools.partial(function, law))(
-                *(x[faces[0] : faces[-1] + 1] for x in arrays)
-            )
-            for law, faces in joints
-        )
-        return jnp.concatenate(list(one))
+        found, order = [], []
+        for law, joints in zip(self.laws, self.sharing, strict=True):
+            faces = [i for j in joints for i in self.faces[j]]
+            given = [rows(x, faces) for x in arrays]
+            if len(joints) > 1:
+                found.append(jax.vmap(function)(law, *given))
+            else:
+                found.append(jax.vmap(functools.partial(function, law))(*given))
+            order += faces
+        return rows(jnp.concatenate(found), np.argsort(order))
+
+    @property
+    def _first(self) -> list[int]:
+        """The tangential face of each joint."""
+        return [faces[0] for faces in self.faces]
+
+    @property
+    def _opening(self) -> list[int]:
+        """The joints that can open, in the order of their guards."""
+        return [j for j, opens in enumerate(self.opens) if opens]
 
     def limits(self, loads) -> Array:
         """The largest friction force of each face in stick (f, ...)."""
@@ -191,20 +205,23 @@ class HybridSystem(eqx.Module):
         if any(self.curves):
             # K holds the spring of the preload: what the load curve lacks is added.
             linear = self.linear_loads(x)
-            rows = list(friction)
+            forces = list(friction)
             for j, P, e, curve in self._on_curves(linear):
                 tangential, normal = self.faces[j]
-                rows[normal] = rows[normal] + linear[tangential] - P * curve(e)
-            friction = jnp.stack(rows)
+                forces[normal] = forces[normal] + linear[tangential] - P * curve(e)
+            friction = jnp.stack(forces)
         if s is not None and any(self.opens):
             # An open joint has no springs: their forces, which K holds, are taken back.
             loads = self.linear_loads(x)
-            taken = list(loads)
-            for faces, opens in zip(self.faces, self.opens, strict=True):
-                if opens:
-                    tangential, normal = faces
+            if all(self.opens):
+                pairs = loads.reshape(-1, 2, *loads.shape[1:])
+                taken = jnp.stack([-pairs[:, 1], pairs[:, 0]], axis=1).reshape(loads.shape)
+            else:
+                taken = list(loads)
+                for tangential, normal in (self.faces[j] for j in self._opening):
                     taken[normal], taken[tangential] = loads[tangential], -loads[normal]
-            friction = jnp.where(s == OPEN, jnp.stack(taken), friction)
+                taken = jnp.stack(taken)
+            friction = jnp.where(s == OPEN, taken, friction)
         free = self._leaf(self.F, x.ndim - 1) - self._times(self.K, x) - self._times(self.C, u)
         return free + self._acceleration(friction)
 
@@ -233,7 +250,7 @@ class HybridSystem(eqx.Module):
         W = self._leaf(jnp.sum(self.T[:, :, None] * self.B[None], axis=1), held.ndim - 1)
         own = jnp.eye(len(W), dtype=W.dtype).reshape(len(W), len(W), *(1,) * (held.ndim - 1))
         W = jnp.where(held[:, None] & held[None], W, own)
-        return jnp.where(held, _solve_positive(W, wanted), 0)
+        return jnp.where(held, solve_positive(W, wanted), 0)
 
     def field(self, y, s) -> Array:
         """dy/dt in contact state s. A sticking face must have w = 0."""
@@ -282,12 +299,12 @@ class HybridSystem(eqx.Module):
         lower = jnp.where(slip, s * w, jnp.where(stick, limits - force, one))
         upper = jnp.where(stick, limits + force, one)
         pairs = jnp.stack([lower, upper], axis=1).reshape(2 * len(w), *w.shape[1:])
-        rows = [self.section(y)[None], pairs]
-        closures = self.closures(x)
-        for j, (faces, opens) in enumerate(zip(self.faces, self.opens, strict=True)):
-            if opens:
-                rows.append(jnp.where(s[faces[0]] == OPEN, -closures[j], closures[j])[None])
-        return jnp.concatenate(rows)
+        found = [self.section(y)[None], pairs]
+        if any(self.opens):
+            closures = rows(self.closures(x), self._opening)
+            opened = rows(s, [self._first[j] for j in self._opening]) == OPEN
+            found.append(jnp.where(opened, -closures, closures))
+        return jnp.concatenate(found)
 
     def stiffness(self, y, s, closing: float = 1 / 16) -> Array:
         """A rate (...) above which no step should be as long as its inverse, in addition to K's.
@@ -345,19 +362,12 @@ class HybridSystem(eqx.Module):
         after = jnp.where(s == 0, jnp.where(lower, 1, -1), after_slip)
         new = jnp.where(ended, after.astype(s.dtype), s)
         exact = ended | (s == 0) | (new == 0)
-        k, x, u, parts = 1 + 2 * f, y[: self.n], y[self.n :], list(new)
-        for j, (faces, opens) in enumerate(zip(self.faces, self.opens, strict=True)):
-            if opens:
-                tangential = faces[0]
-                closes = (guard == k) & (s[tangential] == OPEN)
-                changes = guard == k
-                w = self.sliding(u)
-                for i in faces:
-                    slips = jnp.where(closes, jnp.where(w[i] < 0, -1, 1), OPEN)
-                    parts[i] = jnp.where(changes, slips.astype(s.dtype), parts[i])
-                x = self._without_load(x, j, changes)
-                k += 1
-        new = jnp.stack(parts)
+        x, u = y[: self.n], y[self.n :]
+        if any(self.opens):
+            changes = self._guarded(guard, [0, 1])
+            slips = jnp.where(s == OPEN, jnp.where(self.sliding(u) < 0, -1, 1), OPEN)
+            new = jnp.where(changes, slips.astype(s.dtype), new)
+            x = self._without_load(x, guard)
         # To rounding, the velocity of a face that sticks or starts to slip is the belt's.
         if self.B is None:
             u = jnp.where(exact, self._leaf(self.V, u.ndim - 1), u)
@@ -400,17 +410,35 @@ class HybridSystem(eqx.Module):
 
         return jax.lax.while_loop(going, pivot, (s, jnp.array(True), 0))[0]
 
-    def _without_load(self, x, j: int, where) -> Array:
-        """x moved along the normal of a joint to where its normal force is 0."""
-        tangential, normal = self.faces[j]
-        load = self.closures(x)[j]
-        unit = jnp.zeros((len(self.P), *x.shape[1:]), x.dtype).at[normal].set(1)
-        away = self._acceleration(unit)
-        change = self._times(self.L, away)[tangential]
-        curve = self.curves[j]
-        if curve is not None:
-            change = change / self._leaf(curve.opening, change.ndim)
-        return x - jnp.where(where, load / jnp.where(change == 0, 1, change), 0)[None] * away
+    def _guarded(self, guard, which: Sequence[int]) -> Array:
+        """Whether `guard` (...) is that of the opening of the joint of each face (f, ...).
+
+        Of the tangential faces (0), the normal ones (1) or both.
+        """
+        numbers = np.full(len(self.P), -9)  # no guard
+        for k, j in enumerate(self._opening):
+            numbers[[self.faces[j][i] for i in which]] = 1 + 2 * len(self.P) + k
+        return guard[None] == numbers.reshape(-1, *(1,) * guard.ndim)
+
+    def _without_load(self, x, guard) -> Array:
+        """x moved along the normal of the joint that `guard` opens or closes, to no load on it."""
+        of_first, of_normal = (self._guarded(guard, [i]) for i in (0, 1))
+        away = self._acceleration(of_normal.astype(x.dtype))
+        loads, openings = self.linear_loads(x), jnp.ones_like(x[:1])
+        if any(self.curves):
+            closures, ones = list(loads), [jnp.ones_like(x[0])] * len(loads)
+            for (first, *_), load, curve in zip(
+                self.faces, self.closures(x), self.curves, strict=True
+            ):
+                closures[first] = load
+                if curve is not None:
+                    ones[first] = jnp.broadcast_to(
+                        self._leaf(curve.opening, x.ndim - 1), load.shape
+                    )
+            loads, openings = jnp.stack(closures), jnp.stack(ones)
+        change = jnp.sum(jnp.where(of_first, self._times(self.L, away) / openings, 0), axis=0)
+        load = jnp.sum(jnp.where(of_first, loads, 0), axis=0)
+        return x - (load / jnp.where(change == 0, 1, change))[None] * away
 
     def contact_state(self, y) -> Array:
         """The contact state in which the motion from y begins."""
@@ -425,7 +453,7 @@ class HybridSystem(eqx.Module):
         K = jnp.diag(self.K) if self.K.ndim == 1 else self.K
         B = jnp.eye(self.n, dtype=K.dtype) if self.B is None else self.B
         coupled = K - (B * mu[None]) @ self.L
-        x = _solve(coupled, self.F + B @ (mu * self.P))
+        x = solve(coupled, self.F + B @ (mu * self.P))
         joints = zip(self.faces, self.curves, strict=True)
         curved = [(faces, curve) for faces, curve in joints if curve is not None]
         if curved:
@@ -449,208 +477,3 @@ class HybridSystem(eqx.Module):
         """Units [m, ..., m/s, ...] of a scaled state of the mechanism."""
         n, length = self.n - self.excited, self.speed / self.omega
         return jnp.concatenate([jnp.full(n, length), jnp.full(n, self.speed)])
-
-
-def row_numbers(x) -> Array:
-    """The numbers (k, 1, ...) of the rows of x (k, ...)."""
-    return jnp.arange(len(x)).reshape(-1, *(1,) * (x.ndim - 1))
-
-
-def first_least(x) -> tuple[Array, Array]:
-    """Which row of x (k, ...) holds the least value (...), and that; k where it is not a number.
-
-    What `argmin` says, in reductions that XLA turns into vector instructions.
-    """
-    least = jnp.min(x, axis=0)
-    return jnp.min(jnp.where(x == least[None], row_numbers(x), len(x)), axis=0), least
-
-
-def _solve(W, b) -> Array:
-    """The solution of W x = b for W (f, f, ...) and b (f, ...), lanes last."""
-    if len(b) == 1:
-        return b / W[0]
-    if len(b) == 2:
-        det = W[0, 0] * W[1, 1] - W[0, 1] * W[1, 0]
-        first = W[1, 1] * b[0] - W[0, 1] * b[1]
-        second = W[0, 0] * b[1] - W[1, 0] * b[0]
-        return jnp.stack([first, second]) / det[None]
-    W, b = jnp.moveaxis(W, (0, 1), (-2, -1)), jnp.moveaxis(b, 0, -1)
-    return jnp.moveaxis(jnp.linalg.solve(W, b[..., None])[..., 0], -1, 0)
-
-
-def _solve_positive(W, b) -> Array:
-    """`_solve` of a symmetric positive definite W: elimination, which then needs no pivots."""
-    if len(b) < 3:
-        return _solve(W, b)
-    A = jnp.concatenate([W, b[:, None]], axis=1)
-    for k in range(len(b)):
-        row = (A[k] / A[k, k][None])[None]
-        A = jnp.where(row_numbers(A) == k, row, A - A[:, k, None] * row)
-    return A[:, -1]
-
-
-def degrees_of_freedom(mechanism: Mechanism) -> int:
-    """n of a structure; a scene has two.
-
-    **Raises:** `TypeError` for anything else; `ValueError` for one that holds a batch, or has two
-    joints that slide in one direction at one V.
-    """
-    if isinstance(mechanism, Structure):
-        require_single(mechanism)
-        _require_determinate(mechanism)
-        return mechanism.n
-    require_kind("mechanism", mechanism, Scene)
-    require_scalar(mechanism)
-    return 2
-
-
-def _require_determinate(structure: Structure) -> None:
-    joints = zip(structure.joint_names, structure.joints, strict=True)
-    for (name, joint), (other, second) in itertools.combinations(joints, 2):
-        t, d = structure.direction(joint.tangential), structure.direction(second.tangential)
-        V, W = (None if j.V is None else concrete(jnp.asarray(j.V)) for j in (joint, second))
-        if V is None or W is None:
-            continue
-        ratio = t @ d / (t @ t)
-        if np.allclose(d, ratio * t, rtol=0, atol=1e-12 * np.abs(d).max()) and ratio * V == W:
-            raise ValueError(
-                f"joints {name} and {other} slide in one direction at one V: how they share the "
-                "force in stick is not determined, make them one joint"
-            )
-
-
-def hybrid_system(mechanism: Any) -> HybridSystem:
-    """The scaled system of a scene or a structure."""
-    return _of_structure(mechanism) if isinstance(mechanism, Structure) else _of_scene(mechanism)
-
-
-def _of_scene(scene: Scene) -> HybridSystem:
-    o = scene.oscillator
-    K_n, K_t = stiffness(scene)
-    a, b = o.omega_1**2 + K_t / o.m, o.omega_2**2 + K_n / o.m
-    omega = jnp.sqrt(a + b)
-    f = o.F / o.m / jnp.sqrt(2.0) / omega / o.V
-    unit, zero = o.m * omega * o.V, jnp.zeros_like(f)
-    K = jnp.stack([a, b]) / omega**2
-    P = zero if scene.normal_load is None else scene.normal_load / unit
-    law, curve = scene.friction, None
-    if scene.follows_load_curve:
-        curve = tabulated(scene.contact.load_curve(law.mu_s, law.mu_m))
-    return HybridSystem(
-        laws=(law,),
-        speed=o.V,
-        omega=omega,
-        force_unit=unit,
-        K=K,
-        C=jnp.stack([2 * o.xi_1 * o.omega_1, 2 * o.xi_2 * o.omega_2]) / omega,
-        F=jnp.stack([f, -f]),
-        T=None,
-        B=None,
-        L=jnp.stack(
-            [jnp.stack([zero, K_n / o.m / omega**2]), jnp.stack([-K_t / o.m / omega**2, zero])]
-        ),
-        P=jnp.stack([P, zero]),
-        V=jnp.ones_like(K),
-        curves=(curve,),
-        faces=((0, 1),),
-        opens=(bool(scene.preload),),
-    )
-
-
-def _of_structure(structure: Structure) -> HybridSystem:
-    n, dtype = structure.n, structure.M.dtype
-    K, rows, weights, offsets, speeds, faces = structure.K, [], [], [], [], []
-    curves = []
-    for name, joint in zip(structure.joint_names, structure.joints, strict=True):
-        if joint.V is None:
-            raise ValueError(f"joint {name}: V must be given, for the motion depends on it")
-        K_n, K_t = joint.stiffness()
-        t = jnp.asarray(structure.direction(joint.tangential), dtype)
-        K = K + K_t * jnp.outer(t, t)
-        rows.append(t)
-        speeds.append(joint.V)
-        faces.append((len(rows) - 1,))
-        P, law = joint.normal_load, joint.friction
-        followed = joint.follows_load_curve
-        curve = joint.contact.load_curve(law.mu_s, law.mu_m) if followed else None
-        curves.append(None if curve is None else tabulated(curve))
-        offsets.append(jnp.zeros((), dtype) if P is None else P)
-        if joint.normal is None:
-            weights.append(jnp.zeros(n, dtype))
-            continue
-        normal = jnp.asarray(structure.direction(joint.normal), dtype)
-        K = K + K_n * jnp.outer(normal, normal)
-        weights += [K_n * normal, -K_t * t]
-        offsets.append(jnp.zeros((), dtype))
-        rows.append(normal)
-        speeds.append(joint.V)
-        faces[-1] = (len(rows) - 2, len(rows) - 1)
-    T, L, V, P = jnp.stack(rows), jnp.stack(weights), jnp.stack(speeds), jnp.stack(offsets)
-    given = jnp.zeros(n, dtype) if structure.F is None else structure.F
-    # M^-1 of everything at once.
-    solved = jnp.linalg.solve(
-        structure.M, jnp.concatenate([K, structure.C, T.T, given[:, None]], axis=1)
-    )
-    K, C, B, F = jnp.split(solved, [n, 2 * n, 2 * n + len(rows)], axis=1)
-    # Between the highest eigenfrequency and n^(1/4) times it.
-    omega = jnp.sum(K * K.T) ** 0.25
-    speed = V[0]
-    unit = omega * speed
-    return HybridSystem(
-        laws=tuple(joint.friction for joint in structure.joints),
-        speed=speed,
-        omega=omega,
-        force_unit=unit,
-        K=K / omega**2,
-        C=C / omega,
-        F=F[:, 0] / unit,
-        T=T,
-        B=B,
-        L=L / omega**2,
-        P=P / unit,
-        V=V / speed,
-        curves=tuple(curves),
-        faces=tuple(faces),
-        opens=tuple(bool(joint.preload) and joint.normal is not None for joint in structure.joints),
-    )
-
-
-def start_state(start: ArrayLike | Sequence[float], n: int) -> Float[Array, " 2n"]:
-    """`start` as an array [x, v]; `ValueError` unless it has that shape."""
-    state = number("start", jnp.asarray(start))
-    if state.shape != (2 * n,):
-        many = "; use jax.vmap for many" if state.ndim > 1 else ""
-        raise ValueError(f"start must have shape ({2 * n},), got {state.shape}{many}")
-    return state
-
-
-def scaled_start(system: HybridSystem, start: Array | None) -> Float[Array, " 2n"]:
-    """The start in scaled units, constant: by default the equilibrium with one displacement.
-
-    It is V/omega along the tangential direction of the first joint. An excitation begins at t = 0.
-    """
-    if start is None:
-        y = system.equilibrium()
-        away = system.section_direction
-        y = system.own(y.at[: system.n].add(away / jnp.sum(away**2)))
-    else:
-        y = start / system.units
-    return jax.lax.stop_gradient(system.with_excitation(y, 0.0))
-
-
-def check_rtol(rtol: Any, dtype: DTypeLike) -> float:
-    """`rtol` if it can be reached in `dtype`; by default 1e-9, or the least that can.
-
-    **Raises:** `ValueError` for one above 0.1, or below 4096 times the rounding error of `dtype`;
-    `TypeError` unless it is a number known at trace time.
-    """
-    least = 4096 * float(jnp.finfo(dtype).eps)
-    if rtol is None:
-        return max(1e-9, least)
-    if isinstance(rtol, (bool, str)) or concrete(rtol) is None or np.ndim(rtol):
-        raise TypeError(f"rtol must be a number, got {rtol!r}")
-    if not 0 < rtol <= 0.1:
-        raise ValueError(f"rtol must be above 0 and at most 0.1, got {rtol!r}")
-    if rtol < least:
-        raise ValueError(f"rtol must be at least {least:.2g} in {jnp.dtype(dtype)}, got {rtol!r}")
-    return float(rtol)

@@ -9,7 +9,8 @@ import numpy as np
 from .._continuation import Continuation
 from .._mechanism.mechanism import Mechanism
 from .cycle import LimitCycle
-from .hybrid import NONE, OPEN, SECTION, UNUSED, hybrid_system
+from .hybrid import NONE, OPEN, SECTION, UNUSED
+from .scaled import hybrid_system
 from .shooting import (
     Chain,
     Lifted,

@@ -19,16 +19,9 @@ from . import search
 from .cycle import CycleResult, LimitCycle, Orbit, repels
 from .events import Cubic, first_root, rounding
 from .excitation import Excitation, excited_system
-from .hybrid import (
-    NONE,
-    OPEN,
-    HybridSystem,
-    check_rtol,
-    degrees_of_freedom,
-    scaled_start,
-    start_state,
-)
+from .hybrid import NONE, OPEN, HybridSystem
 from .orbit import Maps, Segments, flow, maps, next_start, orbit
+from .scaled import check_rtol, degrees_of_freedom, scaled_start, start_state
 
 if TYPE_CHECKING:
     from diffrax import AbstractSolver
@@ -282,6 +275,7 @@ def limit_cycle(
 
     **Raises:** `ValueError` for a start of another shape, an rtol above 0.1 or below what the
     precision can hold, less than 16 segments or max_returns below 1; `RuntimeError` if `throw`.
+    Under a trace (`jit`, `vmap`) everything is NaN instead.
     """
     n = degrees_of_freedom(mechanism)
     start = None if start is None else start_state(start, n)

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .hybrid import NONE, UNUSED, HybridSystem, row_numbers
+from .hybrid import NONE, UNUSED, HybridSystem
+from .lanes import row_numbers
 from .runge_kutta import runge_kutta
 
 _ITERATIONS = 16

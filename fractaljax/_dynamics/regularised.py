@@ -20,7 +20,8 @@ from .._mechanism.structure import Structure
 from .cycle import CycleResult, LimitCycle, repels
 from .events import Cubic
 from .excitation import excited_system
-from .hybrid import HybridSystem, scaled_start
+from .hybrid import HybridSystem
+from .scaled import scaled_start
 
 _SETTLING = 64  # slowest periods of the transient
 _LONGEST = 4  # most returns in one period

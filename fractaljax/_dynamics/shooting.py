@@ -18,10 +18,11 @@ from .._base.ranges import is_logarithmic
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import substituted
 from .events import Cubic
-from .hybrid import NONE, UNUSED, HybridSystem, hybrid_system
+from .hybrid import NONE, UNUSED, HybridSystem
 from .limit_cycle import extreme_values
 from .orbit import Segments, chosen_guard, flow, next_start, tableau
 from .runge_kutta import runge_kutta
+from .scaled import hybrid_system
 
 
 class Window(eqx.Module):

@@ -15,12 +15,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, ScalarLike
 
-from .._base.parts import Record, brief, concrete, number, raise_unless, scalar, whole
+from .._base.parts import (
+    Record,
+    brief,
+    concrete,
+    nan_where,
+    number,
+    raise_unless,
+    refused,
+    scalar,
+    whole,
+)
 from .._mechanism.mechanism import Mechanism
 from .events import Cubic, guards_and_rates, without_start
 from .excitation import Excitation, excited_system
-from .hybrid import NONE, OPEN, HybridSystem, check_rtol, degrees_of_freedom, start_state
+from .hybrid import NONE, OPEN, HybridSystem
 from .orbit import chosen_guard, flow
+from .scaled import check_rtol, degrees_of_freedom, start_state
 
 if TYPE_CHECKING:
     from diffrax import AbstractSolver
@@ -60,8 +71,10 @@ class Trajectory(Record):
     def at(self, times: ArrayLike | Sequence[float]) -> Float[Array, "k 2n"]:
         """States at `times` (k,) [s] from `t0` to the end of the simulation.
 
+        NaN at times outside that are traced.
+
         **Raises:** `ValueError` for times of another shape or outside, and for a simulation with
-        `saveat`; `RuntimeError` inside a compiled program.
+        `saveat`.
         """
         return self._at(self._continuous(), self._inside(number("times", jnp.asarray(times))))
 
@@ -100,12 +113,12 @@ class Trajectory(Record):
         # The end is known up to rounding: t1 itself is inside.
         rounding = 8 * jnp.finfo(last.dtype).eps * jnp.maximum(jnp.abs(first), jnp.abs(last))
         outside = (times < first) | (times > last + rounding)
-        wanted = "times must be from t0 to the end of the simulation"
         found, given = concrete(outside), concrete(times)
         if found is None or given is None:
-            return eqx.error_if(times, outside, wanted)
+            return nan_where(outside, times)
         if found.any():
-            raise ValueError(f"{wanted}, {float(last)!r}, got {given[found][0].item()!r}")
+            wanted = f"times must be from t0 to the end of the simulation, {float(last)!r}"
+            raise ValueError(f"{wanted}, got {given[found][0].item()!r}")
         return times
 
     def switches(self) -> list[tuple[float, int, int, int]]:
@@ -422,7 +435,8 @@ def simulate(
     - `throw`: raise unless the end is reached; otherwise `result` says why.
 
     **Raises:** `ValueError` for a start of another shape, an argument outside its domain or an
-    rtol that the precision cannot hold; `RuntimeError` if `throw`.
+    rtol that the precision cannot hold; `RuntimeError` if `throw`. Under a trace (`jit`, `vmap`)
+    everything is NaN instead.
     """
     start = start_state(start, degrees_of_freedom(mechanism))
     system = excited_system(mechanism, excitation)
@@ -447,6 +461,8 @@ def simulate(
             steps = eqx.tree_at(lambda x: (x.duration, x.s, x.guard), steps, shorter)
         trajectory = _repeat(system, y, t0, end, steps)
         trajectory = trajectory if saveat is None else _sampled(trajectory, saveat)
+    if (bad := refused((mechanism, excitation, start, t0, end, saveat))) is not None:
+        trajectory = nan_where(bad, trajectory)  # contact states as well
     return raise_unless(SimulationResult.reached, trajectory) if throw else trajectory
 
 
@@ -457,7 +473,7 @@ def _times(t0, t1) -> tuple[Float[Array, ""], Float[Array, ""]]:
     if start is not None:
         return t0, scalar("t1", t1, above=float(start))
     t1 = scalar("t1", t1)
-    return t0, eqx.error_if(t1, ~(t1 > t0), "t1 must be above t0")
+    return t0, nan_where(~(t1 > t0), t1)
 
 
 def _checked(saveat, t0, t1) -> Float[Array, " k"]:
@@ -466,10 +482,10 @@ def _checked(saveat, t0, t1) -> Float[Array, " k"]:
     if saveat.ndim != 1 or not len(saveat):
         raise ValueError(f"saveat must have shape (k,) with k at least 1, got {saveat.shape}")
     ends = jnp.concatenate([t0[None], saveat, t1[None]])
-    bad, wanted = jnp.any(ends[1:] < ends[:-1]), "saveat must be in order from t0 to t1"
+    bad = jnp.any(ends[1:] < ends[:-1])
     found = concrete(bad)
     if found is None:
-        return eqx.error_if(saveat, bad, wanted)
+        return nan_where(bad, saveat)
     if found:
-        raise ValueError(f"{wanted}, got {brief(np.asarray(saveat))}")
+        raise ValueError(f"saveat must be in order from t0 to t1, got {brief(np.asarray(saveat))}")
     return saveat

@@ -12,7 +12,8 @@ from numpy.polynomial import Polynomial
 
 from filippov import PLAIN, phases
 from fractaljax._dynamics.events import Cubic, first_root, step, without_start
-from fractaljax._dynamics.hybrid import NONE, SECTION, hybrid_system
+from fractaljax._dynamics.hybrid import NONE, SECTION
+from fractaljax._dynamics.scaled import hybrid_system
 from tools import reference_scene
 
 EPS = np.finfo(float).eps

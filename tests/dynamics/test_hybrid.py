@@ -9,14 +9,8 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
-from fractaljax._dynamics.hybrid import (
-    NONE,
-    SECTION,
-    HybridSystem,
-    check_rtol,
-    hybrid_system,
-    start_state,
-)
+from fractaljax._dynamics.hybrid import NONE, SECTION, HybridSystem
+from fractaljax._dynamics.scaled import check_rtol, hybrid_system, start_state
 from tools import both_modes, reference_scene
 
 STATES = list(itertools.product((1, 0, -1), repeat=2))
@@ -338,3 +332,34 @@ def test_rtol(rtol, dtype, outcome):
     with pytest.raises((ValueError, TypeError)) as caught:
         check_rtol(rtol, dtype)
     assert str(caught.value) == outcome
+
+
+def test_guards_of_joints_of_which_some_open():
+    """Each opening has its own guard, which moves its own joint; no other number moves anything."""
+    law, contact = fj.Coulomb(0.4), fj.FixedContact(2.0, 0.5, P=1.5)
+    closed = fj.Joint(fj.FixedContact(1.0, 0.3), law, 0, 1, V=1.0)
+    opening = [fj.Joint(contact, law, t, n, V=0.7, preload=True) for t, n in ((2, 3), (4, 5))]
+    sliding = fj.Joint(contact, law, 1, V=0.5)
+    rng = np.random.default_rng(4)
+    A = rng.standard_normal((6, 6))
+    M, K = np.eye(6) + 0.1 * A @ A.T, 3 * np.eye(6) + 0.2 * A @ A.T
+    structure = fj.Structure(M, 0.1 * K, K, (opening[0], closed, opening[1], sliding))
+    system = hybrid_system(structure)
+    faces = {0: [0, 1], 2: [4, 5]}  # of the joints that open
+    y = jnp.asarray(0.1 * rng.standard_normal(12))
+    s = jnp.array([1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0])
+    switch = jax.jit(lambda y, s, guard: system.switch(y, s, guard))
+    for k, joint in enumerate(faces):
+        number = 1 + 2 * len(s) + k
+        assert system.guards(y, s)[number] == system.closures(y[:6])[joint]
+        after, states = switch(y, s, jnp.asarray(number))
+        changed = np.flatnonzero(np.asarray(states) != np.asarray(s))
+        assert list(changed) == faces[joint] and (states[jnp.array(faces[joint])] == 2).all()
+        # To rounding it opens without load, and the velocity and the other joint keep theirs.
+        assert abs(system.closures(after[:6])[joint]) < 1e-14
+        np.testing.assert_array_equal(after[6:], y[6:])
+        assert system.guards(after, states)[number] == -system.closures(after[:6])[joint]
+    for number in (NONE, SECTION):
+        after, states = switch(y, s, jnp.asarray(number))
+        np.testing.assert_array_equal(after, y)
+        np.testing.assert_array_equal(states, s)

@@ -14,7 +14,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import fractaljax as fj
-from fractaljax._dynamics.hybrid import hybrid_system
+from fractaljax._dynamics.scaled import hybrid_system
 from tools import both_modes
 
 P, K_N, MU = 3000.0, 2.0e8, 0.4

@@ -10,7 +10,7 @@ import pytest
 
 import fractaljax as fj
 from fractaljax._dynamics import regularised
-from fractaljax._dynamics.hybrid import hybrid_system
+from fractaljax._dynamics.scaled import hybrid_system
 from tools import both_modes, motionless_scene, reference_cycle, reference_scene
 
 K_N = 4e8

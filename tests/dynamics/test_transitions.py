@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import hybrid_truth
-from fractaljax._dynamics.hybrid import OPEN, hybrid_system
+from fractaljax._dynamics.hybrid import OPEN
+from fractaljax._dynamics.scaled import hybrid_system
 from mechanisms import PROBLEMS
 from structures import of_problem
 

@@ -1,0 +1,63 @@
+"""Rows and small systems of equations of many lanes at once: components first, lanes last."""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+_WRITTEN_OUT = 6  # unknowns up to which elimination is no loop, which runs faster
+
+
+def rows(x, numbers: Sequence[int] | np.ndarray) -> Array:
+    """Rows (k, ...) of x, by their static numbers; a slice where these have a constant step."""
+    first, count = int(numbers[0]), len(numbers)
+    step = int(numbers[1]) - first if count > 1 else 1
+    if step > 0 and list(numbers) == list(range(first, first + step * count, step)):
+        return x[first : first + step * (count - 1) + 1 : step]
+    return jnp.stack([x[i] for i in numbers])
+
+
+def row_numbers(x) -> Array:
+    """The numbers (k, 1, ...) of the rows of x (k, ...)."""
+    return jnp.arange(len(x)).reshape(-1, *(1,) * (x.ndim - 1))
+
+
+def first_least(x) -> tuple[Array, Array]:
+    """Which row of x (k, ...) holds the least value (...), and that; k where it is not a number.
+
+    What `argmin` says, in reductions that XLA turns into vector instructions.
+    """
+    least = jnp.min(x, axis=0)
+    return jnp.min(jnp.where(x == least[None], row_numbers(x), len(x)), axis=0), least
+
+
+def solve(W, b) -> Array:
+    """The solution of W x = b for W (f, f, ...) and b (f, ...), lanes last."""
+    if len(b) == 1:
+        return b / W[0]
+    if len(b) == 2:
+        det = W[0, 0] * W[1, 1] - W[0, 1] * W[1, 0]
+        first = W[1, 1] * b[0] - W[0, 1] * b[1]
+        second = W[0, 0] * b[1] - W[1, 0] * b[0]
+        return jnp.stack([first, second]) / det[None]
+    W, b = jnp.moveaxis(W, (0, 1), (-2, -1)), jnp.moveaxis(b, 0, -1)
+    return jnp.moveaxis(jnp.linalg.solve(W, b[..., None])[..., 0], -1, 0)
+
+
+def solve_positive(W, b) -> Array:
+    """`solve` of a symmetric positive definite W: elimination, which then needs no pivots."""
+    if len(b) < 3:
+        return solve(W, b)
+    A = jnp.concatenate([W, b[:, None]], axis=1)
+
+    def eliminated(k, A):
+        row = (A[k] / A[k, k][None])[None]
+        return jnp.where(row_numbers(A) == k, row, A - A[:, k, None] * row)
+
+    if len(b) > _WRITTEN_OUT:
+        return jax.lax.fori_loop(0, len(b), eliminated, A)[:, -1]
+    for k in range(len(b)):
+        A = eliminated(k, A)
+    return A[:, -1]

@@ -1,0 +1,205 @@
+"""A scene or structure as a hybrid system in scaled units, where its motion begins, how exactly."""
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, DTypeLike, Float
+
+from .._base.parts import concrete, number, require_kind, require_scalar
+from .._contact.load_curve import tabulated
+from .._friction import Friction
+from .._mechanism.mechanism import Mechanism
+from .._mechanism.scene import Scene, stiffness
+from .._mechanism.structure import Structure, require_single
+from .hybrid import HybridSystem
+
+
+def degrees_of_freedom(mechanism: Mechanism) -> int:
+    """n of a structure; a scene has two.
+
+    **Raises:** `TypeError` for anything else; `ValueError` for one that holds a batch, or has two
+    joints that slide in one direction at one V.
+    """
+    if isinstance(mechanism, Structure):
+        require_single(mechanism)
+        _require_determinate(mechanism)
+        return mechanism.n
+    require_kind("mechanism", mechanism, Scene)
+    require_scalar(mechanism)
+    return 2
+
+
+def _require_determinate(structure: Structure) -> None:
+    joints = zip(structure.joint_names, structure.joints, strict=True)
+    for (name, joint), (other, second) in itertools.combinations(joints, 2):
+        t, d = structure.direction(joint.tangential), structure.direction(second.tangential)
+        V, W = (None if j.V is None else concrete(jnp.asarray(j.V)) for j in (joint, second))
+        if V is None or W is None:
+            continue
+        ratio = t @ d / (t @ t)
+        if np.allclose(d, ratio * t, rtol=0, atol=1e-12 * np.abs(d).max()) and ratio * V == W:
+            raise ValueError(
+                f"joints {name} and {other} slide in one direction at one V: how they share the "
+                "force in stick is not determined, make them one joint"
+            )
+
+
+def hybrid_system(mechanism: Any) -> HybridSystem:
+    """The scaled system of a scene or a structure."""
+    return _of_structure(mechanism) if isinstance(mechanism, Structure) else _of_scene(mechanism)
+
+
+def _of_scene(scene: Scene) -> HybridSystem:
+    o = scene.oscillator
+    K_n, K_t = stiffness(scene)
+    a, b = o.omega_1**2 + K_t / o.m, o.omega_2**2 + K_n / o.m
+    omega = jnp.sqrt(a + b)
+    f = o.F / o.m / jnp.sqrt(2.0) / omega / o.V
+    unit, zero = o.m * omega * o.V, jnp.zeros_like(f)
+    K = jnp.stack([a, b]) / omega**2
+    P = zero if scene.normal_load is None else scene.normal_load / unit
+    law, curve = scene.friction, None
+    if scene.follows_load_curve:
+        curve = tabulated(scene.contact.load_curve(law.mu_s, law.mu_m))
+    return HybridSystem(
+        laws=(law,),
+        speed=o.V,
+        omega=omega,
+        force_unit=unit,
+        K=K,
+        C=jnp.stack([2 * o.xi_1 * o.omega_1, 2 * o.xi_2 * o.omega_2]) / omega,
+        F=jnp.stack([f, -f]),
+        T=None,
+        B=None,
+        L=jnp.stack(
+            [jnp.stack([zero, K_n / o.m / omega**2]), jnp.stack([-K_t / o.m / omega**2, zero])]
+        ),
+        P=jnp.stack([P, zero]),
+        V=jnp.ones_like(K),
+        curves=(curve,),
+        faces=((0, 1),),
+        sharing=((0,),),
+        opens=(bool(scene.preload),),
+    )
+
+
+def _of_structure(structure: Structure) -> HybridSystem:
+    n, dtype = structure.n, structure.M.dtype
+    K, rows, weights, offsets, speeds, faces = structure.K, [], [], [], [], []
+    curves = []
+    for name, joint in zip(structure.joint_names, structure.joints, strict=True):
+        if joint.V is None:
+            raise ValueError(f"joint {name}: V must be given, for the motion depends on it")
+        K_n, K_t = joint.stiffness()
+        t = jnp.asarray(structure.direction(joint.tangential), dtype)
+        K = K + K_t * jnp.outer(t, t)
+        rows.append(t)
+        speeds.append(joint.V)
+        faces.append((len(rows) - 1,))
+        P, law = joint.normal_load, joint.friction
+        followed = joint.follows_load_curve
+        curve = joint.contact.load_curve(law.mu_s, law.mu_m) if followed else None
+        curves.append(None if curve is None else tabulated(curve))
+        offsets.append(jnp.zeros((), dtype) if P is None else P)
+        if joint.normal is None:
+            weights.append(jnp.zeros(n, dtype))
+            continue
+        normal = jnp.asarray(structure.direction(joint.normal), dtype)
+        K = K + K_n * jnp.outer(normal, normal)
+        weights += [K_n * normal, -K_t * t]
+        offsets.append(jnp.zeros((), dtype))
+        rows.append(normal)
+        speeds.append(joint.V)
+        faces[-1] = (len(rows) - 2, len(rows) - 1)
+    T, L, V, P = jnp.stack(rows), jnp.stack(weights), jnp.stack(speeds), jnp.stack(offsets)
+    given = jnp.zeros(n, dtype) if structure.F is None else structure.F
+    # M^-1 of everything at once.
+    solved = jnp.linalg.solve(
+        structure.M, jnp.concatenate([K, structure.C, T.T, given[:, None]], axis=1)
+    )
+    K, C, B, F = jnp.split(solved, [n, 2 * n, 2 * n + len(rows)], axis=1)
+    # Between the highest eigenfrequency and n^(1/4) times it.
+    omega = jnp.sum(K * K.T) ** 0.25
+    speed = V[0]
+    unit = omega * speed
+    laws, sharing = _shared([joint.friction for joint in structure.joints], faces)
+    return HybridSystem(
+        laws=laws,
+        speed=speed,
+        omega=omega,
+        force_unit=unit,
+        K=K / omega**2,
+        C=C / omega,
+        F=F[:, 0] / unit,
+        T=T,
+        B=B,
+        L=L / omega**2,
+        P=P / unit,
+        V=V / speed,
+        curves=tuple(curves),
+        faces=tuple(faces),
+        sharing=sharing,
+        opens=tuple(bool(joint.preload) and joint.normal is not None for joint in structure.joints),
+    )
+
+
+def _shared(laws: Sequence[Friction], faces: Sequence[tuple[int, ...]]):
+    """Laws of one kind as one over the faces of their joints, and which joints these are.
+
+    Programs grow with the kinds, not with the joints.
+    """
+    kinds: dict[Any, list[int]] = {}
+    for j, law in enumerate(laws):
+        shapes = tuple(map(jnp.shape, jax.tree.leaves(law)))
+        kinds.setdefault((jax.tree.structure(law), shapes), []).append(j)
+    shared = []
+    for joints in kinds.values():
+        of_faces = [laws[j] for j in joints for _ in faces[j]]
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *of_faces)
+        shared.append(laws[joints[0]] if len(joints) == 1 else stacked)
+    return tuple(shared), tuple(map(tuple, kinds.values()))
+
+
+def start_state(start: ArrayLike | Sequence[float], n: int) -> Float[Array, " 2n"]:
+    """`start` as an array [x, v]; `ValueError` unless it has that shape."""
+    state = number("start", jnp.asarray(start))
+    if state.shape != (2 * n,):
+        many = "; use jax.vmap for many" if state.ndim > 1 else ""
+        raise ValueError(f"start must have shape ({2 * n},), got {state.shape}{many}")
+    return state
+
+
+def scaled_start(system: HybridSystem, start: Array | None) -> Float[Array, " 2n"]:
+    """The start in scaled units, constant: by default the equilibrium with one displacement.
+
+    It is V/omega along the tangential direction of the first joint. An excitation begins at t = 0.
+    """
+    if start is None:
+        y = system.equilibrium()
+        away = system.section_direction
+        y = system.own(y.at[: system.n].add(away / jnp.sum(away**2)))
+    else:
+        y = start / system.units
+    return jax.lax.stop_gradient(system.with_excitation(y, 0.0))
+
+
+def check_rtol(rtol: Any, dtype: DTypeLike) -> float:
+    """`rtol` if it can be reached in `dtype`; by default 1e-9, or the least that can.
+
+    **Raises:** `ValueError` for one above 0.1, or below 4096 times the rounding error of `dtype`;
+    `TypeError` unless it is a number known at trace time.
+    """
+    least = 4096 * float(jnp.finfo(dtype).eps)
+    if rtol is None:
+        return max(1e-9, least)
+    if isinstance(rtol, (bool, str)) or concrete(rtol) is None or np.ndim(rtol):
+        raise TypeError(f"rtol must be a number, got {rtol!r}")
+    if not 0 < rtol <= 0.1:
+        raise ValueError(f"rtol must be above 0 and at most 0.1, got {rtol!r}")
+    if rtol < least:
+        raise ValueError(f"rtol must be at least {least:.2g} in {jnp.dtype(dtype)}, got {rtol!r}")
+    return float(rtol)

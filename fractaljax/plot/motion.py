@@ -1,0 +1,219 @@
+"""Limit cycles of structures on their meshes, with the contact states of the joints."""
+
+import os
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from jaxtyping import ArrayLike, Float
+
+from .._base.parts import require_kind, scalar, whole
+from .._dynamics.cycle import STATE_NAMES, CycleResult, LimitCycle
+from .._dynamics.hybrid import OPEN
+from .._mechanism.reduced import ReducedStructure
+from .._mechanism.structure import Structure
+from .animation import animated, animation_path
+from .axes import Axes, Figure, frequency_unit, legend_above, new_figure
+from .mesh import Mesh, draw_mesh, mesh_height, projection
+
+if TYPE_CHECKING:
+    from matplotlib.animation import FuncAnimation
+
+_SAMPLES = 256  # of a period, at least
+_NAMED = 24  # joints with a name at their lane
+_STATES = {  # value in `contact_states`: colour, and words
+    1: ("tab:blue", "slips, t.dx/dt < V"),
+    -1: ("tab:cyan", "slips, t.dx/dt > V"),
+    0: ("tab:orange", "sticks"),
+    OPEN: ("tab:red", "open"),
+}
+
+
+def cycle_motion(
+    cycle: LimitCycle,
+    structure: Structure,
+    *,
+    points: ArrayLike,
+    dofs: ArrayLike,
+    cells: ArrayLike,
+    at: float = 0.0,
+    scale: float | None = None,
+) -> Figure:
+    """A limit cycle at one time: the deformed mesh, and what each joint does over the period.
+
+    `structure` is that of the cycle; a reduced one leads to the mesh of the full one. `points`,
+    `dofs` and `cells` are as in `complex_mode`. `at` is the time as a share of the period, from
+    `state` on. Displacements are those from the mean over the period, times `scale`, by default
+    that which draws the largest as 3 % of the size of the mesh; the colour is the largest of each
+    node over the period. A mark on the mesh is at the mean place of the nodes that a joint's
+    directions touch, in the colour of its contact state.
+
+    **Raises:** `ValueError` if there is no limit cycle, for a batch, a regularised cycle, another
+    structure's and a mesh that does not fit.
+    """
+    at = float(scalar("at", at, at_least=0, below=1))
+    figure, draw = _picture(_motion(cycle, structure, points, dofs, cells, 1), scale)
+    draw(at)
+    return figure
+
+
+def animate_cycle(
+    cycle: LimitCycle,
+    structure: Structure,
+    *,
+    points: ArrayLike,
+    dofs: ArrayLike,
+    cells: ArrayLike,
+    scale: float | None = None,
+    frames: int = 24,
+    fps: int = 12,
+    path: str | os.PathLike | None = None,
+) -> "FuncAnimation":
+    """One period of a limit cycle in motion on its mesh, as matplotlib's animation.
+
+    Frame j is that of `cycle_motion` at j/frames of the period. `path` ends in .gif for a picture,
+    or in .html for one page with its frames and buttons inside, which needs no network. Other
+    arguments and errors are as of `cycle_motion`.
+
+    **Raises:** `ValueError` for another ending; `OSError` if the file cannot be written.
+    """
+    frames, fps, path = whole("frames", frames, 2), whole("fps", fps, 1), animation_path(path)
+    motion = _motion(cycle, structure, points, dofs, cells, frames)
+    figure, draw = _picture(motion, scale)
+    return animated(figure, draw, frames, fps, path)
+
+
+# --- the motion -----------------------------------------------------------------------------
+
+
+class _Motion(NamedTuple):
+    mesh: Mesh
+    period: float
+    moved: Float[np.ndarray, "k nodes dim"]  # from the mean, at evenly spaced times
+    states: Float[np.ndarray, "k m"]  # of contact, at the same times
+    spans: list[list[tuple[float, float, int]]]  # of each joint: begin, duration [s], state
+    names: tuple[str, ...]  # of the joints
+    places: Float[np.ndarray, "m nodes"] | None  # weights that sum to 1
+
+    def step(self, share: float) -> int:
+        """Which of the times is nearest to a share of the period."""
+        return round(share * len(self.moved)) % len(self.moved)
+
+
+def _motion(
+    cycle: LimitCycle, structure: Structure, points: Any, dofs: Any, cells: Any, frames: int
+) -> _Motion:
+    require_kind("cycle", cycle, LimitCycle)
+    require_kind("structure", structure, Structure)
+    if np.ndim(cycle.period):
+        raise ValueError("a picture shows one cycle: index the batch first")
+    if not np.isfinite(cycle.period):
+        raise ValueError(f"there is no limit cycle to draw: {CycleResult[cycle.result]}")
+    n, faces = cycle.amplitude.shape[-1], cycle._system.faces
+    if (n, len(faces)) != (structure.n, len(structure.joints)):
+        raise ValueError(
+            f"structure must be that of the cycle, with {n} degrees of freedom and {len(faces)} "
+            f"joints, got {structure.n} and {len(structure.joints)}"
+        )
+    reduced = structure.reduction if isinstance(structure, ReducedStructure) else None
+    mesh = Mesh.of(points, dofs, cells, n if reduced is None else len(reduced.V))
+    # The mean and the largest displacements take more times than are shown.
+    count = frames * -(-_SAMPLES // frames)
+    x = np.asarray(cycle.orbit(count)[1])[:, :n]
+    x = x - x.mean(axis=0)
+    x = x if reduced is None else x @ reduced.V.T
+    tangential = [each[0] for each in faces]
+    states = np.asarray(cycle.contact_states(count))[:, tangential]
+    spans = [
+        list(_spans(cycle, face, start)) for face, start in zip(tangential, states[0], strict=True)
+    ]
+    touched = structure._touched()
+    places = None if touched is None else _places(mesh, touched)
+    return _Motion(
+        mesh,
+        float(cycle.period),
+        mesh.displacements(x),
+        states,
+        spans,
+        structure.joint_names,
+        places,
+    )
+
+
+def _places(mesh: Mesh, touched: np.ndarray) -> np.ndarray:
+    """The share of each node in the place of each joint (m, nodes), NaN of one beside the mesh."""
+    weights = np.where(mesh.dofs < 0, 0, touched[:, mesh.dofs]).sum(axis=2)
+    total = weights.sum(axis=1, keepdims=True)
+    return np.where(total > 0, weights / np.where(total > 0, total, 1), np.nan)
+
+
+def _spans(cycle: LimitCycle, face: int, start: float) -> Iterator[tuple[float, float, int]]:
+    """Begin [s], duration [s] and contact state, one after the other over a period."""
+    values = {name: value for value, name in STATE_NAMES.items()}
+    begin, state = 0.0, int(start)
+    for switch in cycle.switches():
+        if switch.direction == face + 1:
+            yield begin, switch.time - begin, state
+            begin, state = switch.time, values[switch.after]
+    yield begin, float(cycle.period) - begin, state
+
+
+# --- drawing --------------------------------------------------------------------------------
+
+
+def _picture(motion: _Motion, scale: float | None) -> tuple[Figure, Callable[[float], Any]]:
+    """The figure, and a function that draws a share of the period."""
+    mesh, count = motion.mesh, len(motion.names)
+    amplitudes = np.linalg.norm(motion.moved, axis=2).max(axis=0)
+    largest = float(amplitudes.max()) or 1.0
+    factor = mesh.scale(largest) if scale is None else float(scalar("scale", scale, above=0))
+    heights = mesh_height(mesh), 1.1 + min(0.26 * count, 4.0)
+    figure = new_figure(8.4, sum(heights))
+    grid = figure.add_gridspec(2, 1, height_ratios=heights)
+    ax: Any = figure.add_subplot(grid[0], projection=projection(mesh))
+    per_metre, length = (1e6, "µm") if largest < 1e-3 else (1.0, "m")
+    colours = amplitudes * per_metre, largest * per_metre
+    _, cells, move = draw_mesh(mesh, ax, factor * largest, *colours)
+    bar = figure.colorbar(cells, ax=ax, location="bottom", shrink=0.6, aspect=40)
+    bar.set_label(f"largest displacement from the mean [{length}]")
+    factor_of, unit = frequency_unit([1 / motion.period])
+    ax.set_title(f"{factor_of / motion.period:.4g} {unit}, displacements times {factor:.3g}")
+    marks = ax.scatter(*np.full((mesh.points.shape[1], count), np.nan), s=60, ec="k", zorder=5)
+    cursor = _lanes(figure.add_subplot(grid[1]), motion)
+
+    def draw(share: float) -> Any:
+        k = motion.step(share)
+        moved = factor * motion.moved[k]
+        move(moved)
+        cursor.set_xdata([share, share])
+        if motion.places is not None:
+            at = motion.places @ (mesh.points + moved)
+            if mesh.solid:
+                marks._offsets3d = tuple(at.T)
+            else:
+                marks.set_offsets(at)
+            marks.set_facecolor([_STATES[int(state)][0] for state in motion.states[k]])
+        return [cells, marks, cursor]
+
+    return figure, draw
+
+
+def _lanes(ax: Axes, motion: _Motion) -> Any:
+    """The contact states of each joint over the period, and a line to show the time with."""
+    from matplotlib.patches import Patch
+
+    for i, spans in enumerate(motion.spans):
+        bars = [(begin / motion.period, duration / motion.period) for begin, duration, _ in spans]
+        colours = [_STATES[state][0] for _, _, state in spans]
+        ax.broken_barh(bars, (i - 0.4, 0.8), facecolors=colours)
+    passed = {state for spans in motion.spans for _, _, state in spans}
+    shown = [
+        Patch(color=colour, label=words) for s, (colour, words) in _STATES.items() if s in passed
+    ]
+    legend_above(ax, shown)
+    few = len(motion.names) <= _NAMED
+    ax.set_yticks(range(len(motion.names)) if few else [], motion.names if few else [])
+    ax.set(xlim=(0, 1), ylim=(len(motion.names) - 0.5, -0.5))
+    ax.set_xlabel("share of the period [-]")
+    ax.set_ylabel("" if few else "joints")
+    return ax.axvline(0.0, color="k", lw=1.2)
