@@ -1,4 +1,4 @@
-"""Scale: `sweep` over more and more points, in memory and in shards, interrupted, and shared.
+"""Scale: `sweep` over more and more points, in memory and in a store, interrupted, and shared.
 
 Every sweep is one of the growth rate over D, G, mu_s and V in a Python process of its own, so that
 its peak of memory is its own. Beside it all points in one call of the vmapped program, which is
@@ -27,7 +27,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import fractaljax as fj
-from fractaljax._sweep.shards import Shards
+from fractaljax._sweep.batches import Batches
+from fractaljax._sweep.blocks import blocks
+from fractaljax._sweep.store import Store
 
 from .page import columns, draw, in_words, png, subplots, table
 from .timing import devices, ended, ratio, started
@@ -43,14 +45,15 @@ FULL |= {"lengths": (100, 100, 20, 20), "batch": 8192, "turns": 3}
 QUICK = {"sides": SIDES[:2], "repeats": 1, "most_at_once": 10_000, "checked": 4}
 QUICK |= {"lengths": (100, 100, 10, 5), "batch": 1024, "turns": 1}
 LINEAR, OWN_MEMORY = 0.1, 100  # how far from 1 a slope may be; MB beyond the result
+AHEAD = 2  # batches: one is computed while the one before it is written
 KILLS = (0.25, 0.5, 0.75)  # shares of the batches that are there when a sweep is killed
-IN_MEMORY, SHARDS, AT_ONCE = "sweep, in memory", "sweep, in shards", "one call of jax.vmap"
+IN_MEMORY, STORED, AT_ONCE = "sweep, in memory", "sweep, in a store", "one call of jax.vmap"
 RANGES = {"D": (2.3, 2.6), "G": (1e-11, 1e-9), "mu_s": (0.3, 0.5), "V": (0.05, 0.3)}
 WAYS = (  # name, devices of a process, processes
     ("one device, in memory", 1, 1),
     ("two devices, in memory", 2, 1),
-    ("one process, in shards", 1, 1),
-    ("two processes, in shards", 1, 2),
+    ("one process, in a store", 1, 1),
+    ("two processes, in a store", 1, 2),
 )
 Result = dict[str, Any]
 
@@ -84,7 +87,7 @@ class _Enough(Exception):
 
 def first_batch(lengths, batch: int | None) -> None:
     """Trace, compile and run one batch of the sweep, with axes of the same lengths."""
-    stop = mock.patch.object(Shards, "write", side_effect=_Enough)
+    stop = mock.patch.object(Store, "write", side_effect=_Enough)
     with tempfile.TemporaryDirectory() as folder, stop, contextlib.suppress(_Enough):
         swept(lengths, batch, Path(folder))
 
@@ -123,16 +126,14 @@ def forget_peak() -> None:
 
 
 def log_begun(file: str) -> None:
-    """Add the number of every batch that a sweep finds missing to a file, before it is computed."""
-    log, has = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_APPEND), Shards.has
+    """Add the number of every batch of a sweep to a file, before it is computed."""
+    log, begin = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_APPEND), Batches.begin
 
     def logged(self, k):
-        found = has(self, k)
-        if not found:
-            os.write(log, f"{k}\n".encode())
-        return found
+        os.write(log, f"{k}\n".encode())
+        return begin(self, k)
 
-    Shards.has = logged
+    Batches.begin = logged
 
 
 def in_this_process(
@@ -140,7 +141,7 @@ def in_this_process(
     repeats: int = 1,
     batch: int | None = None,  # points at a time, by default those of `sweep`
     at_once: bool = False,  # all points in one call of a vmapped program instead
-    shards: str | None = None,  # folder in which every repeat keeps its batches
+    stores: str | None = None,  # folder in which every repeat has its store
     begun: str | None = None,  # file to which the number of every batch that is begun is added
     warm: bool = True,  # whether the program is compiled before the clock starts
     picked=(),  # points whose values are returned
@@ -162,7 +163,7 @@ def in_this_process(
     times, result = [], np.empty(0)
     for repeat in range(repeats):
         del result
-        folder = None if shards is None else Path(shards) / str(repeat)
+        folder = None if stores is None else Path(stores) / str(repeat)
         if port is not None:
             from jax.experimental.multihost_utils import sync_global_devices
 
@@ -192,8 +193,8 @@ def begin(environment: dict[str, str] | None = None, **job: Any) -> subprocess.P
 
 
 def files(folder: str) -> list[Path]:
-    """The batches that the first repeat of a sweep has kept in its folder."""
-    return list((Path(folder) / "0").glob("[0-9]*.npz"))
+    """The marks of the batches that the first repeat of a sweep has kept in its store."""
+    return list((Path(folder) / "0" / "computed").glob("c.*[0-9]"))
 
 
 def measured(way: str, lengths, repeats: int, checked: int) -> Result:
@@ -202,10 +203,11 @@ def measured(way: str, lengths, repeats: int, checked: int) -> Result:
     repeats = repeats if points <= 10_000_000 else 1
     picked = np.random.default_rng(0).integers(points, size=checked).tolist()
     with tempfile.TemporaryDirectory() as place:
-        job = {"at_once": way == AT_ONCE, "shards": place if way == SHARDS else None}
+        job = {"at_once": way == AT_ONCE, "stores": place if way == STORED else None}
         found = ended(begin(lengths=lengths, repeats=repeats, picked=picked, **job))
-        kept = [file.stat().st_size for file in files(place)]
-    row = {"way": way, "points": points, "repeats": repeats, "files": len(kept)}
+        batches = len(files(place))
+        kept = [file.stat().st_size for file in Path(place).glob("0/**/*") if file.is_file()]
+    row = {"way": way, "points": points, "repeats": repeats, "batches": batches}
     row |= {"seconds": statistics.median(found["times"]), "disk_bytes": sum(kept) or None}
     shown = "device", "compile_s", "base_bytes", "peak_beyond_base", "result_bytes"
     return row | {key: found[key] for key in shown} | errors(lengths, picked, found["values"])
@@ -232,10 +234,10 @@ def interrupted(lengths, batch: int) -> Result:
     """A sweep killed in the middle, more than once, and finished; beside one left alone."""
     job: Result = {"lengths": lengths, "batch": batch, "warm": False}
     whole = ended(begin(**job))
-    batches, kills = -(-math.prod(lengths) // batch), []
+    batches, kills = blocks(lengths, batch).number, []
     with tempfile.TemporaryDirectory() as place:
         log = Path(place) / "begun.txt"
-        job |= {"shards": place, "begun": str(log)}
+        job |= {"stores": place, "begun": str(log)}
         for share in KILLS:
             process = begin(**job)
             while process.poll() is None and len(files(place)) < share * batches:
@@ -243,9 +245,8 @@ def interrupted(lengths, batch: int) -> Result:
             process.send_signal(signal.SIGKILL)
             process.communicate()
             if process.returncode == -signal.SIGKILL:
-                there = {int(file.stem) for file in files(place)}
-                lost = set(map(int, log.read_text().split())) - there
-                kills.append({"batches_there": len(there), "begun_but_not_there": len(lost)})
+                there, begun = len(files(place)), len(set(log.read_text().split()))
+                kills.append({"batches_there": there, "begun_but_not_there": begun - there})
         resumed = ended(begin(**job))
         begun, complete = log.read_text().split(), len(files(place))
     return {
@@ -272,7 +273,7 @@ def shared(lengths, turns: int) -> list[Result]:
     for _ in range(turns):
         for name, count, processes in WAYS:
             with tempfile.TemporaryDirectory() as place:
-                job = {"lengths": lengths, "shards": place if "shards" in name else None}
+                job = {"lengths": lengths, "stores": place if "store" in name else None}
                 job["port"] = free_port() if processes > 1 else None
                 jobs = [begin(devices(count), **job, rank=rank) for rank in range(processes)]
                 found = [ended(process) for process in jobs]
@@ -281,7 +282,7 @@ def shared(lengths, turns: int) -> list[Result]:
             times[name].append(max(one["times"][0] for one in found))
     rows = []
     for name, own in times.items():
-        alone = times[WAYS[2 if "shards" in name else 0][0]]
+        alone = times[WAYS[2 if "store" in name else 0][0]]
         row = {"name": name, "device_count": counts[name], "beside_one": ratio(alone, own)}
         row["points_a_second"] = math.prod(lengths) / statistics.median(own)
         rows.append(row | {"equal_to_the_last_bit": len(hashes) == 1})
@@ -298,11 +299,11 @@ def measure(sides, repeats, most_at_once, checked, lengths, batch: int, turns: i
     """The sweeps of more and more points, the one that is killed and the one that is shared."""
     from tqdm import tqdm
 
-    steps = [(way, side) for way in (IN_MEMORY, SHARDS, AT_ONCE) for side in sides]
+    steps = [(way, side) for way in (IN_MEMORY, STORED, AT_ONCE) for side in sides]
     steps = [step for step in steps if step[0] != AT_ONCE or math.prod(step[1]) <= most_at_once]
     rows = [measured(*step, repeats, checked) for step in tqdm(steps, desc="more points")]
     killed, bounds = interrupted(lengths, batch), []
-    own = {way: [row for row in rows if row["way"] == way] for way in (IN_MEMORY, SHARDS)}
+    own = {way: [row for row in rows if row["way"] == way] for way in (IN_MEMORY, STORED)}
     for way, found in own.items():
         what = f"{way}: slope of log time over log points, last decade"
         bounds.append((what, slope(found, "seconds"), [1 - LINEAR, 1 + LINEAR]))
@@ -310,7 +311,7 @@ def measure(sides, repeats, most_at_once, checked, lengths, batch: int, turns: i
         most = max(row["peak_beyond_base"] - row["result_bytes"] for row in found) / 1e6
         bounds.append((f"{way}: most memory beyond the result [MB]", most, [0, OWN_MEMORY]))
     again = killed["computed_again"] / max(len(killed["kills"]), 1)
-    bounds.append(("batches computed again after a kill", again, [0, 1]))
+    bounds.append(("batches computed again after a kill", again, [0, AHEAD]))
     return {
         "headline": [dict(zip(("what", "value", "wanted"), b, strict=True)) for b in bounds],
         "checked": checked,
@@ -333,7 +334,7 @@ def short(count: float) -> str:
 
 def page(result: Result) -> list[str]:
     rows, killed = result["rows"], result["interrupted"]
-    by_way = ([r for r in rows if r["way"] == way] for way in (IN_MEMORY, SHARDS, AT_ONCE))
+    by_way = ([r for r in rows if r["way"] == way] for way in (IN_MEMORY, STORED, AT_ONCE))
     own, kept, (*_, peer) = by_way
     same, last = next(r for r in own if r["points"] == peer["points"]), own[-1]
     there = ", ".join(str(kill["batches_there"]) for kill in killed["kills"])
@@ -343,7 +344,7 @@ def page(result: Result) -> list[str]:
 
     def shown(row):
         more = {"count": short(row["points"]), "rate": row["points"] / row["seconds"]}
-        return row | more | {"files": row["files"] or None}
+        return row | more | {"batches": row["batches"] or None}
 
     return [
         f"""Use `sweep`: {short(last["points"])} growth rates in {last["seconds"]:.3g} s and
@@ -357,11 +358,11 @@ def page(result: Result) -> list[str]:
         "## More points",
         table(
             "way | points | time [s] | points a second | peak memory [MB] | of it the result [MB]"
-            " | files | on disk [MB] | before the first batch is there [s]"
+            " | batches kept | on disk [MB] | before the first batch is there [s]"
             " | error beside single calls | error to 40 digits",
             map(shown, rows),
             "{way} | {count} | {seconds:.3g} | {rate:.3g} | {peak_beyond_base!M:.3g}"
-            " | {result_bytes!M:.3g} | {files} | {disk_bytes!M:.3g} | {compile_s:.1f}"
+            " | {result_bytes!M:.3g} | {batches} | {disk_bytes!M:.3g} | {compile_s:.1f}"
             " | {off_single:.0e} | {off_exact:.0e}",
         ),
         f"""Growth rates of the reference brake over D, G, mu_s and V in double precision, each row
@@ -393,7 +394,7 @@ def page(result: Result) -> list[str]:
     ]
 
 
-STYLES = {IN_MEMORY: "C0o-", SHARDS: "C1s--", AT_ONCE: "C2^:"}
+STYLES = {IN_MEMORY: "C0o-", STORED: "C1s--", AT_ONCE: "C2^:"}
 
 
 def picture(result: Result) -> bytes:

@@ -6,9 +6,10 @@ derivative rules, addresses. (The StableHLO text of JAX would be shorter to hash
 times as long, and whether it holds the captured constants depends on a flag of JAX.)
 """
 
+import contextlib
 import enum
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -22,6 +23,7 @@ from .._mechanism.quantities import substituted
 from .._mechanism.scene import Scene
 
 _SETTINGS = ("jax_enable_x64", "jax_threefry_partitionable", "jax_default_matmul_precision")
+_TRACED_UNDER = (*_SETTINGS, "jax_default_prng_impl", "jax_numpy_dtype_promotion")
 # Other parameters of these operations change no value: shardings, derivative rules, names.
 _MEANT = {
     "jit": ("jaxpr", "compiler_options_kvs"),
@@ -63,6 +65,11 @@ class Program:
         """The arrays of the measure at one point."""
         return jaxpr_as_fun(self._jaxpr)(*jax.tree.leaves((scene, values)))
 
+    @property
+    def digest(self) -> bytes:
+        """Equal for equal programs, in every process; blind to what a program calls outside."""
+        return self._digest.digest
+
     def _identity(self):
         return self._digest.digest, self._digest.outside
 
@@ -71,6 +78,10 @@ class Program:
 
     def __eq__(self, other):
         return isinstance(other, Program) and self._identity() == other._identity()
+
+    def __repr__(self):
+        outside = self._digest.outside
+        return f"{type(self).__name__}({self._digest.digest.hex()}, {outside})"
 
     def key(self) -> bytes:
         """The digest, the same in every process.
@@ -94,6 +105,20 @@ class Program:
                     " in the program"
                 )
         return digest.digest
+
+
+def settings() -> dict[str, Any]:
+    """The settings of JAX under which this thread traces programs."""
+    return {name: getattr(jax.config, name) for name in _TRACED_UNDER}
+
+
+@contextlib.contextmanager
+def under(settings: Mapping[str, Any]) -> Iterator[None]:
+    """Let this thread trace and run programs under the settings of another one."""
+    with contextlib.ExitStack() as stack:
+        for name, value in settings.items():
+            stack.enter_context(getattr(jax, name.removeprefix("jax_"))(value))
+        yield
 
 
 def _only_raises(called) -> bool:

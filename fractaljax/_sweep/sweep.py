@@ -1,19 +1,18 @@
 """A measure over a grid of any named quantities, in batches of one compiled shape.
 
-The grid itself is never stored: memory is that of one batch and of the result. With a folder every
-batch is kept (`shards.py`), so that an interrupted sweep resumes and processes share the work.
+The grid itself is never stored: memory is that of two batches and of the result. With a folder
+every batch is kept (`store.py`), so that an interrupted sweep resumes and processes share the work.
+With an executor other processes and machines compute (`workers.py`).
 """
 
-import functools
+import contextlib
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import ArrayLike, PyTree
 
 from .._base.memory import require_memory
@@ -26,11 +25,13 @@ from .._mechanism.quantities import (
 )
 from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
+from .batches import Batches, mesh_of
+from .blocks import blocks
 from .program import Program
 from .result import Sweep
-from .shards import Shards, describe, description
+from .store import Store, describe, description, leaf_names, zarr
+from .workers import Computed, Job, gathered, require_executor
 
-_POINTS = "points"  # the axis that devices share
 _POINTS_EACH = 8192  # in a batch, on every device
 
 
@@ -39,8 +40,9 @@ def sweep(
     x: Scene | Structure,
     batch_size: int | None = None,
     progress: bool = True,
-    *,
     out: str | os.PathLike | None = None,
+    executor: Any = None,
+    *,
     devices: Sequence[Any] | None = None,
     **axes: ArrayLike | Sequence[float],
 ) -> Sweep:
@@ -52,72 +54,102 @@ def sweep(
     `jax.grad` act on the measure, not on the sweep. The measure is traced once a sweep, with the
     values that it captures at that time; equal programs are compiled once.
 
-    Points are evaluated `batch_size` at a time (8192 for every device), split evenly over
-    `devices` (all of this process).
+    Points are evaluated in batches, blocks of the grid of at most `batch_size` points (8192
+    for every device), split evenly over `devices` (all of this process). The last digits of a
+    result may depend on the size of a batch, and on nothing else here.
 
-    `out` names a folder that keeps the batches. The same sweep called again computes what is
-    missing. Another sweep is refused, and one begun by other versions resumes under a warning.
-    Under `jax.distributed` every process must name the same folder: each computes its share of the
-    batches, and all return the whole.
+    `out` names a folder for a Zarr store, which `xarray.open_zarr` opens, finished or not: the
+    values of each axis with unit and meaning (K_t/K_n as K_t_over_K_n), an array for each of the
+    measure, and `computed`, which is 0 where a point is not computed yet. The same sweep called
+    again computes what is missing; what was running when it was killed is lost. Another sweep is
+    refused, and one begun by other versions resumes under a warning. Under `jax.distributed` every
+    process must name the same folder: each computes its share of the batches, and all return the
+    whole. Needs `fractaljax[sweep]`.
+
+    `executor` computes the batches: a `ThreadPoolExecutor`, a `ProcessPoolExecutor` that spawns,
+    `client.get_executor()` of Dask, an `MPIPoolExecutor`, or anything like them. It needs several
+    batches for each worker. Measure and x are sent along, a lambda with `fractaljax[sweep]` alone;
+    workers trace and compile them once, with the 64 bits and other settings of the caller, who
+    collects the results and alone writes to `out`. Where a batch fails, those that were running
+    are kept in `out` before its error is raised.
 
     **Raises:** `ValueError` for no axis, an unknown name, two of one quantity, values that are not
-    one-dimensional or outside their domain, a batch that does not divide by the devices, a scene
-    that holds arrays, more values than memory, a folder of another sweep or with a damaged batch,
-    a measure that calls Python (`jax.pure_callback`) beside a folder, or several processes without
-    one; `TypeError` for what is not numeric; `OSError` if the folder cannot be written.
+    one-dimensional or outside their domain, a batch size that does not divide by the devices, a
+    scene that holds arrays, more values than memory, a store of another sweep or with a damaged
+    batch, a measure that calls Python (`jax.pure_callback`) beside `out`, several processes without
+    it, devices beside an executor, or an executor that forks; `TypeError` for what is not numeric,
+    no executor, or cannot be sent to a worker; `RuntimeError` if a worker of a pool dies, or traces
+    another program; `OSError` if the folder cannot be written; `ImportError` for `out` without
+    Zarr.
     """
+    if executor is not None:
+        require_executor(executor)
+        if devices is not None:
+            raise ValueError("devices are those of this process: leave them out beside executor")
+    if out is not None:
+        zarr()
     grid = _checked(x, axes)
     names, shape = tuple(grid), tuple(map(len, grid.values()))
-    points, mesh = math.prod(shape), _mesh(devices)
+    points, mesh = math.prod(shape), mesh_of(devices)
     if batch_size is None and out is not None and (begun := describe(out)) is not None:
-        batch_size = begun["batch"]
-    batch = _batch_size(batch_size, points, mesh.size)
+        most: int = begun["batch"]
+    else:
+        most = _batch_size(batch_size, points, mesh.size)
+    parts = blocks(shape, most)
     whole: Any = with_optional(x, names)  # pyright: ignore[reportArgumentType]
     program = Program(measure, names, whole, list(grid.values()))
     leaves, tree = jax.tree.flatten(program.shapes)
     each = max(1, sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in leaves))
     require_memory(f"a sweep of {points} points", points * each)
-    require_memory(f"a batch of {batch} points", batch * each)
-    folder = None
+    store = None
     if out is not None:
-        folder = Shards(out, description(program, whole, grid, batch))
+        named = dict(zip(leaf_names(measure, program.shapes, grid), leaves, strict=True))
+        about = description(program, whole, grid, most)
+        store = Store(out, about, x, grid, named, parts)
     elif jax.process_count() > 1:
         raise ValueError("out must name a folder that all processes share, got None")
-    arrays = [np.empty((points, *leaf.shape), leaf.dtype) for leaf in leaves]
-    everywhere = NamedSharding(mesh, PartitionSpec())
-    fixed = jax.device_put((whole, [jnp.asarray(v) for v in grid.values()]), everywhere)
-
-    def run(k):
-        return _batch(program, mesh, *fixed, _places(k * batch, batch, shape, mesh))
-
-    def size(k):
-        return min(batch, points - k * batch)  # the last batch may be short
+    arrays = [np.empty((*shape, *leaf.shape), leaf.dtype) for leaf in leaves]
 
     def put(k, found):
         for array, leaf in zip(arrays, found, strict=True):
-            array[k * batch : k * batch + size(k)] = leaf[: size(k)]
+            array[parts.index(k)] = leaf
 
-    batches = range(-(-points // batch))
-    share = batches if folder is None else batches[jax.process_index() :: jax.process_count()]
-    with _bar(sum(map(size, share)), progress and jax.process_index() == 0) as bar:
-        following: Any = run(0) if folder is None else None
-        for k in share:
-            if folder is None:
-                # The next batch runs while this one is copied.
-                found, following = following, run(k + 1) if k + 1 in batches else None
-                put(k, found)
-            elif not folder.has(k):
-                folder.write(k, [np.asarray(leaf)[: size(k)] for leaf in run(k)])
-            bar.update(size(k))
-    if folder is not None:
+    share = range(jax.process_index(), parts.number, jax.process_count())
+    kept = store.there() if store else set()
+    missing = [k for k in share if k not in kept]
+    if executor is None:
+        computed = _in_turn(Batches(program, whole, list(grid.values()), parts, mesh), missing)
+    else:
+        job = Job(measure, names, whole, list(grid.values()), parts, program)
+        hint = f"out {out} keeps what is done" if store else "out would keep what is done"
+        computed = gathered(executor, job, missing, f"{hint}, for the next call to resume")
+    shown = progress and jax.process_index() == 0
+    with contextlib.closing(computed), _bar(sum(map(parts.size, share)), shown) as bar:
+        bar.update(sum(parts.size(k) for k in share if k in kept))
+        for k, found in computed:
+            if store:
+                store.write(k, found)
+            put(k, found)
+            bar.update(parts.size(k))
+    if store:
         if jax.process_count() > 1:
             from jax.experimental.multihost_utils import sync_global_devices
 
             sync_global_devices("the batches of a sweep are written")
-        for k in batches:
-            put(k, folder.read(k))
-    arrays = [array.reshape(*shape, *array.shape[1:]) for array in arrays]
+        for k in sorted(set(range(parts.number)) - set(missing)):
+            put(k, store.read(k))
     return Sweep(jax.tree.unflatten(tree, arrays), tuple(grid.values()), names, x)
+
+
+def _in_turn(batches: Batches, numbers: Sequence[int]) -> Computed:
+    """Every batch by its number with its leaves, each computed while the last one is put away."""
+    begun = None
+    for k in numbers:
+        last, begun = begun, (k, batches.begin(k))
+        if last is not None:
+            yield last[0], batches.end(*last)
+    if begun is not None:
+        yield begun[0], batches.end(*begun)
 
 
 def _checked(x: Any, axes: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -142,37 +174,6 @@ def _batch_size(asked: int | None, points: int, devices: int) -> int:
             f"batch_size must be a multiple of the number of devices, {devices}, got {asked}"
         )
     return asked
-
-
-def _mesh(devices: Sequence[Any] | None) -> Mesh:
-    chosen = jax.local_devices() if devices is None else list(devices)
-    if not chosen:
-        raise ValueError("devices must name at least one device, got none")
-    return Mesh(np.array(chosen), (_POINTS,))
-
-
-@functools.partial(jax.jit, static_argnums=(0, 1))
-def _batch(point: Program, mesh: Mesh, scene, axes, places) -> list[jax.Array]:
-    """The program `point` at the points that lie at `places` (batch,) on each of the axes."""
-
-    def one(scene, axes, places):
-        return point(scene, [axis[i] for axis, i in zip(axes, places, strict=True)])
-
-    program = jax.vmap(one, (None, None, 0))
-    if mesh.size > 1:
-        whole, split = PartitionSpec(), PartitionSpec(_POINTS)
-        # One program a device: if XLA split a single one, every loop would wait for the slowest.
-        program = jax.shard_map(
-            program, mesh=mesh, in_specs=(whole, whole, split), out_specs=split, check_vma=False
-        )
-    return program(scene, axes, places)
-
-
-def _places(begin: int, batch: int, shape, mesh):
-    """Where points begin, begin + 1, ... of the grid lie on each axis; the last one repeats."""
-    points = np.minimum(np.arange(begin, begin + batch), math.prod(shape) - 1)
-    places = [axis.astype(np.int32) for axis in np.unravel_index(points, shape)]
-    return jax.device_put(places, NamedSharding(mesh, PartitionSpec(_POINTS)))
 
 
 def _bar(points: int, shown: bool):

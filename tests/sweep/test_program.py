@@ -214,7 +214,7 @@ def python(x):
         (lambda scene: io_callback(lambda x: np.asarray(x), FLOAT, D(scene)), "io_callback"),
     ],
 )
-def test_callbacks_are_refused_beside_a_folder(tmp_path, measure, name):
+def test_callbacks_are_refused_beside_a_store(tmp_path, measure, name):
     with pytest.raises(ValueError, match=f"what its {name} does is not in the program"):
         fj.sweep(measure, SCENE, progress=False, out=tmp_path / "out", D=[2.3, 2.4])
     assert not (tmp_path / "out").exists()

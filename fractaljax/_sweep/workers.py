@@ -1,0 +1,172 @@
+"""The batches of a sweep on the workers of an executor: threads, processes, other machines.
+
+What travels is the measure, the scene and the axes. A worker traces them itself, under the settings
+of JAX that the sweep was called under, and refuses unless its program has the digest of the
+caller's: no worker computes in 32 bits, or something else, unnoticed. Results travel back, and the
+caller alone keeps them: a batch that an executor computes anew, since its worker died, counts once.
+"""
+
+import functools
+import pickle
+import queue
+import secrets
+import threading
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+
+from .._base.parts import brief, one_line
+from .._base.versions import version_text
+from .batches import Batches, mesh_of
+from .blocks import Blocks
+from .program import Program, settings, under
+
+Computed = Generator[
+    tuple[int, list[np.ndarray]], None, None
+]  # the number of a batch, and its leaves
+_lock = threading.RLock()  # a worker may have several threads, and compiles once
+
+
+class Job:
+    """One sweep. To another process it goes as bytes, which are read when it is first needed."""
+
+    def __init__(
+        self,
+        measure: Callable,
+        names: Sequence[str],
+        scene: Any,
+        grid: Sequence[np.ndarray],
+        blocks: Blocks,
+        program: Program,
+    ):
+        self._token = secrets.token_hex(16)
+        self._settings = settings()
+        self._bytes: bytes | None = None
+        self._parts = measure, names, scene, grid, blocks, program.digest, version_text()
+        self._batches: Batches | None = Batches(program, scene, grid, blocks, mesh_of(None))
+
+    def __eq__(self, other):
+        return isinstance(other, Job) and self._token == other._token
+
+    def __hash__(self):
+        return hash(self._token)
+
+    def __reduce__(self):
+        return _arrived, (self._token, self._settings, self.pack())
+
+    def pack(self) -> bytes:
+        """Measure, scene and axes. **Raises:** `TypeError` for what cannot be sent."""
+        if self._bytes is not None:
+            return self._bytes
+        try:
+            import cloudpickle as pickler
+        except ImportError:
+            pickler = pickle
+        try:
+            self._bytes = pickler.dumps(self._parts)
+        except Exception as error:  # whatever the classes in it raise
+            raise TypeError(
+                "executor cannot send measure and x to its workers; a function of a module can be"
+                ' sent, others with python -m pip install "fractaljax[sweep]": ' + one_line(error)
+            ) from None
+        return self._bytes
+
+    def compute(self, k: int) -> list[np.ndarray]:
+        """The leaves (*shape of batch k, ...)."""
+        with under(self._settings):
+            with _lock:
+                batches = self._batches or _prepared(self)
+                begun = batches.begin(k)
+            return batches.end(k, begun)
+
+
+def _arrived(token: str, found: dict[str, Any], content: bytes) -> Job:
+    job = Job.__new__(Job)
+    job._token, job._settings, job._bytes, job._batches = token, found, content, None
+    return job
+
+
+@functools.lru_cache(maxsize=4)
+def _prepared(job: Job) -> Batches:
+    # Under the settings of the job: without 64 bits its arrays would be rounded.
+    measure, names, scene, grid, blocks, digest, versions = pickle.loads(job.pack())
+    program = Program(measure, names, scene, grid)
+    if program.digest != digest:
+        raise RuntimeError(
+            f"a worker of executor has {version_text()}, and traces another program than its caller"
+            f" with {versions}: the same packages and numbers at the top of modules are needed"
+        )
+    return Batches(program, scene, grid, blocks, mesh_of(None))
+
+
+def _computed(job: Job, k: int) -> list[np.ndarray]:
+    """What a worker calls."""
+    try:
+        return job.compute(k)
+    except Exception as error:
+        try:
+            pickle.loads(pickle.dumps(error))
+        except Exception:  # some errors of Equinox: they would end a process pool
+            raise RuntimeError(f"batch {k}: {one_line(error)}") from None
+        raise
+
+
+def gathered(executor: Any, job: Job, batches: Sequence[int], hint: str) -> Computed:
+    """Every batch by its number with its leaves, in the order in which they are done.
+
+    Where one fails those that are running are still given. Then its error is raised.
+    """
+    if not isinstance(executor, ThreadPoolExecutor):
+        job.pack()
+    done: queue.SimpleQueue = queue.SimpleQueue()
+    running: dict[Any, int] = {}
+    failed: BaseException | None = None
+    try:
+        try:
+            for k in batches:
+                future = executor.submit(_computed, job, k)
+                running[future] = k
+                future.add_done_callback(done.put)
+        except BrokenExecutor as error:
+            failed = error
+        while running:
+            future = done.get()
+            k = running.pop(future)
+            if future.cancelled():
+                continue
+            if (error := future.exception()) is None:
+                yield k, future.result()
+            elif failed is None:
+                failed = error
+                for other in list(running):
+                    other.cancel()
+    finally:
+        for future in running:
+            future.cancel()
+    if isinstance(failed, BrokenExecutor):
+        raise RuntimeError(f"a worker of executor died; {hint}: {one_line(failed)}") from failed
+    if failed is not None:
+        failed.add_note(hint)
+        raise failed
+
+
+def require_executor(executor: Any) -> None:
+    """Refuse what has no interface of `concurrent.futures`, and processes that are forked.
+
+    **Raises:** `TypeError` and `ValueError`, in this order.
+    """
+    methods = (getattr(executor, name, None) for name in ("submit", "map"))
+    if isinstance(executor, type) or not all(map(callable, methods)):
+        raise TypeError(
+            "executor must have the methods of concurrent.futures.Executor, such as"
+            f" ThreadPoolExecutor() has, got {brief(executor)}"
+        )
+    # Python offers no other way to ask, and a fork of JAX stops for good.
+    context = getattr(executor, "_mp_context", None)
+    if context is not None and context.get_start_method() == "fork":
+        raise ValueError(
+            "executor must not fork, which JAX does not survive:"
+            ' ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn"))'
+        )
