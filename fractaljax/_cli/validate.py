@@ -1,0 +1,44 @@
+"""`fractaljax validate`: published results beside ours."""
+
+from pathlib import Path
+
+from .output import csv_text, output, picture
+
+
+def add_validate(commands) -> None:
+    """Add `fractaljax validate`."""
+    parser = commands.add_parser(
+        "validate", help="compute what was published elsewhere", description=_run.__doc__
+    )
+    parser.add_argument("cases", nargs="*", metavar="CASE", help="published cases; default all")
+    parser.add_argument(
+        "--out", type=Path, metavar="FOLDER", help="for a picture of each case and validation.csv"
+    )
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+    parser.set_defaults(run=_run)
+
+
+def _run(arguments) -> int:
+    """Compute published cases; print their numbers beside ours. Exit status 1 if one differs.
+
+    A case that lacks its data is not run. FRACTALJAX_BRAKE names the folder of the matrices of the
+    4669-degree-of-freedom brake.
+    """
+    from .._validate.validate import validate
+
+    if arguments.out is None:
+        found = validate(*arguments.cases, progress=not arguments.quiet)
+        print(found)
+        return 0 if found.agrees else 1
+    from .. import plot
+
+    with output(arguments.out) as write:
+        found = validate(*arguments.cases, progress=not arguments.quiet)
+        files = {
+            f"{name}.png": picture(plot.validation(case))
+            for name, case in found.cases.items()
+            if case.panels
+        }
+        written = write(files | {"validation.csv": csv_text(*found.rows()).encode()})
+    print(f"{found!r}\n{written}")
+    return 0 if found.agrees else 1

@@ -1,0 +1,1 @@
+"""Published results beside ours. Each module holds the cases of one subject."""

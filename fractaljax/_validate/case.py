@@ -1,0 +1,92 @@
+"""What a published case is: numbers and curves of an article, and a function that computes ours."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from jaxtyping import ArrayLike
+
+# Where a published number comes from.
+STATED = "stated"  # the article states it
+CLOSED = "closed form"  # it follows from the article's equations by hand
+SOLVED = "SciPy"  # it is SciPy's solution of the article's equations
+CORRECTED = "corrected"  # what the article states is wrong: the note says both
+
+
+class Check(NamedTuple):
+    """One number of an article beside ours, in the unit that `quantity` names."""
+
+    quantity: str
+    published: float | tuple[float, float]  # or the ends of a range
+    ours: float | None  # None where it cannot be computed: the note says why
+    tolerance: float  # absolute
+    basis: str
+    note: str = ""
+
+    @property
+    def difference(self) -> float | None:
+        """Ours less the published number, or less the nearer end of a range; 0 within it."""
+        if self.ours is None:
+            return None
+        low, high = self.published if isinstance(self.published, tuple) else [self.published] * 2
+        return self.ours - min(max(self.ours, low), high)
+
+    @property
+    def agrees(self) -> bool | None:
+        """Whether they differ by no more than the tolerance; None where there is none of ours."""
+        return None if self.difference is None else abs(self.difference) <= self.tolerance
+
+
+class Curve(NamedTuple):
+    """A line of a picture: theirs as marks, or dashed if it is a bound; ours drawn through.
+
+    One without a label continues the one before it of its kind.
+    """
+
+    x: ArrayLike | Sequence[float]
+    y: ArrayLike | Sequence[float]
+    label: str
+    ours: bool
+    dashed: bool = False
+
+
+class Panel(NamedTuple):
+    """One graph: curves over the same axes. `options` are those of `Axes.set`."""
+
+    xlabel: str
+    ylabel: str
+    curves: Sequence[Curve]
+    options: Mapping[str, Any] = {}
+
+
+class Found(NamedTuple):
+    """What a case computes."""
+
+    checks: Sequence[Check]
+    panels: Sequence[Panel]
+
+
+class Case(NamedTuple):
+    """A published case. `missing` says what it lacks to be run here, or nothing."""
+
+    name: str
+    title: str
+    citation: str
+    doi: str | None  # None where it has none, or we are not certain of it
+    run: Callable[[], Found]
+    missing: Callable[[], str] = lambda: ""
+
+
+def stated(quantity: str, published: float, ours: Any, digit: float, note: str = "") -> Check:
+    """A number as the article prints it; its last digit is worth `digit`, and half of it counts."""
+    return Check(quantity, published, float(ours), 0.5 * digit, STATED, note)
+
+
+def closed(quantity: str, published: Any, ours: Any, rtol: float, note: str = "") -> Check:
+    """A closed form, which ours meets to the relative tolerance."""
+    published = float(published)
+    return Check(quantity, published, float(ours), rtol * abs(published), CLOSED, note)
+
+
+def solved(quantity: str, published: Any, ours: Any, rtol: float, note: str = "") -> Check:
+    """A solution of the article's equations by SciPy, met to the relative tolerance."""
+    return closed(quantity, published, ours, rtol, note)._replace(basis=SOLVED)

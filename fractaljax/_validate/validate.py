@@ -1,0 +1,184 @@
+"""Run published cases and put their numbers beside ours."""
+
+import dataclasses
+import functools
+import importlib
+import math
+import re
+from collections.abc import Iterator
+
+import jax
+
+from .._base.parts import flag
+from .._base.table import aligned
+from .case import Case, Check, Panel
+
+_MODULES = ("source", "coupling", "follower", "belts", "rough", "smooth", "finite_elements")
+_TITLES = ["case", "quantity", "published", "ours", "difference", "tolerance", "basis", "result"]
+
+
+@dataclasses.dataclass(frozen=True)
+class ValidatedCase:
+    """One published case after its run."""
+
+    name: str
+    title: str
+    citation: str
+    doi: str | None
+    checks: tuple[Check, ...]
+    panels: tuple[Panel, ...] = dataclasses.field(repr=False)  # the curves of its picture
+    reason: str = ""  # why it did not run, or what ended it
+    failed: bool = False  # whether an error ended it
+
+    @property
+    def agrees(self) -> bool:
+        """Whether no number differs by more than its tolerance, and no error ended the run."""
+        return not self.failed and all(check.agrees is not False for check in self.checks)
+
+    def rows(self) -> list[list[str]]:
+        """The rows of the table, without the name of the case: one for each number."""
+        found = [_cells(check) for check in self.checks]
+        if self.reason:
+            dashes = ["-"] * (len(_TITLES) - 3)
+            found.append([self.title, *dashes, "FAILS" if self.failed else "NOT RUN"])
+        return found
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Validation:
+    """Published cases beside ours, as `validate` returns them; printed as a table."""
+
+    cases: dict[str, ValidatedCase]
+
+    @property
+    def agrees(self) -> bool:
+        """Whether all that ran agrees with what was published."""
+        return all(case.agrees for case in self.cases.values())
+
+    def rows(self) -> tuple[list[str], list[list[str]]]:
+        """The titles and the rows of the table: one for each number."""
+        found = [[case.name, *row] for case in self.cases.values() for row in case.rows()]
+        return _TITLES, found
+
+    def notes(self) -> Iterator[str]:
+        """What the table has no room for, a line each: misprints, and why a case did not run."""
+        for case in self.cases.values():
+            for check in case.checks:
+                if check.note:
+                    yield f"{case.name}, {check.quantity}: {check.note}"
+            if case.reason:
+                yield f"{case.name}: {case.reason}"
+
+    def summary(self) -> str:
+        """How many numbers agree, in a line."""
+        verdicts = [check.agrees for case in self.cases.values() for check in case.checks]
+        lacking = sum(bool(case.reason) and not case.failed for case in self.cases.values())
+        right, skipped = verdicts.count(True), lacking + verdicts.count(None)
+        wrong = verdicts.count(False) + sum(case.failed for case in self.cases.values())
+        said = f"{_count(right, 'number')} of {_count(len(self.cases) - lacking, 'case')} agree"
+        said += "s" if right == 1 else ""
+        said += f", {wrong} {'does' if wrong == 1 else 'do'} not" if wrong else ""
+        return said + (f", {skipped} not run." if skipped else ".")
+
+    def __repr__(self) -> str:
+        titles, rows = self.rows()
+        previous = [""] + [name for name, *_ in rows]
+        shown = [
+            ["" if row[0] == above else row[0], *row[1:]]
+            for row, above in zip(rows, previous, strict=False)
+        ]
+        notes = [f"- {note}" for note in self.notes()]
+        return "\n".join([aligned([titles, *shown]), *notes, self.summary()])
+
+
+def validate(*cases: str, progress: bool = True) -> Validation:
+    """Compute what was published elsewhere, and print both with their difference.
+
+    `cases` are names of published cases, by default all. Each number has a tolerance, from the
+    digits that were printed or the order of an approximation, and a basis: `stated` in the article,
+    a `closed form` that follows from its equations, the solution of its equations by `SciPy`, or
+    `corrected` where the article is wrong, with a note that says how. SI units unless the
+    quantity names another. A case that lacks its data says so and counts for nothing. The
+    4669-degree-of-freedom brake needs the folder of its matrices, in the environment variable
+    FRACTALJAX_BRAKE. All together take some three minutes.
+
+    `plot.validation(case)` draws our curves over theirs.
+
+    **Raises:** `ValueError` for an unknown case, and without 64 bits (`jax_enable_x64`).
+    """
+    from tqdm import tqdm
+
+    chosen = [known_case(name) for name in cases] or list(known_cases().values())
+    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        raise ValueError('validate needs 64 bits: jax.config.update("jax_enable_x64", True)')
+    found = {}
+    with tqdm(total=len(chosen), unit="case", disable=not flag("progress", progress)) as bar:
+        for case in chosen:
+            bar.set_description(case.name)
+            found[case.name] = _run(case)
+            bar.update()
+    return Validation(found)
+
+
+@functools.cache
+def known_cases() -> dict[str, Case]:
+    """All published cases by name, in the order of the gallery."""
+    modules = (importlib.import_module(f"{__package__}.{name}") for name in _MODULES)
+    return {case.name: case for module in modules for case in module.CASES}
+
+
+def known_case(name: str) -> Case:
+    """The case of a name.
+
+    **Raises:** `ValueError` for an unknown one.
+    """
+    known = known_cases()
+    if name not in known:
+        raise ValueError(f"no case {name!r}; the cases are {', '.join(known)}")
+    return known[name]
+
+
+def _run(case: Case) -> ValidatedCase:
+    head = case.name, case.title, case.citation, case.doi
+    if reason := case.missing():
+        return ValidatedCase(*head, (), (), f"not run: {reason}")
+    try:
+        checks, panels = case.run()
+    except RuntimeError as error:  # no convergence, no cycle: what a result says of itself
+        return ValidatedCase(*head, (), (), _reason(error), failed=True)
+    return ValidatedCase(*head, tuple(checks), tuple(panels))
+
+
+def _reason(error: RuntimeError) -> str:
+    """The message of an error; of one from a compiled program, one line of JAX's long account."""
+    checked = re.search(r"EquinoxRuntimeError: (.+)", str(error))
+    return checked[1] if checked else str(error).partition("\n")[0]
+
+
+def _cells(check: Check) -> list[str]:
+    published = check.published
+    if isinstance(published, tuple):
+        shown = " to ".join(_digits(end, check.tolerance) for end in published)
+    else:
+        shown = _digits(published, check.tolerance)
+    if check.ours is None or check.difference is None:
+        return [check.quantity, shown, "-", "-", "-", check.basis, "NOT RUN"]
+    ours = _digits(check.ours, check.tolerance)
+    margin = f"{check.tolerance:.1e}" if check.tolerance else "0"
+    difference = f"{check.difference:+.1e}" if check.difference else "0"
+    return [check.quantity, shown, ours, difference, margin, check.basis, _VERDICTS[check.agrees]]
+
+
+def _count(n: int, noun: str) -> str:
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
+_VERDICTS = {True: "ok", False: "DIFFERS", None: "NOT RUN"}
+
+
+def _digits(number: float, tolerance: float) -> str:
+    """A number with the digits that its tolerance lets count, 4 to 13 of them."""
+    digits = 6
+    if tolerance > 0 and number:
+        digits = round(math.log10(abs(number) / tolerance)) + 2
+    return f"{number:.{min(max(digits, 4), 13)}g}"
