@@ -9,13 +9,16 @@ import pytest
 
 import fractaljax as fj
 from benchmarks import (
+    boundary_element,
     branches,
     eigenvalues,
+    half_spaces,
     limit_cycle,
     loops,
     many_cycles,
     scale,
     scene_cost,
+    scipy_user,
     timing,
     transients,
     whole_design as designs,
@@ -23,7 +26,7 @@ from benchmarks import (
 from benchmarks.extremes import FAMILIES, corner_rows, family_rows
 from benchmarks.growth_rate import surfaces
 from benchmarks.timing import versions
-from fractaljax._sweep.shards import Shards
+from fractaljax._sweep.batches import Batches
 
 REGIMES = {"elastic-plastic", "fully plastic", "gross slip"}
 
@@ -46,6 +49,35 @@ def test_smooth_equations_over_friction_are_those_of_each_law(mu_s):
     found = branches.smooth_field(0.1)(u, mu_s, None)
     own = transients.accelerations(math.tanh, transients.law(mu_s=mu_s).numbers, 0.1)
     np.testing.assert_allclose(found, [*u[2:], *own(*u.tolist())], rtol=1e-14)
+
+
+def test_residual_of_a_wave_in_contact():
+    """A pressure E q h/2 over its mean closes all gaps; half of that wave leaves half of them."""
+    n, dx, E, height = 16, 1e-5, 2e11, 1e-8
+    wave = np.cos(2 * np.pi * np.arange(n) / n)[:, None] * np.ones(8)
+    pressure = E * np.pi / (n * dx) * height * wave
+    mean = 2 * pressure.max()
+    assert half_spaces.residual(mean + pressure, height * wave, dx, E) < 1e-12
+    left = half_spaces.residual(mean + pressure / 2, height * wave, dx, E)
+    assert left == pytest.approx(0.5 * np.sqrt(2), rel=1e-12)
+
+
+def test_a_peer_is_compared_at_its_residual():
+    """With the quickest of our settings that reach it, by ratios within a turn."""
+    rows = [
+        {"family": family, "setting": setting, "residual": residual, "seconds": seconds}
+        for family, setting, residual, seconds in [
+            ("fractaljax", "loose", 1e-3, 1.0),
+            ("fractaljax", "middle", 1e-6, 3.0),
+            ("fractaljax", "tight", 1e-9, 2.0),
+            ("Tamaas", "a", 1e-3, 4.0),
+            ("Tamaas", "b", 1e-4, 4.0),
+            ("Tamaas", "c", 1e-10, 9.0),
+        ]
+    ]
+    boundary_element.beside(rows, [[row["seconds"]] * 3 for row in rows])
+    assert [row.get("beside") for row in rows] == [None] * 3 + ["loose", "tight", None]
+    assert [row.get("ratio") for row in rows] == [None] * 3 + [4.0, 2.0, None]
 
 
 @pytest.mark.parametrize("order", [2, 4])
@@ -221,7 +253,7 @@ def test_runs_are_compared_as_wholes_by_the_median_start():
 @pytest.mark.slow
 def test_a_job_gives_the_values_at_its_points(tmp_path):
     lengths, picked = (2, 3, 2, 2), (0, 5, 23)
-    found = scale.in_this_process(lengths, 2, 10, shards=str(tmp_path), picked=picked)
+    found = scale.in_this_process(lengths, 2, 10, stores=str(tmp_path), picked=picked)
     scenes = [fj.brake_scene().replace(**scale.at(lengths, point)) for point in picked]
     np.testing.assert_allclose(found["values"], list(map(fj.growth_rate, scenes)), rtol=1e-9)
     assert len(found["times"]) == 2 and found["result_bytes"] == 8 * 24
@@ -231,12 +263,12 @@ def test_a_job_gives_the_values_at_its_points(tmp_path):
 
 
 def test_batches_that_are_begun_are_written_down(tmp_path, monkeypatch):
-    monkeypatch.setattr(Shards, "has", Shards.has)  # put back afterwards
+    monkeypatch.setattr(Batches, "begin", Batches.begin)  # put back afterwards
     scale.log_begun(str(tmp_path / "begun.txt"))
-    shards = Shards(tmp_path / "sweep", {"key": "", "axes": {}, "batch": 1, "arrays": []})
-    shards.write(1, [np.arange(3)])
-    assert [shards.has(k) for k in range(3)] == [False, True, False]
-    assert (tmp_path / "begun.txt").read_text().split() == ["0", "2"]
+    for expected in (["0", "1", "2", "3"], ["0", "1", "2", "3", "1"]):
+        scale.swept((2, 2, 2, 3), 10, tmp_path / "sweep")
+        assert (tmp_path / "begun.txt").read_text().split() == expected
+        (tmp_path / "sweep" / "computed" / "c.0.1.0.0").unlink()
     rows = [{"points": n, "seconds": 2e-6 * n} for n in (10, 1000, 100_000)]
     assert scale.slope(rows, "seconds") == pytest.approx(1)
     assert (scale.short(100_000_000), scale.short(4e6)) == ("1e8", "4e6")
@@ -267,6 +299,16 @@ BY_HAND = ("mechanism", "critical friction")
 
 
 @pytest.mark.slow
+def test_scipys_user_has_the_same_brake():
+    """The joint and the growth rate by other code, in two regimes and at the reference."""
+    scene = fj.brake_scene()
+    for D, G in ((2.4, 1.342e-10), (2.55, 1e-10), (2.5, 3e-11), (2.35, 1e-8)):
+        moved = scene.replace(D=D, G=G)
+        found = scipy_user.joint(D, G)[:2]
+        np.testing.assert_allclose(found, fj.stiffness(moved), rtol=1e-11)
+        np.testing.assert_allclose(scipy_user.growth_rate(D, G), fj.growth_rate(moved), rtol=1e-9)
+
+
 @pytest.mark.parametrize("name", BY_HAND)
 def test_a_family_is_exact_to_what_its_inputs_allow(name):
     (family,) = (family for family in FAMILIES if family.name == name)

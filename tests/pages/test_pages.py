@@ -4,17 +4,35 @@ The same bounds on errors hold for a quick run of each page (slow).
 """
 
 import json
+import math
 
 import pytest
 
 from benchmarks import page
 from benchmarks.__main__ import PAGES
+from fractaljax._sweep.blocks import blocks
 from tools import ROOT, quick_benchmark
 
 RESULTS = ROOT / "benchmarks" / "results"
 STORED = page.stored(RESULTS)
 # The ratio to the best peer of one cycle; the time of a branch.
 MISSED = {"limit_cycle", "branches"}
+UNWRITTEN = {"first_answers"}  # it takes a quarter of an hour of an idle machine
+WRITTEN = [name for name in PAGES if name not in UNWRITTEN]
+
+
+def boundary_element(numbers):
+    """Each reaches its tolerance, and the same contact; times are of the machine."""
+    for surface in numbers["surfaces"]:
+        for row in surface["methods"]:
+            tolerance = float(row["setting"].split()[1])
+            # A peer stops by a residual of its own.
+            assert row["residual"] < (1 if row["family"] == "fractaljax" else 3) * tolerance
+            assert row["mean_gap"] < tolerance and row["pressure"] < 30 * tolerance
+        own = next(row for row in surface["methods"] if row.get("default"))
+        assert own["pressure"] < 1e-8 and own["mean_gap"] < 1e-9
+        assert own["K_n"] < 1e-4  # a point may join between the two loads of the truth
+        assert 0 < surface["touching"] < 1
 
 
 def branches(numbers):
@@ -72,6 +90,15 @@ def growth_rate(numbers):
         assert rows[-1]["step"] < step < rows[0]["step"]
 
 
+def first_answers(numbers):
+    """Answers of two programs that share no code; times are of the machine."""
+    rows = {row["name"]: row for row in numbers["rows"]}
+    assert rows["fractaljax stability"]["apart"] < 1e-5  # as it is printed
+    assert rows["fractaljax design"]["apart"] < 1e-5
+    assert rows.get("fractaljax cycle", {"apart": 0})["apart"] < 1e-3  # of the smoothed law
+    assert all(row["cold_s"] > 0 for row in rows.values())
+
+
 def limit_cycle(numbers):
     for row in numbers["methods"]:
         if row["group"] == "fractaljax, exact":
@@ -90,13 +117,18 @@ def many_cycles(numbers):
 
 
 def scale(numbers):
+    from benchmarks.scale import AHEAD, SIDES
+
+    batches = {math.prod(side): blocks(side, 8192).number for side in SIDES}
     for row in numbers["rows"]:
         assert max(row["off_single"], row["off_exact"]) < 1e-12
         assert row["result_bytes"] == 8 * row["points"]
-        assert row["files"] == (-(-row["points"] // 8192) if "shards" in row["way"] else 0)
+        assert row["batches"] == (batches[row["points"]] if "store" in row["way"] else 0)
     assert all(map(page.held, numbers["headline"][2:]))  # memory and batches, no times
     killed = numbers["interrupted"]
-    assert killed["equal_to_the_last_bit"] and killed["computed_again"] <= len(killed["kills"])
+    assert killed["equal_to_the_last_bit"] and killed["computed_again"] <= AHEAD * len(
+        killed["kills"]
+    )
     assert killed["batches_at_the_end"] == killed["batches"]
     assert all(way["equal_to_the_last_bit"] for way in numbers["shared"])
 
@@ -123,7 +155,7 @@ def whole_design(numbers):
 PROMISES = {name: globals()[name] for name in PAGES}
 
 
-@pytest.mark.parametrize("name", PAGES)
+@pytest.mark.parametrize("name", WRITTEN)
 def test_committed_page_is_written_from_its_numbers_and_keeps_its_promises(name):
     assert (RESULTS / f"{name}.md").read_text() == page.text(PAGES[name], STORED[name])
     assert (RESULTS / f"{name}.png").read_bytes().startswith(b"\x89PNG")
@@ -133,17 +165,24 @@ def test_committed_page_is_written_from_its_numbers_and_keeps_its_promises(name)
     assert name in MISSED or all(map(page.held, heads))
 
 
-def test_committed_index_is_that_of_all_pages_from_one_machine():
-    assert set(STORED) == set(PAGES)
+def test_committed_index_is_that_of_all_pages():
+    assert set(STORED) == set(WRITTEN)
     assert (RESULTS / page.INDEX).read_text() == page.index(RESULTS)
-    machines = [numbers["machine"] | {"others_running": None} for numbers in STORED.values()]
-    assert all(machine == machines[0] for machine in machines)
 
 
 # The others compile limit cycles and designs for many minutes: run them by hand before a release.
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", ["contact", "eigenvalues", "extremes", "growth_rate", "scene_cost"]
+    "name",
+    [
+        "boundary_element",
+        "contact",
+        "eigenvalues",
+        "extremes",
+        "first_answers",
+        "growth_rate",
+        "scene_cost",
+    ],
 )
 def test_quick_run_keeps_the_same_promises(name, tmp_path):
     numbers, _ = quick_benchmark(name, tmp_path)

@@ -1,0 +1,43 @@
+"""`fractaljax explore`: a page with sliders over the quantities of a scene."""
+
+from pathlib import Path
+
+from .output import output
+from .parsing import add_scene_file, load_given, windows_of
+
+_FORM = "NAME=LOW:HIGH"
+
+
+def add_explore(commands) -> None:
+    """Add `fractaljax explore`."""
+    parser = commands.add_parser(
+        "explore", help="write a page with sliders to play with", description=_run.__doc__
+    )
+    add_scene_file(parser)
+    parser.add_argument("--out", type=Path, default=Path("fractaljax-explore"), metavar="FOLDER")
+    parser.add_argument(
+        "--over",
+        nargs="+",
+        metavar=_FORM,
+        default=[],
+        help="quantities and their windows, the first two those of the map; default D, G, P and mu",
+    )
+    parser.add_argument("--no-cycles", action="store_true", help="leave out limit cycles: seconds")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+    parser.set_defaults(run=_run)
+
+
+def _run(arguments) -> int:
+    """Write explore.html, a page that needs no network: sliders over the quantities of a scene.
+
+    It shows growth rate, frequency, stiffness, the mode in motion, the surface, and limit cycles.
+    """
+    from ..plot.explore import page
+
+    scene = load_given(arguments.scene)
+    windows = windows_of("--over", arguments.over, _FORM)
+    with output(arguments.out) as write:
+        text = page(scene, windows, not arguments.no_cycles, not arguments.quiet)
+        written = write({"explore.html": text.encode()})
+    print(written)
+    return 0

@@ -1,0 +1,372 @@
+"""A page to play with: sliders over the quantities of a scene, in one file that needs no network.
+
+Growth rate, frequency, mode and stiffness are computed in the browser, by the program of the
+package translated to JavaScript. Limit cycles are computed here, on a grid.
+"""
+
+import base64
+import functools
+import html
+import itertools
+import json
+import math
+import os
+import re
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._base.files import write_whole
+from .._base.parts import require_kind, require_scalar, whole
+from .._contact.contact import Regime
+from .._dynamics.cycle import CycleResult
+from .._dynamics.limit_cycle import limit_cycle
+from .._mechanism.quantities import (
+    axis_values,
+    known_quantities,
+    label,
+    own_quantities,
+    require_independent,
+    require_inside,
+    require_known,
+    sliding_friction,
+    substituted,
+    unit,
+    value_of,
+    with_optional,
+)
+from .._mechanism.scene import Scene, stiffness
+from .._stability.linearise import linearised_at, pressed
+from .._stability.quartic import rightmost_root
+from .._surface.roughness import roughness
+from .._surface.surface import frequency_count
+from .._surface.topography import random_phases
+from .._version import __version__
+from .javascript import javascript
+from .maps import regime_of
+
+_AROUND = {"D": (-0.05, 0.05), "G": (0.5, 2.0), "P": (0.5, 2.0), "mu": (0.5, 1.5)}
+_AROUND |= {"K_n": (0.5, 2.0), "K_t/K_n": (0.5, 1.5)}  # added to D, else factors
+_STOPS = 120  # of a slider, or a few more
+WAVELENGTHS = 1e-3, 1e-6  # [m], of Sq; the surface is drawn over the longest
+_PIXELS, _DIRECTIONS = 96, 10  # of the picture of the surface
+_SAMPLES = 96  # of one period of a limit cycle
+_BATCH, _MOST_RETURNS = 32, 500
+_NODES = 13, 5, 3  # of limit cycles over the first quantity, the second, and each of the others
+_MAP, _LONG = (150, 75), 1000  # points of the map along a side; lines from where there are fewer
+_SHADES = ["growth_rate", "plastic", "slip"]  # what the map shows, in the order of the leaves
+_CYCLE = ("period", "amplitude_1", "amplitude_2", "stick")
+
+
+class Axis(NamedTuple):
+    """A quantity that a slider moves."""
+
+    name: str
+    label: str  # meaning and symbol
+    unit: str
+    log: bool
+    nodes: np.ndarray  # where limit cycles are computed; the own value is among them
+    own: int  # index of the own value
+    refine: int  # stops of the slider in each interval between nodes
+
+    @property
+    def stops(self) -> np.ndarray:
+        """The values of the slider: every `refine`-th is a node, to the last bit."""
+        share = np.arange(self.refine) / self.refine
+        low, high = self.nodes[:-1, None], self.nodes[1:, None]
+        inner = low ** (1 - share) * high**share if self.log else low * (1 - share) + high * share
+        inner[:, 0] = self.nodes[:-1]
+        return np.append(inner.ravel(), self.nodes[-1])
+
+
+def explore(
+    scene: Scene,
+    path: str | os.PathLike,
+    *,
+    cycles: bool | Mapping[str, int] = True,
+    progress: bool = True,
+    **windows: tuple[float, float],
+) -> None:
+    """Write a page with a slider for each of `windows`, in one .html file that needs no network.
+
+    `windows` are quantities by name, as the axes of `sweep`, each (low, high), two or more:
+    `D=(2.35, 2.45)`. By default D, G, P and mu, those that the scene has, or K_n, K_t/K_n and mu.
+    The first two span the map of growth rates.
+
+    The page shows what `stability` and `stiffness` give at every place of the sliders, to rounding:
+    it runs the same program, translated. It also shows the mode in motion, a surface with its
+    D and G, and limit cycles from a small disturbance. These are computed here, where sliding
+    squeals, on a grid of 13 values of the first quantity, 5 of the second and 3 of the others, or
+    as many as `cycles` says by name, and the value of the scene. Where it squeals in between the
+    page shows the nearest and says so. `cycles=False` leaves them out: seconds, not minutes.
+
+    **Raises:** `TypeError` for what is not a `Scene`; `ValueError` for a scene that holds arrays,
+    one whose program has loops (as of `AsperityContact`, or on a load curve), an unknown quantity,
+    two that are not independent, less than two, a window outside its domain, that is no
+    (low, high) or that leaves out the value of the scene, and a path that does not end in .html;
+    `OSError` if the file cannot be written.
+    """
+    if not os.fspath(path).endswith(".html"):
+        raise ValueError(f"path must end in .html, got {os.fspath(path)!r}")
+    write_whole(path, page(scene, windows, cycles, progress).encode())
+
+
+def page(
+    scene: Scene,
+    windows: Mapping[str, tuple[float, float]],
+    cycles: bool | Mapping[str, int] = True,
+    progress: bool = True,
+) -> str:
+    """The text of the page that `explore` writes."""
+    axes, scene = explored(scene, windows, cycles)
+    names = [axis.name for axis in axes]
+
+    def numbers(*q):
+        return point(substituted(scene, dict(zip(names, q, strict=True))))
+
+    def shade(*q):
+        found = numbers(*q)
+        return {name: found[name] for name in _SHADES}
+
+    # First: it refuses a law before cycles are searched for.
+    program = javascript(shade, len(axes), "shade")
+    programs = javascript(numbers, len(axes), "point") + program
+    shown: Any = jax.eval_shape(numbers, *[0.0] * len(axes))
+    data = {
+        "axes": [
+            {
+                **{key: getattr(axis, key) for key in ("name", "label", "unit", "log", "refine")},
+                "stops": axis.stops.tolist(),
+                "start": axis.own * axis.refine,
+            }
+            for axis in axes
+        ],
+        "numbers": sorted(shown),  # as the leaves of a dictionary are
+        "shades": _SHADES,
+        "map": _MAP[program.count("\n") > _LONG],
+        "colours": {"growth": _colours("YlOrBr", 0.05), "heights": _colours("cividis", 0.0)},
+        "surface": _waves(scene) if scene.contact.has_surface else None,
+        "cycles": None if cycles is False else _cycles(scene, axes, progress),
+    }
+    text = {
+        "title": html.escape(f"fractaljax: a scene over {', '.join(names)}"),
+        "version": html.escape(__version__),
+        "programs": programs,
+        "data": json.dumps(data).replace("</", "<\\/"),
+    }
+    template = (
+        resources.files("fractaljax.plot").joinpath("explore.html").read_text(encoding="utf-8")
+    )
+    return re.sub(r"@(\w+)@", lambda found: text[found[1]], template)
+
+
+def explored(
+    scene: Scene, windows: Mapping[str, Any], cycles: bool | Mapping[str, int] = False
+) -> tuple[list[Axis], Any]:
+    """The axes of `windows`, and the scene with a number for each quantity among them.
+
+    **Raises:** as `explore`.
+    """
+    require_kind("scene", scene, Scene)
+    require_scalar(scene)
+    windows = dict(windows) or _default(scene)
+    if len(windows) < 2:
+        raise ValueError(f"explore needs two quantities or more, got {', '.join(windows)}")
+    for name in windows:
+        require_known(scene, name)
+    require_independent(scene, tuple(windows))
+    counts = dict(zip(windows, [*_NODES, *[_NODES[-1]] * len(windows)], strict=False))
+    counts |= cycles if isinstance(cycles, Mapping) else {}
+    if unknown := counts.keys() - windows.keys():
+        raise ValueError(f"cycles must name quantities of the sliders, got {', '.join(unknown)}")
+    axes = [_axis(scene, name, windows[name], whole("cycles", counts[name], 2)) for name in windows]
+    require_inside(scene, {axis.name: axis.nodes for axis in axes})
+    return axes, with_optional(scene, tuple(windows))
+
+
+def point(scene: Scene) -> dict[str, Any]:
+    """The numbers that a page shows of a scene, by name, each a scalar.
+
+    "coupling" and "first" are the factors of (s^2 + c_1 s + a) x1 = mu K_n/m x2, for the mode.
+    """
+    joint, (K_n, K_t) = pressed(scene), stiffness(scene)
+    lin = linearised_at(scene, joint, True)
+    s = rightmost_root(lin)
+    re, im = s.real, s.imag
+    found = {
+        "growth_rate": re,
+        "frequency": im / (2 * math.pi),
+        "K_n": K_n,
+        "K_t": K_t,
+        "V": scene.oscillator.V,
+        "coupling": sliding_friction(scene) * joint.K_n / scene.oscillator.m,
+        "first_real": re**2 - im**2 + lin.c_1 * re + lin.a,
+        "first_imag": (2 * re + lin.c_1) * im,
+        "plastic": False,
+        "slip": False,
+    }
+    if scene.contact.fractal:
+        regime = regime_of(scene)
+        found["plastic"] = regime == Regime.fully_plastic
+        found["slip"] = regime == Regime.gross_slip
+    if scene.contact.has_surface:
+        surface = scene.contact.surface
+        found |= {"D": surface.D, "G": surface.G, "gamma": surface.gamma}
+        found["Sq"] = roughness(surface, *WAVELENGTHS).Sq
+    return found
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def points_at(scene: Any, names: tuple[str, ...], values: Any) -> dict[str, Any]:
+    """The numbers of `point` where these quantities have the values (k, names), each (k,)."""
+    return jax.vmap(lambda q: point(substituted(scene, dict(zip(names, q, strict=True)))))(values)
+
+
+def _default(scene: Scene) -> dict[str, tuple[float, float]]:
+    known = known_quantities(scene)
+    names = [name for name in ("D", "G", "P", "mu") if name in known]
+    if "D" not in names:
+        names = [name for name in ("K_n", "K_t/K_n", "mu") if name in known]
+    windows = {}
+    for name in names:
+        own, (low, high) = float(value_of(scene, name)), _AROUND[name]
+        if name == "D":
+            windows[name] = max(2.001, own + low), min(2.999, own + high)
+        else:
+            windows[name] = own * low, own * high
+    return windows
+
+
+def _axis(scene: Scene, name: str, window: Any, count: int) -> Axis:
+    ends = np.asarray(axis_values(scene, name, window))
+    own = float(value_of(scene, name))
+    if ends.shape != (2,) or not ends[0] < ends[1]:
+        raise ValueError(f"{name} must be (low, high), got {window!r}")
+    if not ends[0] <= own <= ends[1]:
+        raise ValueError(f"the window of {name} must hold its value, {own:g}, got {window!r}")
+    quantity = own_quantities(scene).get(name)
+    log = quantity is not None and quantity.log
+    space: Any = np.geomspace if log else np.linspace
+    nodes = space(*ends, count)
+    nodes[[0, -1]] = ends
+    k = int(np.abs(nodes - own).argmin())
+    if abs(nodes[k] - own) <= 1e-9 * (ends[1] - ends[0]):  # a node, up to rounding
+        nodes[k] = own
+    else:
+        nodes = np.sort(np.append(nodes, own))
+    place, refine = int(np.searchsorted(nodes, own)), math.ceil(_STOPS / (len(nodes) - 1))
+    words = label(scene, name).rsplit(" [", 1)[0]
+    return Axis(name, words, unit(scene, name), log, nodes, place, refine)
+
+
+def _colours(name: str, start: float) -> list[str]:
+    import matplotlib as mpl
+    from matplotlib.colors import to_hex
+
+    return [to_hex(colour) for colour in mpl.colormaps[name](np.linspace(start, 1, 64))]
+
+
+def _base64(values: Any, kind: type) -> str:
+    """An array as the text from which a page reads it: its bytes, the lowest first."""
+    return base64.b64encode(np.asarray(values, np.dtype(kind).newbyteorder("<")).tobytes()).decode()
+
+
+# --- the surface ----------------------------------------------------------------------------
+
+
+def _waves(scene: Scene) -> dict[str, Any]:
+    """The sum of Eq. 13 over directions for each frequency, which D and G only weigh."""
+    surface, (L, L_s) = scene.contact.surface, WAVELENGTHS
+    waves = surface_waves(float(surface.gamma), _PIXELS)
+    return {
+        "n": _PIXELS,
+        "L": L,
+        "M": _DIRECTIONS,
+        "count": len(waves),
+        "band": f"wavelengths {1e6 * L_s:g} to {1e6 * L:g} µm",
+        "waves": _base64(waves, np.float32),
+    }
+
+
+def surface_waves(gamma: float, n: int) -> np.ndarray:
+    """(frequencies, n, n): cos(phi) - cos(k.x + phi) summed over directions, with fixed phases."""
+    count = int(frequency_count(np.float64(gamma), n / 2, np))
+    phases = 2 * np.pi * np.asarray(random_phases(jax.random.key(0), count, _DIRECTIONS))
+    angles = np.pi * np.arange(1, _DIRECTIONS + 1) / _DIRECTIONS
+    i = np.arange(n) / n
+    found = np.empty((count, n, n))
+    for k in range(count):
+        x, y = 2 * np.pi * gamma**k * i[:, None, None], 2 * np.pi * gamma**k * i[None, :, None]
+        turned = x * np.cos(angles) + y * np.sin(angles) + phases[k]
+        found[k] = (np.cos(phases[k]) - np.cos(turned)).sum(axis=-1)
+    return found
+
+
+# --- limit cycles ---------------------------------------------------------------------------
+
+
+def _cycles(scene, axes: Sequence[Axis], progress: bool) -> dict[str, Any]:
+    """Limit cycles at the nodes where sliding squeals, and words for the others."""
+    from tqdm import tqdm
+
+    names = tuple(axis.name for axis in axes)
+    nodes = np.array(list(itertools.product(*(axis.nodes for axis in axes))))
+    found = points_at(scene, names, nodes)
+    words = [
+        "quiet: small disturbances die out",
+        "fully plastic: the joint has no stiffness",
+        "gross slip: the joint has no tangential stiffness",
+        "no steady sliding",
+    ]
+    growth = np.asarray(found["growth_rate"])
+    kinds = [np.asarray(found["plastic"]), np.asarray(found["slip"]), np.isnan(growth)]
+    state = np.select(kinds, [1, 2, 3], 0).astype(np.int32)
+    row = np.full(len(nodes), -1, np.int32)
+    numbers: list[Any] = []
+    orbits: list[Any] = []
+    squeals = np.flatnonzero((state == 0) & (growth > 0))
+    with tqdm(total=len(squeals), desc="limit cycles", disable=not progress) as bar:
+        for begin in range(0, len(squeals), _BATCH):
+            some = squeals[begin : begin + _BATCH]
+            # A short batch repeats its nodes: one shape compiles once.
+            batch = nodes[np.resize(some, _BATCH)]
+            result, *of = _batch_of_cycles(scene, names, batch)
+            of = [np.asarray(each) for each in of]
+            for i, node in enumerate(some):
+                said = CycleResult[jax.tree.map(lambda x, i=i: x[i], result)]
+                if said not in words:
+                    words.append(said)
+                state[node] = words.index(said)
+                if np.isfinite(of[0][i, 0]):
+                    row[node] = len(numbers)
+                    numbers.append(of[0][i])
+                    orbits.append(of[1][i])
+            bar.update(len(some))
+    return {
+        "nodes": [axis.nodes.tolist() for axis in axes],
+        "samples": _SAMPLES,
+        "names": _CYCLE,
+        "words": words,
+        "state": _base64(state, np.int32),
+        "row": _base64(row, np.int32),
+        "numbers": _base64(numbers, np.float64),
+        "orbits": _base64(orbits, np.float32),
+    }
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _batch_of_cycles(scene, names, nodes):
+    """Result, the numbers of `_CYCLE` and orbits (samples, [x1, v1]) of a batch of nodes."""
+
+    def one(q):
+        moved = substituted(scene, dict(zip(names, q, strict=True)))
+        cycle = limit_cycle(moved, max_returns=_MOST_RETURNS, throw=False)
+        _, states = cycle.orbit(_SAMPLES)
+        numbers = cycle.period, *cycle.amplitude, cycle.stick_fraction[0]
+        return cycle.result, jnp.stack(numbers), states[:, jnp.array([0, 2])]
+
+    return jax.vmap(one)(nodes)

@@ -1,0 +1,146 @@
+"""The sliders of `plot.explore` in a notebook, where Python computes."""
+
+import html
+import io
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from .._contact.contact import Regime
+from .._dynamics.cycle import CycleResult
+from .._dynamics.limit_cycle import limit_cycle
+from .._mechanism.quantities import replaced
+from .._mechanism.scene import Scene, stiffness
+from .._stability.stability import stability
+from .._surface.roughness import roughness
+from .._surface.topography import topography
+from .axes import new_figure
+from .cycle import cycle as draw_cycle
+from .design import stability_map
+from .explore import WAVELENGTHS, Axis, explored
+from .maps import regime_of
+from .shapes import complex_mode
+from .topography import topography as draw_topography
+
+_POINTS = 128  # of a side of the surface
+
+
+def explore(scene: Scene, **windows: tuple[float, float]) -> Any:
+    """Sliders over the quantities of a scene, for a notebook: the widget to end a cell in.
+
+    `windows` are as of `plot.explore`, which writes a page for those without Python. Beside the
+    sliders are the numbers of `stability` and `stiffness`, the map of the first two quantities with
+    the point on it, the surface and the mode. A button finds the limit cycle.
+
+    **Raises:** `ImportError` unless ipywidgets is installed; else as `plot.explore`, but that any
+    contact law will do.
+    """
+    try:
+        import ipywidgets
+    except ImportError:
+        raise ImportError("explore needs ipywidgets: python -m pip install ipywidgets") from None
+    axes, scene = explored(scene, windows)
+    sliders = {axis.name: _slider(ipywidgets, axis) for axis in axes}
+    numbers, words = ipywidgets.HTML(), ipywidgets.HTML()
+    pictures = {name: ipywidgets.Image(format="png") for name in ("map", "surface", "mode")}
+    motion = ipywidgets.Image(format="png")
+    button, on_map = ipywidgets.Button(description="Limit cycle"), _Map(axes)
+    if not scene.contact.has_surface:
+        del pictures["surface"]
+
+    def values() -> dict[str, float]:
+        return {name: slider.value for name, slider in sliders.items()}
+
+    def update(_: Any = None) -> None:
+        here = replaced(scene, values())
+        numbers.value, words.value = _table(here), ""
+        pictures["map"].value = on_map.at(here, values())
+        pictures["mode"].value = _mode(here)
+        if "surface" in pictures:
+            pictures["surface"].value = _surface(here)
+        motion.layout.display = "none"  # that of the place before
+
+    def find(_: Any) -> None:
+        words.value = "searching"
+        found = limit_cycle(replaced(scene, values()), throw=False)
+        words.value = html.escape(CycleResult[found.result])
+        if np.isfinite(found.period):
+            size = ", ".join(f"{x:.5g}" for x in found.amplitude)
+            words.value += f": peak to peak {size} m, {found.frequency:.5g} Hz"
+            motion.value, motion.layout.display = _png(draw_cycle(found)), "block"
+
+    for slider in sliders.values():
+        slider.observe(update, names="value")
+    button.on_click(find)
+    update()
+    left = ipywidgets.VBox([*sliders.values(), numbers, button, words])
+    row = ipywidgets.Layout(flex_flow="row wrap")
+    return ipywidgets.VBox([ipywidgets.Box([left, *pictures.values()], layout=row), motion])
+
+
+def _slider(ipywidgets: Any, axis: Axis) -> Any:
+    unit = "" if axis.unit == "-" else f" [{axis.unit}]"
+    return ipywidgets.SelectionSlider(
+        options=[(f"{stop:.5g}", float(stop)) for stop in axis.stops],
+        index=axis.own * axis.refine,
+        description=f"{axis.name}{unit}",
+        continuous_update=False,  # a drag computes where it ends
+    )
+
+
+def _table(scene: Scene) -> str:
+    """The numbers of a scene as rows of a table."""
+    modes, (K_n, K_t) = stability(scene), stiffness(scene)
+    rows = {
+        "growth rate": f"{modes.growth_rate:+.5g} 1/s",
+        "frequency": f"{modes.frequency:.5g} Hz",
+        "normal stiffness K_n": f"{K_n:.5g} N/m",
+        "tangential stiffness K_t": f"{K_t:.5g} N/m",
+    }
+    if scene.contact.has_surface:
+        rows["Sq"] = f"{roughness(scene.contact.surface, *WAVELENGTHS).Sq:.5g} m"
+    if scene.contact.fractal:
+        rows["regime"] = Regime[regime_of(scene)]
+    cells = (f"<tr><td>{name}</td><td>{html.escape(text)}</td></tr>" for name, text in rows.items())
+    return f"<table>{''.join(cells)}</table>"
+
+
+class _Map:
+    """The map of the first two quantities; it is drawn anew where another quantity changes."""
+
+    def __init__(self, axes: list[Axis]):
+        self.names = [axis.name for axis in axes[:2]]
+        self.bounds = {axis.name: (axis.nodes[0], axis.nodes[-1]) for axis in axes[:2]}
+        self.key: Any = None
+        self.ax: Any = None
+
+    def at(self, scene: Scene, values: Mapping[str, float]) -> bytes:
+        key = [value for name, value in values.items() if name not in self.names]
+        if self.ax is None or key != self.key:
+            self.key, self.ax = key, stability_map(scene, self.bounds)
+        style: dict[str, Any] = {"mfc": "tab:cyan", "mec": "k", "ms": 9}
+        (point,) = self.ax.plot(*([values[name]] for name in self.names), "o", **style)
+        picture = _png(self.ax.figure)
+        point.remove()
+        return picture
+
+
+def _surface(scene: Scene) -> bytes:
+    L = WAVELENGTHS[0]
+    z = topography(scene.contact.surface, L, _POINTS, key=jax.random.key(0))
+    return _png(draw_topography(z, L / _POINTS, new_figure(5.6, 4.8).add_subplot()).figure)
+
+
+def _mode(scene: Scene) -> bytes:
+    modes = stability(scene)
+    if not np.isfinite(modes.growth_rate):
+        return b""
+    return _png(complex_mode(modes, 0, new_figure(5.6, 4.8).add_subplot()).figure)
+
+
+def _png(figure: Any) -> bytes:
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=80)
+    return content.getvalue()
