@@ -8,8 +8,11 @@ import jax
 
 from .page import INDEX, index, measured, write
 
-NAMES = "branches contact eigenvalues extremes growth_rate limit_cycle many_cycles scale scene_cost"
-PAGES = {n: importlib.import_module(f".{n}", __package__) for n in (*NAMES.split(), "whole_design")}
+NAMES = (
+    "boundary_element branches contact eigenvalues extremes first_answers growth_rate limit_cycle"
+    " many_cycles scale scene_cost whole_design"
+)
+PAGES = {name: importlib.import_module(f".{name}", __package__) for name in NAMES.split()}
 
 
 def main() -> None:

@@ -19,7 +19,7 @@ import numpy as np
 
 import fractaljax as fj
 from fractaljax._dynamics import search
-from fractaljax._dynamics.hybrid import hybrid_system, scaled_start
+from fractaljax._dynamics.scaled import hybrid_system, scaled_start
 
 from .page import draw, png, spread, subplots, table, verdict
 from .timing import compiled, devices, ended, ratio, seconds, started, taking_turns, versions

@@ -1,7 +1,11 @@
 """Strict numerics for every test: 64 bits, no silent broadcasting, warnings are errors."""
 
+import functools
+import gc
 import os
+import sys
 import warnings
+from pathlib import Path
 
 import jax
 import pytest
@@ -18,10 +22,11 @@ def pytest_configure(config):
     config.addinivalue_line("filterwarnings", f"ignore:{cache}")
     warnings.simplefilter("error")
     # Most of a run is compilation. It takes a fifth less time so.
-    quick = "--xla_cpu_use_fusion_emitters=false"
+    flags = "--xla_cpu_use_fusion_emitters=false"
     passes = "while-loop-invariant-code-motion,simplify-while-loops"
-    os.environ.setdefault("XLA_FLAGS", f"{quick} --xla_disable_hlo_passes={passes}")
+    os.environ.setdefault("XLA_FLAGS", f"{flags} --xla_disable_hlo_passes={passes}")
     # Workers, subprocesses and later runs share what is compiled.
+    from fractaljax._base import quick
     from fractaljax._cli.compiled import FIRST_QUIET_JAX
 
     folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(config.cache.mkdir("jax"))
@@ -31,10 +36,36 @@ def pytest_configure(config):
     if jax.__version_info__ >= FIRST_QUIET_JAX:
         os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+    # Without optimisation a cycle with both gradients compiles in 4 s instead of 10. Runs with slow
+    # tests have it, as users do: of a hundred thousand scenes some keep their digits only by it.
+    if config.getoption("markexpr") == "not slow":
+        jax.config.update("jax_disable_most_optimizations", True)
+        os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"  # of subprocesses
+        # The library's own options would win, with some optimisation.
+        quick._available = functools.wraps(quick._available)(lambda: False)
+    # A quarter of tracing is a search for garbage among the modules, which stay.
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 50)
 
 
 @pytest.fixture(autouse=True, scope="module")
 def bounded_memory():
-    """What one file compiled is let go after it: of all files together it takes gigabytes."""
+    """Files share what is compiled. Beyond 2.5 GB of memory each lets go of what there is."""
     yield
-    jax.clear_caches()
+    if memory() > 2.5e9:
+        jax.clear_caches()
+
+
+def memory() -> float:
+    """What this process holds now, or has held at most where that is not known [bytes]."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        return pages * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        pass
+    try:
+        import resource
+    except ImportError:  # Windows
+        return float("inf")
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak * (1 if sys.platform == "darwin" else 1024)

@@ -18,11 +18,21 @@ def blocks(page, language):
 
 @pytest.mark.parametrize("page", [README, pytest.param(GUIDE, marks=pytest.mark.slow)])
 def test_examples_print_what_is_printed(page, capsys, tmp_path, monkeypatch):
-    """The output shown is printed digit for digit, and the picture of the guide is drawn."""
+    """The output shown is printed digit for digit, and the picture of the guide is drawn.
+
+    README's table of limits is what its call of `verdict` says of the design.
+    """
     monkeypatch.chdir(tmp_path)
+    names = {}
     for code, text in zip(blocks(page, "python"), blocks(page, "text"), strict=True):
-        exec(compile(code, page, "exec"), {})
+        names = {}
+        exec(compile(code, page, "exec"), names)
         assert capsys.readouterr().out == text
+    if page == README:
+        limits = (ROOT / README).read_text().partition("## Limits")[2]
+        (call,) = re.findall(r"`(fj\.verdict\(.*\))`", limits)
+        shown = re.findall(r"^    (.*)$", limits, flags=re.MULTILINE)
+        assert shown == repr(eval(call, names)).splitlines()
     if page == GUIDE:
         assert_same_picture(tmp_path / "cycle.png", "cycle.png")
 
