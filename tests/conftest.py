@@ -7,6 +7,9 @@ import sys
 import warnings
 from pathlib import Path
 
+# Read when NumPy and SciPy load. Two workers with two threads each wait for one another.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import jax
 import pytest
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.core import Tracer
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Float
 
@@ -188,7 +189,10 @@ def mass_matrix(M: Float[Array, "n n"]) -> Float[Array, "n n"]:
     **Raises:** `ValueError` unless M is symmetric to 1e-6 and positive definite; NaN if it is
     traced.
     """
-    values, half = concrete(M), (M + M.T) / 2
+    values = concrete(M)
+    # NumPy's where nothing is traced: a program for each shape is slow to compile.
+    X = M if isinstance(M, Tracer) else np.asarray(M)
+    half = jnp.asarray((X + X.T) / 2)
     if values is None:
         units = jnp.sqrt(jnp.diagonal(half))
         unit = jax.lax.stop_gradient(M / units[:, None] / units[None])

@@ -436,7 +436,7 @@ def _estimated(
     A = np.block([[np.zeros((r, r)), np.eye(r)], [-inverse @ K / omega**2, -inverse @ C / omega]])
     solved: Any = eig(A, left=True, right=True)
     z, left, right = solved
-    sought = np.asarray(in_band(jnp.asarray(omega * z), reduced.band)) & (z.imag > 0)
+    sought = in_band(omega * z, reduced.band) & (z.imag > 0)
     s, q, p = omega * z[sought], right[:r, sought], inverse.T @ left[r:, sought].conj()
     slope = (p * (2 * s * (M @ q) + C @ q)).sum(axis=0)
 
@@ -592,10 +592,10 @@ class _Greedy:
             # With its own equilibrium.
             numbers = _numbers(substituted(reduced, values), self.snapshots.friction_slope)
             s, _ = self.estimated(reduced, (u, np.asarray(numbers)))
-            exact = self.add(u).modes.s
+            exact: Any = self.add(u).modes.s
             edge, frequency = self.tol * np.abs(exact), np.imag(exact)
             well_inside = (frequency > low + edge) & (frequency < high - edge)
-            well_inside &= np.asarray(in_band(jnp.asarray(exact), self.snapshots.band))
+            well_inside &= in_band(exact, self.snapshots.band)
             largest = max(largest, _apart(s, exact[well_inside]))
         return largest
 

@@ -86,6 +86,9 @@ def test_a_mass_matrix_is_made_exactly_symmetric():
     found = np.asarray(mass_matrix(jnp.asarray(uneven)))
     np.testing.assert_array_equal(found, found.T)
     np.testing.assert_allclose(found, M, rtol=1e-9)
+    weights = np.random.default_rng(0).standard_normal(M.shape)
+    slope = jax.grad(lambda M: (mass_matrix(M) * weights).sum())(jnp.asarray(M))
+    np.testing.assert_allclose(slope, (weights + weights.T) / 2, rtol=1e-14)
 
 
 def test_coordinates_of_unit_mass():
