@@ -24,6 +24,7 @@ from jax.core import Tracer
 from .files import write_whole
 
 _MOST_BYTES = 300_000_000  # of all programs; those not used for longest go
+LAPACK = b"lapack_", b"blas_"  # in the names of its functions
 _OWN = "fractaljax", "builtins", "jax", "jaxlib", "equinox"  # packages whose versions are known
 
 _folder: Path | None = None
@@ -48,12 +49,6 @@ def is_traced(*args: Any) -> bool:
     """Whether JAX traces these arguments, or whatever is computed now."""
     found = any(isinstance(x, Tracer) for x in jax.tree.leaves(args))
     return found or isinstance(jnp.zeros(()), Tracer)
-
-
-def kept_jit(function: Callable, static_argnames: str | tuple[str, ...] = ()) -> Callable:
-    """`jax.jit`, whose outermost programs a command keeps."""
-    jitted = jax.jit(function, static_argnames=static_argnames)
-    return kept(jitted, static_argnames, lambda: jitted)
 
 
 def kept(function: Callable, static_argnames: str | tuple[str, ...], jitted: Callable) -> Callable:
@@ -103,7 +98,8 @@ def _read(file: Path, dynamic: dict) -> Callable | None:
 
     try:
         executable, result = pickle.loads(file.read_bytes())
-        _find_lapack()
+        if any(name in executable for name in LAPACK):
+            _find_lapack()
         tree = jax.tree.structure(((), dynamic))
         found = deserialize_and_load(executable, tree, jax.tree.structure(result))
         os.utime(file)
@@ -114,7 +110,10 @@ def _read(file: Path, dynamic: dict) -> Callable | None:
 
 @functools.cache
 def _find_lapack() -> None:
-    """Let XLA know the addresses of LAPACK's functions, as lowering a program with one does."""
+    """Let XLA know the addresses of LAPACK's functions, as lowering a program with one does.
+
+    They are SciPy's, whose import is a tenth of a command.
+    """
     jax.jit(jax.lax.linalg.cholesky).lower(jnp.ones((1, 1)))
 
 

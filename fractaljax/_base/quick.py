@@ -10,7 +10,7 @@ from .kept import is_traced, kept
 
 # Of XLA on CPU. A program that runs many times is slower with them, by up to two thirds.
 _OPTIONS = {
-    "xla_backend_optimization_level": 1,
+    "xla_backend_optimization_level": 0,
     "xla_cpu_use_fusion_emitters": False,
     "xla_disable_hlo_passes": "while-loop-invariant-code-motion,simplify-while-loops",
 }

@@ -110,6 +110,7 @@ def _run(arguments) -> int:
     from .._design.design_file import design_files, read_design
     from .._mechanism.scene import Scene
     from .._mechanism.structure import Structure
+    from ..plot.topography import drawn_topographies
 
     if arguments.repeat is None:
         options = _options(arguments)
@@ -138,7 +139,7 @@ def _run(arguments) -> int:
             files["design.png"] = picture(plot.design(best).figure)
         if best.has_surface:
             surfaces = best.topographies()
-            files["topographies.png"] = picture(plot.topographies(best))
+            files["topographies.png"] = picture(drawn_topographies(best, surfaces))
             files["topography.npy"] = npy(surfaces.after)
             side, dx = len(surfaces.after), surfaces.dx
             heights = [f"topography.npy: {side} x {side} heights in m, dx = {dx:g} m"]

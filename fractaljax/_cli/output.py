@@ -62,6 +62,4 @@ def npy(array) -> bytes:
 
 def picture(figure) -> bytes:
     """A figure as the content of a PNG file."""
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=150)
-    return content.getvalue()
+    return figure.png(150)

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from .._base.kept import kept_jit
 from .._base.parts import Record, concrete
+from .._base.quick import command_jit
 from .hybrid import OPEN, UNUSED, HybridSystem
 from .orbit import Segments, flow, mean_square
 
@@ -211,7 +211,7 @@ class LimitCycle(Record):
         return found
 
 
-@functools.partial(kept_jit, static_argnames="n")
+@functools.partial(command_jit, static_argnames="n")
 def _sampled(orbit, system: HybridSystem, period, n: int):
     share = jnp.arange(n) / n
     y = orbit.at(system, share * period * system.omega)

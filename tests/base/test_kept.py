@@ -22,7 +22,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path / "programs"
 
 
-def counted(jit=kept.kept_jit):
+def counted(jit=quick.command_jit):
     """A program that counts its traces, and the count."""
     traces = []
 
@@ -39,7 +39,7 @@ def forget(monkeypatch):
     jax.clear_caches()
 
 
-@pytest.mark.parametrize("jit", [kept.kept_jit, quick.quick_jit, quick.command_jit])
+@pytest.mark.parametrize("jit", [quick.quick_jit, quick.command_jit])
 def test_a_program_is_loaded_without_a_trace(folder, monkeypatch, jit):
     program, traces = counted(jit)
     x = jnp.arange(3.0)
@@ -112,8 +112,8 @@ class Elsewhere(fj.Friction):
 
 def test_classes_and_functions_from_elsewhere_are_not_kept(folder):
     law = Elsewhere(jnp.asarray(0.3), jnp.asarray(0.2))
-    assert kept.kept_jit(lambda law: law.mu(0.0))(law) == 0.3
-    applied = kept.kept_jit(lambda x, function: function(x), "function")
+    assert quick.command_jit(lambda law: law.mu(0.0))(law) == 0.3
+    applied = quick.command_jit(lambda x, function: function(x), "function")
     assert applied(2.0, function=lambda x: 3 * x) == 6
     assert not [*folder.iterdir()]
 
