@@ -51,8 +51,13 @@ def is_traced(*args: Any) -> bool:
     return found or isinstance(jnp.zeros(()), Tracer)
 
 
-def kept(function: Callable, static_argnames: str | tuple[str, ...], jitted: Callable) -> Callable:
-    """`function`, where programs are kept by the one of `jitted()`, the same function jitted."""
+def kept(
+    function: Callable, static_argnames: str | tuple[str, ...], jitted: Callable, options: str = ""
+) -> Callable:
+    """`function`, where programs are kept by the one of `jitted()`, the same function jitted.
+
+    `options` tells apart two programs of one function.
+    """
     static = (static_argnames,) if isinstance(static_argnames, str) else static_argnames
     parameters = inspect.signature(function)
 
@@ -62,7 +67,7 @@ def kept(function: Callable, static_argnames: str | tuple[str, ...], jitted: Cal
             return function(*args, **kwargs)
         given = parameters.bind(*args, **kwargs).arguments
         dynamic = {name: x for name, x in given.items() if name not in static}
-        program = _program(_folder, function, jitted, given, dynamic)
+        program = _program(_folder, function, options, jitted, given, dynamic)
         return function(*args, **kwargs) if program is None else program(**dynamic)
 
     return call
@@ -73,14 +78,15 @@ def _one_processor() -> bool:
     return jax.default_backend() == "cpu" and jax.device_count() == 1
 
 
-def _program(folder: Path, function, jitted, given, dynamic) -> Callable | None:
+def _program(folder: Path, function, options, jitted, given, dynamic) -> Callable | None:
     leaves, tree = jax.tree.flatten(dynamic)
     kinds = tuple(map(_kind, leaves))
     static = tuple((name, x) for name, x in given.items() if name not in dynamic)
     key = function, static, tree, kinds
     if key not in _loaded:
         _loaded[key] = None
-        stated = f"{_surroundings()} {function.__module__}.{function.__qualname__} {key[1:]}"
+        name = f"{function.__module__}.{function.__qualname__} {options}"
+        stated = f"{_surroundings()} {name} {key[1:]}"
         if _belongs(tree) and " at 0x" not in stated:  # a function that has no name of its own
             file = folder / hashlib.sha256(stated.encode()).hexdigest()
             _loaded[key] = _read(file, dynamic) or _compiled(file, jitted(), given)

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from .output import csv_text, output, picture
+from .output import csv_text, import_pictures, output, picture
 from .parsing import add_constant_friction, add_scene_file, load_given
 
 _SAMPLES = 512  # of one period
@@ -61,6 +61,8 @@ def _cycle(arguments) -> int:
 
     Of a scene, or of a structure (a file with a table of that name).
     """
+    import jax
+
     from .. import plot
     from .._dynamics.limit_cycle import CycleResult, limit_cycle
     from .._dynamics.summary import cycle_table
@@ -72,8 +74,9 @@ def _cycle(arguments) -> int:
         require_computable(scene)
     options = {name: getattr(arguments, name) for name in ("start", "rtol", "max_returns")}
     options = {name: value for name, value in options.items() if value is not None}
+    import_pictures()
     with output(arguments.out) as write:
-        cycle = limit_cycle(scene, **options, throw=False)
+        cycle = jax.device_get(limit_cycle(scene, **options, throw=False))  # NumPy goes on
         exists = CycleResult.converged, CycleResult.inaccurate, CycleResult.unstable
         found = cycle.result in exists
         if found:

@@ -4,7 +4,7 @@ import inspect
 from pathlib import Path
 from typing import Any
 
-from .output import csv_text, npy, output, picture
+from .output import csv_text, import_pictures, npy, output, picture
 from .parsing import (
     add_constant_friction,
     add_scene_file,
@@ -125,6 +125,7 @@ def _run(arguments) -> int:
         scalar("--area", arguments.area, above=0)
         if not isinstance(x, Scene) or not x.contact.has_surface:
             raise ValueError("--area needs a scene whose contact has a surface")
+    import_pictures()
     with output(arguments.out) as write:
         best = design(x, **options, progress=not arguments.quiet)
         heights, designed = [], arguments.out / "design.toml"

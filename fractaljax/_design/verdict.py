@@ -174,7 +174,7 @@ class _Found(NamedTuple):
     damping: Array  # minus the sum of the real parts of the eigenvalues, whatever the stiffness
 
 
-@functools.partial(quick_jit, static_argnames="friction_slope")
+@functools.partial(quick_jit, static_argnames="friction_slope", once=True)
 def _growth_rates(scenes: tuple[Scene, ...], friction_slope: bool) -> _Found:
     """Growth rates of m scenes, and of the first over K_t/K_n, in one program.
 

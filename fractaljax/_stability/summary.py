@@ -39,7 +39,7 @@ class _Critical(NamedTuple):
     normal_force: Array | None
 
 
-@functools.partial(quick_jit, static_argnames="friction_slope")
+@functools.partial(quick_jit, static_argnames="friction_slope", once=True)
 def _critical(scene: Scene, friction_slope: bool, wavelengths):
     """Critical mode, stiffness, contact state, and the roughness over wavelengths unless None."""
     joint = pressed(scene)
@@ -50,7 +50,7 @@ def _critical(scene: Scene, friction_slope: bool, wavelengths):
     return mode, stiffness(scene), _contact_state(scene), rough
 
 
-@functools.partial(quick_jit, static_argnames="friction_slope")
+@functools.partial(quick_jit, static_argnames="friction_slope", once=True)
 def _numbers(scene: Scene, friction_slope: bool):
     """Stability, stiffness, contact state and friction."""
     friction = sliding_friction(scene)
@@ -138,7 +138,7 @@ def verdict(modes: Stability) -> dict[str, str]:
     return {"growth rate [1/s]": f"{growth:+.6g}  ({verdict})"}
 
 
-@quick_jit
+@functools.partial(quick_jit, once=True)
 def _friction(law, speed):
     return law.mu(speed), law.mu_s
 
