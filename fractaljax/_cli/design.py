@@ -31,7 +31,7 @@ _LIMITS = {  # option: class of `fractaljax.constraints`, and its meaning
 _OPTIONS = {  # plain arguments of `design`
     "target": (
         float,
-        "largest growth rate allowed [1/s]; default minus half the least damping rate",
+        "largest growth rate allowed [1/s]; default -min(xi_i omega_i)/2",
     ),
     "K_n_min": (float, "least normal stiffness allowed [N/m]; default that of the scene"),
     "area_ratio_min": (float, "least a_l/a_e; default 2"),

@@ -23,7 +23,7 @@ _OPTIONS = {
     "--stylus-radius": {"type": float, "metavar": "RADIUS", "help": "radius of the stylus tip [m]"},
     "--aliased": {
         "choices": ("yes", "no"),
-        "help": "whether the heights hold waves finer than two steps; default: as the spectrum says",
+        "help": "whether waves finer than two steps are aliased; default: as the spectrum says",
     },
     "--scene": {
         "type": Path,

@@ -40,7 +40,8 @@ class Parser(argparse.ArgumentParser):
         self._negative_number_matcher = re.compile(r"-\.?\d")
 
     def error(self, message):
-        refuse(message)
+        missing = message.startswith("the following arguments are required")
+        refuse(f"{message}; see {self.prog} --help" if missing else message)
 
 
 def add_out(parser, folder: str) -> None:
