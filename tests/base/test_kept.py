@@ -33,6 +33,10 @@ def counted(jit=quick.command_jit):
     return jit(program, "power"), traces
 
 
+def square(x):
+    return x**2
+
+
 def forget(monkeypatch):
     """As in a new process."""
     monkeypatch.setattr(kept, "_loaded", {})
@@ -118,6 +122,28 @@ def test_classes_and_functions_from_elsewhere_are_not_kept(folder):
     assert not [*folder.iterdir()]
 
 
+def test_two_ways_to_compile_one_function_are_two_programs(folder):
+    for once in (False, True):
+        program = quick.quick_jit(square, once=once)
+        assert program(3.0) == 9
+    assert len([*folder.iterdir()]) == 2
+
+
+@pytest.mark.parametrize(
+    ("function", "needed"),
+    [(jnp.linalg.eigvals, True), (jnp.linalg.cholesky, True), (square, False)],
+)
+def test_programs_that_call_it_find_lapack(folder, monkeypatch, function, needed):
+    """Without its addresses such a program ends the process."""
+    asked, found = [], kept._find_lapack
+    monkeypatch.setattr(kept, "_find_lapack", lambda: (asked.append(True), found()))
+    program, x = quick.command_jit(function), jnp.eye(3) * 2
+    first = program(x)
+    forget(monkeypatch)
+    np.testing.assert_array_equal(program(x), first)
+    assert asked == [True] * needed
+
+
 def test_within_a_trace_nothing_is_kept(folder):
     program, _ = counted()
     assert jax.grad(lambda x: program(x)["value"])(3.0) == 6
@@ -165,6 +191,7 @@ def test_commands_in_new_processes(tmp_path):
         from fractaljax.__main__ import main
         main(sys.argv[1:])
         own = {"linearised", "_limit_cycle", "_stability", "_growth_rate", "_numbers", "_of_scene"}
+        print("scipy.linalg" in sys.modules, file=sys.stderr)
         print(sorted(own & set(traced)), file=sys.stderr)
     """
     environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache")}
@@ -188,3 +215,5 @@ def test_commands_in_new_processes(tmp_path):
         assert outputs[0].splitlines()[:10] == outputs[1].splitlines()[:10]
         heard = [set(eval(run.stderr.splitlines()[-1])) for run in runs]
         assert heard[0] >= set(traced) and not heard[1]
+        loaded = runs[1].stderr.splitlines()[-2]
+        assert loaded == "False" or command != ["stability"]  # it needs no LAPACK
