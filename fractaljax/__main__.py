@@ -26,9 +26,16 @@ def main(argv: list[str] | None = None) -> int:
     0, or 1 for an infeasible design, no limit cycle, a surface that is not fractal or a published
     number that is not met, or 2 for bad input, or 128 plus the number of the signal that ended it.
     """
-    parser = Parser(prog="fractaljax", description="From a machined surface to a stable mechanism.")
+    parser = Parser(
+        prog="fractaljax",
+        description="From a machined surface to a stable mechanism.",
+        epilog="Without a scene file a command takes the reference brake; `fractaljax scene > "
+        "brake.toml` writes it as a file to change. `fractaljax COMMAND --help` lists the options.",
+    )
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, parser_class=Parser)
+    commands = parser.add_subparsers(
+        dest="command", required=True, metavar="COMMAND", parser_class=Parser
+    )
     for add in (
         add_design,
         add_stability,

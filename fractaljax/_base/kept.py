@@ -24,6 +24,7 @@ from jax.core import Tracer
 from .files import write_whole
 
 _MOST_BYTES = 300_000_000  # of all programs; those not used for longest go
+LAPACK = b"lapack_", b"blas_"  # in the names of its functions
 _OWN = "fractaljax", "builtins", "jax", "jaxlib", "equinox"  # packages whose versions are known
 
 _folder: Path | None = None
@@ -50,14 +51,13 @@ def is_traced(*args: Any) -> bool:
     return found or isinstance(jnp.zeros(()), Tracer)
 
 
-def kept_jit(function: Callable, static_argnames: str | tuple[str, ...] = ()) -> Callable:
-    """`jax.jit`, whose outermost programs a command keeps."""
-    jitted = jax.jit(function, static_argnames=static_argnames)
-    return kept(jitted, static_argnames, lambda: jitted)
+def kept(
+    function: Callable, static_argnames: str | tuple[str, ...], jitted: Callable, options: str = ""
+) -> Callable:
+    """`function`, where programs are kept by the one of `jitted()`, the same function jitted.
 
-
-def kept(function: Callable, static_argnames: str | tuple[str, ...], jitted: Callable) -> Callable:
-    """`function`, where programs are kept by the one of `jitted()`, the same function jitted."""
+    `options` tells apart two programs of one function.
+    """
     static = (static_argnames,) if isinstance(static_argnames, str) else static_argnames
     parameters = inspect.signature(function)
 
@@ -67,7 +67,7 @@ def kept(function: Callable, static_argnames: str | tuple[str, ...], jitted: Cal
             return function(*args, **kwargs)
         given = parameters.bind(*args, **kwargs).arguments
         dynamic = {name: x for name, x in given.items() if name not in static}
-        program = _program(_folder, function, jitted, given, dynamic)
+        program = _program(_folder, function, options, jitted, given, dynamic)
         return function(*args, **kwargs) if program is None else program(**dynamic)
 
     return call
@@ -78,14 +78,15 @@ def _one_processor() -> bool:
     return jax.default_backend() == "cpu" and jax.device_count() == 1
 
 
-def _program(folder: Path, function, jitted, given, dynamic) -> Callable | None:
+def _program(folder: Path, function, options, jitted, given, dynamic) -> Callable | None:
     leaves, tree = jax.tree.flatten(dynamic)
     kinds = tuple(map(_kind, leaves))
     static = tuple((name, x) for name, x in given.items() if name not in dynamic)
     key = function, static, tree, kinds
     if key not in _loaded:
         _loaded[key] = None
-        stated = f"{_surroundings()} {function.__module__}.{function.__qualname__} {key[1:]}"
+        name = f"{function.__module__}.{function.__qualname__} {options}"
+        stated = f"{_surroundings()} {name} {key[1:]}"
         if _belongs(tree) and " at 0x" not in stated:  # a function that has no name of its own
             file = folder / hashlib.sha256(stated.encode()).hexdigest()
             _loaded[key] = _read(file, dynamic) or _compiled(file, jitted(), given)
@@ -103,7 +104,8 @@ def _read(file: Path, dynamic: dict) -> Callable | None:
 
     try:
         executable, result = pickle.loads(file.read_bytes())
-        _find_lapack()
+        if any(name in executable for name in LAPACK):
+            _find_lapack()
         tree = jax.tree.structure(((), dynamic))
         found = deserialize_and_load(executable, tree, jax.tree.structure(result))
         os.utime(file)
@@ -114,7 +116,10 @@ def _read(file: Path, dynamic: dict) -> Callable | None:
 
 @functools.cache
 def _find_lapack() -> None:
-    """Let XLA know the addresses of LAPACK's functions, as lowering a program with one does."""
+    """Let XLA know the addresses of LAPACK's functions, as lowering a program with one does.
+
+    They are SciPy's, whose import is a tenth of a command.
+    """
     jax.jit(jax.lax.linalg.cholesky).lower(jnp.ones((1, 1)))
 
 

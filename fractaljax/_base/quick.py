@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,11 +10,12 @@ import jax.numpy as jnp
 from .kept import is_traced, kept
 
 # Of XLA on CPU. A program that runs many times is slower with them, by up to two thirds.
-_OPTIONS = {
+_OPTIONS: dict[str, Any] = {
     "xla_backend_optimization_level": 1,
     "xla_cpu_use_fusion_emitters": False,
     "xla_disable_hlo_passes": "while-loop-invariant-code-motion,simplify-while-loops",
 }
+_RUNS_ONCE = _OPTIONS | {"xla_backend_optimization_level": 0}  # up to three times as slow
 
 
 @functools.cache
@@ -28,25 +30,32 @@ def _available() -> bool:
     return True
 
 
-def quick_jit(function: Callable, static_argnames: str | tuple[str, ...] = ()) -> Callable:
-    """`jax.jit`, compiled quickly where it is the outermost program: only there JAX has options."""
-    plain, outermost = _jitted(function, static_argnames)
+def quick_jit(
+    function: Callable, static_argnames: str | tuple[str, ...] = (), *, once: bool = False
+) -> Callable:
+    """`jax.jit`, compiled quickly where it is the outermost program: only there JAX has options.
+
+    `once` halves that again for a program which runs a few times, or on few numbers.
+    """
+    plain, outermost = _jitted(function, static_argnames, _RUNS_ONCE if once else _OPTIONS)
 
     @functools.wraps(plain)
     def call(*args, **kwargs):
         return (plain if is_traced(args, kwargs) else outermost())(*args, **kwargs)
 
-    return kept(call, static_argnames, outermost)
+    return kept(call, static_argnames, outermost, "once" if once else "")
 
 
-def command_jit(function: Callable, static_argnames: str | tuple[str, ...] = ()) -> Callable:
-    """`jax.jit`; a command, which runs the program a few times, compiles it quickly."""
-    plain, outermost = _jitted(function, static_argnames)
-    return kept(plain, static_argnames, outermost)
+def command_jit(
+    function: Callable, static_argnames: str | tuple[str, ...] = (), *, once: bool = False
+) -> Callable:
+    """`jax.jit`; a command, which runs the program a few times, compiles it as `quick_jit` does."""
+    plain, outermost = _jitted(function, static_argnames, _RUNS_ONCE if once else _OPTIONS)
+    return kept(plain, static_argnames, outermost, "once" if once else "")
 
 
-def _jitted(function, static_argnames) -> tuple[Callable, Callable[[], Callable]]:
+def _jitted(function, static_argnames, options) -> tuple[Callable, Callable[[], Callable]]:
     """The function jitted, and what gives the same compiled quickly, where options allow it."""
     plain = jax.jit(function, static_argnames=static_argnames)
-    quick = jax.jit(function, static_argnames=static_argnames, compiler_options=_OPTIONS)
+    quick = jax.jit(function, static_argnames=static_argnames, compiler_options=options)
     return plain, lambda: quick if _available() else plain

@@ -1,10 +1,9 @@
 """`fractaljax stability`, `cycle` and `scene`."""
 
-from pathlib import Path
 from typing import Any
 
-from .output import csv_text, output, picture
-from .parsing import add_constant_friction, add_scene_file, load_given
+from .output import csv_text, import_pictures, output, picture
+from .parsing import add_constant_friction, add_out, add_scene_file, load_given
 
 _SAMPLES = 512  # of one period
 
@@ -40,7 +39,7 @@ def add_cycle(commands) -> None:
         "cycle", help="find the stick-slip limit cycle", description=_cycle.__doc__
     )
     add_scene_file(parser)
-    parser.add_argument("--out", type=Path, default=Path("fractaljax-cycle"), metavar="FOLDER")
+    add_out(parser, "fractaljax-cycle")
     parser.add_argument(
         "--start",
         type=float,
@@ -49,9 +48,11 @@ def add_cycle(commands) -> None:
         help="where the motion starts: displacements [m], then velocities [m/s], of every degree of"
         " freedom (a scene has two); else near the sliding equilibrium",
     )
-    parser.add_argument("--rtol", type=float, help="of period and states; default 1e-9")
     parser.add_argument(
-        "--max-returns", type=int, help="of the Poincare map before giving up; default 5000"
+        "--rtol", type=float, help="relative error of period and states; default 1e-9"
+    )
+    parser.add_argument(
+        "--max-returns", type=int, help="returns of the Poincare map before giving up; default 5000"
     )
     parser.set_defaults(run=_cycle)
 
@@ -61,6 +62,8 @@ def _cycle(arguments) -> int:
 
     Of a scene, or of a structure (a file with a table of that name).
     """
+    import jax
+
     from .. import plot
     from .._dynamics.limit_cycle import CycleResult, limit_cycle
     from .._dynamics.summary import cycle_table
@@ -72,8 +75,9 @@ def _cycle(arguments) -> int:
         require_computable(scene)
     options = {name: getattr(arguments, name) for name in ("start", "rtol", "max_returns")}
     options = {name: value for name, value in options.items() if value is not None}
+    import_pictures()
     with output(arguments.out) as write:
-        cycle = limit_cycle(scene, **options, throw=False)
+        cycle = jax.device_get(limit_cycle(scene, **options, throw=False))  # NumPy goes on
         exists = CycleResult.converged, CycleResult.inaccurate, CycleResult.unstable
         found = cycle.result in exists
         if found:

@@ -32,8 +32,12 @@ def keep_compiled():
                 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     given = getattr(jax.config, _FOLDER)
     if given is not None and jax.__version_info__ >= FIRST_QUIET_JAX:
+        programs = Path(given) / "programs"
+        first = not programs.exists()
         with contextlib.suppress(OSError):
-            keep_in(Path(given) / "programs")
+            keep_in(programs)
+            if first and sys.stderr is not None and sys.stderr.isatty():
+                print(f"first run: compiled programs are kept in {given}", file=sys.stderr)
     try:
         yield
     finally:

@@ -1,10 +1,9 @@
 """`fractaljax contact`: the stiffness of a joint by every contact law."""
 
-from pathlib import Path
 from typing import Any
 
 from .output import csv_text, output, picture
-from .parsing import add_scene_file, load_given, numbers
+from .parsing import add_out, add_scene_file, load_given, numbers
 
 _OPTIONS: dict[str, dict[str, Any]] = {
     "--area": {"type": float, "help": "nominal area of the joint [m^2], if not in the scene"},
@@ -17,7 +16,6 @@ _OPTIONS: dict[str, dict[str, Any]] = {
     "--L-s": {"type": float, "help": "shortest wavelength [m]; default 4 L/n"},
     "--n": {"type": int, "help": "points of a boundary-element surface along a side; default 128"},
     "--seeds": {"type": int, "help": "how many such surfaces, 0 for none; default 4"},
-    "--out": {"type": Path, "default": Path("fractaljax-contact"), "metavar": "FOLDER"},
 }
 
 
@@ -29,6 +27,7 @@ def add_contact(commands) -> None:
     add_scene_file(parser)
     for name, options in _OPTIONS.items():
         parser.add_argument(name, **options)
+    add_out(parser, "fractaljax-contact")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.set_defaults(run=_run)
 

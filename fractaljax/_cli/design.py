@@ -4,9 +4,10 @@ import inspect
 from pathlib import Path
 from typing import Any
 
-from .output import csv_text, npy, output, picture
+from .output import csv_text, import_pictures, npy, output, picture
 from .parsing import (
     add_constant_friction,
+    add_out,
     add_scene_file,
     envelope_of,
     kick_size,
@@ -28,24 +29,28 @@ _LIMITS = {  # option: class of `fractaljax.constraints`, and its meaning
     "velocity-level": ("VelocityLevel", "velocity level of the limit cycle in x1 [dB re 1 nm/s]"),
 }
 _OPTIONS = {  # plain arguments of `design`
-    "target": (float, "largest growth rate allowed [1/s]"),
-    "K_n_min": (float, "least normal stiffness allowed [N/m]"),
-    "area_ratio_min": (float, "least a_l/a_e"),
-    "slip_ratio_max": (float, "largest Q_e/(mu_s P)"),
-    "quantile": (float, "of the scatter; default 0.95"),
-    "starts": (int, "designs that the solver starts from"),
-    "lattice": (int, "designs a side that starts are chosen from"),
-    "seed": (int, "of the draws as machined; default 0"),
+    "target": (
+        float,
+        "largest growth rate allowed [1/s]; default -min(xi_i omega_i)/2",
+    ),
+    "K_n_min": (float, "least normal stiffness allowed [N/m]; default that of the scene"),
+    "area_ratio_min": (float, "least a_l/a_e; default 2"),
+    "slip_ratio_max": (float, "largest Q_e/(mu_s P); default 0.9"),
+    "quantile": (float, "quantile of the scatter that counts; default 0.95"),
+    "starts": (int, "how many designs the solver starts from; default 12, 8 of a structure"),
+    "lattice": (int, "how many designs a side the starts are chosen from; default 48 or fewer"),
+    "seed": (int, "seed of all draws; default 0"),
 }
 _SEVERAL = {
-    "bounds": ("NAME=LOW:HIGH", "bounds on any quantities; default D and G"),
+    "bounds": ("NAME=LOW:HIGH", "bounds on any quantities; default D=2.1:2.9 G=1e-12:1e-8"),
     "envelope": (
         "NAME=LOW:HIGH",
         "ranges, or NAME=V1,V2,V3 measured together, that the design withstands",
     ),
     "tolerance": (
         "NAME=SIGMA",
-        "standard deviations as machined, of D and lnG, say; or a tolerance.toml of `identify`",
+        "standard deviations as machined, such as D=0.01 lnG=0.1; or the tolerance.toml that "
+        "`fractaljax identify` writes",
     ),
 }
 
@@ -59,19 +64,27 @@ def add_design(commands) -> None:
     )
     add_scene_file(parser)
     add_constant_friction(parser)
-    parser.add_argument("--out", type=Path, default=Path("fractaljax-design"), metavar="FOLDER")
+    add_out(parser, "fractaljax-design")
     for name, unit in (("D", ""), ("G", " [m]")):
         ends = ("LOW", "HIGH")
         parser.add_argument(
-            f"--{name}", type=float, nargs=2, metavar=ends, help=f"bounds on {name}{unit}"
+            f"--{name}",
+            type=float,
+            nargs=2,
+            metavar=ends,
+            help=f"as --bounds {name}=LOW:HIGH{unit}",
         )
     for name, (form, meaning) in _SEVERAL.items():
         parser.add_argument(f"--{name}", action="extend", nargs="+", metavar=form, help=meaning)
     for name, (kind, meaning) in _OPTIONS.items():
         parser.add_argument(f"--{name.replace('_', '-')}", type=kind, help=meaning)
-    parser.add_argument("--risk", help="worst (the default), smooth, smooth:T or cvar:ALPHA")
+    parser.add_argument(
+        "--risk", help="over the envelope: worst (the default), smooth, smooth:T or cvar:ALPHA"
+    )
     for name, (_, meaning) in _LIMITS.items():
-        parser.add_argument(f"--{name}", metavar="LOW:HIGH", help=f"{meaning}; one may be absent")
+        parser.add_argument(
+            f"--{name}", metavar="LOW:HIGH", help=f"limits: {meaning}; LOW or HIGH may be left out"
+        )
     parser.add_argument(
         "--sq-lengths",
         type=float,
@@ -110,6 +123,7 @@ def _run(arguments) -> int:
     from .._design.design_file import design_files, read_design
     from .._mechanism.scene import Scene
     from .._mechanism.structure import Structure
+    from ..plot.topography import drawn_topographies
 
     if arguments.repeat is None:
         options = _options(arguments)
@@ -124,6 +138,7 @@ def _run(arguments) -> int:
         scalar("--area", arguments.area, above=0)
         if not isinstance(x, Scene) or not x.contact.has_surface:
             raise ValueError("--area needs a scene whose contact has a surface")
+    import_pictures()
     with output(arguments.out) as write:
         best = design(x, **options, progress=not arguments.quiet)
         heights, designed = [], arguments.out / "design.toml"
@@ -138,7 +153,7 @@ def _run(arguments) -> int:
             files["design.png"] = picture(plot.design(best).figure)
         if best.has_surface:
             surfaces = best.topographies()
-            files["topographies.png"] = picture(plot.topographies(best))
+            files["topographies.png"] = picture(drawn_topographies(best, surfaces))
             files["topography.npy"] = npy(surfaces.after)
             side, dx = len(surfaces.after), surfaces.dx
             heights = [f"topography.npy: {side} x {side} heights in m, dx = {dx:g} m"]

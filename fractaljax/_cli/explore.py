@@ -1,9 +1,7 @@
 """`fractaljax explore`: a page with sliders over the quantities of a scene."""
 
-from pathlib import Path
-
 from .output import output
-from .parsing import add_scene_file, load_given, windows_of
+from .parsing import add_out, add_scene_file, load_given, windows_of
 
 _FORM = "NAME=LOW:HIGH"
 
@@ -14,7 +12,7 @@ def add_explore(commands) -> None:
         "explore", help="write a page with sliders to play with", description=_run.__doc__
     )
     add_scene_file(parser)
-    parser.add_argument("--out", type=Path, default=Path("fractaljax-explore"), metavar="FOLDER")
+    add_out(parser, "fractaljax-explore")
     parser.add_argument(
         "--over",
         nargs="+",
@@ -22,7 +20,9 @@ def add_explore(commands) -> None:
         default=[],
         help="quantities and their windows, the first two those of the map; default D, G, P and mu",
     )
-    parser.add_argument("--no-cycles", action="store_true", help="leave out limit cycles: seconds")
+    parser.add_argument(
+        "--no-cycles", action="store_true", help="leave out limit cycles, which take minutes"
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.set_defaults(run=_run)
 

@@ -4,9 +4,8 @@ import shlex
 from pathlib import Path
 
 from .output import output, picture
-from .parsing import envelope_of, load_given
+from .parsing import add_out, envelope_of, load_given
 
-_FOLDER = Path("fractaljax-identification")
 _MANY = 5  # warnings, with which a surface is not worth a design
 _OPTIONS = {
     "--dx": {"type": float, "help": "step between heights [m], if not in the file"},
@@ -21,15 +20,15 @@ _OPTIONS = {
         "help": "spatial frequencies to use [1/m]; chosen by default",
     },
     "--resolution": {"type": float, "help": "lateral resolution of the instrument [m]"},
-    "--stylus-radius": {"type": float, "metavar": "RADIUS", "help": "of the tip [m]"},
+    "--stylus-radius": {"type": float, "metavar": "RADIUS", "help": "radius of the stylus tip [m]"},
     "--aliased": {
         "choices": ("yes", "no"),
-        "help": "whether waves finer than two points are aliased; default: from the spectrum",
+        "help": "whether waves finer than two steps are aliased; default: as the spectrum says",
     },
     "--scene": {
         "type": Path,
         "metavar": "FILE",
-        "help": "scene for the surface; default the brake",
+        "help": "scene that the surface is put into; default the reference brake",
     },
     "--area": {
         "type": float,
@@ -44,7 +43,6 @@ _OPTIONS = {
         "action": "store_true",
         "help": "write a scene even where the warnings leave D and G no meaning",
     },
-    "--out": {"type": Path, "default": _FOLDER, "metavar": "FOLDER"},
 }
 
 
@@ -56,6 +54,7 @@ def add_identify(commands) -> None:
     parser.add_argument("file", type=Path, help="heights: CSV, NPY or an instrument's own format")
     for name, options in _OPTIONS.items():
         parser.add_argument(name, **options)
+    add_out(parser, "fractaljax-identification")
     parser.set_defaults(run=_run)
 
 

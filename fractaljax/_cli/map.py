@@ -1,10 +1,9 @@
 """`fractaljax map`: where a mechanism is quiet, squeals, or does as it was kicked."""
 
-from pathlib import Path
 from typing import Any
 
 from .output import csv_text, output, picture
-from .parsing import add_scene_file, kick_size, load_given, windows_of
+from .parsing import add_out, add_scene_file, kick_size, load_given, windows_of
 
 _FORM = "NAME=LOW:HIGH"
 _AROUND = {"D": (-0.05, 0.05), "G": (0.5, 2.0)}  # of the default window: added, and a factor
@@ -14,11 +13,11 @@ def add_map(commands) -> None:
     """Add `fractaljax map`."""
     parser = commands.add_parser(
         "map",
-        help="map where it is quiet, squeals, or does as it was kicked",
+        help="map where it is quiet, where it squeals and where a kick decides",
         description=_run.__doc__,
     )
     add_scene_file(parser)
-    parser.add_argument("--out", type=Path, default=Path("fractaljax-map"), metavar="FOLDER")
+    add_out(parser, "fractaljax-map")
     for which, name in (("x", "D"), ("y", "G")):
         parser.add_argument(
             f"--{which}", metavar=_FORM, help=f"a quantity and its window; default around {name}"

@@ -2,8 +2,10 @@
 
 import contextlib
 import csv
+import importlib
 import io
 import tempfile
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
@@ -60,8 +62,16 @@ def npy(array) -> bytes:
     return content.getvalue()
 
 
+def import_pictures() -> None:
+    """Import matplotlib in another thread: programs are compiled or loaded meanwhile."""
+
+    def begin():
+        importlib.import_module("matplotlib.backends.backend_agg")
+        importlib.import_module("fractaljax.plot.figure")
+
+    threading.Thread(target=begin).start()
+
+
 def picture(figure) -> bytes:
     """A figure as the content of a PNG file."""
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=150)
-    return content.getvalue()
+    return figure.png(150)

@@ -22,17 +22,32 @@ class _Once(argparse.Action):
         setattr(namespace, self.dest, values)
 
 
+class _Help(argparse.HelpFormatter):
+    """Shows a whole number as N and any other as X."""
+
+    def _get_default_metavar_for_optional(self, action):
+        own = super()._get_default_metavar_for_optional(action)
+        return {int: "N", float: "X"}.get(action.type, own)  # pyright: ignore[reportArgumentType]
+
+
 class Parser(argparse.ArgumentParser):
     """A parser that reports an error in one line and takes negative numbers of any form."""
 
     def __init__(self, *arguments, **options):
-        super().__init__(*arguments, **options)
+        super().__init__(*arguments, formatter_class=_Help, **options)
         self.register("action", None, _Once)
         # Older Pythons take -1e-5 for an option.
         self._negative_number_matcher = re.compile(r"-\.?\d")
 
     def error(self, message):
-        refuse(message)
+        missing = message.startswith("the following arguments are required")
+        refuse(f"{message}; see {self.prog} --help" if missing else message)
+
+
+def add_out(parser, folder: str) -> None:
+    """Add `--out`."""
+    words = f"the folder to write to; default {folder}"
+    parser.add_argument("--out", type=Path, default=Path(folder), metavar="FOLDER", help=words)
 
 
 def refuse(message: str) -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from .output import output
-from .parsing import numbers, pairs_of, reduction_of
+from .parsing import add_out, numbers, pairs_of, reduction_of
 
 _FORM = "NAME=LOW:HIGH"
 _FILE = "reduced.toml"
@@ -18,7 +18,7 @@ def add_reduce(commands) -> None:
         description=_run.__doc__,
     )
     parser.add_argument("structure", type=Path, help="a file with a table [structure]")
-    parser.add_argument("--out", type=Path, default=Path("fractaljax-reduced"), metavar="FOLDER")
+    add_out(parser, "fractaljax-reduced")
     parser.add_argument(
         "--band",
         metavar="LOW:HIGH",
@@ -30,7 +30,9 @@ def add_reduce(commands) -> None:
         metavar=_FORM,
         help="quantities and the ranges in which the reduction holds; else those of the file",
     )
-    parser.add_argument("--tol", type=float, help="largest error, of |s|; default 1e-8")
+    parser.add_argument(
+        "--tol", type=float, help="largest error of an eigenvalue s, relative to |s|; default 1e-8"
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.set_defaults(run=_run)
 

@@ -12,7 +12,10 @@ def add_validate(commands) -> None:
     )
     parser.add_argument("cases", nargs="*", metavar="CASE", help="published cases; default all")
     parser.add_argument(
-        "--out", type=Path, metavar="FOLDER", help="for a picture of each case and validation.csv"
+        "--out",
+        type=Path,
+        metavar="FOLDER",
+        help="the folder for a picture of each case and validation.csv; default none",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.set_defaults(run=_run)

@@ -358,12 +358,12 @@ def _conclude(
 ) -> Design:
     """How every requirement stands at the end of the path; unchanged without a start."""
     path, after, starts, failed = found
-    final = x
+    final, history = x, describe(problem, path)
     if starts:
         # exp(ln G) and the scaling back may end a rounding beyond a bound.
         ends = {
-            name: np.asarray(np.clip(value, *options["bounds"][name]), problem.low.dtype)
-            for name, value in problem.quantities(path[-1]).items()
+            name: np.asarray(np.clip(history[name][-1], *ends), problem.low.dtype)
+            for name, ends in options["bounds"].items()
         }
         final = replaced(x, ends)
     names, envelope, tolerance = (problem.residual_names, options["envelope"], options["tolerance"])
@@ -402,7 +402,7 @@ def _conclude(
         active=tuple(name for name, r in residuals.items() if -active <= r <= 0),
         violated=violated,
         result=DesignResult.infeasible if violated else result,
-        history=describe(problem, path),
+        history=history,
         bounds={name: (float(low), float(high)) for name, (low, high) in options["bounds"].items()},
         target=float(problem.target),
         K_n_min=max(map(float, problem.K_n_min), default=0.0),

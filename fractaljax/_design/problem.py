@@ -198,6 +198,12 @@ class DesignProblem(eqx.Module):
         return bool(self.conditions) or self.scatter is not None
 
     @property
+    def light(self) -> bool:
+        """Whether a row takes less time than its call: the source's law, and nothing besides."""
+        more = self.robust or self.modes or self.laws or self.constraints or self.objective
+        return isinstance(self.x, Scene) and self.x.contact.fractal and not more
+
+    @property
     def least_growth(self) -> bool:
         """Whether the objective is the growth rate of a structure, the largest of many modes'."""
         return self.modes > 0 and self.objective is growth_rate
@@ -254,7 +260,8 @@ def linearise(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray):
 
     Each design is at a condition (n, c).
     """
-    rows, jacobians, numbers = _in_batches(_linearise, problem, us, conditions)
+    program = _linearise_light if problem.light else _linearise
+    rows, jacobians, numbers = _in_batches(program, problem, us, conditions)
     rows, jacobians = rows.astype(float), jacobians.astype(float)
     if problem.cycles is not None:
         problem.cycles.fill(problem, us, rows, jacobians)
@@ -298,7 +305,7 @@ def linearised(problem: DesignProblem, us, conditions):
     return jax.vmap(one)(us, conditions)
 
 
-_linearise = quick_jit(linearised)
+_linearise, _linearise_light = quick_jit(linearised), quick_jit(linearised, once=True)
 
 
 @quick_jit

@@ -1,14 +1,14 @@
 """What a quiet scene rests on: its growth rate under each assumption that a workshop may doubt."""
 
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ScalarLike
+from jaxtyping import Array, ScalarLike
 
 from .._base.parts import Record, flag, require_kind, require_scalar, scalar, substitute
 from .._base.quick import quick_jit
@@ -20,7 +20,8 @@ from .._contact.fractal import FractalContact
 from .._contact.persson import PerssonContact, mindlin_ratio
 from .._mechanism.quantities import known_quantities, unit, value_of
 from .._mechanism.scene import Scene, stiffness
-from .._stability.stability import growth_rate, stability
+from .._stability.linearise import linearised
+from .._stability.quartic import rightmost_root
 from .design import DesignResult, design
 from .envelope import Envelope
 from .problem import under
@@ -118,39 +119,40 @@ def verdict(
         require_kind(f"laws[{i}]", law, Contact)
     if area is not None:
         laws += _laws_of(scene, scalar("area", area, above=0))
-    own, slope = type(scene.contact).__name__, friction_slope
-    questions = [_of("", f"as it is ({own})", scene, slope)]
+    own = type(scene.contact).__name__
+    asked = [("", f"as it is ({own})", scene)]
     if getattr(scene.contact, "P", None) is not None:
         other = Scene(scene.contact, scene.friction, scene.oscillator, not scene.preload)
         force, instead = "friction on K_n x2", "friction on P + K_n x2"
         if scene.preload:
             force, instead = instead, force
-        questions.append(_of(force, instead, other, slope))
-    for law in laws:
-        questions.append(_of(own, f"by {type(law).__name__}", under(scene, law), slope))
-    questions += _stiffness_ratios(scene, friction_slope)
+        asked.append((force, instead, other))
+    asked += [(own, f"by {type(law).__name__}", under(scene, law)) for law in laws]
+    found = _growth_rates(tuple(changed for *_, changed in asked), friction_slope)
+    rates, ratios = found.rates.tolist(), np.asarray(found.ratios)
+    questions = [
+        Question(assumed, name, _as_text(rate), rate < 0)
+        for (assumed, name, _), rate in zip(asked, rates[: len(asked)], strict=True)
+    ]
+    if found.K_n > 0 and len(ratios):
+        questions.append(_of_ratios(ratios, np.array(rates[len(asked) :]), float(found.own_ratio)))
     if tolerance is not None:
         questions.append(_scattered(scene, tolerance, envelope, friction_slope, seed))
     if quiet_within is not None:
         kicks = Kicks.of(scene, quiet_within, seed, flag("progress", progress))
-        survived, asked = kicks.survived(scene), kicks.size
-        found = f"comes to rest from {survived:.3g} of {asked:.3g}"
+        survived, size = kicks.survived(scene), kicks.size
+        words = f"comes to rest from {survived:.3g} of {size:.3g}"
         name = f"kicks within {quiet_within}"
-        questions.append(Question("smaller kicks", name, found, survived >= asked))
-    # The sum of the growth rates is minus the trace of the damping, whatever the stiffness.
-    incurable = bool(stability(scene, friction_slope).eigenvalues.real.sum() > 0)
+        questions.append(Question("smaller kicks", name, words, survived >= size))
     others = "area" if scene.contact.has_surface else "laws"
-    asked = {f"other contact laws ({others})": laws, "scatter (tolerance)": tolerance is not None}
-    asked["kicks (quiet_within)"] = quiet_within is not None
-    return Verdict(
-        tuple(questions), incurable, tuple(name for name, was in asked.items() if not was)
-    )
+    wanted = {f"other contact laws ({others})": laws, "scatter (tolerance)": tolerance is not None}
+    wanted["kicks (quiet_within)"] = quiet_within is not None
+    not_asked = tuple(name for name, was in wanted.items() if not was)
+    return Verdict(tuple(questions), bool(found.damping < 0), not_asked)
 
 
-def _of(assumed: str, name: str, scene: Scene, friction_slope: bool) -> Question:
-    growth = float(growth_rate(scene, friction_slope))
-    found = f"{growth:+.6g}" if np.isfinite(growth) else "no closed equilibrium"
-    return Question(assumed, name, found, growth < 0)
+def _as_text(growth: float) -> str:
+    return f"{growth:+.6g}" if np.isfinite(growth) else "no closed equilibrium"
 
 
 def _laws_of(scene: Scene, area) -> tuple[Contact, ...]:
@@ -162,40 +164,54 @@ def _laws_of(scene: Scene, area) -> tuple[Contact, ...]:
     return AsperityContact(*joint, L / _WAVES), PerssonContact(*joint, area, L, L / _WAVES)
 
 
-def _stiffness_ratios(scene: Scene, friction_slope: bool) -> Iterator[Question]:
+class _Found(NamedTuple):
+    """What `_growth_rates` finds."""
+
+    rates: Array  # (m + k,) [1/s], of the scenes and then at the ratios
+    ratios: Array  # (k,) of K_t to K_n; none without a material
+    own_ratio: Array
+    K_n: Array
+    damping: Array  # minus the sum of the real parts of the eigenvalues, whatever the stiffness
+
+
+@functools.partial(quick_jit, static_argnames="friction_slope", once=True)
+def _growth_rates(scenes: tuple[Scene, ...], friction_slope: bool) -> _Found:
+    """Growth rates of m scenes, and of the first over K_t/K_n, in one program.
+
+    The ratios lie between its own, the fractal law's and Mindlin's.
+    """
+    first = scenes[0]
+    systems = [linearised(scene, friction_slope) for scene in scenes]
+    K_n, K_t = stiffness(first)
+    contact, ratios, own = first.contact, jnp.zeros((0,), K_n.dtype), K_t / K_n
+    if (material := getattr(contact, "material", None)) is not None:
+        ends = [own, jnp.asarray(mindlin_ratio(material.nu), own.dtype)]
+        if isinstance(contact, FractalContact) and contact.stiffness_ratio is not None:
+            law = FractalContact(contact.surface, contact.material, contact.P)
+            k_n, k_t = law.stiffness(first.friction.mu_s, first.friction.mu_m)
+            ends.append(k_t / k_n)
+        low, high = jnp.stack(ends).min(), jnp.stack(ends).max()
+        ratios = jnp.linspace(low, high, _RATIOS)
+    zero = FixedContact(0.0, 0.0, 1.0)
+    P = getattr(contact, "P", zero.P)
+
+    def at(ratio):
+        known = substitute(zero, {"K_n": K_n, "K_t": ratio * K_n, "P": P})
+        return linearised(eqx.tree_at(lambda s: s.contact, first, known), friction_slope)
+
+    # One closed form for all: each use of it takes long to compile.
+    own_systems = jax.tree.map(lambda *x: jnp.stack(x), *systems)
+    every = jax.tree.map(lambda *x: jnp.concatenate(x), own_systems, jax.vmap(at)(ratios))
+    rates = jax.vmap(rightmost_root)(every).real
+    return _Found(rates, ratios, own, K_n, systems[0].c_1 + systems[0].c_2)
+
+
+def _of_ratios(ratios: np.ndarray, rates: np.ndarray, own: float) -> Question:
     """The worst growth rate between the scene's own K_t/K_n, the fractal law's and Mindlin's."""
-    material = getattr(scene.contact, "material", None)
-    if material is None:
-        return
-    K_n, K_t = stiffness(scene)
-    if not K_n > 0:
-        return
-    own = float(K_t / K_n)
-    ends = [own, float(mindlin_ratio(material.nu))]
-    if isinstance(scene.contact, FractalContact) and scene.contact.stiffness_ratio is not None:
-        contact = scene.contact
-        law = FractalContact(contact.surface, contact.material, contact.P)
-        K_n, K_t = law.stiffness(scene.friction.mu_s, scene.friction.mu_m)
-        ends.append(float(K_t / K_n))
-    ratios = np.linspace(min(ends), max(ends), _RATIOS)
-    rates = np.asarray(_rates(scene, K_n, jnp.asarray(ratios, K_n.dtype), friction_slope))
     worst = int(np.argmax(rates))
     name = f"K_t/K_n from {ratios[0]:.3g} to {ratios[-1]:.3g}"
     found = f"{rates[worst]:+.6g} at {ratios[worst]:.3g}"
-    yield Question(f"K_t/K_n = {own:.3g}", name, found, bool(rates[worst] < 0))
-
-
-@functools.partial(quick_jit, static_argnames="friction_slope")
-def _rates(scene: Scene, K_n, ratios, friction_slope: bool):
-    """Growth rates (k,) at ratios (k,) of K_t to K_n."""
-    zero = FixedContact(0.0, 0.0, 1.0)
-
-    def at(ratio):
-        P = getattr(scene.contact, "P", zero.P)
-        known = substitute(zero, {"K_n": K_n, "K_t": ratio * K_n, "P": P})
-        return growth_rate(eqx.tree_at(lambda s: s.contact, scene, known), friction_slope)
-
-    return jax.vmap(at)(ratios)
+    return Question(f"K_t/K_n = {own:.3g}", name, found, bool(rates[worst] < 0))
 
 
 def _scattered(scene, tolerance, envelope, friction_slope, seed) -> Question:

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from .._base.kept import kept_jit
 from .._base.parts import Record, concrete
+from .._base.quick import command_jit
 from .hybrid import OPEN, UNUSED, HybridSystem
 from .orbit import Segments, flow, mean_square
 
@@ -124,9 +124,7 @@ class LimitCycle(Record):
     def multipliers(self) -> Complex[Array, " 2n"]:
         """The Floquet multipliers, largest modulus first; one is 1 where nothing excites."""
         # Computed only when asked for: eigenvalues have no second derivative in JAX.
-        values = jnp.linalg.eigvals(self._monodromy)
-        order = jnp.argsort(-jnp.abs(jax.lax.stop_gradient(values)), axis=-1)
-        return jnp.take_along_axis(values, order, axis=-1)
+        return _multipliers(self._monodromy)
 
     @property
     def of_scene(self) -> bool:
@@ -170,11 +168,7 @@ class LimitCycle(Record):
 
     def harmonics(self, rows, n: int = 512) -> tuple[Float[Array, " n/2"], Float[Array, "n/2 k"]]:
         """As `spectrum`, of the displacements rows @ x, rows (k, dofs)."""
-        _, states = self.orbit(n)
-        x = states[:, : states.shape[1] // 2] @ jnp.asarray(rows, states.dtype).T
-        lines = jnp.abs(jnp.fft.rfft(x, axis=0)) / n * 2
-        harmonics = jnp.arange(1, n // 2 + 1)
-        return harmonics / self.period, lines[1 : n // 2 + 1]
+        return _harmonics(self._orbit, self._system, self.period, rows, n=n)
 
     def contact_states(self, n: int = 512) -> Float[Array, "n f"]:
         """From the times of `orbit(n)` on: +1, -1 slip forward, backward, 0 stick, 2 open.
@@ -211,7 +205,23 @@ class LimitCycle(Record):
         return found
 
 
-@functools.partial(kept_jit, static_argnames="n")
+@command_jit
+def _multipliers(monodromy):
+    values = jnp.linalg.eigvals(monodromy)
+    order = jnp.argsort(-jnp.abs(jax.lax.stop_gradient(values)), axis=-1)
+    return jnp.take_along_axis(values, order, axis=-1)
+
+
+@functools.partial(command_jit, static_argnames="n", once=True)
+def _harmonics(orbit, system: HybridSystem, period, rows, n: int):
+    _, states = _sampled(orbit, system, period, n=n)
+    x = states[:, : states.shape[1] // 2] @ jnp.asarray(rows, states.dtype).T
+    lines = jnp.abs(jnp.fft.rfft(x, axis=0)) / n * 2
+    harmonics = jnp.arange(1, n // 2 + 1)
+    return harmonics / period, lines[1 : n // 2 + 1]
+
+
+@functools.partial(command_jit, static_argnames="n", once=True)
 def _sampled(orbit, system: HybridSystem, period, n: int):
     share = jnp.arange(n) / n
     y = orbit.at(system, share * period * system.omega)

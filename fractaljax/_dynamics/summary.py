@@ -1,6 +1,6 @@
 """Limit cycles as printed tables."""
 
-import jax.numpy as jnp
+import numpy as np
 
 from .._base.table import table
 from .._mechanism.scene import Scene
@@ -21,7 +21,7 @@ _CONTACT_STATES = {
 def cycle_table(mechanism: Scene | Structure, cycle: LimitCycle) -> str:
     """The result of the search for one limit cycle, its numbers and its switches."""
     found = {"result": str(CycleResult[cycle.result])} | verdict(stability(mechanism))
-    if not jnp.isfinite(cycle.period):
+    if not np.isfinite(cycle.period):
         return table([""], [found])
     whole = found | {
         "period [ms]": f"{cycle.period * 1e3:.6g}",
@@ -34,7 +34,7 @@ def cycle_table(mechanism: Scene | Structure, cycle: LimitCycle) -> str:
     if regularised:
         whole["off the exact law by"] = f"{cycle.regularisation_error:.1e}"
     # Rounded first, and + 0: a multiplier of zero has a sign at random.
-    multipliers = (jnp.round(cycle.multipliers, 6) + 0).tolist()
+    multipliers = (np.round(np.asarray(cycle.multipliers), 6) + 0).tolist()
     whole |= {
         f"Floquet multiplier {i}": f"{s.real:+.6f} {s.imag:+.6f}i  (modulus {abs(s):.6f})"
         for i, s in enumerate(multipliers[:_MOST], start=1)
@@ -63,8 +63,8 @@ def cycle_table(mechanism: Scene | Structure, cycle: LimitCycle) -> str:
     switches = [] if regularised else cycle.switches()
     if switches:
         tables.append(_switching(switches, cycle.period))
-    relative = scene.oscillator.V - jnp.stack([cycle.velocity_min, cycle.velocity_max])
-    tables += friction_remark(scene, jnp.abs(relative).max())
+    ends = np.stack([cycle.velocity_min, cycle.velocity_max])
+    tables += friction_remark(scene, np.abs(np.asarray(scene.oscillator.V) - ends).max())
     return "\n\n".join(tables)
 
 

@@ -156,7 +156,7 @@ def growth_rate(scene: Mechanism, friction_slope: bool = True) -> Float[Array, "
     return found
 
 
-@functools.partial(command_jit, static_argnames="friction_slope")
+@functools.partial(command_jit, static_argnames="friction_slope", once=True)
 def _growth_rate(scene, friction_slope):
     if isinstance(scene, Structure):
         s = solve(*assembled(scene, friction_slope).matrices).s
@@ -172,7 +172,7 @@ def stability(scene: Mechanism, friction_slope: bool = True) -> Stability:
     return found
 
 
-@functools.partial(command_jit, static_argnames="friction_slope")
+@functools.partial(command_jit, static_argnames="friction_slope", once=True)
 def _stability(scene, friction_slope):
     if isinstance(scene, Structure):
         attached = assembled(scene, friction_slope)

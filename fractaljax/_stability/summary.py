@@ -2,8 +2,11 @@
 
 import functools
 import math
+from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from .._base.quick import quick_jit
 from .._base.table import table
@@ -13,7 +16,9 @@ from .._mechanism.scene import Scene, stiffness
 from .._mechanism.structure import Joint, Structure
 from .._surface.roughness import roughness
 from .critical_friction import critical_friction
-from .linearise import Assembled, with_equilibrium
+from .linearise import Assembled, linearised_at, normal_force, pressed, with_equilibrium
+from .margin import damping_ratios
+from .quartic import rightmost_root
 from .stability import Stability, require_computable, stability
 
 ABSENT = "-"
@@ -22,13 +27,39 @@ _ROUNDING = 1e-14  # relative: growth rates and excesses of friction below it sa
 _LEAST_DAMPED = 10  # stable modes of a structure that its table lists
 
 
-@functools.partial(quick_jit, static_argnames="friction_slope")
+# Each table is one program: eager operations are slow, and so is every call of JAX's compiler.
+
+
+class _Critical(NamedTuple):
+    """The critical mode of a scene, named as `Stability` names it."""
+
+    growth_rate: Array
+    frequency: Array
+    damping_ratio: Array
+    normal_force: Array | None
+
+
+@functools.partial(quick_jit, static_argnames="friction_slope", once=True)
+def _critical(scene: Scene, friction_slope: bool, wavelengths):
+    """Critical mode, stiffness, contact state, and the roughness over wavelengths unless None."""
+    joint = pressed(scene)
+    s = rightmost_root(linearised_at(scene, joint, friction_slope))
+    frequency = jnp.abs(s.imag) / (2 * jnp.pi)
+    mode = _Critical(s.real, frequency, damping_ratios(s), normal_force(scene, joint))
+    rough = None if wavelengths is None else roughness(scene.contact.surface, *wavelengths)
+    return mode, stiffness(scene), _contact_state(scene), rough
+
+
+@functools.partial(quick_jit, static_argnames="friction_slope", once=True)
 def _numbers(scene: Scene, friction_slope: bool):
-    """Stability, stiffness and state of the contact, in one program: eager operations are slow."""
-    friction, state = scene.friction, None
-    if scene.contact.fractal:
-        state = scene.contact.state(friction.mu_s, friction.mu_m)
-    return stability(scene, friction_slope), stiffness(scene), state, sliding_friction(scene)
+    """Stability, stiffness, contact state and friction."""
+    friction = sliding_friction(scene)
+    return stability(scene, friction_slope), stiffness(scene), _contact_state(scene), friction
+
+
+def _contact_state(scene: Scene):
+    friction = scene.friction
+    return scene.contact.state(friction.mu_s, friction.mu_m) if scene.contact.fractal else None
 
 
 def scene_rows(
@@ -38,13 +69,17 @@ def scene_rows(
 
     With the longest and the shortest of the `wavelengths` [m] to count, the roughness as well.
     """
-    modes, K, state, _ = _numbers(scene, friction_slope)
+    if not scene.contact.has_surface:
+        wavelengths = None
+    return _rows(scene, *_critical(scene, friction_slope, wavelengths))
+
+
+def _rows(scene: Scene, mode: _Critical | Stability, K, state, rough=None) -> dict[str, str]:
     contact, surface, after = scene.contact, {}, {}
     if contact.has_surface:
         surface = {"D": f"{contact.surface.D:.6g}", "G [m]": f"{contact.surface.G:.6g}"}
-        if wavelengths is not None:
-            rough = roughness(contact.surface, *wavelengths)
-            surface |= {"Sq [m]": f"{rough.Sq:.6g}", "Sdq": f"{rough.Sdq:.6g}"}
+    if rough is not None:
+        surface |= {"Sq [m]": f"{rough.Sq:.6g}", "Sdq": f"{rough.Sdq:.6g}"}
     if state is not None:
         slip = state.slip_ratio
         after = {
@@ -52,12 +87,12 @@ def scene_rows(
             "a_l/a_e": f"{np.exp(np.asarray(state.log_area_ratio)):.6g}",
             "Q_e/(mu_s P)": "not evaluated" if slip is None else f"{slip:.6g}",
         }
-    if modes.normal_force is not None:
-        after |= {"normal force [N]": f"{modes.normal_force[0]:.6g}"}
+    if mode.normal_force is not None:
+        after |= {"normal force [N]": f"{mode.normal_force[0]:.6g}"}
     critical = {
-        "growth rate [1/s]": f"{modes.growth_rate:+.6g}",
-        "frequency [Hz]": f"{modes.frequency:.6g}",
-        "damping ratio": f"{modes.damping_ratio:+.6g}",
+        "growth rate [1/s]": f"{mode.growth_rate:+.6g}",
+        "frequency [Hz]": f"{mode.frequency:.6g}",
+        "damping ratio": f"{mode.damping_ratio:+.6g}",
     }
     return surface | _stiffness_rows(K) | after | critical
 
@@ -73,10 +108,10 @@ def stability_table(scene: Scene, friction_slope: bool = True) -> str:
 
     **Raises:** `ValueError` if the growth rate cannot be computed.
     """
-    modes, _, _, friction = _numbers(scene, friction_slope)
+    modes, K, state, friction = _numbers(scene, friction_slope)
     require_computable(scene, friction_slope, modes)
     critical = float(critical_friction(scene, friction_slope))
-    rows = scene_rows(scene, friction_slope) | verdict(modes)
+    rows = _rows(scene, modes, K, state) | verdict(modes)
     rows |= {
         "margin": f"{modes.margin:+.6g}",
         "friction at V": f"{friction:.6g}",
@@ -103,7 +138,7 @@ def verdict(modes: Stability) -> dict[str, str]:
     return {"growth rate [1/s]": f"{growth:+.6g}  ({verdict})"}
 
 
-@quick_jit
+@functools.partial(quick_jit, once=True)
 def _friction(law, speed):
     return law.mu(speed), law.mu_s
 

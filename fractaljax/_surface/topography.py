@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, ScalarLike
 
-from .._base.kept import kept_jit
 from .._base.memory import require_memory
 from .._base.parts import (
     concrete,
@@ -27,6 +26,7 @@ from .._base.parts import (
     scalar,
     whole,
 )
+from .._base.quick import command_jit
 from .surface import Surface, frequency_count
 
 _BLOCK = 256  # waves in one product of matrices
@@ -99,8 +99,8 @@ def topography(
     steps = steps - np.round(steps)
     bits = jnp.finfo(dtype).nmant + 1 - (n - 1).bit_length()
     coarse = np.round(steps * 2.0**bits) / 2.0**bits
-    phases = random_phases(key, count, M)
-    return _sum(surface, L, phases, directions, coarse, steps - coarse, lengths, n)
+    _require_key(key)
+    return _sum(surface, L, key, directions, coarse, steps - coarse, lengths, n)
 
 
 def random_phases(key: PRNGKeyArray, count: int, M: int) -> Float[Array, "count M"]:
@@ -108,15 +108,20 @@ def random_phases(key: PRNGKeyArray, count: int, M: int) -> Float[Array, "count 
 
     **Raises:** `TypeError` unless `key` is a key of `jax.random`, `ValueError` for many.
     """
+    _require_key(key)
     rows = math.ceil(count / _ROWS) * _ROWS  # whole blocks, so that more rows change none
+    bits = jax.random.bits(key, (rows, M), jnp.uint32)
+    return bits[:count].astype(float) * 2.0**-32  # of 32 bits: one surface in every precision
+
+
+def _require_key(key) -> None:
     try:
-        bits = jax.random.bits(key, (rows, M), jnp.uint32)
+        jax.eval_shape(jax.random.bits, key)
     except (TypeError, ValueError):
         many = getattr(key, "ndim", 0) > 0
         got = f"an array of shape {key.shape}" if many else repr(key)
         kind = ValueError if many else TypeError
         raise kind(f"key must be one key of jax.random, got {got}") from None
-    return bits[:count].astype(float) * 2.0**-32  # of 32 bits: one surface in every precision
 
 
 def _known(name: str, value: jax.Array) -> np.ndarray:
@@ -129,14 +134,15 @@ def _known(name: str, value: jax.Array) -> np.ndarray:
     return values
 
 
-@functools.partial(kept_jit, static_argnames="n")
-def _sum(surface, L, phases, directions, coarse, fine, lengths, n):
-    """Eq. 13 on the grid (n, n): phases (n_max + 1, M), coarse and fine (2, n_max + 1, M).
+@functools.partial(command_jit, static_argnames="n")
+def _sum(surface, L, key, directions, coarse, fine, lengths, n):
+    """Eq. 13 on the grid (n, n), with phases by `key`; coarse and fine (2, n_max + 1, M).
 
     `lengths` (n_max + 1, M) stand for gamma^n, which moves no wave then, unless they are None.
     """
     D, G, gamma, dtype = surface.D, surface.G, surface.gamma, surface.D.dtype
-    count, M = phases.shape
+    count, M = coarse.shape[1:]
+    phases = random_phases(key, count, M)
     powers = gamma ** jnp.arange(count)[:, None] if lengths is None else jnp.asarray(lengths, dtype)
     # Zero, with the derivatives of gamma^n: its value is in coarse and fine already.
     slope = (powers - jax.lax.stop_gradient(powers))[None]

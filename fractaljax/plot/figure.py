@@ -14,8 +14,23 @@ class Figure(matplotlib.figure.Figure):
     def __init__(self, size: tuple[float, float]) -> None:
         super().__init__(figsize=size, layout="constrained")
 
+    def png(self, dpi: float) -> bytes:
+        """The pixels of `savefig` as a PNG file, in less time: that would draw everything twice."""
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.image import imsave
+
+        before, picture = self.dpi, io.BytesIO()
+        self.set_dpi(dpi)
+        try:
+            canvas = FigureCanvasAgg(self)
+            canvas.draw()
+            # Better compression takes longer than all the rest.
+            more = {"format": "png", "dpi": dpi, "pil_kwargs": {"compress_level": 1}}
+            imsave(picture, canvas.buffer_rgba(), **more)
+        finally:
+            self.set_dpi(before)
+        return picture.getvalue()
+
     def _repr_png_(self) -> bytes:
         """What Jupyter asks for where a figure is the last expression of a cell."""
-        picture = io.BytesIO()
-        self.savefig(picture, format="png")
-        return picture.getvalue()
+        return self.png(self.dpi)

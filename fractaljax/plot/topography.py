@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from .._design.design import Design
+from .._surface.topography import Topographies
 from .axes import Axes, Figure, given_or_new, new_figure
 
 
@@ -35,7 +36,11 @@ def topographies(design: Design, **options: Any) -> Figure:
 
     `options` are those of `Design.topographies`.
     """
-    surfaces = design.topographies(**options)
+    return drawn_topographies(design, design.topographies(**options))
+
+
+def drawn_topographies(design: Design, surfaces: Topographies) -> Figure:
+    """As `topographies`, of surfaces that are known already."""
     heights = [_about_mean(z) for z in (surfaces.before, surfaces.after)]
     low, high = min(z.min() for z in heights), max(z.max() for z in heights)
     figure = new_figure(11.2, 5.4)

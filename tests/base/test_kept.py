@@ -22,7 +22,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path / "programs"
 
 
-def counted(jit=kept.kept_jit):
+def counted(jit=quick.command_jit):
     """A program that counts its traces, and the count."""
     traces = []
 
@@ -33,13 +33,17 @@ def counted(jit=kept.kept_jit):
     return jit(program, "power"), traces
 
 
+def square(x):
+    return x**2
+
+
 def forget(monkeypatch):
     """As in a new process."""
     monkeypatch.setattr(kept, "_loaded", {})
     jax.clear_caches()
 
 
-@pytest.mark.parametrize("jit", [kept.kept_jit, quick.quick_jit, quick.command_jit])
+@pytest.mark.parametrize("jit", [quick.quick_jit, quick.command_jit])
 def test_a_program_is_loaded_without_a_trace(folder, monkeypatch, jit):
     program, traces = counted(jit)
     x = jnp.arange(3.0)
@@ -112,10 +116,32 @@ class Elsewhere(fj.Friction):
 
 def test_classes_and_functions_from_elsewhere_are_not_kept(folder):
     law = Elsewhere(jnp.asarray(0.3), jnp.asarray(0.2))
-    assert kept.kept_jit(lambda law: law.mu(0.0))(law) == 0.3
-    applied = kept.kept_jit(lambda x, function: function(x), "function")
+    assert quick.command_jit(lambda law: law.mu(0.0))(law) == 0.3
+    applied = quick.command_jit(lambda x, function: function(x), "function")
     assert applied(2.0, function=lambda x: 3 * x) == 6
     assert not [*folder.iterdir()]
+
+
+def test_two_ways_to_compile_one_function_are_two_programs(folder):
+    for once in (False, True):
+        program = quick.quick_jit(square, once=once)
+        assert program(3.0) == 9
+    assert len([*folder.iterdir()]) == 2
+
+
+@pytest.mark.parametrize(
+    ("function", "needed"),
+    [(jnp.linalg.eigvals, True), (jnp.linalg.cholesky, True), (square, False)],
+)
+def test_programs_that_call_it_find_lapack(folder, monkeypatch, function, needed):
+    """Without its addresses such a program ends the process."""
+    asked, found = [], kept._find_lapack
+    monkeypatch.setattr(kept, "_find_lapack", lambda: (asked.append(True), found()))
+    program, x = quick.command_jit(function), jnp.eye(3) * 2
+    first = program(x)
+    forget(monkeypatch)
+    np.testing.assert_array_equal(program(x), first)
+    assert asked == [True] * needed
 
 
 def test_within_a_trace_nothing_is_kept(folder):
@@ -165,6 +191,7 @@ def test_commands_in_new_processes(tmp_path):
         from fractaljax.__main__ import main
         main(sys.argv[1:])
         own = {"linearised", "_limit_cycle", "_stability", "_growth_rate", "_numbers", "_of_scene"}
+        print("scipy.linalg" in sys.modules, file=sys.stderr)
         print(sorted(own & set(traced)), file=sys.stderr)
     """
     environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache")}
@@ -188,3 +215,5 @@ def test_commands_in_new_processes(tmp_path):
         assert outputs[0].splitlines()[:10] == outputs[1].splitlines()[:10]
         heard = [set(eval(run.stderr.splitlines()[-1])) for run in runs]
         assert heard[0] >= set(traced) and not heard[1]
+        loaded = runs[1].stderr.splitlines()[-2]
+        assert loaded == "False" or command != ["stability"]  # it needs no LAPACK

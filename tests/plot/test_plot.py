@@ -37,6 +37,16 @@ SAMPLES = {"wide": np.array([3.0, -1.0, 0.5, 2.0]), "narrow": [0.1, 0.2]}
 MU, KAPPA = np.linspace(0.02, 1, 41), np.linspace(0.0, 1.4, 30)
 
 
+def test_a_png_has_the_pixels_of_savefig():
+    figure, other = (plot.topography(Z, 1e-6).figure for _ in range(2))  # layouts move on
+    found, expected, dpi = io.BytesIO(figure.png(60)), io.BytesIO(), figure.dpi
+    other.savefig(expected, format="png", dpi=60)
+    assert dpi == other.dpi != 60
+    expected.seek(0)
+    pixels = matplotlib.image.imread(found)
+    np.testing.assert_array_equal(pixels, matplotlib.image.imread(expected))
+
+
 @functools.cache
 def best():
     return fj.design(BRAKE, progress=False)
