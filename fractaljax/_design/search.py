@@ -82,6 +82,7 @@ class Found(NamedTuple):
     evaluation: Evaluation  # of that
     starts: int
     failed: int
+    least_growth: Any = None  # `limit.LeastGrowth`, where the growth rate is too large
 
 
 @dataclasses.dataclass(frozen=True)
@@ -456,6 +457,28 @@ class Search:
             found = self._ends(paths)
         return paths, found
 
+    def least_growth(self, starts: Sequence[np.ndarray]) -> tuple[list[np.ndarray], Evaluation]:
+        """Ways (s, v) to the least growth rate with all else met, and what their ends are.
+
+        The largest of all growth rates is minimised, whatever the target.
+        """
+        growing, others = self.growing, self.evaluator.problem.asked & ~self.growing
+        others[0] = False
+        paths = self._ways([start[None] for start in starts], growing, others)
+        found = self._ends(paths)
+        unmet = found.rows[:, others[: found.rows.shape[1]]].max(axis=1, initial=-np.inf) > 0
+        lost = np.flatnonzero(unmet).tolist()
+        again = [starts[i][None] for i in lost]
+        for i, way in zip(lost, self._ways(again, growing, others, restored=True), strict=True):
+            paths[i] = way
+        return paths, self._ends(paths)
+
+    @property
+    def growing(self) -> np.ndarray:
+        """Which columns of a row are growth rates."""
+        columns = np.arange(len(self.evaluator.problem.asked))
+        return np.isin(columns, columns[self.evaluator.problem.growth_columns])
+
     def _ends(self, paths) -> Evaluation:
         return self.evaluator.evaluate(np.array([path[-1] for path in paths]))
 
@@ -465,12 +488,9 @@ class Search:
         With some requirements (k,) marked as violated, to the least of their largest residual that
         meets those before them. If `restored`, by the nearest design that violates all the least.
         """
-        from tqdm import tqdm
-
         problem = self.evaluator.problem
         asked = problem.asked
         columns = np.arange(len(asked))
-        growing = np.isin(columns, columns[problem.growth_columns])
         aim, limited = columns == 0, columns > 0
         if violated is not None:
             aim[asked] = np.append(False, violated)
@@ -479,7 +499,13 @@ class Search:
             # The largest of many modes has kinks where they change places; each has none.
             aim, limited = ~asked, limited & asked
         elif problem.smooth:
-            limited &= ~growing
+            limited &= ~self.growing
+        return self._ways(paths, aim, limited, progress, restored)
+
+    def _ways(self, paths, aim, limited, progress=False, restored=False):
+        """Ways continued to the least of the columns in `aim` with those in `limited` met."""
+        from tqdm import tqdm
+
         with tqdm(total=len(paths), desc="design", unit="start", disable=not progress) as bar:
 
             def task(path, ask):

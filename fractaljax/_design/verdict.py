@@ -1,4 +1,4 @@
-"""What a quiet scene rests on: its growth rate under each assumption that a workshop may doubt."""
+"""What a quiet scene or structure rests on: its growth rate where an assumption is another."""
 
 import functools
 from collections.abc import Iterator, Mapping, Sequence
@@ -8,9 +8,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ScalarLike
 
-from .._base.parts import Record, flag, require_kind, require_scalar, scalar, substitute
+from .._base.parts import Record, brief, flag, require_kind, require_scalar, scalar, substitute
 from .._base.quick import quick_jit
 from .._base.table import table
 from .._contact.asperity import AsperityContact
@@ -18,18 +17,21 @@ from .._contact.contact import Contact
 from .._contact.fixed import FixedContact
 from .._contact.fractal import FractalContact
 from .._contact.persson import PerssonContact, mindlin_ratio
-from .._mechanism.quantities import known_quantities, unit, value_of
-from .._mechanism.scene import Scene, stiffness
+from .._mechanism.joint import Joint
+from .._mechanism.mechanism import Mechanism
+from .._mechanism.quantities import joints_of, known_quantities, require_one, unit, value_of
+from .._mechanism.scene import Scene
+from .._mechanism.structure import Structure
 from .._stability.stability import growth_rate, stability
 from .design import DesignResult, design
 from .envelope import Envelope
-from .problem import under
+from .joints import under, with_contacts
 from .quiet import Kicks
 from .tolerance import Tolerance, squeal_probability
 
 _WAVES = 100  # of the side of the area, for a law that needs a shortest wavelength
 _ACCEPTED = 0.05  # probability of squeal
-_RATIOS = 65  # values of K_t/K_n between its ends
+_RATIOS, _RATIOS_OF_STRUCTURES = 65, 17  # values of K_t/K_n between its ends
 _RANGE = 100.0  # a suggestion changes a scale up to so many times, either way
 _DAMPING = 0.5  # and a damping ratio up to this
 
@@ -87,9 +89,9 @@ class Verdict(Record):
 
 
 def verdict(
-    scene: Scene,
+    x: Mechanism,
     *,
-    area: ScalarLike | None = None,
+    area: Any = None,
     laws: Sequence[Contact] = (),
     tolerance: Any = None,
     envelope: Envelope | Mapping[str, Any] | None = None,
@@ -98,109 +100,173 @@ def verdict(
     seed: int = 0,
     progress: bool = True,
 ) -> Verdict:
-    """Ask of a scene whether it stays quiet where an assumption is another.
+    """Ask of a scene or a structure whether it stays quiet where an assumption is another.
 
     Its growth rate [1/s] as it is; with the load P in the friction, or without it where it is
     there; under every other of the contact `laws`, with its surface, material and load, and by
-    `AsperityContact` and `PerssonContact` if the nominal `area` [m^2] is given, with wavelengths
-    from its side down to a hundredth of it; and with K_t/K_n between its own, the fractal law's
-    and Mindlin's, the worst of 65 values. With a `tolerance` or an `Identification`, and an
-    `envelope`, the probability of squeal (see `squeal_probability`), quiet below 5 percent; with
-    `quiet_within` (see `design`) the largest kick survived. What no argument asks for is named.
+    `AsperityContact` and `PerssonContact` if the nominal `area` [m^2] is given, one for all joints
+    or by joint, with wavelengths from its side down to a hundredth of it; and with K_t/K_n between
+    its own, the fractal law's and Mindlin's, the worst of 65 values, or 17 of a structure. With a
+    `tolerance` or an `Identification`, and an `envelope`, the probability of squeal (see
+    `squeal_probability`), quiet below 5 percent; with `quiet_within` (see `design`) the largest
+    kick survived. What no argument asks for is named. The joints of a structure change together.
 
-    **Raises:** `ValueError` for a scene that holds arrays, and as those functions.
+    **Raises:** `ValueError` for what holds arrays, for an area without a surface or of a joint that
+    is not there, and as those functions.
     """
-    require_kind("scene", scene, Scene)
-    require_scalar(scene)
+    require_one("x", x)
     flag("friction_slope", friction_slope)
-    laws = list(laws)
+    parts, slope = joints_of(x), friction_slope
+    own = " and ".join(dict.fromkeys(type(part.contact).__name__ for part in parts.values()))
     for i, law in enumerate(laws):
         require_kind(f"laws[{i}]", law, Contact)
+    by = [(type(law).__name__, under(x, law)) for law in laws]
     if area is not None:
-        laws += _laws_of(scene, scalar("area", area, above=0))
-    own, slope = type(scene.contact).__name__, friction_slope
-    questions = [_of("", f"as it is ({own})", scene, slope)]
-    if getattr(scene.contact, "P", None) is not None:
-        other = Scene(scene.contact, scene.friction, scene.oscillator, not scene.preload)
-        force, instead = "friction on K_n x2", "friction on P + K_n x2"
-        if scene.preload:
-            force, instead = instead, force
-        questions.append(_of(force, instead, other, slope))
-    for law in laws:
-        questions.append(_of(own, f"by {type(law).__name__}", under(scene, law), slope))
-    questions += _stiffness_ratios(scene, friction_slope)
+        by += [(kind.__name__, with_contacts(x, laws)) for kind, laws in _laws_of(x, area)]
+    questions = [_of("", f"as it is ({own})", x, slope), *_other_load(x, slope)]
+    questions += [_of(own, f"by {name}", other, slope) for name, other in by]
+    questions += _stiffness_ratios(x, slope)
     if tolerance is not None:
-        questions.append(_scattered(scene, tolerance, envelope, friction_slope, seed))
+        questions.append(_scattered(x, tolerance, envelope, friction_slope, seed))
     if quiet_within is not None:
-        kicks = Kicks.of(scene, quiet_within, seed, flag("progress", progress))
-        survived, asked = kicks.survived(scene), kicks.size
+        kicks = Kicks.of(x, quiet_within, seed, flag("progress", progress))
+        survived, asked = kicks.survived(x), kicks.size
         found = f"comes to rest from {survived:.3g} of {asked:.3g}"
         name = f"kicks within {quiet_within}"
         questions.append(Question("smaller kicks", name, found, survived >= asked))
-    # The sum of the growth rates is minus the trace of the damping, whatever the stiffness.
-    incurable = bool(stability(scene, friction_slope).eigenvalues.real.sum() > 0)
-    others = "area" if scene.contact.has_surface else "laws"
-    asked = {f"other contact laws ({others})": laws, "scatter (tolerance)": tolerance is not None}
+    # The sum of the growth rates is minus the trace of the damping, whatever the stiffness. Of a
+    # reduced structure they are not all known.
+    rates = stability(x, friction_slope).eigenvalues.real
+    incurable = bool(rates.sum() > 0) and getattr(x, "band", None) is None
+    others = "area" if any(part.contact.has_surface for part in parts.values()) else "laws"
+    asked = {f"other contact laws ({others})": by, "scatter (tolerance)": tolerance is not None}
     asked["kicks (quiet_within)"] = quiet_within is not None
     return Verdict(
         tuple(questions), incurable, tuple(name for name, was in asked.items() if not was)
     )
 
 
-def _of(assumed: str, name: str, scene: Scene, friction_slope: bool) -> Question:
-    growth = float(growth_rate(scene, friction_slope))
+def _of(assumed: str, name: str, x: Mechanism, friction_slope: bool) -> Question:
+    growth = float(growth_rate(x, friction_slope))
     found = f"{growth:+.6g}" if np.isfinite(growth) else "no closed equilibrium"
     return Question(assumed, name, found, growth < 0)
 
 
-def _laws_of(scene: Scene, area) -> tuple[Contact, ...]:
-    """The other laws of the surface on a nominal area."""
-    contact = scene.contact
-    if not contact.has_surface:
-        raise ValueError(f"area needs a contact with a surface, got a {type(contact).__name__}")
-    L, joint = jnp.sqrt(area), (contact.surface, contact.material, contact.P)
-    return AsperityContact(*joint, L / _WAVES), PerssonContact(*joint, area, L, L / _WAVES)
+def _other_load(x: Mechanism, friction_slope: bool) -> list[Question]:
+    """With the load P in the friction of all joints that have one, or without it."""
+    along = "x2"
+    if isinstance(x, Scene):
+        if getattr(x.contact, "P", None) is None:
+            return []
+        preloaded = bool(x.preload)
+        other: Any = Scene(x.contact, x.friction, x.oscillator, not preloaded)
+    elif isinstance(x, Structure):
+        along = "n.x"
+        able = [j.normal is not None and hasattr(j.contact, "P") for j in x.joints]
+        able = [can and j.contact.P is not None for can, j in zip(able, x.joints, strict=True)]
+        preloaded = any(can and bool(j.preload) for can, j in zip(able, x.joints, strict=True))
+        falls = friction_slope and any(j.friction.velocity_dependent for j in x.joints)
+        if not any(able) or (preloaded and falls and x.F is None):  # without F there is no slope
+            return []
+        joints = tuple(
+            Joint(j.contact, j.friction, j.tangential, j.normal, j.V, not preloaded) if can else j
+            for can, j in zip(able, x.joints, strict=True)
+        )
+        other = eqx.tree_at(lambda structure: structure.joints, x, joints)
+    else:
+        raise TypeError(f"x must be a Scene or a Structure, got {brief(x)}")
+    force, instead = f"friction on K_n {along}", f"friction on P + K_n {along}"
+    if preloaded:
+        force, instead = instead, force
+    return [_of(force, instead, other, friction_slope)]
 
 
-def _stiffness_ratios(scene: Scene, friction_slope: bool) -> Iterator[Question]:
-    """The worst growth rate between the scene's own K_t/K_n, the fractal law's and Mindlin's."""
-    material = getattr(scene.contact, "material", None)
-    if material is None:
+def _laws_of(x: Mechanism, area: Any) -> Iterator[tuple[type[Contact], dict[str, Contact]]]:
+    """The other laws of the surfaces on nominal areas, by joint."""
+    parts = {name: p for name, p in joints_of(x).items() if p.contact.has_surface}
+    if not parts:
+        kinds = " and ".join(dict.fromkeys(type(p.contact).__name__ for p in joints_of(x).values()))
+        raise ValueError(f"area needs a contact with a surface, got a {kinds}")
+    if not isinstance(area, Mapping):
+        area = dict.fromkeys(parts, area)
+    elif set(area) != set(parts):
+        raise ValueError(f"area must be of the joints {', '.join(parts)}, got {', '.join(area)}")
+    sides = {
+        name: jnp.sqrt(scalar(f"area {name}".strip(), given, above=0))
+        for name, given in area.items()
+    }
+    given = {
+        name: (p.contact.surface, p.contact.material, p.contact.P) for name, p in parts.items()
+    }
+    yield (
+        AsperityContact,
+        {name: AsperityContact(*given[name], L / _WAVES) for name, L in sides.items()},
+    )
+    yield (
+        PerssonContact,
+        {name: PerssonContact(*given[name], L**2, L, L / _WAVES) for name, L in sides.items()},
+    )
+
+
+def _stiffness_ratios(x: Mechanism, friction_slope: bool) -> Iterator[Question]:
+    """The worst growth rate between the own K_t/K_n, the fractal law's and Mindlin's."""
+    own, ends, stiff = [], [], {}
+    for name, part in joints_of(x).items():
+        contact, friction = part.contact, part.friction
+        K_n, K_t = contact.stiffness(friction.mu_s, friction.mu_m)
+        if getattr(contact, "material", None) is None or not K_n > 0:
+            continue
+        ratios = [float(K_t / K_n), float(mindlin_ratio(contact.material.nu))]
+        if isinstance(contact, FractalContact) and contact.stiffness_ratio is not None:
+            law = FractalContact(contact.surface, contact.material, contact.P)
+            both = law.stiffness(friction.mu_s, friction.mu_m)
+            ratios.append(float(both[1] / both[0]))
+        own.append(ratios[0])
+        ends.append((min(ratios), max(ratios)))
+        stiff[name] = K_n
+    if not stiff:
         return
-    K_n, K_t = stiffness(scene)
-    if not K_n > 0:
-        return
-    own = float(K_t / K_n)
-    ends = [own, float(mindlin_ratio(material.nu))]
-    if isinstance(scene.contact, FractalContact) and scene.contact.stiffness_ratio is not None:
-        contact = scene.contact
-        law = FractalContact(contact.surface, contact.material, contact.P)
-        K_n, K_t = law.stiffness(scene.friction.mu_s, scene.friction.mu_m)
-        ends.append(float(K_t / K_n))
-    ratios = np.linspace(min(ends), max(ends), _RATIOS)
-    rates = np.asarray(_rates(scene, K_n, jnp.asarray(ratios, K_n.dtype), friction_slope))
+    low, high = np.array(ends).T
+    shares = np.linspace(0, 1, _RATIOS if isinstance(x, Scene) else _RATIOS_OF_STRUCTURES)
+    ratios = low + shares[:, None] * (high - low)
+    rates = np.asarray(_rates(x, stiff, jnp.asarray(ratios), friction_slope))
     worst = int(np.argmax(rates))
-    name = f"K_t/K_n from {ratios[0]:.3g} to {ratios[-1]:.3g}"
-    found = f"{rates[worst]:+.6g} at {ratios[worst]:.3g}"
-    yield Question(f"K_t/K_n = {own:.3g}", name, found, bool(rates[worst] < 0))
+    name = f"K_t/K_n from {low.min():.3g} to {high.max():.3g}"
+    found = f"{rates[worst]:+.6g} at {_extent(ratios[worst])}"
+    yield Question(f"K_t/K_n = {_extent(own)}", name, found, bool(rates[worst] < 0))
+
+
+def _extent(values) -> str:
+    """One number, or the ends of many."""
+    low, high = f"{min(values):.3g}", f"{max(values):.3g}"
+    return low if low == high else f"{low} to {high}"
 
 
 @functools.partial(quick_jit, static_argnames="friction_slope")
-def _rates(scene: Scene, K_n, ratios, friction_slope: bool):
-    """Growth rates (k,) at ratios (k,) of K_t to K_n."""
-    zero = FixedContact(0.0, 0.0, 1.0)
+def _rates(x: Mechanism, K_n, ratios, friction_slope: bool):
+    """Growth rates (k,) at ratios (k, m) of K_t to K_n, by joint."""
+    parts, zero = joints_of(x), FixedContact(0.0, 0.0, 1.0)
 
-    def at(ratio):
-        P = getattr(scene.contact, "P", zero.P)
-        known = substitute(zero, {"K_n": K_n, "K_t": ratio * K_n, "P": P})
-        return growth_rate(eqx.tree_at(lambda s: s.contact, scene, known), friction_slope)
+    def at(row):
+        known = {
+            name: substitute(
+                zero,
+                {
+                    "K_n": K_n[name],
+                    "K_t": ratio * K_n[name],
+                    "P": getattr(parts[name].contact, "P", zero.P),
+                },
+            )
+            for name, ratio in zip(K_n, row, strict=True)
+        }
+        return growth_rate(with_contacts(x, known), friction_slope)
 
-    return jax.vmap(at)(ratios)
+    return jax.lax.map(at, ratios) if isinstance(x, Structure) else jax.vmap(at)(ratios)
 
 
-def _scattered(scene, tolerance, envelope, friction_slope, seed) -> Question:
+def _scattered(x, tolerance, envelope, friction_slope, seed) -> Question:
     tolerance = Tolerance.of(tolerance)
-    found = squeal_probability(scene, tolerance, envelope, friction_slope=friction_slope, seed=seed)
+    found = squeal_probability(x, tolerance, envelope, friction_slope=friction_slope, seed=seed)
     names = " and ".join(tolerance.names)
     over = "" if envelope is None else f" over {Envelope.of(envelope)}"
     words = f"squeals with probability {found.value:.3g} +- {found.standard_error:.1g}"

@@ -97,7 +97,7 @@ def test_draws_have_the_covariance(covariance):
     assert tolerance.standard_deviations == pytest.approx(sigma)
     mapped = Tolerance.of(sigma)
     np.testing.assert_allclose(mapped.covariance, np.diag(np.diagonal(covariance)))
-    values = tolerance.scattered({"D": 2.4, "G": 1e-10, "P": 1.0}, drawn.T)
+    values = tolerance.scattered(fj.brake_scene(), {"D": 2.4, "G": 1e-10, "P": 1.0}, drawn.T)
     assert set(values) == {"D", "G"}
     np.testing.assert_allclose(np.log(values["G"] / 1e-10), drawn[:, 1], rtol=1e-9, atol=1e-12)
 
