@@ -325,11 +325,8 @@ def design(
         if problem.cycles is not None:
             scale = abs(float(before.values[0])) or 1.0
         search = Search(evaluator, solver or slsqp, 1.0 if objective is None else scale)
-        path, after, failed = search.best(us, progress)
-        growing = after.rows[:, search.growing[: after.rows.shape[1]]]
-        limit = None
-        if after.worst[0] > 0 and (growing > 0).any() and kicks is None and problem.cycles is None:
-            limit = least_growth(search, np.concatenate([us, path[-1:]]))
+        path, after, failed, lowest = search.best(us, progress)
+        limit = None if lowest is None else least_growth(search, *lowest)
         return Found(path, after, len(us), failed, limit)
 
     if objective is None and before.worst[0] <= 0:

@@ -14,7 +14,7 @@ import numpy as np
 from .._base.parts import Record
 from .envelope import condition_text
 from .problem import linearise
-from .search import Evaluator, OnAverage, Search
+from .search import Evaluation, Evaluator, OnAverage, Search
 
 _ACTIVE = 1e-4  # a residual, or a scaled variable, is at its limit within this
 _AGREE = 0.01  # of a growth rate
@@ -67,11 +67,10 @@ class LeastGrowth(Record):
         )
 
 
-def least_growth(search: Search, starts: np.ndarray) -> LeastGrowth:
-    """Minimise the largest growth rate from starts (n, v), and say what holds it."""
+def least_growth(search: Search, paths: list[np.ndarray], found: Evaluation) -> LeastGrowth:
+    """What holds the least growth rate at the ends of `Search.least_growth`."""
     evaluator = search.evaluator
     problem = evaluator.problem
-    paths, found = search.least_growth(list(starts))
     growing = search.growing[: found.rows.shape[1]]
     scale = float(problem.growth_scale)
     rates = float(problem.target) + scale * np.sinh(found.rows[:, growing].max(axis=1))
@@ -90,7 +89,7 @@ def least_growth(search: Search, starts: np.ndarray) -> LeastGrowth:
         slope=slope,
         steepest=steepest,
         agreed=int((possible == possible[best])[np.abs(rates - rates[best]) <= near].sum()),
-        starts=len(starts),
+        starts=len(paths),
     )
 
 

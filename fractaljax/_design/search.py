@@ -410,22 +410,36 @@ class Search:
         """The way (s, v) to the best end of all, what it is, and how many starts (n, v) failed.
 
         The first of those whose ends are equally good: the given design leads the starts, and its
-        way begins where the reader does.
+        way begins where the reader does. Last, ways and ends of `least_growth`, if all failed.
         """
         paths, found = self._solve(starts, progress)
         failed = found.worst > 0
         if failed.all():
             model = found.residuals[:, : self.evaluator.problem.model_residuals]
             best = int(np.lexsort((found.worst, model.max(axis=1, initial=0)))[0])
-            return paths[best], found.of(best), len(starts)
+            problem, lowest = self.evaluator.problem, None
+            if problem.cuts is None and problem.cycles is None:
+                lowest = self.least_growth([*starts, paths[best][-1]])
+                met = lowest[1].worst <= 0
+            if lowest is None or not met.any():
+                return paths[best], found.of(best), len(starts), lowest
+            # There is a design that meets all after all.
+            chosen = np.flatnonzero(met).tolist()
+            paths = self._land([lowest[0][i] for i in chosen])
+            found = self._ends(paths)
+            if (found.worst > 0).all():
+                paths = [lowest[0][i] for i in chosen]
+                found = self._ends(paths)
+            failed = found.worst > 0
         values = np.where(failed, np.inf, found.values)
         best = int(np.flatnonzero(values <= values.min() + 1e-8 * abs(values.min()))[0])
         # A solver may have stopped early: once more from where it is.
         (again,) = self._land([paths[best]])
         polished = self._ends([again])
+        count = max(len(starts) - int((~failed).sum()), 0)
         if polished.worst[0] <= 0 and polished.values[0] < values[best]:
-            return again, polished, int(failed.sum())
-        return paths[best], found.of(best), int(failed.sum())
+            return again, polished, count, None
+        return paths[best], found.of(best), count, None
 
     def _solve(self, starts, progress):
         """The ways from all starts, and what their ends are.
@@ -462,7 +476,8 @@ class Search:
 
         The largest of all growth rates is minimised, whatever the target.
         """
-        growing, others = self.growing, self.evaluator.problem.asked & ~self.growing
+        growing = self.growing
+        others = self.evaluator.problem.asked & ~growing
         others[0] = False
         paths = self._ways([start[None] for start in starts], growing, others)
         found = self._ends(paths)
