@@ -425,11 +425,9 @@ class Search:
                 return paths[best], found.of(best), len(starts), lowest
             # There is a design that meets all after all.
             chosen = np.flatnonzero(met).tolist()
-            paths = self._land([lowest[0][i] for i in chosen])
+            landed = self._land([lowest[0][i] for i in chosen])
+            paths = [self._to_best(path) for path in landed]
             found = self._ends(paths)
-            if (found.worst > 0).all():
-                paths = [lowest[0][i] for i in chosen]
-                found = self._ends(paths)
             failed = found.worst > 0
         values = np.where(failed, np.inf, found.values)
         best = int(np.flatnonzero(values <= values.min() + 1e-8 * abs(values.min()))[0])
@@ -470,6 +468,12 @@ class Search:
                 paths[i] = path
             found = self._ends(paths)
         return paths, found
+
+    def _to_best(self, path: np.ndarray) -> np.ndarray:
+        """A way (s, v) up to the best design on it that meets every requirement, if any does."""
+        found = self.evaluator.evaluate(path)
+        values = np.where(found.worst <= 0, found.values, np.inf)
+        return path[: int(values.argmin()) + 1] if np.isfinite(values).any() else path
 
     def least_growth(self, starts: Sequence[np.ndarray]) -> tuple[list[np.ndarray], Evaluation]:
         """Ways (s, v) to the least growth rate with all else met, and what their ends are.
