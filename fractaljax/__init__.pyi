@@ -74,6 +74,7 @@ from ._identify.identify import Identification as Identification, identify as id
 from ._identify.measurement import Measurement as Measurement
 from ._mechanism.damping import modal_damping as modal_damping, rayleigh_damping as rayleigh_damping
 from ._mechanism.matrix_file import Matrices as Matrices, read_matrices as read_matrices
+from ._mechanism.mesh import Mesh as Mesh
 from ._mechanism.oscillator import Oscillator as Oscillator, equilibrium as equilibrium
 from ._mechanism.reduced import ReducedStructure as ReducedStructure
 from ._mechanism.scene import Scene as Scene, brake_scene as brake_scene, stiffness as stiffness

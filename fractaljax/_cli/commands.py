@@ -1,11 +1,13 @@
 """`fractaljax stability`, `cycle` and `scene`."""
 
+from pathlib import Path
 from typing import Any
 
 from .output import csv_text, import_pictures, output, picture
 from .parsing import add_constant_friction, add_out, add_scene_file, load_given
 
 _SAMPLES = 512  # of one period
+_MODES, _MODES_MOST = "fractaljax-stability", 8  # folder of the pictures of modes, and how many
 
 
 def add_stability(commands) -> None:
@@ -15,6 +17,12 @@ def add_stability(commands) -> None:
     )
     add_scene_file(parser)
     add_constant_friction(parser)
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="FOLDER",
+        help=f"of the pictures of a structure with a mesh; default {_MODES}",
+    )
     parser.set_defaults(run=_stability)
 
 
@@ -22,15 +30,44 @@ def _stability(arguments) -> int:
     """Print the joint, the critical mode and the eigenvalues of a scene.
 
     Of a structure (a file with a table of that name): the joints, and the modes that are unstable
-    or least damped.
+    or least damped. With a mesh, pictures of the unstable modes, mode_1.png and so on, or of the
+    first one.
     """
     from .._mechanism.structure import Structure
     from .._stability.summary import stability_table, structure_table
 
-    subject = load_given(arguments.scene, structures=True)
+    subject, slope = load_given(arguments.scene, structures=True), not arguments.constant_friction
     table: Any = structure_table if isinstance(subject, Structure) else stability_table
-    print(table(subject, not arguments.constant_friction))
+    if getattr(subject, "mesh", None) is None:
+        if arguments.out is not None:
+            raise ValueError("--out needs a structure whose file names a mesh, to draw its modes")
+        print(table(subject, slope))
+        return 0
+    with output(arguments.out or Path(_MODES)) as write:
+        written = write(_mode_pictures(subject, slope))
+    print(table(subject, slope))
+    print(written)
     return 0
+
+
+def _mode_pictures(structure, friction_slope: bool) -> dict[str, bytes]:
+    """The unstable modes on the mesh, the fastest first, or the first of all, by file."""
+    from .. import plot
+    from .._mechanism.reduced import ReducedStructure
+    from .._stability.stability import stability
+
+    modes = stability(structure, friction_slope)
+    drawn = (modes.unstable() or modes._modes()[:1])[:_MODES_MOST]
+    files = {}
+    for i, mode in enumerate(drawn, start=1):
+        shape = mode.shape
+        if isinstance(structure, ReducedStructure):
+            shape = structure.full(shape)
+        ax = plot.complex_mode(shape, **structure.mesh.arrays())
+        words = f"{mode.frequency:.5g} Hz, growth rate {mode.growth_rate:.4g} 1/s"
+        ax.set_title(words, fontsize="medium", loc="left")
+        files[f"mode_{i}.png"] = picture(ax.figure)
+    return files
 
 
 def add_cycle(commands) -> None:
@@ -60,7 +97,8 @@ def add_cycle(commands) -> None:
 def _cycle(arguments) -> int:
     """Find the limit cycle that the motion ends in; write cycle.png and cycle.csv.
 
-    Of a scene, or of a structure (a file with a table of that name).
+    Of a scene, or of a structure (a file with a table of that name), and if that has a mesh also
+    motion.png, the motion on it.
     """
     import jax
 
@@ -68,6 +106,7 @@ def _cycle(arguments) -> int:
     from .._dynamics.limit_cycle import CycleResult, limit_cycle
     from .._dynamics.summary import cycle_table
     from .._mechanism.scene import Scene
+    from .._mechanism.structure import Structure
     from .._stability.stability import require_computable
 
     scene = load_given(arguments.scene, structures=True)
@@ -82,7 +121,10 @@ def _cycle(arguments) -> int:
         found = cycle.result in exists
         if found:
             figure, table = picture(plot.cycle(cycle)), _orbit_text(cycle).encode()
-            written = write({"cycle.png": figure, "cycle.csv": table})
+            files = {"cycle.png": figure, "cycle.csv": table}
+            if isinstance(scene, Structure) and scene.mesh is not None:
+                files["motion.png"] = picture(plot.cycle_motion(cycle, scene))
+            written = write(files)
     print(cycle_table(scene, cycle))
     if found:
         print(written)

@@ -29,6 +29,7 @@ from .._surface.topography import Topographies, topography
 from . import constraints as limits
 from .design_file import design_files, read_design
 from .envelope import Envelope, condition_text
+from .limit import LeastGrowth, least_growth
 from .problem import DEFAULT_BOUNDS, DesignProblem, describe, state_problem
 from .quiet import VERIFIED, Kicks, quiet
 from .search import (
@@ -90,6 +91,7 @@ class Design(Record):
     # What is asked of the limit cycle, before and after; 0 at rest.
     cycles: Mapping[str, tuple[float, float]] | None = None
     quiet_radius: float | None = None  # the largest kick survived, as `quiet_within` measures it
+    least_growth: LeastGrowth | None = None  # where the target is out of reach
 
     @property
     def outcome(self) -> str:
@@ -167,6 +169,8 @@ class Design(Record):
             lines.append(f"{name}: {before:.6g}, then {after:.6g}")
         lines += self._under_conditions() + self._under_kicks()
         lines += [f"not met: {name}" for name in self.violated]
+        if self.least_growth is not None:
+            lines += ["", *str(self.least_growth).splitlines(), ""]
         growth = self.growth_rate if self.growth_rates is None else self.growth_rates[1]
         promise = "not stable: small disturbances grow"
         if growth < 0:
@@ -260,9 +264,9 @@ def design(
     `area_ratio_min` a_e; Q_e <= `slip_ratio_max` mu_s P, not with a given stiffness ratio. The
     growth rate is that of small disturbances: a larger kick may still end in a limit cycle.
 
-    With other contact `laws` of a scene the growth rate must be as low under each, in the place of
-    the scene's own: with their own quantities, but with its surface, material and load where they
-    have them.
+    With other contact `laws` the growth rate must be as low under each, in the place of the scene's
+    own, or of those of all joints of a structure whose contacts have a surface: with their own
+    quantities, but with its surface, material and load where they have them.
 
     With an `envelope`, a range (lower, upper) or samples of any quantities by name (see
     `Envelope`), every requirement holds, and an objective is taken, over all its conditions:
@@ -270,8 +274,10 @@ def design(
     that is at least the worst; ("cvar", alpha), the mean of the worst 1 - alpha of them.
     With a `tolerance`, standard deviations {"D": ..., "ln G": ...} of any quantities, a `Tolerance`
     with their covariance, or an `Identification`, every requirement holds, and an objective is
-    taken, at its `quantile`, at each condition of the envelope by itself. The probability of squeal
-    counts 100,000 draws by `seed`, each at a condition drawn evenly from the envelope.
+    taken, at its `quantile`, at each condition of the envelope by itself. "D" of a structure
+    scatters by the same amount in all joints, also where each is designed by itself. The
+    probability of squeal counts draws by `seed` (see `squeal_probability`), each at a condition
+    drawn evenly from the envelope.
 
     With `quiet_within`, the `radius` of `basin`, in units of V/omega and V, or the semi-axes (2n,)
     of an ellipsoid in m and m/s, no start within it of the sliding equilibrium ends anywhere else,
@@ -284,7 +290,8 @@ def design(
     `lattice` a side (48, or 24 of a structure, with an envelope or a tolerance; 1024 or 256 in one
     variable; lattice^2 designs of a low-discrepancy set in more than two variables), and an even
     spread. The same arguments give the same design. A request that cannot be met is a result, not
-    an error: see `Design.result`.
+    an error: see `Design.result`. Then `Design.least_growth` is the least growth rate that was
+    found with all else met, where, what holds it there, and how many starts agree.
 
     **Raises:** `ValueError` for bounds on what `x` lacks, empty, inverted or without its own value,
     for an envelope of what it lacks or the design moves, and for options outside their domain.
@@ -318,8 +325,9 @@ def design(
         if problem.cycles is not None:
             scale = abs(float(before.values[0])) or 1.0
         search = Search(evaluator, solver or slsqp, 1.0 if objective is None else scale)
-        path, after, failed = search.best(us, progress)
-        return Found(path, after, len(us), failed)
+        path, after, failed, lowest = search.best(us, progress)
+        limit = None if lowest is None else least_growth(search, *lowest)
+        return Found(path, after, len(us), failed, limit)
 
     if objective is None and before.worst[0] <= 0:
         found = Found(own[None], before, 0, 0)
@@ -357,7 +365,7 @@ def _conclude(
     quiet_radius: float | None = None,
 ) -> Design:
     """How every requirement stands at the end of the path; unchanged without a start."""
-    path, after, starts, failed = found
+    path, after, starts, failed, limit = found
     final, history = x, describe(problem, path)
     if starts:
         # exp(ln G) and the scaling back may end a rounding beyond a bound.
@@ -411,6 +419,7 @@ def _conclude(
         failed_starts=failed,
         options=options,
         quiet_radius=quiet_radius,
+        least_growth=limit,
         **more,
     )
 

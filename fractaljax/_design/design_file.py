@@ -37,7 +37,8 @@ from .tolerance import Tolerance
 _PACKAGE = __name__.split(".")[0]
 OPTIONS = (*[*inspect.signature(state_problem).parameters][1:-1], "risk", "solver", "starts")
 OPTIONS += ("lattice", "seed", "quiet_within")  # the arguments of `design` that a file holds
-_NOT_RESULTS = {"scene", "initial", "result", "history", "options"}  # of the fields of a `Design`
+# Of the fields of a `Design`.
+_NOT_RESULTS = {"scene", "initial", "result", "history", "options", "least_growth"}
 
 
 def design_files(best: Any, path: Path) -> dict[Path, bytes]:
@@ -76,6 +77,8 @@ def design_files(best: Any, path: Path) -> dict[Path, bytes]:
         | {name: value for name, value in vars(best).items() if name not in _NOT_RESULTS},
         "history": {name: column.tolist() for name, column in best.history.items()},
     }
+    if best.least_growth is not None:
+        tables["result"]["least_growth"] = dict(vars(best.least_growth))
     comment = "A fractaljax design, in SI units: `fractaljax design --repeat` runs it again."
     return files | {path: write_toml(comment, heads | tables).encode()}
 

@@ -133,7 +133,7 @@ def pareto(
         between = share * places[0] + (1 - share) * places[1]
         starts = np.concatenate([places, between[None], promising[: _STARTS - 3]])
         evaluator = Evaluator(problem_at(limit, high - low))
-        path, _, _ = Search(evaluator, solver, scale).best(starts, progress=False)
+        path, *_ = Search(evaluator, solver, scale).best(starts, progress=False)
         # The last limit leaves no room for the slack: there is the second end alone.
         us = np.stack([path[-1], *places])
         ends_here = evaluator.evaluate(us)

@@ -9,7 +9,7 @@ far it is from carrying load elastically. Where quantities scatter, a residual i
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,17 +18,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.batches import in_batches
-from .._base.parts import brief, flag, require_kind, require_scalar, scalar, substitute
+from .._base.parts import brief, flag, require_kind, require_scalar, scalar
 from .._base.quick import quick_jit
 from .._base.ranges import low_discrepancy
-from .._contact.contact import Contact, on_the_same_joint
-from .._contact.fixed import FixedContact
+from .._contact.contact import Contact
 from .._dynamics.scaled import degrees_of_freedom, hybrid_system
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import (
     joints_of,
     known_quantities,
-    moved_by,
     own_quantities,
     replaced,
     require_independent,
@@ -47,6 +45,16 @@ from .constraints import Constraint, CycleConstraint, Plain
 from .cuts import Cuts
 from .envelope import Envelope
 from .followed import FollowedCycles
+from .joints import (
+    is_fractal,
+    least_damping,
+    moved_contacts,
+    of_joint,
+    slips,
+    state_of,
+    under,
+    with_stiffness,
+)
 from .tolerance import Tolerance, nodes, quantile
 
 DEFAULT_BOUNDS: dict[str, tuple[float, float]] = {"D": (2.1, 2.9), "G": (1e-12, 1e-8)}
@@ -54,14 +62,15 @@ DEFAULT_BOUNDS: dict[str, tuple[float, float]] = {"D": (2.1, 2.9), "G": (1e-12, 
 _LOOKED_AT = 15  # designs, besides the given one, in which growing modes are counted
 _MODES_MOST = 16  # that requirements are made of
 _BATCH = 32  # designs, each at one condition, evaluated at once
-_BATCH_OF_STRUCTURES = 8  # which take so long that filling up a batch costs more than a call
+# Structures take so long that filling up a batch costs more than a call.
+_BATCH_OF_STRUCTURES, _SMALL = 8, 16  # of at most so many degrees of freedom; of larger ones 1
 
 
 class Scatter(eqx.Module):
     """The quadrature over a tolerance, and the quantile that counts."""
 
     tolerance: Tolerance
-    base: Float[Array, " k"]  # what the quantities are where nothing moves them
+    base: dict[str, Float[Array, ""]]  # what the quantities are where nothing moves them
     shifts: Float[Array, "n k"]
     weights: Float[Array, " n"]
     level: Float[Array, ""]
@@ -109,16 +118,14 @@ class DesignProblem(eqx.Module):
         """The scene or structure at scaled variables u, a condition and perhaps a shift (k,)."""
         values = self.quantities(u) | dict(zip(self.conditions, condition, strict=True))
         if self.scatter is not None and shift is not None:
-            tolerance = self.scatter.tolerance
-            base = dict(zip(tolerance.quantities, self.scatter.base, strict=True))
-            values |= tolerance.scattered(base | values, shift)
+            values |= self.scatter.tolerance.scattered(self.x, self.scatter.base | values, shift)
         return substituted(self.x, values)
 
     def _row(self, u, condition, shift=None):
         """Objective and residuals (1 + k,), and the numbers that describe a design, by name."""
         x = self.moved(u, condition, shift)
         states = {
-            name: _state(part)
+            name: state_of(part)
             for name, part in joints_of(x).items()
             if part.contact.fractal or name in self.contacts
         }
@@ -128,21 +135,19 @@ class DesignProblem(eqx.Module):
             for name, state in states.items()
             if not joints_of(x)[name].follows_load_curve
         }
-        stiff_x = _with_stiffness(x, known)
-        smooth = []
-        if self.modes:
-            # The rates are NaN where there is no steady sliding; LAPACK gets numbers even so.
-            attached = assembled(stiff_x, self.friction_slope, refuse=False)
-            found = leading(*attached[:3], self.modes, x.band)
-            rates = list(jnp.where(attached.lost, jnp.nan, found.s.real))
-            smooth = list(
-                jnp.arcsinh(found.s.real / self.growth_scale)
-                if self.least_growth
-                else of_neighbours(found, self.target, self.growth_scale)
-            )
-        else:
-            rates = []
-            for each in (stiff_x, *(under(x, law) for law in self.laws)):
+        stiff_x = with_stiffness(x, known)
+        smooth, rates = [], []
+        for each in (stiff_x, *(under(x, law) for law in self.laws)):
+            if self.modes:
+                # The rates are NaN where there is no steady sliding; LAPACK gets numbers even so.
+                attached = assembled(each, self.friction_slope, refuse=False)
+                found = leading(*attached[:3], self.modes, x.band)
+                rates += list(jnp.where(attached.lost, jnp.nan, found.s.real))
+                if not self.least_growth:
+                    smooth += list(of_neighbours(found, self.target, self.growth_scale))
+                elif each is stiff_x:
+                    smooth += list(jnp.arcsinh(found.s.real / self.growth_scale))
+            else:
                 rates.append(growth_rate(each, self.friction_slope))
                 smooth += of_scene(
                     each, self.friction_slope, rates[-1], self.target, self.growth_scale
@@ -175,7 +180,7 @@ class DesignProblem(eqx.Module):
         for name, state in states.items():
             for key in ("K_n", "K_t", "log_area_ratio", "slip_ratio"):
                 if getattr(state, key) is not None:
-                    numbers[_dot(name) + key] = getattr(state, key)
+                    numbers[of_joint(name) + key] = getattr(state, key)
         row = [jnp.asarray(value, growth.dtype), *model, *pressing, *stiff, *own]
         return jnp.stack(row + smooth * self.smooth), numbers
 
@@ -210,16 +215,16 @@ class DesignProblem(eqx.Module):
 
     @property
     def growth_columns(self) -> slice:
-        """Where in a row the growth rates are, of the modes or by the laws."""
+        """Where in a row the growth rates are, of the modes by each law."""
         first = 1 + self.model_residuals
-        return slice(first, first + max(self.modes, 1 + len(self.laws)))
+        return slice(first, first + max(self.modes, 1) * (1 + len(self.laws)))
 
     @property
     def asked(self) -> np.ndarray:
         """Which columns (1 + k,) of a row are the objective and the requirements by name."""
-        named = 1 + len(self.residual_names)
-        smooth = self.smooth * (self.modes or 2 * (1 + len(self.laws)))
-        return np.arange(named + smooth) < named
+        named, laws = 1 + len(self.residual_names), 1 + len(self.laws)
+        smooth = self.modes if self.least_growth else (self.modes or 2) * laws
+        return np.arange(named + self.smooth * smooth) < named
 
     @property
     def rounding(self) -> float:
@@ -229,7 +234,7 @@ class DesignProblem(eqx.Module):
     @property
     def model_residuals(self) -> int:
         """How many residuals, the first, keep the joints inside the model."""
-        return sum(_fractal(self.x, name) + _slips(self.x, name) for name in self.contacts)
+        return sum(is_fractal(self.x, name) + slips(self.x, name) for name in self.contacts)
 
     @property
     def residual_names(self) -> list[str]:
@@ -237,15 +242,16 @@ class DesignProblem(eqx.Module):
         model, stiff = [], []
         for name in self.contacts:
             of = f"{name}: " if name else ""
-            model += [f"{of}a_l >= area_ratio_min a_e"] * _fractal(self.x, name)
-            model += [f"{of}Q_e <= slip_ratio_max mu_s P"] * _slips(self.x, name)
+            model += [f"{of}a_l >= area_ratio_min a_e"] * is_fractal(self.x, name)
+            model += [f"{of}Q_e <= slip_ratio_max mu_s P"] * slips(self.x, name)
             stiff.append(f"{of}K_n >= K_n_min")
         own = [asked.name for asked in self.constraints]
         if self.cuts is not None:
             own += [f"cut {k}" for k in range(len(self.cuts.reach))]
-        growing = [f"growth_rate <= target by {type(law).__name__}" for law in self.laws]
-        others = [f"growth_rate of mode {i} <= target" for i in range(2, self.modes + 1)]
-        return [*model, "growth_rate <= target", *others, *growing, *stiff, *own]
+        growing = ["growth_rate <= target"]
+        growing += [f"growth_rate of mode {i} <= target" for i in range(2, self.modes + 1)]
+        by = [f"{name} by {type(law).__name__}" for law in self.laws for name in growing]
+        return [*model, *growing, *by, *stiff, *own]
 
     def scaled(self, x: Mechanism) -> np.ndarray:
         """The scaled variables (v,) of a scene or structure."""
@@ -287,7 +293,9 @@ def _in_batches(program, problem, us, conditions):
     problem = dataclasses.replace(problem, cycles=None)
     dtype = problem.low.dtype
     pairs = np.asarray(us, dtype), np.asarray(conditions, dtype)
-    batch = _BATCH_OF_STRUCTURES if problem.modes else _BATCH
+    batch = _BATCH
+    if problem.modes:
+        batch = _BATCH_OF_STRUCTURES if problem.x.n <= _SMALL else 1
     return in_batches(functools.partial(program, problem), batch, *pairs)
 
 
@@ -311,88 +319,6 @@ _linearise, _linearise_light = quick_jit(linearised), quick_jit(linearised, once
 @quick_jit
 def _evaluate(problem: DesignProblem, us, conditions):
     return jax.vmap(lambda u, condition: problem.at(u, condition)[0])(us, conditions)
-
-
-# --- scenes and structures alike -------------------------------------------------------------
-
-
-def _dot(name: str) -> str:
-    return f"{name}." if name else ""
-
-
-class _Stiffness(NamedTuple):
-    """What designs ask of a `ContactState`, of a law without one."""
-
-    K_n: Array
-    K_t: Array
-    log_area_ratio: None = None
-    slip_ratio: None = None
-
-
-def _state(part) -> Any:
-    law, friction = part.contact, part.friction
-    if law.fractal:
-        return law.state(friction.mu_s, friction.mu_m)
-    return _Stiffness(*law.stiffness(friction.mu_s, friction.mu_m))
-
-
-def _fractal(x, name) -> bool:
-    return joints_of(x)[name].contact.fractal
-
-
-def _slips(x, name) -> bool:
-    """Whether a contact has the source's tangential law, which slips."""
-    return _fractal(x, name) and joints_of(x)[name].contact.stiffness_ratio is None
-
-
-def _with_stiffness(x, states):
-    """`x` with contacts of known stiffness where their states (by name) are known already."""
-    parts, zero = joints_of(x), FixedContact(0.0, 0.0, 1.0)
-    for name, state in states.items():
-        P = getattr(parts[name].contact, "P", zero.P)  # of a preloaded joint
-        known = substitute(zero, {"K_n": state.K_n, "K_t": state.K_t, "P": P})
-        parts[name] = eqx.tree_at(lambda part: part.contact, parts[name], known)
-    if isinstance(x, Structure):
-        return eqx.tree_at(lambda s: s.joints, x, tuple(parts.values()))
-    return parts[""]
-
-
-def under(scene: Scene, law: Contact) -> Scene:
-    """`scene` with another contact law for its surface, material and load."""
-    other = on_the_same_joint(law, scene.contact)
-    return eqx.tree_at(lambda scene: scene.contact, scene, other)
-
-
-def _moved_contacts(x, names) -> tuple[str, ...]:
-    """The contacts with a law whose stiffness these quantities move."""
-    moved = {each for name in names for each in moved_by(x, name)}
-    found = []
-    for name, part in joints_of(x).items():
-        own = {*own_quantities(part.contact), *own_quantities(part.friction)}
-        law = not isinstance(part.contact, FixedContact)
-        if law and moved & {_dot(name) + each for each in own}:
-            found.append(name)
-    return tuple(found)
-
-
-def _least_damping(x) -> tuple[float, float]:
-    """The least damping rate [1/s] without friction, and the least frequency [rad/s]."""
-    if isinstance(x, Scene):
-        o = x.oscillator
-        omega = np.array([o.omega_1, o.omega_2], float)
-        return float((np.array([o.xi_1, o.xi_2]) * omega).min()), float(omega.min())
-    M, C, K = (np.asarray(X, float) for X in (x.M, x.C, x.K))
-    for joint in x.joints:
-        stiffness = joint.stiffness()
-        for each, dofs in zip(stiffness, (joint.normal, joint.tangential), strict=True):
-            if dofs is None:
-                continue
-            d = np.asarray(x.direction(dofs), float)
-            K = K + float(each) * np.outer(d, d)
-    n = len(M)
-    A = np.block([[np.zeros((n, n)), np.eye(n)], [-np.linalg.solve(M, K), -np.linalg.solve(M, C)]])
-    s = np.linalg.eigvals(A)
-    return max(0.0, float(-s.real.max())), float(np.abs(s).min())
 
 
 # --- checks --------------------------------------------------------------------------------
@@ -429,8 +355,14 @@ def state_problem(
     for i, law in enumerate(laws):
         require_kind(f"laws[{i}]", law, Contact)
         require_scalar(law)
-    if laws and not isinstance(x, Scene):
-        raise ValueError("laws need a scene: the contacts of a structure are its joints'")
+    if (
+        laws
+        and not isinstance(x, Scene)
+        and not any(joint.contact.has_surface for joint in joints_of(x).values())
+    ):
+        raise ValueError("laws of a structure need a joint whose contact has a surface")
+    for law in laws:
+        under(x, law)  # refuses one that a joint cannot have
     bounds = checked_bounds(x, bounds)
     cycles = _cycles(x, objective, constraints, envelope is not None or tolerance is not None)
     objective = _followed if isinstance(objective, CycleConstraint) else objective
@@ -449,21 +381,20 @@ def state_problem(
     if tolerance is not None:
         tolerance.check(x, ranges)
         z, weights = nodes(len(tolerance.names))
-        base = np.array([float(value_of(x, name)) for name in tolerance.quantities])
         shifts = tolerance.shifts(z)
         scatter = Scatter(
-            tolerance, jnp.asarray(base), jnp.asarray(shifts), jnp.asarray(weights), level
+            tolerance, tolerance.base(x), jnp.asarray(shifts), jnp.asarray(weights), level
         )
+    require_independent(x, tuple(ranges))
     everything = dict.fromkeys([*ranges, *(tolerance.quantities if tolerance else ())])
-    require_independent(x, tuple(everything))
     logarithmic = tuple(_is_scale(x, name) and low > 0 for name, (low, _) in bounds.items())
     own = [float(value_of(x, name)) for name in bounds]
     ends = np.array([*zip(*bounds.values(), strict=True), own])
     low, high, own = np.log(ends, out=ends, where=logarithmic)
-    damping, frequency = _least_damping(x)
+    damping, frequency = least_damping(x)
     own_condition = np.array([float(value_of(x, name)) for name in conditions])
     x = with_optional(x, tuple(everything))
-    contacts = _moved_contacts(x, bounds)
+    contacts = moved_contacts(x, bounds)
     least = 0.0 if K_n_min is None else scalar("K_n_min", K_n_min, at_least=0)
     dtype = jax.tree.leaves(x)[0].dtype
     numbers |= dict(
@@ -499,7 +430,7 @@ def state_problem(
     if K_n_min is not None or not contacts:
         return problem
     given = describe(problem, np.asarray(problem.start)[None])
-    own = tuple(jnp.asarray(given[_dot(name) + "K_n"][0], dtype) for name in contacts)
+    own = tuple(jnp.asarray(given[of_joint(name) + "K_n"][0], dtype) for name in contacts)
     return dataclasses.replace(problem, K_n_min=own)
 
 
@@ -514,7 +445,8 @@ def _modes_to_keep(problem: DesignProblem) -> int:
         np.asarray(problem.own_condition), (len(designs), len(problem.conditions))
     )
     rows = _in_batches(_evaluate, looking, designs, own)[:, looking.growth_columns]
-    return min(int((rows > 0).sum(axis=1).max()) + 2, modes)
+    growing = (rows > 0).reshape(len(rows), -1, modes).sum(axis=2)  # by each law
+    return min(int(growing.max()) + 2, modes)
 
 
 def _followed(x) -> float:

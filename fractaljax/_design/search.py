@@ -82,6 +82,7 @@ class Found(NamedTuple):
     evaluation: Evaluation  # of that
     starts: int
     failed: int
+    least_growth: Any = None  # `limit.LeastGrowth`, where the growth rate is too large
 
 
 @dataclasses.dataclass(frozen=True)
@@ -409,22 +410,34 @@ class Search:
         """The way (s, v) to the best end of all, what it is, and how many starts (n, v) failed.
 
         The first of those whose ends are equally good: the given design leads the starts, and its
-        way begins where the reader does.
+        way begins where the reader does. Last, ways and ends of `least_growth`, if all failed.
         """
         paths, found = self._solve(starts, progress)
         failed = found.worst > 0
         if failed.all():
             model = found.residuals[:, : self.evaluator.problem.model_residuals]
             best = int(np.lexsort((found.worst, model.max(axis=1, initial=0)))[0])
-            return paths[best], found.of(best), len(starts)
+            problem, lowest = self.evaluator.problem, None
+            if problem.cuts is None and problem.cycles is None:
+                lowest = self.least_growth([*starts, paths[best][-1]])
+                met = lowest[1].worst <= 0
+            if lowest is None or not met.any():
+                return paths[best], found.of(best), len(starts), lowest
+            # There is a design that meets all after all.
+            chosen = np.flatnonzero(met).tolist()
+            landed = self._land([lowest[0][i] for i in chosen])
+            paths = [self._to_best(path) for path in landed]
+            found = self._ends(paths)
+            failed = found.worst > 0
         values = np.where(failed, np.inf, found.values)
         best = int(np.flatnonzero(values <= values.min() + 1e-8 * abs(values.min()))[0])
         # A solver may have stopped early: once more from where it is.
         (again,) = self._land([paths[best]])
         polished = self._ends([again])
+        count = max(len(starts) - int((~failed).sum()), 0)
         if polished.worst[0] <= 0 and polished.values[0] < values[best]:
-            return again, polished, int(failed.sum())
-        return paths[best], found.of(best), int(failed.sum())
+            return again, polished, count, None
+        return paths[best], found.of(best), count, None
 
     def _solve(self, starts, progress):
         """The ways from all starts, and what their ends are.
@@ -456,6 +469,35 @@ class Search:
             found = self._ends(paths)
         return paths, found
 
+    def _to_best(self, path: np.ndarray) -> np.ndarray:
+        """A way (s, v) up to the best design on it that meets every requirement, if any does."""
+        found = self.evaluator.evaluate(path)
+        values = np.where(found.worst <= 0, found.values, np.inf)
+        return path[: int(values.argmin()) + 1] if np.isfinite(values).any() else path
+
+    def least_growth(self, starts: Sequence[np.ndarray]) -> tuple[list[np.ndarray], Evaluation]:
+        """Ways (s, v) to the least growth rate with all else met, and what their ends are.
+
+        The largest of all growth rates is minimised, whatever the target.
+        """
+        growing = self.growing
+        others = self.evaluator.problem.asked & ~growing
+        others[0] = False
+        paths = self._ways([start[None] for start in starts], growing, others)
+        found = self._ends(paths)
+        unmet = found.rows[:, others[: found.rows.shape[1]]].max(axis=1, initial=-np.inf) > 0
+        lost = np.flatnonzero(unmet).tolist()
+        again = [starts[i][None] for i in lost]
+        for i, way in zip(lost, self._ways(again, growing, others, restored=True), strict=True):
+            paths[i] = way
+        return paths, self._ends(paths)
+
+    @property
+    def growing(self) -> np.ndarray:
+        """Which columns of a row are growth rates."""
+        columns = np.arange(len(self.evaluator.problem.asked))
+        return np.isin(columns, columns[self.evaluator.problem.growth_columns])
+
     def _ends(self, paths) -> Evaluation:
         return self.evaluator.evaluate(np.array([path[-1] for path in paths]))
 
@@ -465,12 +507,9 @@ class Search:
         With some requirements (k,) marked as violated, to the least of their largest residual that
         meets those before them. If `restored`, by the nearest design that violates all the least.
         """
-        from tqdm import tqdm
-
         problem = self.evaluator.problem
         asked = problem.asked
         columns = np.arange(len(asked))
-        growing = np.isin(columns, columns[problem.growth_columns])
         aim, limited = columns == 0, columns > 0
         if violated is not None:
             aim[asked] = np.append(False, violated)
@@ -479,7 +518,13 @@ class Search:
             # The largest of many modes has kinks where they change places; each has none.
             aim, limited = ~asked, limited & asked
         elif problem.smooth:
-            limited &= ~growing
+            limited &= ~self.growing
+        return self._ways(paths, aim, limited, progress, restored)
+
+    def _ways(self, paths, aim, limited, progress=False, restored=False):
+        """Ways continued to the least of the columns in `aim` with those in `limited` met."""
+        from tqdm import tqdm
+
         with tqdm(total=len(paths), desc="design", unit="start", disable=not progress) as bar:
 
             def task(path, ask):

@@ -19,7 +19,15 @@ from .._base.batches import in_batches
 from .._base.parts import Record, brief, number, scalar
 from .._base.ranges import low_discrepancy
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import known_quantities, replaced, substituted, value_of, with_optional
+from .._mechanism.quantities import (
+    known_quantities,
+    moved_by,
+    replaced,
+    require_independent,
+    substituted,
+    value_of,
+    with_optional,
+)
 from .._mechanism.structure import Structure
 from .._stability.stability import growth_rate
 from .envelope import Envelope
@@ -28,7 +36,8 @@ _NODES = 55  # in one and two dimensions: a Fibonacci number, whose lattice is t
 _WIDENING = 2.0  # of the distribution that the nodes are drawn from
 _MOST = 6  # quantities that scatter
 _REACH = 6.0  # standard deviations that must stay inside the domain of a quantity
-_SAMPLES = 100_000
+_SAMPLES = 100_000  # of a scene; of a structure fewer:
+_WORK, _SAMPLES_LEAST = 4e9, 1000  # draws times cubed sizes of the eigenvalue problem
 _EIGENVALUES_AT_ONCE = 1 << 15
 
 
@@ -103,18 +112,21 @@ class Tolerance(Record):
         ):
             if name not in known:
                 raise ValueError(f"tolerance names {given!r}; there are {', '.join(known)}")
-            value = float(value_of(x, name))
-            low, high = min(ranges.get(name, (value,))), max(ranges.get(name, (value,)))
-            if name == given:
-                low, high = low - _REACH * sigma, high + _REACH * sigma
-            else:
-                low, high = low * math.exp(-_REACH * sigma), high * math.exp(_REACH * sigma)
-            try:
-                replaced(x, {name: np.array([low, high])})
-            except ValueError as error:
-                raise ValueError(
-                    f"tolerance of {given} leaves its domain within {_REACH:g} deviations: {error}"
-                ) from None
+            for each in _moved_by(x, name):
+                ends = ranges.get(each, ranges.get(name, (float(value_of(x, each)),)))
+                low, high = min(ends), max(ends)
+                if name == given:
+                    low, high = low - _REACH * sigma, high + _REACH * sigma
+                else:
+                    low, high = low * math.exp(-_REACH * sigma), high * math.exp(_REACH * sigma)
+                try:
+                    replaced(x, {each: np.array([low, high])})
+                except ValueError as error:
+                    raise ValueError(
+                        f"tolerance of {given} leaves its domain within {_REACH:g} deviations: "
+                        f"{error}"
+                    ) from None
+        require_independent(x, self.quantities)
         if len(self.names) > _MOST:
             raise ValueError(f"tolerance takes at most {_MOST} quantities, got {len(self.names)}")
 
@@ -130,12 +142,30 @@ class Tolerance(Record):
         np.fill_diagonal(correlation, 1 + 1e-14)
         return deviates @ np.linalg.cholesky(correlation).T * sigma
 
-    def scattered(self, values: Mapping[str, Any], shift: Any) -> dict[str, Any]:
-        """The quantities at `values` by name, moved by shifts (k,), or (k, n) for values (n,)."""
+    def base(self, x: Mechanism) -> dict[str, Float[Array, ""]]:
+        """The quantities of `x` that scatter, by name: of every joint by itself."""
         return {
-            name: values[name] + by if name == given else values[name] * jnp.exp(by)
-            for name, given, by in zip(self.quantities, self.names, shift, strict=True)
+            each: jnp.asarray(value_of(x, each))
+            for name in self.quantities
+            for each in _moved_by(x, name)
         }
+
+    def scattered(self, x: Mechanism, values: Mapping[str, Any], shift: Any) -> dict[str, Any]:
+        """The quantities at `values` by name, moved by shifts (k,), or (k, n) for values (n,).
+
+        `values` holds a plain name, "D", where it is moved for all joints at once.
+        """
+        found = {}
+        for name, given, by in zip(self.quantities, self.names, shift, strict=True):
+            for each in _moved_by(x, name):
+                value = values[name] if name in values else values[each]
+                found[each] = value + by if name == given else value * jnp.exp(by)
+        return found
+
+
+def _moved_by(x: Mechanism, name: str) -> list[str]:
+    """The name itself; of a structure those of all joints that a plain name moves."""
+    return sorted(moved_by(x, name)) if isinstance(x, Structure) else [name]
 
 
 def nodes(dimensions: int) -> tuple[np.ndarray, np.ndarray]:
@@ -189,17 +219,22 @@ def squeal_probability(
     envelope: Envelope | Mapping[str, Any] | None = None,
     *,
     friction_slope: bool = True,
-    samples: int = _SAMPLES,
+    samples: int | None = None,
     seed: int = 0,
 ) -> SquealProbability:
     """The probability that `x` as machined or identified squeals: growth rate > 0.
 
     `tolerance` is an `Identification`, a `Tolerance` or a mapping of standard deviations; with an
-    `envelope` every draw is at a condition drawn evenly from it.
+    `envelope` every draw is at a condition drawn evenly from it. A name without a joint, "D", of a
+    structure moves all joints that have one by the same amount. `samples` are 100,000 by default,
+    fewer, down to 1000, of a structure of more than 17 degrees of freedom.
 
     **Raises:** `ValueError` for quantities that `x` lacks, or scattered beyond their domain.
     """
     tolerance, values = Tolerance.of(tolerance), {}
+    n = x.n if isinstance(x, Structure) else 2
+    if samples is None:
+        samples = int(np.clip(_WORK / (2 * n) ** 3, _SAMPLES_LEAST, _SAMPLES))
     if envelope is not None:
         envelope = Envelope.of(envelope)
         envelope.check(x, ())
@@ -207,14 +242,13 @@ def squeal_probability(
         values = dict(zip(envelope.names, drawn.T, strict=True))
     tolerance.check(x, {name: (column.min(), column.max()) for name, column in values.items()})
     x = with_optional(x, (*values, *tolerance.quantities))
-    for name in tolerance.quantities:
-        values.setdefault(name, np.full(samples, float(value_of(x, name))))
     random = np.random.default_rng([seed, 0])
     shifts = tolerance.shifts(random.standard_normal((samples, len(tolerance.names))))
-    values |= tolerance.scattered(values, shifts.T)
+    scattered = tolerance.scattered(x, tolerance.base(x) | values, shifts.T)
+    values |= {name: np.broadcast_to(column, samples) for name, column in scattered.items()}
     dtype = jax.tree.leaves(x)[0].dtype
     rows = np.stack([np.asarray(column, dtype) for column in values.values()], axis=1)
-    batch = max(64, _EIGENVALUES_AT_ONCE // (x.n if isinstance(x, Structure) else 2) ** 2)
+    batch = max(64, _EIGENVALUES_AT_ONCE // n**2)
     squeals = in_batches(
         lambda rows: _squeals(x, tuple(values), rows, friction_slope), min(batch, samples), rows
     )

@@ -1,4 +1,4 @@
-"""What a quiet scene rests on: its growth rate under each assumption that a workshop may doubt."""
+"""What a quiet scene or structure rests on: its growth rate where an assumption is another."""
 
 import functools
 from collections.abc import Mapping, Sequence
@@ -8,9 +8,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ScalarLike
+from jaxtyping import Array
 
-from .._base.parts import Record, flag, require_kind, require_scalar, scalar, substitute
+from .._base.parts import Record, brief, flag, require_kind, require_scalar, scalar, substitute
 from .._base.quick import quick_jit
 from .._base.table import table
 from .._contact.asperity import AsperityContact
@@ -18,19 +18,23 @@ from .._contact.contact import Contact
 from .._contact.fixed import FixedContact
 from .._contact.fractal import FractalContact
 from .._contact.persson import PerssonContact, mindlin_ratio
-from .._mechanism.quantities import known_quantities, unit, value_of
-from .._mechanism.scene import Scene, stiffness
+from .._mechanism.joint import Joint
+from .._mechanism.mechanism import Mechanism
+from .._mechanism.quantities import joints_of, known_quantities, require_one, unit, value_of
+from .._mechanism.scene import Scene
+from .._mechanism.structure import Structure
 from .._stability.linearise import linearised
 from .._stability.quartic import rightmost_root
+from .._stability.stability import growth_rate, stability
 from .design import DesignResult, design
 from .envelope import Envelope
-from .problem import under
+from .joints import under, with_contacts
 from .quiet import Kicks
 from .tolerance import Tolerance, squeal_probability
 
 _WAVES = 100  # of the side of the area, for a law that needs a shortest wavelength
 _ACCEPTED = 0.05  # probability of squeal
-_RATIOS = 65  # values of K_t/K_n between its ends
+_RATIOS, _RATIOS_OF_STRUCTURES = 65, 17  # values of K_t/K_n between its ends
 _RANGE = 100.0  # a suggestion changes a scale up to so many times, either way
 _DAMPING = 0.5  # and a damping ratio up to this
 
@@ -88,9 +92,9 @@ class Verdict(Record):
 
 
 def verdict(
-    scene: Scene,
+    x: Mechanism,
     *,
-    area: ScalarLike | None = None,
+    area: Any = None,
     laws: Sequence[Contact] = (),
     tolerance: Any = None,
     envelope: Envelope | Mapping[str, Any] | None = None,
@@ -99,124 +103,189 @@ def verdict(
     seed: int = 0,
     progress: bool = True,
 ) -> Verdict:
-    """Ask of a scene whether it stays quiet where an assumption is another.
+    """Ask of a scene or a structure whether it stays quiet where an assumption is another.
 
     Its growth rate [1/s] as it is; with the load P in the friction, or without it where it is
     there; under every other of the contact `laws`, with its surface, material and load, and by
-    `AsperityContact` and `PerssonContact` if the nominal `area` [m^2] is given, with wavelengths
-    from its side down to a hundredth of it; and with K_t/K_n between its own, the fractal law's
-    and Mindlin's, the worst of 65 values. With a `tolerance` or an `Identification`, and an
-    `envelope`, the probability of squeal (see `squeal_probability`), quiet below 5 percent; with
-    `quiet_within` (see `design`) the largest kick survived. What no argument asks for is named.
+    `AsperityContact` and `PerssonContact` if the nominal `area` [m^2] is given, one for all joints
+    or by joint, with wavelengths from its side down to a hundredth of it; and with K_t/K_n between
+    its own, the fractal law's and Mindlin's, the worst of 65 values, or 17 of a structure. With a
+    `tolerance` or an `Identification`, and an `envelope`, the probability of squeal (see
+    `squeal_probability`), quiet below 5 percent; with `quiet_within` (see `design`) the largest
+    kick survived. What no argument asks for is named. The joints of a structure change together.
 
-    **Raises:** `ValueError` for a scene that holds arrays, and as those functions.
+    **Raises:** `ValueError` for what holds arrays, for an area without a surface or of a joint that
+    is not there, and as those functions.
     """
-    require_kind("scene", scene, Scene)
-    require_scalar(scene)
+    require_one("x", x)
     flag("friction_slope", friction_slope)
-    laws = list(laws)
+    parts = joints_of(x)
+    own = " and ".join(dict.fromkeys(type(part.contact).__name__ for part in parts.values()))
     for i, law in enumerate(laws):
         require_kind(f"laws[{i}]", law, Contact)
+    asked = [("", f"as it is ({own})", x), *_other_load(x, friction_slope)]
+    by = [(type(law).__name__, under(x, law)) for law in laws]
     if area is not None:
-        laws += _laws_of(scene, scalar("area", area, above=0))
-    own = type(scene.contact).__name__
-    asked = [("", f"as it is ({own})", scene)]
-    if getattr(scene.contact, "P", None) is not None:
-        other = Scene(scene.contact, scene.friction, scene.oscillator, not scene.preload)
-        force, instead = "friction on K_n x2", "friction on P + K_n x2"
-        if scene.preload:
-            force, instead = instead, force
-        asked.append((force, instead, other))
-    asked += [(own, f"by {type(law).__name__}", under(scene, law)) for law in laws]
-    found = _growth_rates(tuple(changed for *_, changed in asked), friction_slope)
-    rates, ratios = found.rates.tolist(), np.asarray(found.ratios)
+        by += [(kind.__name__, with_contacts(x, laws)) for kind, laws in _laws_of(x, area)]
+    asked += [(own, f"by {name}", other) for name, other in by]
+    found = _growth_rates(tuple(other for *_, other in asked), friction_slope)
+    rates = found.rates.tolist()
     questions = [
         Question(assumed, name, _as_text(rate), rate < 0)
         for (assumed, name, _), rate in zip(asked, rates[: len(asked)], strict=True)
     ]
-    if found.K_n > 0 and len(ratios):
-        questions.append(_of_ratios(ratios, np.array(rates[len(asked) :]), float(found.own_ratio)))
+    if (stiff := np.asarray(found.stiff)).any():
+        ratios, own_ratios = (np.asarray(r)[..., stiff] for r in (found.ratios, found.own_ratios))
+        questions.append(_of_ratios(ratios, np.array(rates[len(asked) :]), own_ratios))
     if tolerance is not None:
-        questions.append(_scattered(scene, tolerance, envelope, friction_slope, seed))
+        questions.append(_scattered(x, tolerance, envelope, friction_slope, seed))
     if quiet_within is not None:
-        kicks = Kicks.of(scene, quiet_within, seed, flag("progress", progress))
-        survived, size = kicks.survived(scene), kicks.size
+        kicks = Kicks.of(x, quiet_within, seed, flag("progress", progress))
+        survived, size = kicks.survived(x), kicks.size
         words = f"comes to rest from {survived:.3g} of {size:.3g}"
         name = f"kicks within {quiet_within}"
         questions.append(Question("smaller kicks", name, words, survived >= size))
-    others = "area" if scene.contact.has_surface else "laws"
-    wanted = {f"other contact laws ({others})": laws, "scatter (tolerance)": tolerance is not None}
+    # Of a reduced structure not all eigenvalues are known.
+    incurable = bool(found.trace > 0) and getattr(x, "band", None) is None
+    others = "area" if any(part.contact.has_surface for part in parts.values()) else "laws"
+    wanted = {f"other contact laws ({others})": by, "scatter (tolerance)": tolerance is not None}
     wanted["kicks (quiet_within)"] = quiet_within is not None
     not_asked = tuple(name for name, was in wanted.items() if not was)
-    return Verdict(tuple(questions), bool(found.damping < 0), not_asked)
+    return Verdict(tuple(questions), incurable, not_asked)
 
 
 def _as_text(growth: float) -> str:
     return f"{growth:+.6g}" if np.isfinite(growth) else "no closed equilibrium"
 
 
-def _laws_of(scene: Scene, area) -> tuple[Contact, ...]:
-    """The other laws of the surface on a nominal area."""
-    contact = scene.contact
-    if not contact.has_surface:
-        raise ValueError(f"area needs a contact with a surface, got a {type(contact).__name__}")
-    L, joint = jnp.sqrt(area), (contact.surface, contact.material, contact.P)
-    return AsperityContact(*joint, L / _WAVES), PerssonContact(*joint, area, L, L / _WAVES)
+def _other_load(x: Mechanism, friction_slope: bool) -> list[tuple[str, str, Mechanism]]:
+    """With the load P in the friction of all joints that have one, or without it."""
+    along = "x2"
+    if isinstance(x, Scene):
+        if getattr(x.contact, "P", None) is None:
+            return []
+        preloaded = bool(x.preload)
+        other: Any = Scene(x.contact, x.friction, x.oscillator, not preloaded)
+    elif isinstance(x, Structure):
+        along = "n.x"
+        able = [j.normal is not None and hasattr(j.contact, "P") for j in x.joints]
+        able = [can and j.contact.P is not None for can, j in zip(able, x.joints, strict=True)]
+        preloaded = any(can and bool(j.preload) for can, j in zip(able, x.joints, strict=True))
+        falls = friction_slope and any(j.friction.velocity_dependent for j in x.joints)
+        if not any(able) or (preloaded and falls and x.F is None):  # without F there is no slope
+            return []
+        joints = tuple(
+            Joint(j.contact, j.friction, j.tangential, j.normal, j.V, not preloaded) if can else j
+            for can, j in zip(able, x.joints, strict=True)
+        )
+        other = eqx.tree_at(lambda structure: structure.joints, x, joints)
+    else:
+        raise TypeError(f"x must be a Scene or a Structure, got {brief(x)}")
+    force, instead = f"friction on K_n {along}", f"friction on P + K_n {along}"
+    if preloaded:
+        force, instead = instead, force
+    return [(force, instead, other)]
+
+
+def _laws_of(x: Mechanism, area: Any) -> list[tuple[type[Contact], dict[str, Contact]]]:
+    """The other laws of the surfaces on nominal areas, by joint."""
+    parts = {name: p for name, p in joints_of(x).items() if p.contact.has_surface}
+    if not parts:
+        kinds = " and ".join(dict.fromkeys(type(p.contact).__name__ for p in joints_of(x).values()))
+        raise ValueError(f"area needs a contact with a surface, got a {kinds}")
+    if not isinstance(area, Mapping):
+        area = dict.fromkeys(parts, area)
+    elif set(area) != set(parts):
+        raise ValueError(f"area must be of the joints {', '.join(parts)}, got {', '.join(area)}")
+    asperity, persson = {}, {}
+    for name, part in parts.items():
+        A = scalar(f"area {name}".strip(), area[name], above=0)
+        contact, L = part.contact, jnp.sqrt(A)
+        given = contact.surface, contact.material, contact.P
+        asperity[name] = AsperityContact(*given, L / _WAVES)
+        persson[name] = PerssonContact(*given, A, L, L / _WAVES)
+    return [(AsperityContact, asperity), (PerssonContact, persson)]
 
 
 class _Found(NamedTuple):
-    """What `_growth_rates` finds."""
+    """What `_growth_rates` finds, of the j joints whose contacts have a material."""
 
-    rates: Array  # (m + k,) [1/s], of the scenes and then at the ratios
-    ratios: Array  # (k,) of K_t to K_n; none without a material
-    own_ratio: Array
-    K_n: Array
-    damping: Array  # minus the sum of the real parts of the eigenvalues, whatever the stiffness
+    rates: Array  # (m + k,) [1/s], of the mechanisms and then at the ratios
+    ratios: Array  # (k, j) of K_t to K_n
+    own_ratios: Array  # (j,)
+    stiff: Array  # (j,) whether K_n is above 0
+    trace: Array  # the sum of the growth rates, which no stiffness changes
 
 
 @functools.partial(quick_jit, static_argnames="friction_slope", once=True)
-def _growth_rates(scenes: tuple[Scene, ...], friction_slope: bool) -> _Found:
-    """Growth rates of m scenes, and of the first over K_t/K_n, in one program.
+def _growth_rates(asked: tuple[Mechanism, ...], friction_slope: bool) -> _Found:
+    """Growth rates of m mechanisms, and of the first over K_t/K_n, in one program.
 
-    The ratios lie between its own, the fractal law's and Mindlin's.
+    The ratios of each joint lie between its own, the fractal law's and Mindlin's.
     """
-    first = scenes[0]
-    systems = [linearised(scene, friction_slope) for scene in scenes]
-    K_n, K_t = stiffness(first)
-    contact, ratios, own = first.contact, jnp.zeros((0,), K_n.dtype), K_t / K_n
-    if (material := getattr(contact, "material", None)) is not None:
-        ends = [own, jnp.asarray(mindlin_ratio(material.nu), own.dtype)]
+    first, zero = asked[0], FixedContact(0.0, 0.0, 1.0)
+    stiffness, ends = {}, []
+    for name, part in joints_of(first).items():
+        contact, friction = part.contact, part.friction
+        if getattr(contact, "material", None) is None:
+            continue
+        pairs = [contact.stiffness(friction.mu_s, friction.mu_m)]
         if isinstance(contact, FractalContact) and contact.stiffness_ratio is not None:
             law = FractalContact(contact.surface, contact.material, contact.P)
-            k_n, k_t = law.stiffness(first.friction.mu_s, first.friction.mu_m)
-            ends.append(k_t / k_n)
-        low, high = jnp.stack(ends).min(), jnp.stack(ends).max()
-        ratios = jnp.linspace(low, high, _RATIOS)
-    zero = FixedContact(0.0, 0.0, 1.0)
-    P = getattr(contact, "P", zero.P)
+            pairs.append(law.stiffness(friction.mu_s, friction.mu_m))
+        stiffness[name] = pairs[0]
+        mindlin = jnp.asarray(mindlin_ratio(contact.material.nu), pairs[0][0].dtype)
+        ends.append(jnp.stack([*(K_t / K_n for K_n, K_t in pairs), mindlin]))
+    count = _RATIOS if isinstance(first, Scene) else _RATIOS_OF_STRUCTURES
+    low, high, own = (
+        jnp.stack([of(end) for end in ends]) if ends else jnp.zeros(0)
+        for of in (jnp.min, jnp.max, lambda end: end[0])
+    )
+    shares = jnp.linspace(0.0, 1.0, count if ends else 0, dtype=own.dtype)
+    ratios = low[None] + shares[:, None] * (high - low)[None]
 
-    def at(ratio):
-        known = substitute(zero, {"K_n": K_n, "K_t": ratio * K_n, "P": P})
-        return linearised(eqx.tree_at(lambda s: s.contact, first, known), friction_slope)
+    def at(row):
+        known = {}
+        for (name, (K_n, K_t)), ratio in zip(stiffness.items(), row, strict=True):
+            K_t = jnp.where(K_n > 0, ratio * K_n, K_t)
+            P = getattr(joints_of(first)[name].contact, "P", zero.P)
+            known[name] = substitute(zero, {"K_n": K_n, "K_t": K_t, "P": P})
+        return with_contacts(first, known)
 
-    # One closed form for all: each use of it takes long to compile.
-    own_systems = jax.tree.map(lambda *x: jnp.stack(x), *systems)
-    every = jax.tree.map(lambda *x: jnp.concatenate(x), own_systems, jax.vmap(at)(ratios))
-    rates = jax.vmap(rightmost_root)(every).real
-    return _Found(rates, ratios, own, K_n, systems[0].c_1 + systems[0].c_2)
+    if isinstance(first, Scene):
+        # One closed form for all: each use of it takes long to compile.
+        systems = [linearised(x, friction_slope) for x in asked if isinstance(x, Scene)]
+        own_systems = jax.tree.map(lambda *x: jnp.stack(x), *systems)
+        moved = jax.vmap(lambda row: linearised(at(row), friction_slope))(ratios)
+        every = jax.tree.map(lambda *x: jnp.concatenate(x), own_systems, moved)
+        rates = jax.vmap(rightmost_root)(every).real
+        trace = -(systems[0].c_1 + systems[0].c_2)
+    else:
+        moved = jax.lax.map(lambda row: growth_rate(at(row), friction_slope), ratios)
+        rates = jnp.stack([growth_rate(x, friction_slope) for x in asked])
+        rates = jnp.concatenate([rates, moved])
+        trace = stability(first, friction_slope).eigenvalues.real.sum()
+    stiff = [K_n > 0 for K_n, _ in stiffness.values()]
+    return _Found(rates, ratios, own, jnp.stack(stiff) if stiff else jnp.zeros(0, bool), trace)
 
 
-def _of_ratios(ratios: np.ndarray, rates: np.ndarray, own: float) -> Question:
-    """The worst growth rate between the scene's own K_t/K_n, the fractal law's and Mindlin's."""
+def _of_ratios(ratios: np.ndarray, rates: np.ndarray, own: np.ndarray) -> Question:
+    """The worst growth rate between the own K_t/K_n, the fractal law's and Mindlin's."""
     worst = int(np.argmax(rates))
-    name = f"K_t/K_n from {ratios[0]:.3g} to {ratios[-1]:.3g}"
-    found = f"{rates[worst]:+.6g} at {ratios[worst]:.3g}"
-    return Question(f"K_t/K_n = {own:.3g}", name, found, bool(rates[worst] < 0))
+    name = f"K_t/K_n from {ratios[0].min():.3g} to {ratios[-1].max():.3g}"
+    found = f"{rates[worst]:+.6g} at {_extent(ratios[worst])}"
+    return Question(f"K_t/K_n = {_extent(own)}", name, found, bool(rates[worst] < 0))
 
 
-def _scattered(scene, tolerance, envelope, friction_slope, seed) -> Question:
+def _extent(values) -> str:
+    """One number, or the ends of many."""
+    low, high = f"{min(values):.3g}", f"{max(values):.3g}"
+    return low if low == high else f"{low} to {high}"
+
+
+def _scattered(x, tolerance, envelope, friction_slope, seed) -> Question:
     tolerance = Tolerance.of(tolerance)
-    found = squeal_probability(scene, tolerance, envelope, friction_slope=friction_slope, seed=seed)
+    found = squeal_probability(x, tolerance, envelope, friction_slope=friction_slope, seed=seed)
     names = " and ".join(tolerance.names)
     over = "" if envelope is None else f" over {Envelope.of(envelope)}"
     words = f"squeals with probability {found.value:.3g} +- {found.standard_error:.1g}"

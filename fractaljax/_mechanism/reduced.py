@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from .._base.parts import Numbers, brief
+from .mesh import Mesh
 from .structure import ParametricStructure
 
 
@@ -38,28 +39,36 @@ class Reduction:
         self.friction_slope = friction_slope
         self.residuals = residuals  # L^T Q^-1 R of the residuals of all terms, see `_Space`
         self.points = list(points)  # where eigenvectors were taken
-        self.touched = touched  # (m, n), `Structure._touched` of the large one; not in files
+        self.touched = touched  # (m, n), `Structure._touched` of the large one
         self.error = error  # the largest found at candidates and fresh points, of |s|
 
 
 class ReducedStructure(ParametricStructure):
     """A structure of few degrees of freedom q (r,), as `reduce` makes it: x = V q.
 
-    It has the parameters and the joints of the large one and goes wherever a structure goes. Only
-    eigenvalues in `band` are those of the large structure, and only they count in its stability.
-    `replace` of a matrix gives a plain structure.
+    It has the parameters, the joints and the mesh of the large one and goes wherever a structure
+    goes. Only eigenvalues in `band` are those of the large structure, and only they count in its
+    stability. `replace` of a matrix gives a plain structure.
     """
 
     reduction: Reduction = eqx.field(static=True)
 
-    def __init__(self, M, C, K, joints, parameters, F, reduction: Reduction):
-        super().__init__(M, C, K, joints, parameters, F)
+    def __init__(
+        self, M, C, K, joints, parameters, F, reduction: Reduction, mesh: Mesh | None = None
+    ):
         self.reduction = reduction
+        super().__init__(M, C, K, joints, parameters, F, mesh=mesh)
 
     @property
     def band(self) -> tuple[float, float]:
         """Where eigenvalues are those of the large structure, in |Im s| [rad/s]."""
         return self.reduction.band
+
+    def _full_n(self, n: int) -> int:
+        return len(self.reduction.V)
+
+    def _own_mesh(self) -> None:
+        return None
 
     def _touched(self) -> np.ndarray | None:
         return self.reduction.touched
@@ -113,7 +122,9 @@ class ReducedStructure(ParametricStructure):
 
     def _more_arrays(self):
         of = self.reduction
+        touched = {} if of.touched is None else {"touched": of.touched}
         return {
+            **touched,
             "V": of.V,
             "W": of.W,
             "residuals": np.stack([np.real(of.residuals), np.imag(of.residuals)]),

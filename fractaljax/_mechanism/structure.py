@@ -21,6 +21,7 @@ from .._base.parts import (
     number,
     quantities,
     rebuild,
+    require_kind,
     require_scalar,
     scalar,
 )
@@ -38,6 +39,7 @@ from .matrices import (
     square_or_sparse,
 )
 from .mechanism import Mechanism
+from .mesh import Mesh
 from .scene import Scene
 from .structure_file import npz_bytes, read_structure, structure_text
 
@@ -51,7 +53,7 @@ class Structure(Mechanism):
     units. `joints` is one `Joint`, a sequence of them (named joint_1, joint_2, ...) or a mapping
     from names. `F` (n,) [N], or a mapping from degrees of freedom to forces, presses the joints
     together: the slope of a friction law acts through the static equilibrium under it. `names` of
-    the degrees of freedom are optional.
+    the degrees of freedom are optional, and so is a `Mesh` for pictures.
 
     **Raises:** `ValueError` or `TypeError` saying which matrix does not fit, is not finite or not
     positive definite, which degree of freedom is unknown, or which joint is wrong.
@@ -63,6 +65,7 @@ class Structure(Mechanism):
     joints: tuple[Joint, ...]
     joint_names: tuple[str, ...] = eqx.field(static=True)
     names: tuple[str, ...] | None = eqx.field(static=True)
+    mesh: Mesh | None = eqx.field(static=True)
 
     def __init__(
         self,
@@ -72,10 +75,11 @@ class Structure(Mechanism):
         joints: Joint | Sequence[Joint] | Mapping[str, Joint],
         F: ArrayLike | Sequence[float] | Mapping[Any, ArrayLike] | None = None,
         names: Iterable[str] | None = None,
+        mesh: Mesh | None = None,
     ):
-        self._fill({"M": M, "C": C, "K": K}, {}, joints, F, names)
+        self._fill({"M": M, "C": C, "K": K}, {}, joints, F, names, mesh)
 
-    def _fill(self, given, parameters, joints, F, names):
+    def _fill(self, given, parameters, joints, F, names, mesh):
         self.parameters = parameters
         mass = matrix_sum("M", given["M"], parameters, square_or_sparse)
         # Each term symmetric to the last bit, if their sum is a mass matrix.
@@ -97,10 +101,18 @@ class Structure(Mechanism):
             damping = 0 * abs(stiffness.at(parameters))
         self.sums = {"M": mass, "C": matrix_sum("C", damping, parameters, fit), "K": stiffness}
         self.names = _names(names, n)
+        self.mesh = mesh
+        if mesh is not None:
+            require_kind("mesh", mesh, Mesh)
+            mesh.require(self._full_n(n))
         self.joints, self.joint_names = _joints(joints)
         self._check_joints()
         F = self._forces(F) if isinstance(F, Mapping) else F
         self.F = None if F is None else fitting("F", F, (n,))
+
+    def _full_n(self, n: int) -> int:
+        """The degrees of freedom that its mesh has, of n itself."""
+        return n
 
     @classmethod
     def from_scene(cls, scene: Scene) -> "Structure":
@@ -234,10 +246,11 @@ class Structure(Mechanism):
         }
         if changes.keys() & {*self.sums, "F"}:
             own = {name: changes.get(name, self._terms(name)) for name in self.sums}
-            more = joints, changes.get("F", self.F), self.names
+            own |= {"joints": joints, "F": changes.get("F", self.F), "names": self.names}
+            own |= {"mesh": self._own_mesh()}
             if not self.parameters:
-                return Structure(**own, joints=more[0], F=more[1], names=more[2])
-            return ParametricStructure(**own, joints=more[0], parameters=parameters, F=more[1])
+                return Structure(**own)
+            return ParametricStructure(**own, parameters=parameters)
         # The matrices are as they were: there is nothing to check or factorise again.
         new = eqx.tree_at(lambda structure: structure.joints, self, tuple(joints.values()))
         new._check_joints()
@@ -245,6 +258,10 @@ class Structure(Mechanism):
             new = eqx.tree_at(lambda structure: structure.parameters, new, parameters)
             _check_coefficients(new)
         return new
+
+    def _own_mesh(self) -> Mesh | None:
+        """The mesh, if its degrees of freedom are those of the matrices."""
+        return self.mesh
 
     def _terms(self, name: str) -> list[tuple[Any, Any]]:
         """The matrix of a name as it was given, less its numbers."""
@@ -331,11 +348,12 @@ class ParametricStructure(Structure):
         parameters: Mapping[str, ArrayLike] | None = None,
         F: ArrayLike | Sequence[float] | Mapping[Any, ArrayLike] | None = None,
         names: Iterable[str] | None = None,
+        mesh: Mesh | None = None,
     ):
         if not isinstance(parameters or {}, Mapping):
             raise TypeError(f"parameters must be a mapping, got {brief(parameters)}")
         held = {name: number(str(name), value) for name, value in (parameters or {}).items()}
-        self._fill({"M": M, "C": C, "K": K}, held, joints, F, names)
+        self._fill({"M": M, "C": C, "K": K}, held, joints, F, names, mesh)
         taken = {"M", "C", "K", "F", "pi"}.union(*map(quantities, self.joints))
         for name in held:
             if not (isinstance(name, str) and name.isidentifier()):

@@ -18,9 +18,11 @@ from .damping import modal_damping, rayleigh_damping
 from .joint import JOINT_LAWS, Joint
 from .matrices import MatrixSum, is_sparse
 from .matrix_file import read_matrices
+from .mesh import Mesh
 
 _LARGEST_FILE = 2**30
-_MATRICES, _BASES = ("M", "C", "K"), ("V", "W", "residuals")
+_MATRICES, _BASES = ("M", "C", "K"), ("V", "W", "residuals", "touched")
+_MESH = "mesh."  # what its arrays begin with, beside the matrices
 _TABLES = ("structure", "parameters", "joints", "reduction", "reduced")
 _SPARSE = ("data", "indices", "indptr", "shape")  # of a matrix in compressed rows
 _WANTED = "the name of a file or of a matrix, or a list of {coefficient = ..., matrix = ...}"
@@ -31,6 +33,7 @@ _KEYS = {  # of [structure]: what each may be
     "rayleigh": (list, "[alpha, beta]"),
     "damping_ratio": ((float, int, list), "a number or a list of one a mode"),
     "names": (list, "a list"),
+    "mesh": (str, "the name of a .npz file with points, dofs and cells"),
 }
 
 
@@ -77,8 +80,21 @@ class _Source:
         """Refuse arrays in the file of matrices that nothing asks for."""
         if self.file is not None and self.file.lower().endswith(".npz"):
             known = [*_MATRICES, "F", *_BASES]
-            rest = [name for name in self.held if name not in self.used]
+            rest = [
+                name for name in self.held if name not in self.used and not name.startswith(_MESH)
+            ]
             toml.refuse_unknown(self.file, rest, known)
+
+    def mesh(self, name: str | None) -> Mesh | None:
+        """That in a file of its own, or beside the matrices."""
+        if name is None:
+            held = {key.removeprefix(_MESH): x for key, x in self.held.items() if _MESH in key}
+            return Mesh.of_arrays(held, str(self.file)) if held else None
+        if any(key.startswith(_MESH) for key in self.held):
+            raise ValueError("[structure] gives mesh twice: in matrices and as mesh")
+        if Path(name).suffix.lower() != ".npz":
+            raise ValueError(f"[structure] mesh must be {_KEYS['mesh'][1]}, got {brief(name)}")
+        return Mesh.of_arrays(_npz(self.folder / name), name)
 
     def _read(self, path: Path) -> dict[str, Any]:
         found = read_matrices(path)
@@ -145,6 +161,7 @@ def read_structure(document: dict[str, Any], folder: Path) -> dict[str, Any]:
                 joint[which] = {_dof(key, names or ()): x for key, x in joint[which].items()}
         attached[name] = toml.read_part(Joint, joint, JOINT_LAWS, f"joints.{name}")
     found = {"C": None, **given, "F": F, "joints": attached, "names": names}
+    found["mesh"] = source.mesh(table.get("mesh"))
     if "reduced" in document:
         bases = {name: source.held.get(name) for name in _BASES}
         found["reduced"] = {**toml.table_at(document, "reduced"), **bases}
@@ -207,7 +224,10 @@ def structure_text(structure: Any, matrices: str) -> str:
 
     **Raises:** `ValueError` for a coefficient that is a function.
     """
-    table = {"matrices": toml.Noted(matrices, "M, C, K and perhaps F"), "names": structure.names}
+    table = {
+        "matrices": toml.Noted(matrices, "M, C, K and perhaps F and a mesh"),
+        "names": structure.names,
+    }
     for name, held in structure.sums.items():
         if held.coefficients != (None,):
             table[name] = [
@@ -257,6 +277,8 @@ def npz_bytes(structure: Any) -> bytes:
         arrays |= _arrays_of(name, held)
     if structure.F is not None:
         arrays["F"] = np.asarray(structure.F)
+    if structure.mesh is not None:
+        arrays |= {f"{_MESH}{name}": array for name, array in structure.mesh.arrays().items()}
     content = io.BytesIO()
     np.savez(content, **arrays)
     return content.getvalue()

@@ -569,7 +569,8 @@ class _Greedy:
             touched=snapshots.structure._touched(),
             error=np.inf,
         )
-        return ReducedStructure(**_projected(snapshots.structure, V, W), reduction=reduction)
+        small = _projected(snapshots.structure, V, W)
+        return ReducedStructure(**small, reduction=reduction, mesh=snapshots.structure.mesh)
 
     def errors(self, reduced, points) -> np.ndarray:
         """The largest error at each point, of |s|."""

@@ -1,50 +1,20 @@
 """Deformed meshes: triangles or quadrilaterals in a plane, or the outer ones of a solid."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import ArrayLike, Float, Int, Shaped
+from jaxtyping import Float
 
+from .._mechanism.mesh import Mesh
 from .axes import new_figure
 
 _SHARE = 0.03  # of the size of a mesh, to which the largest displacement is drawn
 
 
-class Mesh(NamedTuple):
-    """Places of nodes [m], and where their displacements stand among n degrees of freedom."""
-
-    points: Float[np.ndarray, "nodes dim"]
-    dofs: Int[np.ndarray, "nodes dim"]  # -1 where held
-    cells: Int[np.ndarray, "cells corners"]
-
-    @classmethod
-    def of(cls, points: ArrayLike, dofs: ArrayLike, cells: ArrayLike, n: int) -> "Mesh":
-        """**Raises:** `ValueError` for a mesh that does not fit n degrees of freedom."""
-        p, d, c = np.asarray(points, float), np.asarray(dofs), np.asarray(cells)
-        if p.ndim != 2 or p.shape[1] not in (2, 3):
-            raise ValueError(f"points must be (nodes, 2) or (nodes, 3), got {p.shape}")
-        if d.shape != p.shape:
-            raise ValueError(f"dofs must have shape {p.shape} as points, got {d.shape}")
-        if c.ndim != 2 or c.shape[1] not in (3, 4):
-            raise ValueError(f"cells must be (cells, 3) or (cells, 4), got {c.shape}")
-        for name, held, least, end in (("dofs", d, -1, n), ("cells", c, 0, len(p))):
-            if not (held.dtype.kind in "iu" and ((held >= least) & (held < end)).all()):
-                raise ValueError(f"{name} must be whole numbers from {least} to {end - 1}")
-        return cls(p, d, c)
-
-    @property
-    def solid(self) -> bool:
-        """Whether it is drawn in space."""
-        return self.points.shape[1] == 3
-
-    def displacements(self, x: Shaped[np.ndarray, "*k n"]) -> Shaped[np.ndarray, "*k nodes dim"]:
-        """Of the nodes, from those of all degrees of freedom."""
-        return np.where(self.dofs < 0, 0, x[..., self.dofs])
-
-    def scale(self, largest: float) -> float:
-        """The factor that draws the largest displacement as 3 % of the size of the mesh."""
-        return _SHARE * float(np.linalg.norm(np.ptp(self.points, axis=0))) / largest
+def scale_of(mesh: Mesh, largest: float) -> float:
+    """The factor that draws the largest displacement as 3 % of the size of the mesh."""
+    return _SHARE * float(np.linalg.norm(np.ptp(mesh.points, axis=0))) / largest
 
 
 def draw_mesh(

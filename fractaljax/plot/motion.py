@@ -10,11 +10,12 @@ from jaxtyping import ArrayLike, Float
 from .._base.parts import require_kind, scalar, whole
 from .._dynamics.cycle import STATE_NAMES, CycleResult, LimitCycle
 from .._dynamics.hybrid import OPEN
+from .._mechanism.mesh import Mesh
 from .._mechanism.reduced import ReducedStructure
 from .._mechanism.structure import Structure
 from .animation import animated, animation_path
 from .axes import Axes, Figure, frequency_unit, legend_above, new_figure
-from .mesh import Mesh, draw_mesh, mesh_height, projection
+from .mesh import draw_mesh, mesh_height, projection, scale_of
 
 if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
@@ -33,19 +34,20 @@ def cycle_motion(
     cycle: LimitCycle,
     structure: Structure,
     *,
-    points: ArrayLike,
-    dofs: ArrayLike,
-    cells: ArrayLike,
+    points: ArrayLike | None = None,
+    dofs: ArrayLike | None = None,
+    cells: ArrayLike | None = None,
     at: float = 0.0,
     scale: float | None = None,
 ) -> Figure:
     """A limit cycle at one time: the deformed mesh, and what each joint does over the period.
 
     `structure` is that of the cycle; a reduced one leads to the mesh of the full one. `points`,
-    `dofs` and `cells` are as in `complex_mode`. `at` is the time as a share of the period, from
-    `state` on. Displacements are those from the mean over the period, times `scale`, by default
-    that which draws the largest as 3 % of the size of the mesh; the colour is the largest of each
-    node over the period. A mark on the mesh is at the mean place of the nodes that a joint's
+    `dofs` and `cells` are as in `complex_mode`, by default those of the structure's mesh. `at` is
+    the time as a share of the period, from `state` on. Displacements are those from the mean over
+    the period, times `scale`, by default that which draws the largest as 3 % of the size of the
+    mesh; the colour is the largest of each node over the period. A mark on the mesh is at the mean
+    place of the nodes that a joint's
     directions touch, in the colour of its contact state.
 
     **Raises:** `ValueError` if there is no limit cycle, for a batch, a regularised cycle, another
@@ -61,9 +63,9 @@ def animate_cycle(
     cycle: LimitCycle,
     structure: Structure,
     *,
-    points: ArrayLike,
-    dofs: ArrayLike,
-    cells: ArrayLike,
+    points: ArrayLike | None = None,
+    dofs: ArrayLike | None = None,
+    cells: ArrayLike | None = None,
     scale: float | None = None,
     frames: int = 24,
     fps: int = 12,
@@ -116,7 +118,15 @@ def _motion(
             f"joints, got {structure.n} and {len(structure.joints)}"
         )
     reduced = structure.reduction if isinstance(structure, ReducedStructure) else None
-    mesh = Mesh.of(points, dofs, cells, n if reduced is None else len(reduced.V))
+    given = {"points": points, "dofs": dofs, "cells": cells}
+    missing = [name for name, array in given.items() if array is None]
+    if len(missing) < len(given):
+        if missing:
+            raise ValueError(f"a mesh needs {' and '.join(missing)} as well")
+        mesh = Mesh(points, dofs, cells)
+    elif (mesh := structure.mesh) is None:
+        raise ValueError("structure has no mesh: give points, dofs and cells")
+    mesh.require(n if reduced is None else len(reduced.V))
     # The mean and the largest displacements take more times than are shown.
     count = frames * -(-_SAMPLES // frames)
     x = np.asarray(cycle.orbit(count)[1])[:, :n]
@@ -166,7 +176,7 @@ def _picture(motion: _Motion, scale: float | None) -> tuple[Figure, Callable[[fl
     mesh, count = motion.mesh, len(motion.names)
     amplitudes = np.linalg.norm(motion.moved, axis=2).max(axis=0)
     largest = float(amplitudes.max()) or 1.0
-    factor = mesh.scale(largest) if scale is None else float(scalar("scale", scale, above=0))
+    factor = scale_of(mesh, largest) if scale is None else float(scalar("scale", scale, above=0))
     heights = mesh_height(mesh), 1.1 + min(0.26 * count, 4.0)
     figure = new_figure(8.4, sum(heights))
     grid = figure.add_gridspec(2, 1, height_ratios=heights)

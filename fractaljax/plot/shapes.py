@@ -8,10 +8,11 @@ import numpy as np
 from jaxtyping import ArrayLike, Complex, Float
 
 from .._base.parts import whole
+from .._mechanism.mesh import Mesh
 from .._stability.stability import Stability
 from .animation import animated, animation_path
 from .axes import Axes, frequency_unit, given_or_new
-from .mesh import Mesh, draw_mesh
+from .mesh import draw_mesh, scale_of
 
 if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
@@ -94,7 +95,7 @@ def _picture(
     else:
         if dofs is None or cells is None:
             raise ValueError("points need dofs and cells beside them")
-        ax, move = _deformed(Mesh.of(points, dofs, cells, len(shape)), shape, ax, scale)
+        ax, move = _deformed(Mesh(points, dofs, cells).require(len(shape)), shape, ax, scale)
 
     def draw(phase: float) -> Any:
         move(np.exp(1j * phase))
@@ -128,7 +129,7 @@ def _deformed(
     motion = mesh.displacements(shape)
     amplitudes = _amplitudes(motion)
     largest = float(amplitudes.max()) or 1.0
-    factor = mesh.scale(largest) if scale is None else scale
+    factor = scale_of(mesh, largest) if scale is None else scale
     ax, drawn, move = draw_mesh(mesh, ax, factor * largest, amplitudes / largest, 1.0)
     bar = ax.figure.colorbar(drawn, ax=ax, location="bottom", shrink=0.6, aspect=40)
     bar.set_label("amplitude, of the largest [-]")

@@ -82,3 +82,84 @@ def test_starts_far_from_the_requirements_are_led_to_them():
     target = 0.5 * float(fj.growth_rate(x))
     best = fj.design(x, bounds, None, target, 0.0, starts=6, lattice=6, progress=False)
     assert best.failed_starts == 0 and best.violated == ()
+
+
+def test_what_holds_the_least_growth_rate():
+    """At p = q = r = 0.75 all four modes, each with a weight of 1/4 as none leads; by hand."""
+    x = one_damper(p=0.1, q=0.2, r=0.3)
+    best = fj.design(x, BOUNDS, target=-0.5, starts=2, lattice=4, progress=False)
+    found = best.least_growth
+    assert found is not None and found.met and found.stationary
+    assert found.growth_rate == pytest.approx(-0.375, abs=1e-7) and found.margin > 0
+    assert found.values == pytest.approx({name: 0.75 for name in SHARES}, abs=1e-6)
+    assert list(found.held_by.values()) == pytest.approx([0.25] * 4, abs=1e-6)
+    assert found.steepest == pytest.approx(0.5 * 1.99 * 3**0.5, rel=1e-3)  # of the last damper
+    assert found.agreed == found.starts == 3
+    words = str(best)
+    assert "least growth rate found, with every other requirement met: -0.375 1/s" in words
+    assert "no small change lowers it" in words and "3 of 3 starts end within 1 %" in words
+
+
+def test_bounds_and_requirements_hold_it_as_well():
+    """Only r may move, up to 0.5: the rate of its mode is held by the bound, 1/2 a unit of r."""
+    x = one_damper(p=0.7, q=0.7, r=0.3)
+    limits = {"r": (0.1, 0.5)}
+    found = fj.design(x, limits, target=-0.4, starts=1, lattice=2, progress=False).least_growth
+    assert found is not None and found.growth_rate == pytest.approx(-0.25, abs=1e-7)
+    assert found.held_by == pytest.approx(
+        {"growth_rate <= target": 1.0, "r <= upper bound": 0.4 / 2}, abs=1e-6
+    )
+
+    def most(x):
+        return 10 * (x.parameters["r"] - 0.4)
+
+    asked = dict(constraints=[most], starts=1, lattice=2, progress=False)
+    found = fj.design(x, limits, None, -0.4, **asked).least_growth
+    assert found is not None and found.growth_rate == pytest.approx(-0.2, abs=1e-6)
+    assert found.held_by == pytest.approx({"growth_rate <= target": 1.0, "most": 0.05}, abs=1e-6)
+
+
+def test_every_law_has_its_modes():
+    """A structure of two joints under its own law and another: rates as of each by itself."""
+    from fractaljax._design.joints import under
+    from fractaljax._design.problem import evaluate, state_problem
+
+    x = fractal_joints()
+    contact = x.joints[0].contact
+    law = fj.AsperityContact(fj.Surface(2.2, 1e-9), contact.material, 1.0, 1e-5)
+    none = dict.fromkeys(("objective", "target", "envelope", "tolerance"))
+    rest = dict(K_n_min=0.0, constraints=(), quantile=0.95, friction_slope=True)
+    limits = dict(area_ratio_min=2.0, slip_ratio_max=0.9, laws=[law])
+    problem = state_problem(x, {"left.D": (2.3, 2.5)}, **none, **rest, **limits)
+    k = problem.modes
+    row = evaluate(problem, np.asarray(problem.start)[None], np.zeros((1, 0)))[0]
+    growing = np.sinh(row[problem.growth_columns]) * float(problem.growth_scale)
+    assert len(growing) == 2 * k and len(problem.asked) == len(row)
+    names = problem.residual_names[problem.model_residuals :]
+    assert names[k] == "growth_rate <= target by AsperityContact"
+    for mechanism, rates in ((x, growing[:k]), (under(x, law), growing[k:])):
+        s = np.asarray(fj.stability(mechanism).eigenvalues)
+        wanted = np.sort(s[s.imag >= 0].real)[::-1][:k]
+        np.testing.assert_allclose(rates + float(problem.target), wanted, rtol=1e-8)
+    for joint, own in zip(under(x, law).joints, x.joints, strict=True):
+        assert repr(joint.contact.surface) == repr(own.contact.surface)
+        assert joint.contact.P == own.contact.P
+        assert joint.contact.L_s == law.L_s
+
+
+@pytest.mark.slow
+def test_a_structure_is_designed_under_two_laws():
+    x = fractal_joints()
+    law = fj.AsperityContact(fj.Surface(2.2, 1e-9), x.joints[0].contact.material, 1.0, 1e-5)
+    from fractaljax._design.joints import under
+
+    bounds: dict[str, tuple[float, float]] = {"D": (2.15, 2.85), "G": (1e-12, 1e-8)}
+    bounds = {
+        f"{joint}.{name}": ends for joint in ("left", "right") for name, ends in bounds.items()
+    }
+    own, other = (float(fj.growth_rate(y)) for y in (x, under(x, law)))
+    target = min(own, other) - 0.1 * abs(min(own, other))
+    best = fj.design(x, bounds, None, target, 0.0, laws=[law], starts=4, lattice=6, progress=False)
+    rates = [float(fj.growth_rate(y)) for y in (best.scene, under(best.scene, law))]
+    assert (best.violated == ()) == (max(rates) <= target + 1e-6)
+    assert best.violated == () or best.least_growth.growth_rate > target

@@ -97,7 +97,7 @@ def test_draws_have_the_covariance(covariance):
     assert tolerance.standard_deviations == pytest.approx(sigma)
     mapped = Tolerance.of(sigma)
     np.testing.assert_allclose(mapped.covariance, np.diag(np.diagonal(covariance)))
-    values = tolerance.scattered({"D": 2.4, "G": 1e-10, "P": 1.0}, drawn.T)
+    values = tolerance.scattered(fj.brake_scene(), {"D": 2.4, "G": 1e-10, "P": 1.0}, drawn.T)
     assert set(values) == {"D", "G"}
     np.testing.assert_allclose(np.log(values["G"] / 1e-10), drawn[:, 1], rtol=1e-9, atol=1e-12)
 
@@ -172,3 +172,42 @@ def test_refusals(tolerance, message):
 def test_what_is_no_covariance(covariance):
     with pytest.raises(ValueError, match=r"^tolerance must (have a symmetric|name the rows)"):
         Tolerance(("D", "ln G"), covariance)
+
+
+def test_a_plain_name_moves_all_joints_by_the_same_amount():
+    """Also where they differ, and where one of them is designed by itself."""
+    from structures import fractal_joints
+
+    x = fractal_joints().replace(**{"left.D": 2.3, "right.D": 2.5})
+    tolerance = Tolerance.of({"D": 0.01, "ln G": 0.1})
+    shift = np.array([0.02, 0.3])
+    found = tolerance.scattered(x, tolerance.base(x) | {"left.D": 2.35}, shift)
+    G = float(x.joints[0].contact.surface.G)
+    wanted = {
+        "left.D": 2.37,
+        "right.D": 2.52,
+        "left.G": G * np.exp(0.3),
+        "right.G": G * np.exp(0.3),
+    }
+    assert {name: float(value) for name, value in found.items()} == pytest.approx(wanted)
+    moved = tolerance.scattered(x, tolerance.base(x) | {"D": 2.6}, shift)
+    assert float(moved["left.D"]) == float(moved["right.D"]) == pytest.approx(2.62)
+    with pytest.raises(ValueError, match="independent, got D and left.D"):
+        Tolerance.of({"left.D": 0.01, "D": 0.01}).check(x, {})
+
+
+@pytest.mark.slow
+def test_probability_of_squeal_of_a_structure_by_a_loop():
+    """The draws of `squeal_probability`, one replace and one growth rate each."""
+    from structures import fractal_joints
+
+    x = fractal_joints().replace(**{"left.D": 2.3, "right.D": 2.5})
+    tolerance = Tolerance.of({"D": 0.05})
+    found = fj.squeal_probability(x, tolerance, samples=200)
+    shifts = tolerance.shifts(np.random.default_rng([0, 0]).standard_normal((200, 1)))[:, 0]
+
+    @jax.jit
+    def growth(by):
+        return fj.growth_rate(x.replace(**{"left.D": 2.3 + by, "right.D": 2.5 + by}))
+
+    assert found.value == np.mean([float(growth(by)) > 0 for by in shifts])

@@ -172,7 +172,9 @@ def test_refuses_what_is_no_list_of_laws(laws, message):
 def test_refuses_laws_of_a_structure():
     joint = fj.Joint(fj.FixedContact(1e6, 1e6, 10.0), fj.Coulomb(0.3), 0, 1)
     x = fj.Structure(jnp.eye(2), 0.1 * jnp.eye(2), jnp.eye(2) * 1e6, {"pad": joint})
-    with pytest.raises(ValueError, match="laws need a scene"):
+    with pytest.raises(
+        ValueError, match="laws of a structure need a joint whose contact has a surface"
+    ):
         fj.design(x, {"K_t": (1e5, 1e7)}, laws=[persson()], progress=False)
 
 
@@ -206,7 +208,7 @@ def test_default_suggestions():
 
 
 def test_refuses_what_is_no_scene():
-    with pytest.raises(TypeError, match="scene must be a Scene, got 3"):
+    with pytest.raises(TypeError, match="x must be a Scene or a Structure, got 3"):
         fj.verdict(cast(Any, 3))
     with pytest.raises(TypeError, match="scene must be a Scene, got 3"):
         fj.suggest(cast(Any, 3))

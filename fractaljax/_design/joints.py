@@ -1,0 +1,128 @@
+"""What designs ask of the joints of a scene or of a structure, which has several."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._base.parts import substitute
+from .._contact.contact import Contact, on_the_same_joint
+from .._contact.fixed import FixedContact
+from .._mechanism.joint import Joint
+from .._mechanism.mechanism import Mechanism
+from .._mechanism.quantities import joints_of, moved_by, own_quantities
+from .._mechanism.scene import Scene
+from .._mechanism.structure import Structure
+from .._stability.band import in_band
+
+
+def of_joint(name: str) -> str:
+    """What a quantity of a joint begins with; of a scene, nothing."""
+    return f"{name}." if name else ""
+
+
+class _Stiffness(NamedTuple):
+    """What designs ask of a `ContactState`, of a law without one."""
+
+    K_n: Array
+    K_t: Array
+    log_area_ratio: None = None
+    slip_ratio: None = None
+
+
+def state_of(part) -> Any:
+    """The `ContactState` of a scene or a joint, of other laws their stiffness."""
+    law, friction = part.contact, part.friction
+    if law.fractal:
+        return law.state(friction.mu_s, friction.mu_m)
+    return _Stiffness(*law.stiffness(friction.mu_s, friction.mu_m))
+
+
+def is_fractal(x, name) -> bool:
+    """Whether a contact has the source's law."""
+    return joints_of(x)[name].contact.fractal
+
+
+def slips(x, name) -> bool:
+    """Whether a contact has the source's tangential law, which slips."""
+    return is_fractal(x, name) and joints_of(x)[name].contact.stiffness_ratio is None
+
+
+def with_stiffness(x, states):
+    """`x` with contacts of known stiffness where their states (by name) are known already."""
+    parts, zero = joints_of(x), FixedContact(0.0, 0.0, 1.0)
+    for name, state in states.items():
+        P = getattr(parts[name].contact, "P", zero.P)  # of a preloaded joint
+        known = substitute(zero, {"K_n": state.K_n, "K_t": state.K_t, "P": P})
+        parts[name] = eqx.tree_at(lambda part: part.contact, parts[name], known)
+    if isinstance(x, Structure):
+        return eqx.tree_at(lambda s: s.joints, x, tuple(parts.values()))
+    return parts[""]
+
+
+def with_contacts(x: Mechanism, contacts: Mapping[str, Contact]) -> Any:
+    """`x` with other contact laws in the joints of these names; that of a scene is "".
+
+    **Raises:** `ValueError` naming the joint of a structure that a law does not suit.
+    """
+    if isinstance(x, Scene):
+        return eqx.tree_at(lambda scene: scene.contact, x, contacts.get("", x.contact))
+    joints = joints_of(x)
+    for name, contact in contacts.items():
+        joint = joints[name]
+        rest = joint.friction, joint.tangential, joint.normal, joint.V, joint.preload
+        try:
+            joints[name] = Joint(contact, *rest)
+        except ValueError as error:
+            raise ValueError(f"joint {name} by {type(contact).__name__}: {error}") from None
+    return eqx.tree_at(lambda structure: structure.joints, x, tuple(joints.values()))
+
+
+def under(x: Mechanism, law: Contact) -> Any:
+    """`x` with another contact law for its surface, material and load.
+
+    Of a structure, in every joint whose contact has a surface; errors as `with_contacts`.
+    """
+    found = {
+        name: on_the_same_joint(law, part.contact)
+        for name, part in joints_of(x).items()
+        if isinstance(x, Scene) or part.contact.has_surface
+    }
+    return with_contacts(x, found)
+
+
+def moved_contacts(x, names) -> tuple[str, ...]:
+    """The contacts with a law whose stiffness these quantities move."""
+    moved = {each for name in names for each in moved_by(x, name)}
+    found = []
+    for name, part in joints_of(x).items():
+        own = {*own_quantities(part.contact), *own_quantities(part.friction)}
+        law = not isinstance(part.contact, FixedContact)
+        if law and moved & {of_joint(name) + each for each in own}:
+            found.append(name)
+    return tuple(found)
+
+
+def least_damping(x) -> tuple[float, float]:
+    """The least damping rate [1/s] without friction, and the least frequency [rad/s]."""
+    if isinstance(x, Scene):
+        o = x.oscillator
+        omega = np.array([o.omega_1, o.omega_2], float)
+        return float((np.array([o.xi_1, o.xi_2]) * omega).min()), float(omega.min())
+    M, C, K = (np.asarray(X, float) for X in (x.M, x.C, x.K))
+    for joint in x.joints:
+        stiffness = joint.stiffness()
+        for each, dofs in zip(stiffness, (joint.normal, joint.tangential), strict=True):
+            if dofs is None:
+                continue
+            d = np.asarray(x.direction(dofs), float)
+            K = K + float(each) * np.outer(d, d)
+    n = len(M)
+    A = np.block([[np.zeros((n, n)), np.eye(n)], [-np.linalg.solve(M, K), -np.linalg.solve(M, C)]])
+    s = np.linalg.eigvals(A)
+    inside = np.asarray(in_band(jnp.asarray(s), x.band))
+    s = s[inside] if inside.any() else s
+    return max(0.0, float(-s.real.max())), float(np.abs(s).min())
