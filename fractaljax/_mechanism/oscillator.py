@@ -125,8 +125,8 @@ def linearise(
     """Eq. 43 about the equilibrium, at sliding velocity V; with the friction law's slope if asked.
 
     The slope adds mu'(V) N_0/m to the damping of direction 1 and -mu'(V) K_t x_01/m to that of
-    direction 2, where N_0 is K_n x_02, or P + K_n x_02 of a joint with the preload P; or `static` is
-    (x_01, N_0), and K_n the slope of the load curve there. A law without slope traces neither of
+    direction 2, where N_0 is K_n x_02, or P + K_n x_02 of a joint with the preload P; or `static`
+    is (x_01, N_0), and K_n the slope of the load curve there. A law without slope traces neither of
     them, nor the equilibrium, but for a preload: where N_0 <= 0 the joint is open, and c_1 is NaN.
     """
     m, V = oscillator.m, oscillator.V
