@@ -88,11 +88,11 @@ def cycle() -> dict[str, float]:
         a_2 = -f - 2 * XI_2 * OMEGA_2 * u_2 - (OMEGA_2**2 + K_n) * x_2 - mu(V - u_2) * K_t * x_1
         return [u_1, u_2, a_1, a_2]
 
-    def turns(_, y):
+    def maximum(_, y):
         return y[2]
 
     start = [1e-5, 0.0, 0.0, 0.0]
-    found = solve_ivp(rates, (0, END), start, "LSODA", rtol=1e-8, atol=1e-12, events=turns)
+    found = solve_ivp(rates, (0, END), start, "LSODA", rtol=1e-8, atol=1e-12, events=maximum)
     t, x = found.t_events[0], np.array([y[0] for y in found.y_events[0]])
     return {"frequency": float(1 / (t[-1] - t[-3])), "amplitude": float(abs(x[-1] - x[-2]))}
 

@@ -96,7 +96,7 @@ def put(path: Path, name: str) -> None:
         aim = path.parent / link
         if aim.is_file() and aim.suffix not in (".md", ".png", ".ipynb", ".html"):
             shutil.copy(aim, target.parent / aim.name)  # a file to read, such as CITATION.cff
-    text = re.sub(r"(\]\([^)]*)README\.md", r"\1index.md", text)
+    text = re.sub(r"(\]\([^)]*)README\.md", r"\1index.md", text).replace("](docs/site/", "](")
     target.write_text(re.sub(r"(\]\([^):]*)\.ipynb", r"\1.md", text), encoding="utf-8")
 
 
@@ -125,7 +125,7 @@ def executed(path: Path) -> nbformat.NotebookNode:
     for beside in path.parent.glob("*.py"):
         shutil.copy(beside, work)
     place = {"metadata": {"path": str(work)}}
-    nbclient.NotebookClient(wanted, kernel_name="python3", resources=place, timeout=600).execute()
+    nbclient.NotebookClient(wanted, kernel_name="python3", resources=place, timeout=1800).execute()
     if kept is not None:
         kept.parent.mkdir(parents=True, exist_ok=True)
         nbformat.write(wanted, kept)

@@ -199,11 +199,11 @@ def log_domain_extension(D: Numbers) -> Numbers:
     psi falls from (3 + 5^(1/2))/2 at D = 2 to e - 1 at D = 3.
     """
 
-    def excess(x):
+    def residual(x):
         rest = jnp.log1p(jnp.exp(-(D - 1) / 2 * x))
         return (D - 1) / 2 * boxcox(x, (3 - D) / 2) + boxcox(rest, -(3 - D) / (D - 1)) - 1
 
-    return _root(excess, jnp.full_like(D, 0.75))
+    return _root(residual, jnp.full_like(D, 0.75))
 
 
 def _root(f: Callable[[Numbers], Numbers], start: Numbers) -> Numbers:

@@ -224,11 +224,11 @@ def loaded_equilibrium(curves: Sequence[LoadCurve | LoadTable], e: Array, W: Arr
     comes down to the root from there.
     """
 
-    def excess(at):
+    def residual(at):
         return jnp.stack([1 + x - curve(x) for curve, x in zip(curves, at, strict=True)])
 
     def closer(at, _):
-        value, slope = jax.jvp(excess, (at,), (jnp.ones_like(at),))
+        value, slope = jax.jvp(residual, (at,), (jnp.ones_like(at),))
         matrix = jnp.eye(len(at), dtype=at.dtype) - W * slope[None]
         return at - jnp.linalg.solve(matrix, at - e - W @ value), None
 

@@ -120,10 +120,10 @@ class Follower:
         while not isinstance(state, BranchEnd):
             if len(self.points) - origin >= self.most:
                 return BranchEnd.long
-            state = self._stretch(*state, origin)
+            state = self._within_itinerary(*state, origin)
         return state
 
-    def _stretch(self, shooting: Shooting, z, ahead, origin):
+    def _within_itinerary(self, shooting: Shooting, z, ahead, origin):
         """Follows one itinerary on one mesh; returns where to go on, or why not."""
         smooth = shooting.phases[0].guard == SECTION
         for reached, turned, leaves in shooting.curves.steps(z, ahead):

@@ -120,29 +120,29 @@ def linearise(
     K_t: ArrayLike,
     friction_slope: bool = True,
     P: ArrayLike | None = None,
-    rest: tuple[Array, Array] | None = None,
+    static: tuple[Array, Array] | None = None,
 ) -> Linearised:
     """Eq. 43 about the equilibrium, at sliding velocity V; with the friction law's slope if asked.
 
     The slope adds mu'(V) N_0/m to the damping of direction 1 and -mu'(V) K_t x_01/m to that of
-    direction 2, where N_0 is K_n x_02, or P + K_n x_02 of a joint with the preload P; or `rest` is
-    (x_01, N_0), and K_n the slope of the load curve there. A law without slope traces neither of
+    direction 2, where N_0 is K_n x_02, or P + K_n x_02 of a joint with the preload P; or `static`
+    is (x_01, N_0), and K_n the slope of the load curve there. A law without slope traces neither of
     them, nor the equilibrium, but for a preload: where N_0 <= 0 the joint is open, and c_1 is NaN.
     """
     m, V = oscillator.m, oscillator.V
     mu = friction.mu(V) if friction.velocity_dependent else friction.mu_s
     c_1 = 2 * oscillator.xi_1 * oscillator.omega_1
     c_2 = 2 * oscillator.xi_2 * oscillator.omega_2
-    N = None if rest is None else rest[1]
-    if rest is None and P is not None:
+    N = None if static is None else static[1]
+    if static is None and P is not None:
         N = static_normal_force(oscillator, K_n, K_t, mu, P)
     if flag("friction_slope", friction_slope) and friction.velocity_dependent:
         slope = friction.slope(V)
-        if rest is None:
+        if static is None:
             x_01, x_02 = static_displacements(oscillator, K_n, K_t, mu, P)
             pull = K_n * x_02 if N is None else N
         else:
-            x_01, pull = rest
+            x_01, pull = static
         c_1 = c_1 + slope * pull / m
         c_2 = c_2 - slope * K_t * x_01 / m
     if N is not None:

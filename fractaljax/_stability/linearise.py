@@ -31,7 +31,7 @@ class Pressed(NamedTuple):
 
     K_n: Array
     K_t: Array
-    rest: tuple[Array, Array] | None  # x_01 and the normal force, where a load curve decides them
+    static: tuple[Array, Array] | None  # x_01 and the normal force, where a load curve decides them
 
 
 def pressed(scene: Scene) -> Pressed:
@@ -59,15 +59,15 @@ def linearised_at(scene: Scene, at: Pressed, friction_slope: bool) -> Linearised
     """As `linearised`, with a joint that is known already."""
     load = scene.normal_load
     o, law = scene.oscillator, scene.friction
-    return linearise(o, law, at.K_n, at.K_t, friction_slope, load, at.rest)
+    return linearise(o, law, at.K_n, at.K_t, friction_slope, load, at.static)
 
 
 def normal_force(scene: Scene, at: Pressed) -> Float[Array, " 1"] | None:
     """The normal force [N] at the equilibrium, if the scene is preloaded; at most 0: it is open."""
     if scene.normal_load is None:
         return None
-    if at.rest is not None:
-        return at.rest[1][None]
+    if at.static is not None:
+        return at.static[1][None]
     mu, P = sliding_friction(scene), scene.normal_load
     return static_normal_force(scene.oscillator, at.K_n, at.K_t, mu, P)[None]
 

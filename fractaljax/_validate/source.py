@@ -196,14 +196,14 @@ def _cycle_by_scipy(K_n):
         a_2 = -_F / np.sqrt(2) - mu(_V - v_2) * K_t * x_1 - 2 * xi_2 * w_2 * v_2
         return [v_1, v_2, a_1 - (w_1**2 + K_t) * x_1, a_2 - (w_2**2 + K_n) * x_2]
 
-    def turns(_, y):
+    def maximum(_, y):
         return y[2]
 
-    turns.direction = -1
+    maximum.direction = -1
     period = 2 * np.pi / np.sqrt(w_1**2 + w_2**2 + K_n) * 1.05
     options = {"method": "LSODA", "rtol": 1e-8, "atol": [1e-14, 1e-14, 1e-10, 1e-10]}
     found = solve_ivp(
-        rate, (0, 40 * period), [9e-6, 0, 0, 0], events=turns, max_step=period / 100, **options
+        rate, (0, 40 * period), [9e-6, 0, 0, 0], events=maximum, max_step=period / 100, **options
     )
     first, last = found.t_events[0][-2:]
     inside = (found.t >= first) & (found.t <= last)

@@ -55,7 +55,7 @@ def test_cells_are_equally_likely():
     np.testing.assert_allclose(envelope.values(envelope.cells()).mean(axis=0), [2000, 3])
 
 
-def test_wide_ranges_are_walked_in_logarithms():
+def test_wide_ranges_are_searched_in_logarithms():
     """More than a decade: the middle is the geometric mean."""
     envelope = fj.Envelope({"xi_1": (1e-4, 1e-2), "P": (1000.0, 3000.0)})
     middle = np.array([[0, 0.5, 0.5]])
