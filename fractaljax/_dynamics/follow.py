@@ -13,6 +13,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from .._continuation import cubic
 from .hybrid import OPEN, SECTION
 from .itinerary import Family, Phase, Shooting, Solution, multipliers_of
 from .shooting import after_switch, guards_at, linearised, measured, rate_at
@@ -20,6 +21,7 @@ from .shooting import after_switch, guards_at, linearised, measured, rate_at
 _FINER = 8  # attempts at a mesh that is fine enough
 _NEW = (1e-3, 1e-4, 1e-2)  # durations of a phase that appears, as a share of the period
 SMALL = 0.03  # size of a smooth orbit, in units of V/omega, below which a Hopf point is near
+_NARROW = 3e-8  # share of a step within which the end of an itinerary is found
 _SHORT = 1e-6  # duration of a phase that vanishes, as a share of the period
 _ROUNDING = 1e-9  # a guard this far below zero is kept to
 
@@ -180,7 +182,12 @@ class Follower:
 
     def _between(self, shooting, z, reached, share):
         """The point of the curve near that share of the way, or None."""
-        found = shooting.curves.corrected(z + share * (reached - z))
+        if share in (0.0, 1.0):
+            return reached if share else z
+        way = reached - z
+        ends = (shooting.curves.tangent(shooting.equations(at)[1]) for at in (z, reached))
+        first, last = (t if t @ way > 0 else -t for t in ends)
+        found = shooting.curves.corrected(cubic(z, first, reached, last, share))
         return None if found is None else found[0]
 
     def _root(self, shooting, z, reached, test: Callable) -> np.ndarray | None:
@@ -292,19 +299,7 @@ class Follower:
 
     def _leaves_itinerary(self, shooting: Shooting, z, reached):
         """From an admissible z to where the orbit ceases to be, and on from there."""
-        low, high, inside = 0.0, 1.0, z
-        worst = shooting.admissibility(reached), reached
-        for _ in range(24):
-            middle = (low + high) / 2
-            at = self._between(shooting, z, reached, middle)
-            value = None if at is None else shooting.admissibility(at)
-            if value is not None and value > 0:
-                low, inside = middle, at
-            else:
-                high = middle
-                if value is not None:
-                    worst = value, at
-        outside = worst[1]
+        inside, outside = self._bracket(shooting, z, reached)
         p = int(np.argmin(shooting.durations(inside)))
         # A phase this short is about to vanish, though rounding may touch one of its guards first.
         vanishes = shooting.durations(inside)[p] < _SHORT
@@ -318,6 +313,30 @@ class Follower:
             if candidate is not None:
                 return candidate
         return self._ends(shooting, inside, outside)
+
+    def _bracket(self, shooting: Shooting, z, reached) -> tuple[np.ndarray, np.ndarray]:
+        """Points inside and outside the itinerary, close to each other where it ends."""
+        import scipy.optimize  # not before it is used: it takes its time
+
+        inside, outside = {0.0: z}, {1.0: reached}
+
+        def along(share):
+            at = (inside | outside).get(share)
+            if at is None:
+                at = self._between(shooting, z, reached, share)
+            value = -1.0 if at is None else shooting.admissibility(at)
+            if share > 0 and at is not None:
+                (inside if value > 0 else outside)[share] = at
+            return value if share > 0 else max(value, 1e-15)
+
+        share: Any = scipy.optimize.brentq(along, 0.0, 1.0, xtol=_NARROW)
+        along(min(share + _NARROW, 1.0))
+        # Rounding may hide on which side a point is: further and further inside.
+        away = _NARROW
+        while away < share and along(share - away) <= 0:
+            away *= 4
+        last = min(outside)
+        return inside[max(share for share in inside if share < last)], outside[last]
 
     def _ends(self, shooting, inside, outside) -> BranchEnd:
         """Notes the grazing beyond which no cycle goes on."""
