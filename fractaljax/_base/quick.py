@@ -39,6 +39,17 @@ def quick_jit(function: Callable, static_argnames: str | tuple[str, ...] = ()) -
     return kept(call, static_argnames, outermost)
 
 
+def outermost_jit(function: Callable, static_argnames: str | tuple[str, ...] = ()) -> Callable:
+    """`quick_jit` of a program that is never traced, without the time to look whether it is."""
+    _, outermost = _jitted(function, static_argnames)
+
+    @functools.wraps(function)
+    def call(*args, **kwargs):
+        return outermost()(*args, **kwargs)
+
+    return kept(call, static_argnames, outermost)
+
+
 def command_jit(function: Callable, static_argnames: str | tuple[str, ...] = ()) -> Callable:
     """`jax.jit`; a command, which runs the program a few times, compiles it quickly."""
     plain, outermost = _jitted(function, static_argnames)

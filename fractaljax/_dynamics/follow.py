@@ -15,7 +15,7 @@ import numpy as np
 
 from .._continuation import cubic
 from .hybrid import OPEN, SECTION
-from .itinerary import Family, Phase, Shooting, Solution, multipliers_of
+from .itinerary import Family, Phase, Shooting, Solution
 from .shooting import after_switch, guards_at, linearised, measured, rate_at
 
 _FINER = 8  # attempts at a mesh that is fine enough
@@ -63,7 +63,7 @@ class Follower:
         given = solution.x, self.window, solution.chain, solution.lifted, solution.u
         (low, high, state), second, error = map(np.asarray, measured(*given))
         n, h = self.n, shooting.lengths(z)
-        values = multipliers_of(shooting.monodromy(z))
+        values = shooting.multipliers(z)
         states = np.array([phase.s for phase in shooting.phases])
         row = {
             "period": float(h.sum() * second),
@@ -208,23 +208,21 @@ class Follower:
     def _smooth_events(self, shooting, z, ahead, reached, turned) -> None:
         """Folds and changes of stability between two points of one itinerary."""
 
-        def tangent(at):
-            t = shooting.curves.tangent(shooting.equations(at)[1])
-            return t if t @ ahead > 0 else -t
+        if ahead[-1] * turned[-1] < 0:
 
-        if tangent(z)[-1] * turned[-1] < 0:
-            at = self._root(shooting, z, reached, lambda at: tangent(at)[-1])
+            def slope(at):
+                t = shooting.curves.tangent(shooting.equations(at)[1])
+                return (t if t @ ahead > 0 else -t)[-1]
+
+            at = self._root(shooting, z, reached, slope)
             if at is not None:
                 self._noted("fold", shooting, at, ("fold",))
 
-        def nontrivial(at):
-            return multipliers_of(shooting.monodromy(at))[:-1]
-
         def doubling(at):
-            return float(np.prod(nontrivial(at) + 1).real)
+            return float(np.prod(shooting.multipliers(at)[:-1] + 1).real)
 
         def rotating(at):
-            values = nontrivial(at)
+            values = shooting.multipliers(at)[:-1]
             turning = np.abs(values[np.abs(np.imag(values)) > 1e-9])
             return float(turning.max() - 1) if len(turning) else -1.0
 

@@ -121,9 +121,10 @@ class Shooting:
         u = np.concatenate([np.asarray(y[:, 0]), h, np.zeros(self.padded - m), old.u[-1:]])
         self.chain, self.m, self.length = chain, m, h.copy()
         blank = jnp.zeros((2 * n, len(u), N), y.dtype)
-        self.memory = [(_FAR, Lifted(jnp.asarray(u), y, blank))]
-        self.keys = self.key(u, old.r)[None]  # of the memory
+        self.memory = [Lifted(jnp.asarray(u), y, blank)]
+        self.keys, self.gaps = self.key(u, old.r)[None], np.array([_FAR])  # of the memory
         self.known: dict[bytes, Any] = {}  # of the last points
+        self.spectra: dict[bytes, np.ndarray] = {}  # of the last two
         self.last: tuple[Any, ...] | None = None  # point without gaps, its residual and Jacobian
         size = 1 + float(np.abs(np.asarray(y)).max())
         period = float(h.sum())
@@ -246,33 +247,36 @@ class Shooting:
 
     def near(self, key) -> Lifted:
         """The evaluation that says best where the states are: nearby, and then without gaps."""
-        return self.memory[self._nearest(key)][1]
+        return self.memory[self._nearest(key)]
 
     def _nearest(self, key) -> int:
-        gaps = np.array([gap for gap, _ in self.memory])
-        return int(np.argmin(np.abs(self.keys - key).max(axis=1) ** 2 + gaps**2))
+        return int(np.argmin(np.abs(self.keys - key).max(axis=1) ** 2 + self.gaps**2))
 
     def extrapolated(self, key, u) -> Lifted:
         """The states at u, by a cubic through two evaluations where these lie in line with it."""
         i = self._nearest(key)
-        near, ways, way = self.memory[i][1], self.keys[i] - self.keys, key - self.keys[i]
-        squares = np.maximum((ways**2).sum(axis=1), 1e-300)
-        shares = ways @ way / squares
-        off = np.abs(way - shares[:, None] * ways).max(axis=1)
-        gaps = np.array([gap for gap, _ in self.memory])
+        near, ways, way = self.memory[i], self.keys[i] - self.keys, key - self.keys[i]
         apart = np.abs(way).max()
-        fits = (shares > _BETWEEN[0]) & (shares < _BETWEEN[1]) & (gaps < _APART)
-        fits &= (off < 0.3 * apart) & (gaps[i] < _APART)
-        if apart < self.linear or not fits.any():
+        if apart < self.linear or self.gaps[i] > _APART:
+            return near
+        shares = ways @ way / np.maximum((ways**2).sum(axis=1), 1e-300)
+        off = np.abs(way - shares[:, None] * ways).max(axis=1)
+        fits = (shares > _BETWEEN[0]) & (shares < _BETWEEN[1]) & (self.gaps < _APART)
+        fits &= off < 0.3 * apart
+        if not fits.any():
             return near
         k = int(np.argmin(np.where(fits, np.abs(shares), np.inf)))
-        other, x = self.memory[k][1], shares[k]
-        D, first, last = np.asarray(near.D), np.asarray(other.y), np.asarray(near.y)
-        step = np.asarray(near.u) - np.asarray(other.u)
-        slope, before = (np.einsum("ikn,k->in", np.asarray(A), step) for A in (D, other.D))
-        square, cube = 2 * slope + before - 3 * (last - first), slope + before - 2 * (last - first)
-        y = np.asarray(near.at(u)) + x**2 * (square + x * cube)
-        return Lifted(jnp.asarray(u), jnp.asarray(y), near.D)
+        first, last, D, before = map(
+            np.asarray, (self.memory[k].y, near.y, near.D, self.memory[k].D)
+        )
+        step = np.asarray(near.u) - np.asarray(self.memory[k].u)
+        slope, slope_before, change = (
+            np.einsum("ikn,k->in", A, by)
+            for A, by in ((D, step), (before, step), (D, u - np.asarray(near.u)))
+        )
+        square = 2 * slope + slope_before - 3 * (last - first)
+        cube = slope + slope_before - 2 * (last - first)
+        return Lifted(u, last + change + shares[k] ** 2 * (square + shares[k] * cube), near.D)
 
     def evaluated(self, z):
         """Residual and Jacobian of the orbit at z, by the unknowns before they are scaled."""
@@ -283,18 +287,23 @@ class Shooting:
             at, residual, jacobian = self.last
             return residual + jacobian @ ((z - at) * self.scale), jacobian
         u, at = self.full(z), self.key(self.full(z), z[-1])
-        x, window, states = self.mechanism(z), self.family.window, self.extrapolated(at, self.full(z))
+        x, window, states = (
+            self.mechanism(z),
+            self.family.window,
+            self.extrapolated(at, self.full(z)),
+        )
         rows = np.arange(2 * self.family.n + self.m)
         for _ in range(_CLOSINGS):
             given = x, window, self.chain, states, u
             residual, jacobian, states, gap = condensed(*given)
             residual, gap = np.asarray(residual)[rows], float(gap)
             # Newton's method closes gaps as well, whose squares the residual is uncertain by.
-            if not gap > self.gap or gap < _APART and 10 * gap**2 < np.abs(residual).max():
+            if not gap > self.gap or (gap < _APART and 10 * gap**2 < np.abs(residual).max()):
                 break
         if gap < _FAR:
-            self.memory = [*self.memory[-_MEMORY:], (gap, states)]
-            self.keys = np.vstack([self.keys[-_MEMORY:], at])
+            self.memory = [*self.memory[-_MEMORY:], states]
+            self.keys = np.concatenate([self.keys[-_MEMORY:], at[None]])
+            self.gaps = np.append(self.gaps[-_MEMORY:], gap)
         found = residual, np.asarray(jacobian)[np.ix_(rows, self.active)]
         self.known = dict([*self.known.items()][-_MEMORY:]) | {key: found}
         if gap <= self.gap and self.linear:
@@ -310,9 +319,13 @@ class Shooting:
         lifted = self.near(self.key(u, z[-1]))
         return Solution(self.mechanism(z), self.phases, self.chain, lifted, u)
 
-    def monodromy(self, z) -> np.ndarray:
-        """The Jacobian (2n, 2n) of the return map."""
-        return return_jacobian(self.evaluated(z)[1], 2 * self.family.n, np)
+    def multipliers(self, z) -> np.ndarray:
+        """Floquet multipliers (2n,) by size, and 1 last."""
+        key = z.tobytes()
+        if key not in self.spectra:
+            of_return = return_jacobian(self.evaluated(z)[1], 2 * self.family.n, np)
+            self.spectra = dict([*self.spectra.items()][-1:]) | {key: multipliers_of(of_return)}
+        return self.spectra[key]
 
     def lowest(self, z) -> tuple[float, Place]:
         """The least reduced guard on the orbit, and where."""
