@@ -1,7 +1,8 @@
 """Curves of zeros by pseudo-arclength continuation: n - 1 smooth equations in n unknowns.
 
 A step along the cubic through the last two points and their tangents, then Newton steps back onto
-the curve the shortest way: a fold is a point like any other. In two unknowns `trace` finds all curves in the unit square that cross a lattice.
+the curve the shortest way: a fold is a point like any other. In two unknowns `trace` finds all
+curves in the unit square that cross a lattice.
 """
 
 import dataclasses
@@ -134,7 +135,7 @@ class Continuation:
         target, fixed = u + length * ahead, None
         if before is not None and self._inside(target):
             size = float(np.linalg.norm(u - before[0]))
-            target = cubic(*before, u, ahead, 1 + length / size)
+            target = cubic(before[0], before[1], u, ahead, 1 + length / size)
         leaves = not self._inside(target)
         if leaves:
             share, fixed, side = self._way_out(u, target)

@@ -133,7 +133,7 @@ def verdict(
         questions.append(_scattered(scene, tolerance, envelope, friction_slope, seed))
     if quiet_within is not None:
         kicks = Kicks.of(scene, quiet_within, seed, flag("progress", progress))
-        survived, asked = kicks.survived(scene), kicks.size
+        survived, asked = kicks.survived([scene]), kicks.size
         found = f"comes to rest from {survived:.3g} of {asked:.3g}"
         name = f"kicks within {quiet_within}"
         questions.append(Question("smaller kicks", name, found, survived >= asked))
