@@ -16,13 +16,15 @@ import numpy as np
 from .._continuation import cubic
 from .hybrid import OPEN, SECTION
 from .itinerary import Family, Phase, Shooting, Solution
-from .shooting import after_switch, guards_at, linearised, measured, rate_at
+from .shooting import after_switch, guards_at, largest_friction, linearised, measured, rate_at
 
 _FINER = 8  # attempts at a mesh that is fine enough
 _NEW = (1e-3, 1e-4, 1e-2)  # durations of a phase that appears, as a share of the period
 SMALL = 0.03  # size of a smooth orbit, in units of V/omega, below which a Hopf point is near
 _NARROW = 3e-8  # share of a step within which the end of an itinerary is found
 _SHORT = 1e-6  # duration of a phase that vanishes, as a share of the period
+_FAST = 10.0  # coefficient of friction over the static one, beyond which no law is one
+_SAMPLED = 512  # states of an orbit at which that is looked at
 _ROUNDING = 1e-9  # a guard this far below zero is kept to
 
 
@@ -35,6 +37,7 @@ class BranchEnd(eqx.Enumeration):
     jump = "where no cycle with another itinerary goes on: a motion jumps from here"
     meets = "where another event meets it"
     lost = "where it could not be followed"
+    fast = "where it slides so fast that the friction law has lost its meaning"
     long = "after the largest number of points"
 
 
@@ -147,7 +150,15 @@ class Follower:
                 return self._remeshed(shooting, z, ahead)
         if smooth and self._shrinks(shooting, z, 5):
             return self._hopf(shooting, z)
-        return BranchEnd.lost
+        return self._lost(shooting, z)
+
+    def _lost(self, shooting: Shooting, z) -> BranchEnd:
+        """Why Newton's method fails beyond z: perhaps friction that grows without bound."""
+        solution = shooting.solution(z)
+        times = np.linspace(0, solution.times[-1], _SAMPLED, endpoint=False)
+        y, _ = self.family.sampled(solution, times, _SAMPLED)
+        given = solution.x, self.window, solution.u[-1], y
+        return BranchEnd.fast if float(largest_friction(*given)) > _FAST else BranchEnd.lost
 
     def reverse(self) -> None:
         """The points in the opposite order."""
@@ -170,7 +181,7 @@ class Follower:
             new = old.again(old.solution(z), old.phases, times)
             found = new.curves.corrected(new.begin)
             if found is None:
-                return BranchEnd.lost
+                return self._lost(old, z)
             solution = new.solution(found[0])
             given = solution.x, self.window, solution.chain, solution.lifted, solution.u
             if float(measured(*given)[2]) <= self.family.rtol / 2:

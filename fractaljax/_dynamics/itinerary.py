@@ -225,11 +225,13 @@ class Shooting:
         return u
 
     def durations(self, z) -> np.ndarray:
+        """Of the phases, scaled, which must be above zero."""
         return z[2 * self.family.n : self.quantity]
 
     def lengths(self, z) -> np.ndarray:
         """The durations of the phases in scaled time."""
-        return self.durations(z) * self.scale[2 * self.family.n : self.quantity]
+        of_phases = slice(2 * self.family.n, self.quantity)
+        return z[of_phases] * self.scale[of_phases]
 
     def mechanism(self, z) -> Any:
         return self.x

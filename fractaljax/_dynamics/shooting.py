@@ -332,6 +332,14 @@ def linearised(x, window: Window, q):
 
 
 @jax.jit
+def largest_friction(x, window: Window, q, y):
+    """The largest coefficient of friction at states y (2n, k), over the static one."""
+    system = window.system(x, q)
+    speeds = system.speed * jnp.abs(system.sliding(y[system.n :]))
+    return jnp.max(system.over_static(speeds))
+
+
+@jax.jit
 def after_switch(x, window: Window, q, y, s, guard):
     """The contact state after a guard of contact state s has reached zero at y."""
     return window.system(x, q).switch(y, s, guard)[1]
