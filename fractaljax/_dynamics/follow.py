@@ -147,7 +147,11 @@ class Follower:
             z, ahead = reached, turned
             inaccurate = self.points[-1].row["error"] > self.family.rtol
             if inaccurate or shooting.stale(z):
-                return self._remeshed(shooting, z, ahead)
+                onward = self._remeshed(shooting, z, ahead)
+                if inaccurate and not isinstance(onward, BranchEnd):
+                    self.points.pop()
+                    self.record(*onward[:2])
+                return onward
         if smooth and self._shrinks(shooting, z, 5):
             return self._hopf(shooting, z)
         return self._lost(shooting, z)
