@@ -13,8 +13,8 @@ from scipy.optimize import brentq
 
 import fractaljax as fj
 import hybrid_truth
-from benchmarks import transients
 from belt import least_speed, slip
+from benchmarks import transients
 from fractaljax._mechanism.quantities import replaced
 from mechanisms import PROBLEMS, changed
 from structures import of_problem
