@@ -1,7 +1,8 @@
 """Curves of zeros by pseudo-arclength continuation: n - 1 smooth equations in n unknowns.
 
-A step along the tangent, then Newton steps back onto the curve the shortest way: a fold is a point
-like any other. In two unknowns `trace` finds all curves in the unit square that cross a lattice.
+A step along the cubic through the last two points and their tangents, then Newton steps back onto
+the curve the shortest way: a fold is a point like any other. In two unknowns `trace` finds all
+curves in the unit square that cross a lattice.
 """
 
 import dataclasses
@@ -112,22 +113,29 @@ class Continuation:
 
         They end before the edge where Newton's method fails however short the step.
         """
-        length, leaves = self.longest / 4, False
+        length, leaves, before = self.longest / 4, False, None
         while not leaves:
-            step = self._step(u, ahead, length, sign)
+            step = self._step(u, ahead, length, sign, before)
             if step is None:
                 length /= 2
                 if length < self.shortest:
                     return
                 continue
+            before = u, ahead
             u, ahead, angle, leaves = step
             yield u, ahead, leaves
             if angle < _STRAIGHT:
                 length = min(1.5 * length, self.longest)
 
-    def _step(self, u, ahead, length, sign):
-        """The next point, its direction, the angle to it, whether on the edge; None if too long."""
+    def _step(self, u, ahead, length, sign, before):
+        """The next point, its direction, the angle to it, whether on the edge; None if too long.
+
+        `before` are the last point and the direction there, None at the first one.
+        """
         target, fixed = u + length * ahead, None
+        if before is not None and self._inside(target):
+            size = float(np.linalg.norm(u - before[0]))
+            target = cubic(before[0], before[1], u, ahead, 1 + length / size)
         leaves = not self._inside(target)
         if leaves:
             share, fixed, side = self._way_out(u, target)
@@ -165,6 +173,14 @@ class Continuation:
         aside = np.linalg.norm(start - along * ahead)
         near = aside < 0.1 * np.linalg.norm(step) + self.shortest
         return bool(near and 0 < along <= step @ ahead)
+
+
+def cubic(first, ahead, last, turned, share: float) -> np.ndarray:
+    """A point of the cubic through two points and their unit tangents, some share of the way."""
+    way = last - first
+    size, y = np.linalg.norm(way), share - 1
+    of_square, of_cube = size * (2 * turned + ahead) - 3 * way, size * (turned + ahead) - 2 * way
+    return last + y * (size * turned + y * (of_square + y * of_cube))
 
 
 # --- all curves in the unit square --------------------------------------------------------

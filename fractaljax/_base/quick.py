@@ -46,6 +46,17 @@ def quick_jit(
     return kept(call, static_argnames, outermost, "once" if once else "")
 
 
+def outermost_jit(function: Callable, static_argnames: str | tuple[str, ...] = ()) -> Callable:
+    """`quick_jit` of a program that is never traced, without the time to look whether it is."""
+    plain, outermost = _jitted(function, static_argnames, _OPTIONS)
+
+    @functools.wraps(plain)
+    def call(*args, **kwargs):
+        return outermost()(*args, **kwargs)
+
+    return kept(call, static_argnames, outermost)
+
+
 def command_jit(
     function: Callable, static_argnames: str | tuple[str, ...] = (), *, once: bool = False
 ) -> Callable:

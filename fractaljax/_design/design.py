@@ -184,9 +184,10 @@ class Design(Record):
         ellipsoid = isinstance(self.options["quiet_within"], list)
         unit = "of the ellipsoid" if ellipsoid else "in units of V/omega and V"
         share = f"share below {3 / VERIFIED:.2g} with 95 % confidence"
+        where = " " if self.options["envelope"] is None else ", shared by the worst conditions, "
         return [
             f"largest kick survived: {self.quiet_radius:.6g} {unit}",
-            f"none of {VERIFIED} starts within it ends anywhere but at rest ({share})",
+            f"none of {VERIFIED} starts within it{where}ends anywhere but at rest ({share})",
         ]
 
     def _under_conditions(self) -> list[str]:
@@ -283,7 +284,9 @@ def design(
     of an ellipsoid in m and m/s, no start within it of the sliding equilibrium ends anywhere else,
     as 4000 starts drawn by `seed` confirm. `Design.quiet_radius` is the largest radius, or share of
     the semi-axes, so confirmed. Motions follow the whole friction law whatever `friction_slope`.
-    It needs a V of every joint, and takes no envelope and no tolerance.
+    It needs a V of every joint. Under an envelope the starts are shared by its middle, up to
+    four corners and the worst conditions of the requirements, each in its own V/omega and V.
+    It takes no tolerance: whether a start comes to rest has no quantile.
 
     `solver(objective, constraints, start, bounds)`, by default SciPy's SLSQP (see `slsqp`), lands
     from `starts` designs, by default 12, or 8 of a structure: those given, the most promising of
@@ -308,8 +311,11 @@ def design(
     options["bounds"] = dict(options["bounds"])
     kicks = None
     if quiet_within is not None:
-        if envelope is not None or tolerance is not None:
-            raise ValueError("quiet_within takes no envelope and no tolerance")
+        if tolerance is not None:
+            raise ValueError(
+                "quiet_within takes no tolerance: a start comes to rest or not, which has no "
+                "quantile; give what scatters as an envelope"
+            )
         kicks = Kicks.of(x, quiet_within, seed, progress)
         options["quiet_within"] = kicks.within
     evaluator = evaluator_of(problem, envelope, risk)
@@ -335,7 +341,7 @@ def design(
         found = solved(problem)
     if kicks is None:
         return _conclude(x, problem, options, before, found)
-    found, survived = quiet(problem, found, solved, kicks)
+    found, survived = quiet(problem, found, solved, kicks, envelope)
     found = found._replace(evaluation=evaluator.evaluate(found.path[-1:]))  # without cuts
     return _conclude(x, problem, options, before, found, survived)
 

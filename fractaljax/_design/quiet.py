@@ -5,11 +5,12 @@ solved again: exchange, as in `search.py`. A cut keeps away from the design that
 fold or grazing at which the cycle ends that the kick led to, which moves with the other quantities
 as its derivatives say, or out of its neighbourhood. A cycle that exists may be out of reach of
 every kick, so the design that comes to rest is then moved back by bisection. What is answered has
-been verified by a draw of its own.
+been verified by a draw of its own. Under an envelope a design is kicked at the conditions that are
+worst for its requirements, and at the middle and corners.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -23,11 +24,13 @@ from .._dynamics.scaled import degrees_of_freedom, hybrid_system
 from .._mechanism.mechanism import Mechanism
 from .._stability.stability import growth_rate
 from .cuts import Cuts
+from .envelope import Envelope
 from .problem import DesignProblem
 from .search import Found
 
 VERIFIED = 4000  # starts of the last draw
 _TRIED = 64, 256  # of those before
+_LIKELY = 8  # conditions of an envelope at which kicks are tried beside the worst ones
 _EXCHANGES = 16
 _REACH = 0.1  # of a cut at least, in scaled variables; halved where nothing is left
 _BEYOND = 0.005  # of the way to an event that a cut goes on
@@ -68,24 +71,38 @@ class Kicks:
         moves = np.linalg.norm((found.starts[found.labels != 0] - centre) / axes, axis=1)
         return moves.min(initial=radius), found
 
-    def least(self, x: Mechanism) -> tuple[float, Basin]:
-        """As `tried`, of the size asked for, by larger and larger draws until a kick is found."""
+    def worst(self, xs: Sequence[Mechanism], radius: float, count: int) -> tuple[float, int, Basin]:
+        """As `tried`, of `count` kicks shared by mechanisms; also which one is kicked so."""
+        each = [self.tried(x, radius, -(-count // len(xs))) for x in xs]
+        i = int(np.argmin([least for least, _ in each]))
+        return each[i][0], i, each[i][1]
+
+    def least(self, xs: Sequence[Mechanism]) -> tuple[float, int, Basin]:
+        """As `worst`, of the size asked for, by larger and larger draws until a kick is found."""
         first, *more = _TRIED
-        radius, found = self.tried(x, self.size, first)
+        radius, i, found = self.worst(xs, self.size, first)
         for count in more:
             if radius == self.size:
-                radius, found = self.tried(x, self.size, count)
-        return radius, found
+                radius, i, found = self.worst(xs, self.size, count)
+        return radius, i, found
 
-    def survived(self, x: Mechanism) -> float:
+    def survived(self, xs: Sequence[Mechanism]) -> float:
         """The largest norm, up to `size`, below which a last draw has no counter-example."""
-        if float(growth_rate(x)) >= 0:
+        if any(float(growth_rate(x)) >= 0 for x in xs):
             return 0.0
         radius = self.size
         for count in (*_TRIED, VERIFIED):
-            while (least := self.tried(x, radius, count)[0]) < radius:
+            while (least := self.worst(xs, radius, count)[0]) < radius:
                 radius = least
         return float(radius)
+
+
+def kicked_at(found: Found, envelope: Envelope | None) -> np.ndarray:
+    """Where a design is kicked (k, c): the worst conditions of its requirements, a few others."""
+    if envelope is None:
+        return np.zeros((1, 0))
+    places = np.concatenate([found.evaluation.places[0, 1:], envelope.likely(_LIKELY)])
+    return envelope.values(np.unique(places, axis=0))
 
 
 def quiet(
@@ -93,6 +110,7 @@ def quiet(
     found: Found,
     solve: Callable[[DesignProblem], Found],
     kicks: Kicks,
+    envelope: Envelope | None,
 ) -> tuple[Found, float]:
     """The best design that survives the kicks, and the largest kick survived.
 
@@ -100,8 +118,9 @@ def quiet(
     """
     cuts, failed = Cuts.none(_EXCHANGES, problem.low), []
 
-    def scene(found: Found):
-        return problem.moved(jnp.asarray(found.path[-1]), problem.own_condition)
+    def scenes(found: Found):
+        u = jnp.asarray(found.path[-1])
+        return [problem.moved(u, jnp.asarray(at)) for at in kicked_at(found, envelope)]
 
     for _ in range(_EXCHANGES):
         if found.evaluation.worst[0] > 0:
@@ -109,25 +128,24 @@ def quiet(
                 break
             cuts = dataclasses.replace(cuts, reach=cuts.reach / 2)
         else:
-            x = scene(found)
-            radius, ends = kicks.least(x)
+            radius, i, ends = kicks.least(scenes(found))
             if radius == kicks.size:
                 # The last of these is the one that has been found.
-                for better in [*_moved_back(problem, failed, found, solve, kicks, scene), found]:
-                    radius, ends = kicks.tried(scene(better), kicks.size, VERIFIED)
+                for better in [*_moved_back(problem, failed, found, solve, kicks, scenes), found]:
+                    radius, i, ends = kicks.worst(scenes(better), kicks.size, VERIFIED)
                     if radius == kicks.size:
                         return better, radius
             u = found.path[-1]
-            normals, gaps = _planes(problem, u, ends)
+            normals, gaps = _planes(problem, u, kicked_at(found, envelope)[i], ends)
             reach = max(_REACH, 2 * gaps[gaps < _NONE].max(initial=0))
             cuts = cuts.added(len(failed), u, normals, gaps, reach)
             failed.append((radius, found))
         found = solve(dataclasses.replace(problem, cuts=cuts))
     best = max(failed, key=lambda pair: pair[0])[1] if failed else found
-    return best, kicks.survived(scene(best))
+    return best, kicks.survived(scenes(best))
 
 
-def _moved_back(problem, failed, found, solve, kicks, scene) -> list[Found]:
+def _moved_back(problem, failed, found, solve, kicks, scenes) -> list[Found]:
     """Better designs that seem to survive, the best first: towards the first one that failed."""
     moved: list[Found] = []
     if not failed:
@@ -139,7 +157,7 @@ def _moved_back(problem, failed, found, solve, kicks, scene) -> list[Found]:
         plane = np.stack([way / length, np.zeros_like(way)]), np.array([share * length, _NONE])
         cuts = Cuts.none(_EXCHANGES, problem.low).added(0, centre, *plane, _NONE)
         other = solve(dataclasses.replace(problem, cuts=cuts))
-        if other.evaluation.worst[0] <= 0 and kicks.least(scene(other))[0] == kicks.size:
+        if other.evaluation.worst[0] <= 0 and kicks.least(scenes(other))[0] == kicks.size:
             moved.insert(0, other)
             high = share
         elif high == 1:  # a tenth of the way is not worth more
@@ -150,12 +168,12 @@ def _moved_back(problem, failed, found, solve, kicks, scene) -> list[Found]:
     return moved
 
 
-def _planes(problem: DesignProblem, u: np.ndarray, ends: Basin):
+def _planes(problem: DesignProblem, u: np.ndarray, condition: np.ndarray, ends: Basin):
     """Where the cycle of the largest share ends: normals (2, v) and distances (2,) from u (v,)."""
     normals, gaps = np.zeros((2, len(u))), np.full(2, _NONE)
     if ends.cycles and problem.low.dtype == jnp.float64:
         for i in range(len(u)):
-            for side, plane in enumerate(_ends(problem, u, i, ends.cycles[0])):
+            for side, plane in enumerate(_ends(problem, u, condition, i, ends.cycles[0])):
                 if plane is not None:
                     normals[side], gaps[side] = plane
             if (gaps < _NONE).any():
@@ -164,7 +182,7 @@ def _planes(problem: DesignProblem, u: np.ndarray, ends: Basin):
 
 
 def _ends(
-    problem: DesignProblem, u: np.ndarray, i: int, cycle: LimitCycle
+    problem: DesignProblem, u: np.ndarray, condition: np.ndarray, i: int, cycle: LimitCycle
 ) -> list[tuple[np.ndarray, float] | None]:
     """Tangent planes at both ends of a cycle in quantity i, None where it goes on."""
     name, logarithmic = problem.names[i], problem.logarithmic[i]
@@ -176,7 +194,7 @@ def _ends(
 
     at = quantity(u[i])
     window = min(quantity(0), at), max(quantity(1), at)  # rounding may put it outside
-    x = problem.moved(jnp.asarray(u), problem.own_condition)
+    x = problem.moved(jnp.asarray(u), jnp.asarray(condition))
     try:
         branch = continue_cycle(x, name, window, cycle)
     except ValueError:  # the cycle cannot be followed
@@ -192,7 +210,7 @@ def _ends(
     run = np.arange(first, 1 + unlike[unlike > index].min(initial=len(stable) - 1))
 
     def value(u, event: BranchEvent):
-        return event.value_at(problem.moved(u, problem.own_condition))
+        return event.value_at(problem.moved(u, jnp.asarray(condition)))
 
     planes: list[tuple[np.ndarray, float] | None] = []
     for sign, edge in ((-1, window[0]), (1, window[1])):

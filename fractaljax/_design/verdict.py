@@ -141,7 +141,7 @@ def verdict(
         questions.append(_scattered(x, tolerance, envelope, friction_slope, seed))
     if quiet_within is not None:
         kicks = Kicks.of(x, quiet_within, seed, flag("progress", progress))
-        survived, size = kicks.survived(x), kicks.size
+        survived, size = kicks.survived([x]), kicks.size
         words = f"comes to rest from {survived:.3g} of {size:.3g}"
         name = f"kicks within {quiet_within}"
         questions.append(Question("smaller kicks", name, words, survived >= size))

@@ -20,7 +20,6 @@ from .itinerary import Family
 from .pinned import Event, Pinned
 from .shooting import Window
 
-_HELD = "fold", "multiplier", "touch"
 _STRAIGHT = 0.95  # cosine of the angle by which a curve may turn at a change of itinerary
 
 
@@ -30,7 +29,7 @@ class EventCurve(Record):
     It has k points.
     """
 
-    kind: str = eqx.field(static=True)  # "fold", "grazing", "period doubling", "Neimark-Sacker"
+    kind: str = eqx.field(static=True)  # that of the event, not "Hopf"
     names: tuple[str, str] = eqx.field(static=True)  # of the quantities
     x: Float[np.ndarray, " k"]  # the first quantity, that of the branch
     y: Float[np.ndarray, " k"]  # the second one
@@ -96,7 +95,7 @@ def continue_event(
     step: float = 1 / 64,
     points: int = 1000,
 ) -> EventCurve:
-    """Follow a fold, a grazing or a change of stability as a second quantity changes.
+    """Follow a fold, grazing, order of switches or change of stability in a second quantity.
 
     By pseudo-arclength continuation of the exact orbit together with what vanishes at the event, so
     through extremes of either quantity, and through changes of the itinerary elsewhere on the
@@ -111,15 +110,13 @@ def continue_event(
 
     **Returns:** an `EventCurve`.
 
-    **Raises:** `ValueError` for a Hopf point (`hopf_boundary` follows it), a grazing or an order of
-    switches at which a phase vanishes, and for names and windows as `continue_cycle` does.
+    **Raises:** `ValueError` for a Hopf point (`hopf_boundary` follows it), and for names and
+    windows as `continue_cycle` does.
     """
     require_kind("event", event, BranchEvent)
     (condition, first, *_, detail), solution = event._data, event._cycle
     if condition == "hopf":
         raise ValueError("event must not be a Hopf point: hopf_boundary follows those")
-    if condition not in _HELD:
-        raise ValueError(f"event must be one at which no phase vanishes, got {event.kind}")
     low, high = checked_window(x, name, window)
     require_independent(x, (first.name, name))
     frozen = with_optional(jax.lax.stop_gradient(x), (first.name, name))
@@ -127,7 +124,7 @@ def continue_event(
     step, points = float(number("step", step, above=0)), whole("points", points, 2)
     family = Family(frozen, first, step, event._rtol)
     follower = _CurveFollower(family, points)
-    held = Event.of(condition, detail, solution.chain)
+    held = Event.of(condition, detail, solution)
     solution = solution._replace(x=frozen, r=own_place(frozen, second))
 
     def begun():

@@ -13,14 +13,18 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from .._continuation import cubic
 from .hybrid import OPEN, SECTION
-from .itinerary import Family, Phase, Shooting, Solution, multipliers_of
-from .shooting import after_switch, guards_at, linearised, measured, rate_at
+from .itinerary import Family, Phase, Shooting, Solution
+from .shooting import after_switch, guards_at, largest_friction, linearised, measured, rate_at
 
 _FINER = 8  # attempts at a mesh that is fine enough
 _NEW = (1e-3, 1e-4, 1e-2)  # durations of a phase that appears, as a share of the period
 SMALL = 0.03  # size of a smooth orbit, in units of V/omega, below which a Hopf point is near
+_NARROW = 3e-8  # share of a step within which the end of an itinerary is found
 _SHORT = 1e-6  # duration of a phase that vanishes, as a share of the period
+_FAST = 10.0  # coefficient of friction over the static one, beyond which no law is one
+_SAMPLED = 512  # states of an orbit at which that is looked at
 _ROUNDING = 1e-9  # a guard this far below zero is kept to
 
 
@@ -33,6 +37,7 @@ class BranchEnd(eqx.Enumeration):
     jump = "where no cycle with another itinerary goes on: a motion jumps from here"
     meets = "where another event meets it"
     lost = "where it could not be followed"
+    fast = "where it slides so fast that the friction law has lost its meaning"
     long = "after the largest number of points"
 
 
@@ -61,7 +66,7 @@ class Follower:
         given = solution.x, self.window, solution.chain, solution.lifted, solution.u
         (low, high, state), second, error = map(np.asarray, measured(*given))
         n, h = self.n, shooting.lengths(z)
-        values = multipliers_of(shooting.monodromy(z))
+        values = shooting.multipliers(z)
         states = np.array([phase.s for phase in shooting.phases])
         row = {
             "period": float(h.sum() * second),
@@ -142,10 +147,22 @@ class Follower:
             z, ahead = reached, turned
             inaccurate = self.points[-1].row["error"] > self.family.rtol
             if inaccurate or shooting.stale(z):
-                return self._remeshed(shooting, z, ahead)
+                onward = self._remeshed(shooting, z, ahead)
+                if inaccurate and not isinstance(onward, BranchEnd):
+                    self.points.pop()
+                    self.record(*onward[:2])
+                return onward
         if smooth and self._shrinks(shooting, z, 5):
             return self._hopf(shooting, z)
-        return BranchEnd.lost
+        return self._lost(shooting, z)
+
+    def _lost(self, shooting: Shooting, z) -> BranchEnd:
+        """Why Newton's method fails beyond z: perhaps friction that grows without bound."""
+        solution = shooting.solution(z)
+        times = np.linspace(0, solution.times[-1], _SAMPLED, endpoint=False)
+        y, _ = self.family.sampled(solution, times, _SAMPLED)
+        given = solution.x, self.window, solution.u[-1], y
+        return BranchEnd.fast if float(largest_friction(*given)) > _FAST else BranchEnd.lost
 
     def reverse(self) -> None:
         """The points in the opposite order."""
@@ -168,7 +185,7 @@ class Follower:
             new = old.again(old.solution(z), old.phases, times)
             found = new.curves.corrected(new.begin)
             if found is None:
-                return BranchEnd.lost
+                return self._lost(old, z)
             solution = new.solution(found[0])
             given = solution.x, self.window, solution.chain, solution.lifted, solution.u
             if float(measured(*given)[2]) <= self.family.rtol / 2:
@@ -180,7 +197,12 @@ class Follower:
 
     def _between(self, shooting, z, reached, share):
         """The point of the curve near that share of the way, or None."""
-        found = shooting.curves.corrected(z + share * (reached - z))
+        if share in (0.0, 1.0):
+            return reached if share else z
+        way = reached - z
+        ends = (shooting.curves.tangent(shooting.equations(at)[1]) for at in (z, reached))
+        first, last = (t if t @ way > 0 else -t for t in ends)
+        found = shooting.curves.corrected(cubic(z, first, reached, last, share))
         return None if found is None else found[0]
 
     def _root(self, shooting, z, reached, test: Callable) -> np.ndarray | None:
@@ -201,23 +223,21 @@ class Follower:
     def _smooth_events(self, shooting, z, ahead, reached, turned) -> None:
         """Folds and changes of stability between two points of one itinerary."""
 
-        def tangent(at):
-            t = shooting.curves.tangent(shooting.equations(at)[1])
-            return t if t @ ahead > 0 else -t
+        if ahead[-1] * turned[-1] < 0:
 
-        if tangent(z)[-1] * turned[-1] < 0:
-            at = self._root(shooting, z, reached, lambda at: tangent(at)[-1])
+            def slope(at):
+                t = shooting.curves.tangent(shooting.equations(at)[1])
+                return (t if t @ ahead > 0 else -t)[-1]
+
+            at = self._root(shooting, z, reached, slope)
             if at is not None:
                 self._noted("fold", shooting, at, ("fold",))
 
-        def nontrivial(at):
-            return multipliers_of(shooting.monodromy(at))[:-1]
-
         def doubling(at):
-            return float(np.prod(nontrivial(at) + 1).real)
+            return float(np.prod(shooting.multipliers(at)[:-1] + 1).real)
 
         def rotating(at):
-            values = nontrivial(at)
+            values = shooting.multipliers(at)[:-1]
             turning = np.abs(values[np.abs(np.imag(values)) > 1e-9])
             return float(turning.max() - 1) if len(turning) else -1.0
 
@@ -292,19 +312,7 @@ class Follower:
 
     def _leaves_itinerary(self, shooting: Shooting, z, reached):
         """From an admissible z to where the orbit ceases to be, and on from there."""
-        low, high, inside = 0.0, 1.0, z
-        worst = shooting.admissibility(reached), reached
-        for _ in range(24):
-            middle = (low + high) / 2
-            at = self._between(shooting, z, reached, middle)
-            value = None if at is None else shooting.admissibility(at)
-            if value is not None and value > 0:
-                low, inside = middle, at
-            else:
-                high = middle
-                if value is not None:
-                    worst = value, at
-        outside = worst[1]
+        inside, outside = self._bracket(shooting, z, reached)
         p = int(np.argmin(shooting.durations(inside)))
         # A phase this short is about to vanish, though rounding may touch one of its guards first.
         vanishes = shooting.durations(inside)[p] < _SHORT
@@ -318,6 +326,30 @@ class Follower:
             if candidate is not None:
                 return candidate
         return self._ends(shooting, inside, outside)
+
+    def _bracket(self, shooting: Shooting, z, reached) -> tuple[np.ndarray, np.ndarray]:
+        """Points inside and outside the itinerary, close to each other where it ends."""
+        import scipy.optimize  # not before it is used: it takes its time
+
+        inside, outside = {0.0: z}, {1.0: reached}
+
+        def along(share):
+            at = (inside | outside).get(share)
+            if at is None:
+                at = self._between(shooting, z, reached, share)
+            value = -1.0 if at is None else shooting.admissibility(at)
+            if share > 0 and at is not None:
+                (inside if value > 0 else outside)[share] = at
+            return value if share > 0 else max(value, 1e-15)
+
+        share: Any = scipy.optimize.brentq(along, 0.0, 1.0, xtol=_NARROW)
+        along(min(share + _NARROW, 1.0))
+        # Rounding may hide on which side a point is: further and further inside.
+        away = _NARROW
+        while away < share and along(share - away) <= 0:
+            away *= 4
+        last = min(outside)
+        return inside[max(share for share in inside if share < last)], outside[last]
 
     def _ends(self, shooting, inside, outside) -> BranchEnd:
         """Notes the grazing beyond which no cycle goes on."""

@@ -199,6 +199,10 @@ class HybridSystem(eqx.Module):
         """The largest friction force of each face in stick (f, ...)."""
         return self._each(lambda law, load: law.mu_s * load, loads)
 
+    def over_static(self, speeds) -> Array:
+        """The coefficient of friction at sliding speeds (f, ...) [m/s], over the static one."""
+        return self._each(lambda law, speed: law.mu(speed) / law.mu_s, speeds)
+
     def _driven(self, y, friction, s=None) -> Array:
         """Acceleration (n, ...) with these friction forces, without those of sticking faces."""
         x, u = y[: self.n], y[self.n :]

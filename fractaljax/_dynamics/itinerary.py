@@ -28,6 +28,8 @@ _LENGTH = 0.25  # of segments at rtol 1e-9, in scaled time
 _MEMORY = 64  # evaluations from which states between are extrapolated, the nearest of them
 _CLOSINGS = 4  # attempts at that
 _FAR = 0.3  # gap beyond which an evaluation is not among them
+_APART = 1e-3  # gap that Newton's method may close together with the residual
+_BETWEEN = -0.9, 3.0  # how far beyond an evaluation, in distances from another, a cubic serves
 _STALE = 1.3  # growth of a phase after which it is cut anew
 _SYMBOLS = {1: "+", -1: "-", 0: "0", OPEN: "o"}
 
@@ -104,7 +106,8 @@ class Family:
 class Shooting:
     """The equations of one itinerary for NumPy: unknowns z are u without padding, scaled."""
 
-    gap = 1e-7  # between segments, above which they are first brought together
+    gap = 1e-7  # between segments, above which a zero is none
+    linear = 1e-10  # distance within which an evaluation's derivatives say what another would
 
     def __init__(self, family: Family, old: Solution, phases, times):
         """`phases` begin at `times` (m,) on an old orbit; the last one ends after those."""
@@ -118,8 +121,11 @@ class Shooting:
         u = np.concatenate([np.asarray(y[:, 0]), h, np.zeros(self.padded - m), old.u[-1:]])
         self.chain, self.m, self.length = chain, m, h.copy()
         blank = jnp.zeros((2 * n, len(u), N), y.dtype)
-        self.memory = [(self.key(u, old.r), _FAR, Lifted(jnp.asarray(u), y, blank))]
+        self.memory = [Lifted(jnp.asarray(u), y, blank)]
+        self.keys, self.gaps = self.key(u, old.r)[None], np.array([_FAR])  # of the memory
         self.known: dict[bytes, Any] = {}  # of the last points
+        self.spectra: dict[bytes, np.ndarray] = {}  # of the last two
+        self.last: tuple[Any, ...] | None = None  # point without gaps, its residual and Jacobian
         size = 1 + float(np.abs(np.asarray(y)).max())
         period = float(h.sum())
         self.scale = np.concatenate([np.full(2 * n, size), np.full(m, period), [1.0]])
@@ -219,11 +225,13 @@ class Shooting:
         return u
 
     def durations(self, z) -> np.ndarray:
+        """Of the phases, scaled, which must be above zero."""
         return z[2 * self.family.n : self.quantity]
 
     def lengths(self, z) -> np.ndarray:
         """The durations of the phases in scaled time."""
-        return self.durations(z) * self.scale[2 * self.family.n : self.quantity]
+        of_phases = slice(2 * self.family.n, self.quantity)
+        return z[of_phases] * self.scale[of_phases]
 
     def mechanism(self, z) -> Any:
         return self.x
@@ -241,26 +249,67 @@ class Shooting:
 
     def near(self, key) -> Lifted:
         """The evaluation that says best where the states are: nearby, and then without gaps."""
-        errors = [np.abs(key - at).max() ** 2 + gap**2 for at, gap, _ in self.memory]
-        return self.memory[int(np.argmin(errors))][2]
+        return self.memory[self._nearest(key)]
+
+    def _nearest(self, key) -> int:
+        return int(np.argmin(np.abs(self.keys - key).max(axis=1) ** 2 + self.gaps**2))
+
+    def extrapolated(self, key, u) -> Lifted:
+        """The states at u, by a cubic through two evaluations where these lie in line with it."""
+        i = self._nearest(key)
+        near, ways, way = self.memory[i], self.keys[i] - self.keys, key - self.keys[i]
+        apart = np.abs(way).max()
+        if apart < self.linear or self.gaps[i] > _APART:
+            return near
+        shares = ways @ way / np.maximum((ways**2).sum(axis=1), 1e-300)
+        off = np.abs(way - shares[:, None] * ways).max(axis=1)
+        fits = (shares > _BETWEEN[0]) & (shares < _BETWEEN[1]) & (self.gaps < _APART)
+        fits &= off < 0.3 * apart
+        if not fits.any():
+            return near
+        k = int(np.argmin(np.where(fits, np.abs(shares), np.inf)))
+        first, last, D, before = map(
+            np.asarray, (self.memory[k].y, near.y, near.D, self.memory[k].D)
+        )
+        step = np.asarray(near.u) - np.asarray(self.memory[k].u)
+        slope, slope_before, change = (
+            np.einsum("ikn,k->in", A, by)
+            for A, by in ((D, step), (before, step), (D, u - np.asarray(near.u)))
+        )
+        square = 2 * slope + slope_before - 3 * (last - first)
+        cube = slope + slope_before - 2 * (last - first)
+        return Lifted(u, last + change + shares[k] ** 2 * (square + shares[k] * cube), near.D)
 
     def evaluated(self, z):
         """Residual and Jacobian of the orbit at z, by the unknowns before they are scaled."""
         key = z.tobytes()
         if key in self.known:
             return self.known[key]
+        if self.last is not None and np.abs(z - self.last[0]).max() < self.linear:
+            at, residual, jacobian = self.last
+            return residual + jacobian @ ((z - at) * self.scale), jacobian
         u, at = self.full(z), self.key(self.full(z), z[-1])
-        x, window, states = self.mechanism(z), self.family.window, self.near(at)
+        x, window, states = (
+            self.mechanism(z),
+            self.family.window,
+            self.extrapolated(at, self.full(z)),
+        )
+        rows = np.arange(2 * self.family.n + self.m)
         for _ in range(_CLOSINGS):
             given = x, window, self.chain, states, u
             residual, jacobian, states, gap = condensed(*given)
-            if not float(gap) > self.gap:
+            residual, gap = np.asarray(residual)[rows], float(gap)
+            # Newton's method closes gaps as well, whose squares the residual is uncertain by.
+            if not gap > self.gap or (gap < _APART and 10 * gap**2 < np.abs(residual).max()):
                 break
-        if float(gap) < _FAR:
-            self.memory = [*self.memory[-_MEMORY:], (at, float(gap), states)]
-        rows = np.arange(2 * self.family.n + self.m)
-        found = np.asarray(residual)[rows], np.asarray(jacobian)[np.ix_(rows, self.active)]
+        if gap < _FAR:
+            self.memory = [*self.memory[-_MEMORY:], states]
+            self.keys = np.concatenate([self.keys[-_MEMORY:], at[None]])
+            self.gaps = np.append(self.gaps[-_MEMORY:], gap)
+        found = residual, np.asarray(jacobian)[np.ix_(rows, self.active)]
         self.known = dict([*self.known.items()][-_MEMORY:]) | {key: found}
+        if gap <= self.gap and self.linear:
+            self.last = z, *found
         return found
 
     def equations(self, z):
@@ -272,9 +321,13 @@ class Shooting:
         lifted = self.near(self.key(u, z[-1]))
         return Solution(self.mechanism(z), self.phases, self.chain, lifted, u)
 
-    def monodromy(self, z) -> np.ndarray:
-        """The Jacobian (2n, 2n) of the return map."""
-        return return_jacobian(self.evaluated(z)[1], 2 * self.family.n, np)
+    def multipliers(self, z) -> np.ndarray:
+        """Floquet multipliers (2n,) by size, and 1 last."""
+        key = z.tobytes()
+        if key not in self.spectra:
+            of_return = return_jacobian(self.evaluated(z)[1], 2 * self.family.n, np)
+            self.spectra = dict([*self.spectra.items()][-1:]) | {key: multipliers_of(of_return)}
+        return self.spectra[key]
 
     def lowest(self, z) -> tuple[float, Place]:
         """The least reduced guard on the orbit, and where."""

@@ -1,8 +1,9 @@
 """The equations of a cycle that is held at an event, with two quantities of the mechanism free.
 
-To those of `itinerary.py` comes one condition: a fold, a multiplier on the unit circle, or a guard
-that touches zero. Newton's method finds zeros of the exact equations. In its Jacobian the row of
-the condition and the column of the second quantity are differences, good to some digits.
+To those of `itinerary.py` comes one condition: a fold, a multiplier on the unit circle, a guard
+that touches zero, or a phase of no duration. Newton's method finds zeros of the exact equations. In
+its Jacobian the row of the condition and the column of the second quantity are differences, good to
+some digits.
 """
 
 import functools
@@ -14,9 +15,9 @@ import numpy as np
 
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import substituted
-from .itinerary import Family, Shooting, Solution
+from .hybrid import SECTION
+from .itinerary import Family, Phase, Shooting, Solution
 from .shooting import (
-    Chain,
     Place,
     Window,
     descended,
@@ -33,32 +34,39 @@ _NEAR = 1e-6  # scaled time within which a moment is that of a switch
 class Event(NamedTuple):
     """What is held."""
 
-    condition: str  # "fold", "multiplier" or "touch"
+    condition: str  # "fold", "multiplier", "touch" or "vanish"
     place: Any = None  # of "touch"
+    phase: Phase | None = None  # that has no duration, of "vanish"
     side: int = 0  # -1 where that is at the start of a phase, 1 at its end
     multiplier: complex | None = None  # by default the one nearest to the unit circle
 
     @classmethod
-    def of(cls, condition: str, detail: Any, chain: Chain) -> "Event":
+    def of(cls, condition: str, detail: Any, solution: Solution) -> "Event":
         """From what vanishes at an event of a branch."""
+        if condition == "vanish":
+            return cls(condition, phase=solution.phases[detail])
         if condition != "touch":
             return cls(condition)
-        k, theta = int(detail.segment), float(detail.theta)
+        k, theta, chain = int(detail.segment), float(detail.theta), solution.chain
         begins, ends = chain.begin[k] == 0, chain.begin[k] + chain.share[k] > 1 - _NEAR
         if theta == 0 and begins:
-            return cls(condition, detail, -1)
-        return cls(condition, detail, 1 if theta == 1 and ends else 0)
+            return cls(condition, detail, side=-1)
+        return cls(condition, detail, side=1 if theta == 1 and ends else 0)
 
 
 class Pinned(Shooting):
     """The equations of one itinerary held at an event; the second quantity comes last in z."""
 
     gap = 1e-11  # differences of the Jacobian need more than the orbit does
+    linear = 0.0
 
     def __init__(self, family: Family, second: Window, event: Event, old: Solution, phases, times):
         self.second, self.event, self.borders = second, event, None
+        self.held: int | None = None  # the phase of no duration
         super().__init__(family, old, phases, times)
         self.scale = np.append(self.scale, 1.0)
+        if event.condition == "vanish":
+            self._hold(np.diff(times))
         if event.condition == "touch":
             self._locate(old, np.asarray(times, float))
 
@@ -82,6 +90,10 @@ class Pinned(Shooting):
         away = place is not None and not -0.2 < place.theta < 1.2
         return away or super().stale(z)
 
+    def durations(self, z) -> np.ndarray:
+        found = super().durations(z)
+        return found if self.held is None else np.delete(found, self.held)
+
     def equations(self, z):
         residual, jacobian = self._orbit(z)
         beside = z.copy()
@@ -92,6 +104,9 @@ class Pinned(Shooting):
         if self.event.condition == "touch":
             value, row = self._touch(z, keep=True)
             along = (self._touch(beside)[0] - value) / step
+        elif self.event.condition == "vanish":
+            place = np.nan if self.held is None else self.index(self.held)
+            value, row, along = z[place], np.arange(len(z) - 1) == place, 0.0
         else:
             fold = self.event.condition == "fold"
             value, pairs = (self._fold if fold else self._multiplier)(jacobian)
@@ -134,6 +149,22 @@ class Pinned(Shooting):
         right = np.append(right, -np.linalg.solve(S, T @ right)) / self.scale[:-2]
         left = np.append(left, -np.linalg.solve(S.T, Q.T @ left)) * np.conj(value) / abs(value)
         return abs(value) - 1, [(left.real, right.real), (-left.imag, right.imag)]
+
+    # --- a phase that has no duration ---
+
+    def _hold(self, lengths) -> None:
+        """Which phase that is here; guards that are zero there are not looked at beside it."""
+        alike = [phase == self.event.phase for phase in self.phases]
+        found = np.flatnonzero(np.array(alike) & (lengths <= 1e-9 * lengths.sum()))
+        if not len(found):
+            return
+        self.held = p = int(found[0])
+        last, following = p - 1, (p + 1) % self.m
+        before = np.array(self.orders[0])
+        before[:, p] = -1
+        for guard in {self.phases[last].guard, self.phases[p].guard} - {SECTION}:
+            before[guard, [last, following]] = -1
+        self.orders = jnp.asarray(before), self.orders[1]
 
     # --- a guard that touches zero ---
 

@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from .._mechanism.mechanism import Mechanism
 from .hybrid import HybridSystem
-from .shooting import condensed, durations, reduced_guard, return_jacobian
+from .shooting import durations, equations, reduced_guard, return_jacobian
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -67,14 +67,14 @@ def _orbit(kind, x, event):
     """What vanishes as a function of x at fixed unknowns, its weights, and their normalisation."""
     window, chain, lifted, u, details = event
     frozen = jax.lax.stop_gradient(x)
-    _, jacobian, lifted, _ = condensed(frozen, window, chain, lifted, u)
+    _, jacobian, lifted, _ = equations(frozen, window, chain, lifted, u)
     lifted = jax.lax.stop_gradient(lifted)
     if kind == "fold":
         # The left null vector of the equations with the quantity held.
         weights = jnp.linalg.svd(jacobian[:, :-1])[0][:, -1]
 
         def residual(x):
-            return condensed(x, window, chain, lifted, u)[0]
+            return equations(x, window, chain, lifted, u)[0]
 
         return residual, weights, weights @ jacobian[:, -1]
 
@@ -87,13 +87,13 @@ def _orbit(kind, x, event):
             system = window.system(x, u[-1])
             h = durations(chain, u, system.n)
             return reduced_guard(system, chain, states.at(u), h, details, details.theta)
-        of_orbit = condensed(x, window, chain, states, u)[1]
+        of_orbit = equations(x, window, chain, states, u)[1]
         left, right, value = details
         J = return_jacobian(of_orbit, len(lifted.y)).astype(left.dtype)
         return jnp.real(jnp.conj(value) * (left @ J @ right))
 
     def everything(x):
-        residual, _, states, _ = condensed(x, window, chain, lifted, u)
+        residual, _, states, _ = equations(x, window, chain, lifted, u)
         return jnp.append(residual, condition(x, states, u))
 
     row = jax.grad(lambda u: condition(frozen, lifted, u))(u)

@@ -7,13 +7,14 @@ zero. Their derivatives by the states between are eliminated by the affine maps 
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from .._base.quick import outermost_jit
 from .._base.ranges import is_logarithmic
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import substituted
@@ -71,7 +72,7 @@ class Chain(eqx.Module):
         return (self.guard != NONE) & (self.guard != UNUSED)
 
 
-class Lifted(eqx.Module):
+class Lifted(NamedTuple):
     """States at the starts of the segments near a solution, as an affine function of u."""
 
     u: Float[Array, " k"]
@@ -92,8 +93,7 @@ def _mix(system, rate, e):
     return jax.tree.map(lambda a, d: a + e * d, system, rate)
 
 
-@jax.jit
-def condensed(x: Mechanism, window: Window, chain: Chain, lifted: Lifted, u):
+def equations(x: Mechanism, window: Window, chain: Chain, lifted: Lifted, u):
     """Residual (2n + M,) and Jacobian (2n + M, 2n + M + 1) at u, and the next `Lifted`.
 
     Also the largest gap between segments. Of a phase that is padding the equation is h = 0.
@@ -136,6 +136,9 @@ def condensed(x: Mechanism, window: Window, chain: Chain, lifted: Lifted, u):
     return residual, jacobian, Lifted(u, y + d, D), jnp.max(jnp.abs(d))
 
 
+condensed = outermost_jit(equations)
+
+
 def return_jacobian(jacobian, k: int, xp: Any = jnp) -> Any:
     """The Jacobian (k, k) of the return map from that of the equations, by JAX or NumPy (`xp`)."""
     changes = xp.linalg.solve(jacobian[k:, k:-1], jacobian[k:, :k])
@@ -169,7 +172,7 @@ def _of_phases(chain: Chain, values) -> Array:
     return jnp.where(chain.ends, values, 0) @ place
 
 
-class Place(eqx.Module):
+class Place(NamedTuple):
     """Where on an orbit a guard is looked at."""
 
     guard: Int[Array, ""]
@@ -277,7 +280,7 @@ def descended(
     return jax.lax.scan(vertex, theta, jnp.array(spacings, theta.dtype))[0]
 
 
-@functools.partial(jax.jit, static_argnames="places")
+@functools.partial(outermost_jit, static_argnames="places")
 def resampled(x, window: Window, chain: Chain, lifted: Lifted, u, times, *, places: int):
     """States (2n, places) at times since the start of the orbit, and the rate of friction."""
     system = window.system(x, u[-1])
@@ -289,7 +292,7 @@ def resampled(x, window: Window, chain: Chain, lifted: Lifted, u, times, *, plac
     return y, system.stiffness(y, chain.s[:, k], 1 / 4)
 
 
-@jax.jit
+@outermost_jit
 def measured(x, window: Window, chain: Chain, lifted: Lifted, u):
     """Least, largest and section's states (3, 2n) in SI units, 1/omega, and the error."""
     system = window.system(x, u[-1])
@@ -326,6 +329,14 @@ def linearised(x, window: Window, q):
     y = system.equilibrium()
     slips = jnp.ones(len(system.P), y.dtype)
     return y, jax.jacfwd(lambda y: system.field(y, slips))(y)
+
+
+@jax.jit
+def largest_friction(x, window: Window, q, y):
+    """The largest coefficient of friction at states y (2n, k), over the static one."""
+    system = window.system(x, q)
+    speeds = system.speed * jnp.abs(system.sliding(y[system.n :]))
+    return jnp.max(system.over_static(speeds))
 
 
 @jax.jit

@@ -80,6 +80,20 @@ def test_belt_is_moved_beyond_the_end_of_its_cycle():
     assert GRAZING < speed(best) < 1.005 * GRAZING
 
 
+@pytest.mark.slow
+def test_belt_is_quiet_over_a_range_of_loads():
+    """Under an envelope of P the belt is as fast as the largest load alone asks for."""
+    bounds, loads = {"V": (0.5, 4.0)}, {"P": (0.8, 1.3)}
+    options: dict[str, Any] = {"target": 0.0, "quiet_within": 0.75, "progress": False}
+    best = fj.design(belt(1.4), bounds, envelope=loads, **options)
+    assert best.violated == () and best.quiet_radius == 0.75
+    alone = fj.design(belt(1.4).replace(P=1.3), bounds, **options)
+    np.testing.assert_allclose(speed(best), speed(alone), rtol=0.03)
+    plain = fj.design(belt(1.4), bounds, **options)
+    assert speed(best) > 1.03 * speed(plain)
+    assert "shared by the worst conditions" in str(best)
+
+
 def test_unchanged_where_the_ball_is_held(monkeypatch):
     """Of a few draws; the slow tests make all of them."""
     monkeypatch.setattr("fractaljax._design.quiet.VERIFIED", 512)
@@ -103,7 +117,7 @@ def test_request_that_cannot_be_met():
 def test_kicks_in_an_ellipsoid():
     """Semi-axes of 0.9 V hold a kick of the share that the ball of 0.9 V/omega holds."""
     x, axes = belt(1.5), [0.9 * 1.5, 0.9 * 1.5]
-    found = Kicks.of(x, axes, 0, False).survived(x)
+    found = Kicks.of(x, axes, 0, False).survived([x])
     assert 1 <= found * 0.9 / smallest_kick(1.5) < 1.03
 
 
@@ -121,7 +135,7 @@ def test_kicks_are_the_starts_of_a_basin(within, axes):
 
 def test_nothing_comes_to_rest_where_the_equilibrium_repels():
     x = belt(1.0)
-    assert Kicks.of(x, 0.1, 0, False).survived(x) == 0
+    assert Kicks.of(x, 0.1, 0, False).survived([x]) == 0
 
 
 @pytest.mark.slow
@@ -132,7 +146,7 @@ def test_a_plane_is_the_tangent_of_where_the_cycle_ends():
     problem = state_problem(x, bounds, friction_slope=True, **OPTIONS)
     u = np.asarray(problem.start)
     ends = fj.basin(x, radius=2.0, starts=16, progress=False)
-    normals, gaps = _planes(problem, u, ends)
+    normals, gaps = _planes(problem, u, np.zeros(0), ends)
     assert gaps[0] == 1e3 and np.linalg.norm(normals[1]) == pytest.approx(1)
     errors = []
     for step in (0.01, -0.01):
@@ -167,8 +181,7 @@ def test_cuts():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"envelope": {"P": (1800.0, 2000.0)}}, "takes no envelope and no tolerance"),
-        ({"tolerance": {"D": 0.01}}, "takes no envelope and no tolerance"),
+        ({"tolerance": {"D": 0.01}}, "takes no tolerance: a start comes to rest or not"),
         ({"quiet_within": [1.0, 2.0]}, "must have 4 semi-axes, got 2"),
     ],
 )

@@ -14,6 +14,7 @@ from scipy.optimize import brentq
 import fractaljax as fj
 import hybrid_truth
 from belt import least_speed, slip
+from benchmarks import transients
 from fractaljax._mechanism.quantities import replaced
 from mechanisms import PROBLEMS, changed
 from structures import of_problem
@@ -205,14 +206,23 @@ def test_derivatives_of_events(kind):
 
 
 @pytest.mark.slow
-def test_period_doubling_in_two_quantities():
+@pytest.mark.parametrize("kind", ["period doubling", "order of switches"])
+def test_event_in_two_quantities(kind):
     """Followed in V and P, it is where a branch at another P has it."""
     x = of_problem(PROBLEMS["lift_off"])
-    (event, *_) = branch("lift_off", "V", 0.2, 1.0).of_kind("period doubling")
+    (event, *_) = branch("lift_off", "V", 0.2, 1.0).of_kind(kind)
     curve = fj.continue_event(x, event, "P", (1.94, 2.0), step=1 / 8)
     P, V = curve.y[-3], curve.x[-3]
-    found = fj.continue_cycle(x.replace(P=P), "V", (0.5, 0.7), cycle("lift_off"))
-    np.testing.assert_allclose(V, found.of_kind("period doubling")[0].value, rtol=1e-8)
+    found = fj.continue_cycle(x.replace(P=P), "V", (0.3, 0.7), cycle("lift_off"))
+    np.testing.assert_allclose(V, found.of_kind(kind)[0].value, rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_a_branch_runs_away_where_friction_does():
+    """The cubic law at a hundred times v_m; every point on the way keeps its accuracy."""
+    found = fj.continue_cycle(transients.reference(), "V", (0.05, 1.0))
+    assert bool(found.start == fj.BranchEnd.window) and bool(found.end == fj.BranchEnd.fast)
+    assert np.abs(found.velocity_min[-1]).max() > 20 and float(found.error.max()) < 1e-8
 
 
 BRAKE = fj.brake_scene()
