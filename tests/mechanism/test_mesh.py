@@ -27,7 +27,7 @@ def test_a_file_keeps_the_mesh(tmp_path):
     for name, array in x.mesh.arrays().items():
         np.testing.assert_array_equal(again.mesh.arrays()[name], array)
     assert x.mesh != fj.Mesh(POINTS, DOFS, [[0, 1, 2]])
-    assert x.replace(P=2.0).mesh is x.mesh if "P" in x._known() else True
+    assert x.replace(**{"left.K_n": 2e6}).mesh is x.mesh
     assert x.replace(F=np.zeros(6)).mesh == x.mesh
 
 
@@ -40,7 +40,7 @@ def test_a_file_names_a_mesh_of_its_own(tmp_path):
     (tmp_path / "brake.toml").write_text(named)
     assert fj.load(tmp_path / "brake.toml").mesh == meshed().mesh
     np.savez(tmp_path / "nodes.npz", points=POINTS, cells=CELLS)
-    with pytest.raises(ValueError, match="nodes.npz lacks dofs: a mesh is points, dofs, cells"):
+    with pytest.raises(ValueError, match=r"nodes\.npz lacks dofs: a mesh is points, dofs, cells"):
         fj.load(tmp_path / "brake.toml")
 
 
