@@ -55,9 +55,10 @@ def sweep(
     `jax.grad` act on the measure, not on the sweep. The measure is traced once a sweep, with the
     values that it captures at that time; equal programs are compiled once.
 
-    Points are evaluated in batches, blocks of the grid of at most `batch_size` points (8192
-    for every device, fewer of a structure of more than 8 degrees of freedom), split evenly over `devices` (all of this process). The last digits of a
-    result may depend on the size of a batch, and on nothing else here.
+    Points are evaluated in batches, blocks of the grid of at most `batch_size` points (8192 for
+    every device, fewer of a structure of more than 8 degrees of freedom), split evenly over
+    `devices` (all of this process). The last digits of a result may depend on the size of a batch,
+    and on nothing else here.
 
     `out` names a folder for a Zarr store, which `xarray.open_zarr` opens, finished or not: the
     values of each axis with unit and meaning (K_t/K_n as K_t_over_K_n), an array for each of the

@@ -222,7 +222,7 @@ def test_refuses_what_is_no_scene():
 def test_verdict_of_a_structure_changes_all_its_joints():
     from structures import fractal_joints
 
-    x = fractal_joints()
+    x: Any = fractal_joints()
     area = {"left": 1e-4, "right": 4e-4}
     found = fj.verdict(x, area=area, tolerance={"D": 0.01})
     names = [question.name for question in found.questions]
@@ -234,14 +234,14 @@ def test_verdict_of_a_structure_changes_all_its_joints():
     ]
 
     def with_joints(change):
-        joints = {
-            name: fj.Joint(*change(name, joint)[:1], joint.friction, joint.tangential, joint.normal,
-                           joint.V, change(name, joint)[1])
-            for name, joint in zip(x.joint_names, x.joints, strict=True)
-        }  # fmt: skip
+        joints = {}
+        for name, joint in zip(x.joint_names, x.joints, strict=True):
+            contact, preload = change(name, joint)
+            rest = joint.friction, joint.tangential, joint.normal, joint.V, preload
+            joints[name] = fj.Joint(contact, *rest)
         return fj.Structure(x.M, x.C, x.K, joints, F=x.F)
 
-    def persson(name, joint):
+    def persson_of(name, joint):
         L = area[name] ** 0.5
         given = joint.contact.surface, joint.contact.material, joint.contact.P
         return fj.PerssonContact(*given, area[name], L, L / 100), False
@@ -249,7 +249,7 @@ def test_verdict_of_a_structure_changes_all_its_joints():
     def loaded(name, joint):
         return joint.contact, True
 
-    for question, change in ((1, loaded), (3, persson)):
+    for question, change in ((1, loaded), (3, persson_of)):
         wanted = growth(with_joints(change))
         assert float(found.questions[question].found) == pytest.approx(wanted, rel=1e-5)
     share = np.linspace(0, 1, 17)[:, None]
