@@ -1,7 +1,7 @@
 """Where the degrees of freedom of a structure are, for pictures of its motion."""
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,12 @@ class Mesh:
     dofs: Int[np.ndarray, "nodes dim"]
     cells: Int[np.ndarray, "cells corners"]
 
-    def __init__(self, points: ArrayLike, dofs: ArrayLike, cells: ArrayLike):
+    def __init__(
+        self,
+        points: ArrayLike | Sequence[Any],
+        dofs: ArrayLike | Sequence[Any],
+        cells: ArrayLike | Sequence[Any],
+    ):
         p, d, c = np.asarray(points, float), np.asarray(dofs), np.asarray(cells)
         if p.ndim != 2 or p.shape[1] not in (2, 3):
             raise ValueError(f"points must be (nodes, 2) or (nodes, 3), got {p.shape}")
@@ -55,7 +60,7 @@ class Mesh:
         _require_whole("dofs", self.dofs, -1, n)
         return self
 
-    def arrays(self) -> dict[str, np.ndarray]:
+    def arrays(self) -> dict[str, Any]:
         """points, dofs and cells by name, as the functions in `plot` take them."""
         return {key: getattr(self, key) for key in _KEYS}
 

@@ -32,7 +32,8 @@ from .result import Sweep
 from .store import Store, describe, description, leaf_names, zarr
 from .workers import Computed, Job, gathered, require_executor
 
-_POINTS_EACH = 8192  # in a batch, on every device
+_POINTS_EACH = 8192  # in a batch, on every device; fewer of structures:
+_ENTRIES_EACH = 2**21  # of one matrix of the eigenvalue problem, of all points together
 
 
 def sweep(
@@ -54,9 +55,10 @@ def sweep(
     `jax.grad` act on the measure, not on the sweep. The measure is traced once a sweep, with the
     values that it captures at that time; equal programs are compiled once.
 
-    Points are evaluated in batches, blocks of the grid of at most `batch_size` points (8192
-    for every device), split evenly over `devices` (all of this process). The last digits of a
-    result may depend on the size of a batch, and on nothing else here.
+    Points are evaluated in batches, blocks of the grid of at most `batch_size` points (8192 for
+    every device, fewer of a structure of more than 8 degrees of freedom), split evenly over
+    `devices` (all of this process). The last digits of a result may depend on the size of a batch,
+    and on nothing else here.
 
     `out` names a folder for a Zarr store, which `xarray.open_zarr` opens, finished or not: the
     values of each axis with unit and meaning (K_t/K_n as K_t_over_K_n), an array for each of the
@@ -94,7 +96,7 @@ def sweep(
     if batch_size is None and out is not None and (begun := describe(out)) is not None:
         most: int = begun["batch"]
     else:
-        most = _batch_size(batch_size, points, mesh.size)
+        most = _batch_size(batch_size, points, mesh.size, x)
     parts = blocks(shape, most)
     whole: Any = with_optional(x, names)  # pyright: ignore[reportArgumentType]
     program = Program(measure, names, whole, list(grid.values()))
@@ -164,9 +166,12 @@ def _checked(x: Any, axes: Mapping[str, Any]) -> dict[str, np.ndarray]:
     return grid
 
 
-def _batch_size(asked: int | None, points: int, devices: int) -> int:
+def _batch_size(asked: int | None, points: int, devices: int, x: Any) -> int:
     if asked is None:
-        return devices * min(_POINTS_EACH, -(-points // devices))
+        each = _POINTS_EACH
+        if isinstance(x, Structure):  # whose modes take memory by the square of their number
+            each = max(1, min(each, _ENTRIES_EACH // (2 * x.n) ** 2))
+        return devices * min(each, -(-points // devices))
     if isinstance(asked, bool) or not isinstance(asked, int) or asked < 1:
         raise ValueError(f"batch_size must be an integer of at least 1, got {asked!r}")
     if asked % devices:

@@ -1,5 +1,7 @@
 """Designs of structures whose growth rate is now that of one mode, now that of another."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -103,7 +105,7 @@ def test_what_holds_the_least_growth_rate():
 def test_bounds_and_requirements_hold_it_as_well():
     """Only r may move, up to 0.5: the rate of its mode is held by the bound, 1/2 a unit of r."""
     x = one_damper(p=0.7, q=0.7, r=0.3)
-    limits = {"r": (0.1, 0.5)}
+    limits: Any = {"r": (0.1, 0.5)}
     found = fj.design(x, limits, target=-0.4, starts=1, lattice=2, progress=False).least_growth
     assert found is not None and found.growth_rate == pytest.approx(-0.25, abs=1e-7)
     assert found.held_by == pytest.approx(
@@ -113,7 +115,7 @@ def test_bounds_and_requirements_hold_it_as_well():
     def most(x):
         return 10 * (x.parameters["r"] - 0.4)
 
-    asked = dict(constraints=[most], starts=1, lattice=2, progress=False)
+    asked: Any = dict(constraints=[most], starts=1, lattice=2, progress=False)
     found = fj.design(x, limits, None, -0.4, **asked).least_growth
     assert found is not None and found.growth_rate == pytest.approx(-0.2, abs=1e-6)
     assert found.held_by == pytest.approx({"growth_rate <= target": 1.0, "most": 0.05}, abs=1e-6)
@@ -124,12 +126,12 @@ def test_every_law_has_its_modes():
     from fractaljax._design.joints import under
     from fractaljax._design.problem import evaluate, state_problem
 
-    x = fractal_joints()
+    x: Any = fractal_joints()
     contact = x.joints[0].contact
     law = fj.AsperityContact(fj.Surface(2.2, 1e-9), contact.material, 1.0, 1e-5)
-    none = dict.fromkeys(("objective", "target", "envelope", "tolerance"))
-    rest = dict(K_n_min=0.0, constraints=(), quantile=0.95, friction_slope=True)
-    limits = dict(area_ratio_min=2.0, slip_ratio_max=0.9, laws=[law])
+    none: Any = dict.fromkeys(("objective", "target", "envelope", "tolerance"))
+    rest: Any = dict(K_n_min=0.0, constraints=(), quantile=0.95, friction_slope=True)
+    limits: Any = dict(area_ratio_min=2.0, slip_ratio_max=0.9, laws=[law])
     problem = state_problem(x, {"left.D": (2.3, 2.5)}, **none, **rest, **limits)
     k = problem.modes
     row = evaluate(problem, np.asarray(problem.start)[None], np.zeros((1, 0)))[0]
@@ -138,7 +140,7 @@ def test_every_law_has_its_modes():
     names = problem.residual_names[problem.model_residuals :]
     assert names[k] == "growth_rate <= target by AsperityContact"
     for mechanism, rates in ((x, growing[:k]), (under(x, law), growing[k:])):
-        s = np.asarray(fj.stability(mechanism).eigenvalues)
+        s: Any = np.asarray(fj.stability(mechanism).eigenvalues)
         wanted = np.sort(s[s.imag >= 0].real)[::-1][:k]
         np.testing.assert_allclose(rates + float(problem.target), wanted, rtol=1e-8)
     for joint, own in zip(under(x, law).joints, x.joints, strict=True):
@@ -149,7 +151,7 @@ def test_every_law_has_its_modes():
 
 @pytest.mark.slow
 def test_a_structure_is_designed_under_two_laws():
-    x = fractal_joints()
+    x: Any = fractal_joints()
     law = fj.AsperityContact(fj.Surface(2.2, 1e-9), x.joints[0].contact.material, 1.0, 1e-5)
     from fractaljax._design.joints import under
 
@@ -159,7 +161,9 @@ def test_a_structure_is_designed_under_two_laws():
     }
     own, other = (float(fj.growth_rate(y)) for y in (x, under(x, law)))
     target = min(own, other) - 0.1 * abs(min(own, other))
-    best = fj.design(x, bounds, None, target, 0.0, laws=[law], starts=4, lattice=6, progress=False)
+    best: Any = fj.design(
+        x, bounds, None, target, 0.0, laws=[law], starts=4, lattice=6, progress=False
+    )
     rates = [float(fj.growth_rate(y)) for y in (best.scene, under(best.scene, law))]
     assert (best.violated == ()) == (max(rates) <= target + 1e-6)
     assert best.violated == () or best.least_growth.growth_rate > target

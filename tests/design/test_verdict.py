@@ -216,3 +216,55 @@ def test_refuses_what_is_no_scene():
         fj.verdict(reference_scene(), area=1e-4)
     with pytest.raises(ValueError, match=r"area must be above 0, got -1\.0"):
         fj.verdict(BRAKE, area=-1.0)
+
+
+@pytest.mark.slow
+def test_verdict_of_a_structure_changes_all_its_joints():
+    from structures import fractal_joints
+
+    x: Any = fractal_joints()
+    area = {"left": 1e-4, "right": 4e-4}
+    found = fj.verdict(x, area=area, tolerance={"D": 0.01})
+    names = [question.name for question in found.questions]
+    assert names[:4] == [
+        "as it is (FractalContact)",
+        "friction on P + K_n n.x",
+        "by AsperityContact",
+        "by PerssonContact",
+    ]
+
+    def with_joints(change):
+        joints = {}
+        for name, joint in zip(x.joint_names, x.joints, strict=True):
+            contact, preload = change(name, joint)
+            rest = joint.friction, joint.tangential, joint.normal, joint.V, preload
+            joints[name] = fj.Joint(contact, *rest)
+        return fj.Structure(x.M, x.C, x.K, joints, F=x.F)
+
+    def persson_of(name, joint):
+        L = area[name] ** 0.5
+        given = joint.contact.surface, joint.contact.material, joint.contact.P
+        return fj.PerssonContact(*given, area[name], L, L / 100), False
+
+    def loaded(name, joint):
+        return joint.contact, True
+
+    for question, change in ((1, loaded), (3, persson_of)):
+        wanted = growth(with_joints(change))
+        assert float(found.questions[question].found) == pytest.approx(wanted, rel=1e-5)
+    share = np.linspace(0, 1, 17)[:, None]
+    stiff = np.array([[float(k) for k in joint.stiffness()] for joint in x.joints])
+    own, mindlin = stiff[:, 1] / stiff[:, 0], 2 * (1 - 0.3) / (2 - 0.3)
+    low, high = np.minimum(own, mindlin), np.maximum(own, mindlin)
+
+    def fixed(row):
+        kinds = {"left": 0, "right": 1}
+        return lambda name, joint: (
+            fj.FixedContact(stiff[kinds[name], 0], row[kinds[name]] * stiff[kinds[name], 0], 1.0),
+            False,
+        )
+
+    worst = max(growth(with_joints(fixed(row))) for row in low + share * (high - low))
+    assert float(found.questions[4].found.split()[0]) == pytest.approx(worst, rel=1e-5)
+    with pytest.raises(ValueError, match="area must be of the joints left, right, got left"):
+        fj.verdict(x, area={"left": 1e-4})

@@ -1,5 +1,7 @@
 """Meshes of structures: their files, what refuses them, and that reductions and files keep them."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -12,7 +14,7 @@ DOFS = [[0, 1], [2, 3], [4, 5], [-1, -1]]
 CELLS = [[0, 1, 2, 3]]
 
 
-def meshed(**change):
+def meshed(**change: Any) -> Any:
     plain = two_joints(6)
     mesh = fj.Mesh(**{"points": POINTS, "dofs": DOFS, "cells": CELLS} | change)
     joints = dict(zip(plain.joint_names, plain.joints, strict=True))
@@ -22,12 +24,12 @@ def meshed(**change):
 def test_a_file_keeps_the_mesh(tmp_path):
     x = meshed()
     x.save(tmp_path / "brake.toml")
-    again = fj.load(tmp_path / "brake.toml")
+    again: Any = fj.load(tmp_path / "brake.toml")
     assert again.mesh == x.mesh and hash(again.mesh) == hash(x.mesh)
     for name, array in x.mesh.arrays().items():
         np.testing.assert_array_equal(again.mesh.arrays()[name], array)
     assert x.mesh != fj.Mesh(POINTS, DOFS, [[0, 1, 2]])
-    assert x.replace(P=2.0).mesh is x.mesh if "P" in x._known() else True
+    assert x.replace(**{"left.K_n": 2e6}).mesh is x.mesh
     assert x.replace(F=np.zeros(6)).mesh == x.mesh
 
 
@@ -38,9 +40,10 @@ def test_a_file_names_a_mesh_of_its_own(tmp_path):
     text = (tmp_path / "brake.toml").read_text()
     named = text.replace("[structure]", '[structure]\nmesh = "nodes.npz"', 1)
     (tmp_path / "brake.toml").write_text(named)
-    assert fj.load(tmp_path / "brake.toml").mesh == meshed().mesh
+    again: Any = fj.load(tmp_path / "brake.toml")
+    assert again.mesh == meshed().mesh
     np.savez(tmp_path / "nodes.npz", points=POINTS, cells=CELLS)
-    with pytest.raises(ValueError, match="nodes.npz lacks dofs: a mesh is points, dofs, cells"):
+    with pytest.raises(ValueError, match=r"nodes\.npz lacks dofs: a mesh is points, dofs, cells"):
         fj.load(tmp_path / "brake.toml")
 
 
@@ -49,7 +52,7 @@ def test_a_reduction_keeps_mesh_and_places(tmp_path):
     reduced = fj.reduce(x, {}, (0.0, 1e5), tol=1e-6)
     assert reduced.mesh == x.mesh
     reduced.save(tmp_path / "reduced.toml")
-    again = fj.load(tmp_path / "reduced.toml")
+    again: Any = fj.load(tmp_path / "reduced.toml")
     assert again.mesh == x.mesh
     np.testing.assert_array_equal(again._touched(), x._touched())
 
