@@ -145,13 +145,11 @@ class Follower:
             if len(self.points) - origin >= self.most:
                 return BranchEnd.long
             z, ahead = reached, turned
-            inaccurate = self.points[-1].row["error"] > self.family.rtol
-            if inaccurate or shooting.stale(z):
-                onward = self._remeshed(shooting, z, ahead)
-                if inaccurate and not isinstance(onward, BranchEnd):
-                    self.points.pop()
-                    self.record(*onward[:2])
+            onward = self._accurate(shooting, z, ahead)
+            if isinstance(onward, BranchEnd) or onward[0] is not shooting:
                 return onward
+            if shooting.stale(z):
+                return self._remeshed(shooting, z, ahead)
         if smooth and self._shrinks(shooting, z, 5):
             return self._hopf(shooting, z)
         return self._lost(shooting, z)
@@ -177,6 +175,16 @@ class Follower:
             return False
         start = shooting.located(self.home.u, self.home.r)
         return shooting.curves.passes(start - z, ahead, reached - z)
+
+    def _accurate(self, shooting: Shooting, z, ahead):
+        """Where to go on from z, recorded last: on a finer mesh, and recorded anew, if need be."""
+        if not self.points[-1].row["error"] > self.family.rtol:
+            return shooting, z, ahead
+        onward = self._remeshed(shooting, z, ahead)
+        if not isinstance(onward, BranchEnd):
+            self.points.pop()
+            self.record(*onward[:2])
+        return onward
 
     def _remeshed(self, old: Shooting, z, ahead):
         """Where to go on with a new mesh of the same itinerary, finer if that is not enough."""
@@ -515,7 +523,7 @@ class Follower:
             self._change(kind, shooting, at, shooting, new, condition)
             self.record(new, found[0])
             forward = tangent[new.index(index)] > 0
-            return new, found[0], tangent if forward else -tangent
+            return self._accurate(new, found[0], tangent if forward else -tangent)
         return None
 
     def _direct(self, shooting, at, phases, edges, condition):
