@@ -333,7 +333,7 @@ class Follower:
         for candidate in candidates:
             if candidate is not None:
                 return candidate
-        return self._ends(shooting, inside, outside)
+        return self._ends(shooting, inside, outside, p if vanishes else None)
 
     def _bracket(self, shooting: Shooting, z, reached) -> tuple[np.ndarray, np.ndarray]:
         """Points inside and outside the itinerary, close to each other where it ends."""
@@ -359,10 +359,10 @@ class Follower:
         last = min(outside)
         return inside[max(share for share in inside if share < last)], outside[last]
 
-    def _ends(self, shooting, inside, outside) -> BranchEnd:
-        """Notes the grazing beyond which no cycle goes on."""
-        found, p = None, int(np.argmin(shooting.durations(outside)))
-        if shooting.durations(outside)[p] > 0:
+    def _ends(self, shooting, inside, outside, p: int | None) -> BranchEnd:
+        """Notes the grazing beyond which no cycle goes on, where phase p vanishes if it is one."""
+        found = None
+        if p is None:
             at = self._root(shooting, inside, outside, lambda z: shooting.lowest(z)[0])
             if at is not None:
                 found = at, ("touch", shooting.lowest(at)[1])
@@ -424,7 +424,7 @@ class Follower:
             yield self._inserted(shooting, at, swapped, times, p, "order of switches", condition)
         for guard in (old.guard, phases[p].guard):
             kept, edges = _without(phases, times, p, guard)
-            yield self._direct(shooting, at, kept, edges, condition)
+            yield self._direct(shooting, at, kept, edges, p, condition)
 
     def _touching(self, shooting: Shooting, inside, outside) -> Iterator[Any]:
         """Ways on where a guard touches zero between two switches, or at one."""
@@ -526,8 +526,8 @@ class Follower:
             return self._accurate(new, found[0], tangent if forward else -tangent)
         return None
 
-    def _direct(self, shooting, at, phases, edges, condition):
-        """On without a phase that has vanished between two others."""
+    def _direct(self, shooting, at, phases, edges, p: int, condition):
+        """On without phase p, which has vanished between two others."""
         new = shooting.again(shooting.solution(at), phases, edges)
         found = new.curves.corrected(new.begin)
         if found is None or np.linalg.norm(found[0] - new.begin) > 1e-3:
@@ -535,10 +535,22 @@ class Follower:
         tangent = new.curves.tangent(found[1])
         for direction in (tangent, -tangent):
             beside = new.curves.corrected(found[0] + 1e-4 * direction)
-            if beside is not None and new.admissibility(beside[0]) > 0:
+            if beside is None or new.admissibility(beside[0]) <= 0:
+                continue
+            if self._switches(new, beside[0], p):
                 self._change("grazing", shooting, at, shooting, new, condition)
                 return new, beside[0], direction
         return None
+
+    def _switches(self, shooting: Shooting, z, p: int) -> bool:
+        """Whether the motion goes over into phase p by itself where the one before it ends."""
+        p = p % shooting.m
+        solution, last = shooting.solution(z), shooting.phases[p - 1]
+        moment = np.array([solution.times[p]])
+        y = np.asarray(self.family.sampled(solution, moment, 1)[0])[:, 0]
+        s = np.array(last.s, float)
+        state = after_switch(solution.x, self.window, solution.u[-1], y, s, last.guard)
+        return tuple(int(i) for i in np.asarray(state)) == shooting.phases[p].s
 
     def _change(self, kind, where, at, old, new, condition) -> None:
         self.record(where, at)
