@@ -101,7 +101,8 @@ def _held_by(evaluator: Evaluator, u: np.ndarray, growing: np.ndarray) -> Any:
     row, slopes = _linearised(evaluator, u)
     names = ["objective", *problem.residual_names]
     row, slopes = row[: len(names)], slopes[: len(names)]
-    scale = np.where(growing, float(problem.growth_scale) * np.cosh(row), 1.0)
+    with np.errstate(over="ignore"):  # far from any target
+        scale = np.where(growing, float(problem.growth_scale) * np.cosh(row), 1.0)
     slopes = slopes * scale[:, None]
     largest = growing & (row >= row[growing].max() - _ACTIVE)
     others = ~growing & (np.abs(row) <= _ACTIVE)

@@ -66,6 +66,13 @@ def test_map_refuses(capsys, arguments, said):
     assert status == 2 and said in err and not Path("fractaljax-map").exists()
 
 
+def assert_same_orbit(rows, cycle):
+    """Up to rounding: the command compiles the same program with other options of XLA."""
+    wanted = np.column_stack(cycle.orbit(512))
+    found = np.array(rows, float)
+    assert (abs(found - wanted) <= 4e-15 * abs(wanted).max(axis=0)).all()
+
+
 def test_cycle(capsys):
     """The table, the picture, and one period as numbers that are those of the orbit."""
     reference_scene().save("mine.toml")
@@ -77,8 +84,7 @@ def test_cycle(capsys):
     with open("fractaljax-cycle/cycle.csv", newline="") as file:
         titles, *rows = csv.reader(file)
     assert titles == ["time [s]", "x1 [m]", "x2 [m]", "v1 [m/s]", "v2 [m/s]"]
-    t, states = reference_cycle().orbit(512)
-    np.testing.assert_array_equal(np.array(rows, float), np.column_stack([t, states]))
+    assert_same_orbit(rows, reference_cycle())
     assert Path("fractaljax-cycle/cycle.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -99,7 +105,7 @@ def test_cycle_of_a_structure(capsys):
     with open("fractaljax-cycle/cycle.csv", newline="") as file:
         titles, *rows = csv.reader(file)
     assert titles == ["time [s]", "x1 [m]", "v1 [m/s]"]
-    np.testing.assert_array_equal(np.array(rows, float), np.column_stack(cycle.orbit(512)))
+    assert_same_orbit(rows, cycle)
     said = "fractaljax: start must have shape (2,), got (1,)\n"
     assert run(capsys, "cycle", "belt.toml", "--start", 1.5) == (2, "", said)
 
@@ -192,7 +198,7 @@ def test_friction_beyond_its_law(capsys, tmp_path):
         (["cycle", "--rtol", 1, "--rtol", 2], "argument --rtol: given more than once"),
         (["cycle", "--constant-friction"], "unrecognized arguments: --constant-friction"),
         (["polish"], "invalid choice: 'polish'"),
-        ([], "required: command"),
+        ([], "required: COMMAND"),
     ],
 )
 def test_bad_arguments(capsys, tmp_path, arguments, message):
