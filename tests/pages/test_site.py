@@ -130,6 +130,9 @@ def test_equations_are_typeset(site):
     assert numbers == ["(2)", "(21)", "(25)", "(26)", "(30)", "(33)", "(36)"]
     font = "return document.fonts.ready.then(f => [...f].some(x => x.status === 'loaded'))"
     assert browser.execute_script(font)
+    wider = "e => e.offsetWidth > e.clientWidth"  # by a vertical scroll bar
+    scrolls = f"return [...document.querySelectorAll('.equation')].some({wider})"
+    assert not browser.execute_script(scrolls)
     tall = "return document.querySelector('.equation mfrac').getBoundingClientRect().height"
     assert browser.execute_script(tall) > 25
 
