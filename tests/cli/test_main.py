@@ -198,7 +198,7 @@ def test_friction_beyond_its_law(capsys, tmp_path):
         (["cycle", "--rtol", 1, "--rtol", 2], "argument --rtol: given more than once"),
         (["cycle", "--constant-friction"], "unrecognized arguments: --constant-friction"),
         (["polish"], "invalid choice: 'polish'"),
-        ([], "required: COMMAND"),
+        ([], "required: COMMAND; see fractaljax --help"),
     ],
 )
 def test_bad_arguments(capsys, tmp_path, arguments, message):
