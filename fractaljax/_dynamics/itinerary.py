@@ -28,7 +28,6 @@ _LENGTH = 0.25  # of segments at rtol 1e-9, in scaled time
 _MEMORY = 64  # evaluations from which states between are extrapolated, the nearest of them
 _CLOSINGS = 4  # attempts at that
 _FAR = 0.3  # gap beyond which an evaluation is not among them
-_APART = 1e-3  # gap that Newton's method may close together with the residual
 _BETWEEN = -0.9, 3.0  # how far beyond an evaluation, in distances from another, a cubic serves
 _STALE = 1.3  # growth of a phase after which it is cut anew
 _SYMBOLS = {1: "+", -1: "-", 0: "0", OPEN: "o"}
@@ -107,6 +106,7 @@ class Shooting:
     """The equations of one itinerary for NumPy: unknowns z are u without padding, scaled."""
 
     gap = 1e-7  # between segments, above which a zero is none
+    apart = 1e-3  # gap that Newton's method may close, and between which a cubic serves
     linear = 1e-10  # distance within which an evaluation's derivatives say what another would
 
     def __init__(self, family: Family, old: Solution, phases, times):
@@ -259,11 +259,11 @@ class Shooting:
         i = self._nearest(key)
         near, ways, way = self.memory[i], self.keys[i] - self.keys, key - self.keys[i]
         apart = np.abs(way).max()
-        if apart < self.linear or self.gaps[i] > _APART:
+        if not self.apart or apart < self.linear or self.gaps[i] > self.apart:
             return near
         shares = ways @ way / np.maximum((ways**2).sum(axis=1), 1e-300)
         off = np.abs(way - shares[:, None] * ways).max(axis=1)
-        fits = (shares > _BETWEEN[0]) & (shares < _BETWEEN[1]) & (self.gaps < _APART)
+        fits = (shares > _BETWEEN[0]) & (shares < _BETWEEN[1]) & (self.gaps < self.apart)
         fits &= off < 0.3 * apart
         if not fits.any():
             return near
@@ -300,7 +300,7 @@ class Shooting:
             residual, jacobian, states, gap = condensed(*given)
             residual, gap = np.asarray(residual)[rows], float(gap)
             # Newton's method closes gaps as well, whose squares the residual is uncertain by.
-            if not gap > self.gap or (gap < _APART and 10 * gap**2 < np.abs(residual).max()):
+            if not gap > self.gap or (gap < self.apart and 10 * gap**2 < np.abs(residual).max()):
                 break
         if gap < _FAR:
             self.memory = [*self.memory[-_MEMORY:], states]

@@ -58,7 +58,7 @@ class Pinned(Shooting):
     """The equations of one itinerary held at an event; the second quantity comes last in z."""
 
     gap = 1e-11  # differences of the Jacobian need more than the orbit does
-    linear = 0.0
+    apart = linear = 0.0
 
     def __init__(self, family: Family, second: Window, event: Event, old: Solution, phases, times):
         self.second, self.event, self.borders = second, event, None
