@@ -108,7 +108,7 @@ DRIVERS = {
     ),
     "design": (
         problem,
-        ["_linearise"],
+        ["_linearise_light"],
         lambda: fj.design(BRAKE, {"D": (2.39, 2.41)}, starts=1, progress=False),
     ),
     "basin": (
