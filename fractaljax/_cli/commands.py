@@ -56,14 +56,14 @@ def _mode_pictures(structure, friction_slope: bool) -> dict[str, bytes]:
     from .._mechanism.reduced import ReducedStructure
     from .._stability.stability import stability
 
-    modes = stability(structure, friction_slope)
+    modes, mesh = stability(structure, friction_slope), structure.mesh.arrays()
     drawn = (modes.unstable() or modes._modes()[:1])[:_MODES_MOST]
     files = {}
     for i, mode in enumerate(drawn, start=1):
         shape = mode.shape
         if isinstance(structure, ReducedStructure):
             shape = structure.full(shape)
-        ax = plot.complex_mode(shape, **structure.mesh.arrays())
+        ax = plot.complex_mode(shape, **mesh)
         words = f"{mode.frequency:.5g} Hz, growth rate {mode.growth_rate:.4g} 1/s"
         ax.set_title(words, fontsize="medium", loc="left")
         files[f"mode_{i}.png"] = picture(ax.figure)
