@@ -16,25 +16,28 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .hybrid import NONE, UNUSED, HybridSystem
-from .lanes import row_numbers
+from .lanes import row_numbers, solve
 from .runge_kutta import runge_kutta
 
-_ITERATIONS = 16
-_PHASES = 256  # most of one contact state in an orbit
+_ITERATIONS = 20
+_COARSE = 0.5  # longest step of a coarse map
 _BLOCK = 32  # of sums
 _SMALL = 8  # states up to which products of matrices are sums
 
 
 class Segments(eqx.Module):
-    """A closed chain of N segments; the last one's end is the first one's start."""
+    """A closed chain of N segments, of one orbit or of several lanes.
 
-    y: Float[Array, "2n N"]  # state at the start of each
-    duration: Float[Array, " N"]
-    s: Float[Array, "f N"]  # contact state
-    guard: Int[Array, " N"]  # which guard ends it: a number, NONE within a phase, or UNUSED
+    The end of the last one is the start of the first.
+    """
+
+    y: Float[Array, "2n ... N"]  # state at the start of each
+    duration: Float[Array, "... N"]
+    s: Float[Array, "f ... N"]  # contact state
+    guard: Int[Array, "... N"]  # which guard ends it: a number, NONE within a phase, or UNUSED
 
     @property
-    def used(self) -> Bool[Array, " N"]:
+    def used(self) -> Bool[Array, "... N"]:
         """Which segments are not padding of zero duration."""
         return self.guard != UNUSED
 
@@ -42,9 +45,9 @@ class Segments(eqx.Module):
 class Maps(eqx.Module):
     """Derivatives of each segment's end, and of the guard that ends it."""
 
-    A: Float[Array, "2n 2n N"]  # of the end by the state at its start
-    b: Float[Array, "2n N"]  # of the end by its duration
-    c: Float[Array, "2n N"]  # of the guard by the state it ends in; 0 where none ends it
+    A: Float[Array, "2n 2n ... N"]  # of the end by the state at its start
+    b: Float[Array, "2n ... N"]  # of the end by its duration
+    c: Float[Array, "2n ... N"]  # of the guard by the state it ends in; 0 where none ends it
 
 
 def tableau():
@@ -53,6 +56,13 @@ def tableau():
     import diffrax
 
     return diffrax.Dopri8.tableau
+
+
+def coarse_tableau():
+    """The coefficients of the steps of coarse maps."""
+    import diffrax
+
+    return diffrax.Tsit5.tableau
 
 
 def flow(system: HybridSystem, y, duration, s, error=False) -> Any:
@@ -80,8 +90,11 @@ def chosen_guard(system: HybridSystem, y, s, guard) -> Array:
     return jnp.sum(jnp.where(row_numbers(guards) == guard[None], guards, 0), axis=0)
 
 
-def maps(system: HybridSystem, segments: Segments) -> tuple[Array, Maps]:
-    """The ends of the segments and their derivatives."""
+def maps(system: HybridSystem, segments: Segments, *, coarse: bool = False) -> tuple[Array, Maps]:
+    """The ends of the segments and their derivatives.
+
+    The `coarse` ones, which Newton's method converges with as well, take a third of the time.
+    """
     y, s = segments.y, segments.s
 
     def field(columns):
@@ -90,11 +103,16 @@ def maps(system: HybridSystem, segments: Segments) -> tuple[Array, Maps]:
         tangents = jax.vmap(slope, in_axes=1, out_axes=1)(columns[:, 1:])
         return jnp.concatenate([along[:, None], tangents], axis=1)
 
-    units = jnp.broadcast_to(jnp.eye(len(y), dtype=y.dtype)[:, :, None], (len(y), *y.shape))
-    columns = jnp.concatenate([y[:, None], units], axis=1)
+    eye = jnp.eye(len(y), dtype=y.dtype).reshape(len(y), len(y), *(1,) * (y.ndim - 1))
+    columns = jnp.concatenate([y[:, None], jnp.broadcast_to(eye, (len(y), *y.shape))], axis=1)
     duration = segments.duration[None, None]
-    ends = runge_kutta(tableau(), field, columns, duration)
-    ends, A = ends[:, 0], ends[:, 1:]
+    if coarse:
+        parts = jnp.maximum(jnp.ceil(jnp.max(duration) / _COARSE), 1)
+        step = functools.partial(runge_kutta, coarse_tableau(), field, h=duration / parts)
+        columns = jax.lax.fori_loop(0, parts.astype(int), lambda _, x: step(x), columns)
+    else:
+        columns = runge_kutta(tableau(), field, columns, duration)
+    ends, A = columns[:, 0], columns[:, 1:]
     target = next_start(y)
     _, pull = jax.vjp(lambda end: chosen_guard(system, end, s, segments.guard), target)
     (c,) = pull(jnp.ones_like(segments.duration))
@@ -112,115 +130,73 @@ def cumulative(x) -> Array:
     return (inside + before[..., None]).reshape(x.shape)
 
 
-def _product(A, B) -> Array:
-    """A @ B; a small one as a sum, which compiles into one loop with what surrounds it."""
-    return jnp.sum(A[:, :, None] * B[None], axis=1) if len(A) <= _SMALL else A @ B
+def product(A, B) -> Array:
+    """A @ B of each lane; a small one as a sum, which compiles into one loop with the rest."""
+    if len(A) <= _SMALL:
+        return jnp.sum(A[:, :, None] * B[None], axis=1)
+    return jnp.einsum("ij...,jk...->ik...", A, B)
 
 
-def _in_phase(phase, values) -> Array:
-    """The sum of `values` (N,) over the phase of each segment."""
-    return jax.ops.segment_sum(values, phase, len(phase))[phase]
+def last_of_phase(segments: Segments) -> Int[Array, "... N"]:
+    """For each segment the last one of its phase."""
+    ends = segments.used & (segments.guard != NONE)
+    ended = cumulative(ends)
+    phase = ended - ends
+    last = jnp.sum(ended[..., None, :] <= phase[..., None], axis=-1)
+    return jnp.minimum(last, ends.shape[-1] - 1)
 
 
-def corrections(local: Maps, segments: Segments, gap, guard, constant: int | None = None):
+def corrections(local: Maps, segments: Segments, last, gap, guard, constant: int | None = None):
     """Changes of states and durations that close the gaps and bring the guards to zero.
 
     They solve dy_next = A dy + b dt + gap on every segment of the chain, with the same dt in a
-    phase, and c dy_next = -guard at its end. Of the first state the component `constant`, which
-    repeats whatever it is, does not change. Returns them and the product of all maps (2n, 2n), the
-    Jacobian of the return map.
+    phase, which ends with the segment `last`, and c dy_next = -guard at its end. Of the first state
+    the component `constant`, which repeats whatever it is, does not change. Returns them and the
+    product of all maps (2n, 2n), the Jacobian of the return map.
     """
-    ends = segments.used & (segments.guard != NONE)
-    phase = cumulative(ends) - ends
-    share = jnp.where(segments.used, 1 / jnp.maximum(_in_phase(phase, segments.used * 1.0), 1), 0)
-    share = share.astype(gap.dtype)
-    b = local.b * share[None]
+    n, used = len(gap), segments.used
+    ends = used & (segments.guard != NONE)
 
     def chain(W, segment):
-        """The affine map from the first state to this end, and what the phase's duration adds.
+        """The affine map from the first state to this end, and what the phase's dt adds.
 
         The columns of W are the derivatives by the first state, the shift, and those by the
-        duration of the phase so far, which is known at its end: r dy_first + d.
+        dt of the phase so far, which is known at its end: r dy_first + d.
         """
         A, added, c, guard, last = segment
-        W = _product(A, W) + added
-        off = jnp.sum(c[:, None] * W, axis=0).at[n].add(guard)
-        off = jnp.where(last, off / jnp.where(last, -off[-1], 1), 0)
+        W = product(A, W) + added
+        off = jnp.sum(c[:, None] * W, axis=0) + guard
+        off = jnp.where(last[None], off / jnp.where(last, -off[-1], 1)[None], 0)
         return W + W[:, -1:] * off[None], off[:-1]
 
-    n = len(gap)
-    eye, none = jnp.eye(n, dtype=gap.dtype), jnp.zeros((n, 2), gap.dtype)
-    A, c = jnp.moveaxis(local.A, -1, 0), local.c.T
-    added = jnp.stack([gap.T, b.T], axis=-1)
-    added = jnp.concatenate([jnp.zeros_like(A), added], axis=-1)
-    W, durations = jax.lax.scan(
-        chain, jnp.concatenate([eye, none], axis=1), (A, added, c, guard, ends)
-    )
+    def in_order(x):
+        return jnp.moveaxis(x, -1, 0)
+
+    zero, b = jnp.zeros_like(local.A), jnp.where(used[None], local.b, 0)
+    added = jnp.concatenate([zero, gap[:, None], b[:, None]], axis=1)
+    guards = jnp.concatenate([zero[0], guard[None], jnp.zeros_like(guard)[None]])
+    eye = jnp.eye(n, dtype=gap.dtype).reshape(n, n, *(1,) * (gap.ndim - 2))
+    W = jnp.broadcast_to(eye, zero.shape[:-1])
+    W = jnp.concatenate([W, jnp.zeros_like(W[:, :2])], axis=1)
+    W, dt = jax.lax.scan(chain, W, jax.tree.map(in_order, (local.A, added, local.c, guards, ends)))
     jacobian, shift = W[:, :n], W[:, n]
     # Without segments the equations would be singular.
-    jacobian = jnp.where(jnp.any(ends), jacobian, 0)
+    jacobian = jnp.where(jnp.any(ends, axis=-1)[None, None], jacobian, 0)
     matrix = eye - jacobian
     if constant is not None:
-        matrix, shift = matrix.at[constant].set(eye[constant]), shift.at[constant].set(0)
-    first = jnp.linalg.solve(matrix, shift)
-    durations = share * _in_phase(phase, durations[:, :n] @ first + durations[:, n])
+        matrix = matrix.at[constant].set(jnp.broadcast_to(eye[constant], shift.shape))
+        shift = shift.at[constant].set(0)
+    first = solve(matrix, shift)
+    dt = jnp.moveaxis(jnp.sum(dt[:, :n] * first[None], axis=1) + dt[:, n], 0, -1)
+    dt = jnp.where(used, jnp.take_along_axis(dt, last, axis=-1), 0)
 
     def along(dy, segment):
-        A, b, gap, dt = segment
-        return _product(A, dy[:, None])[:, 0] + b * dt + gap, dy
+        A, added = segment
+        return product(A, dy[:, None])[:, 0] + added, dy
 
-    _, starts = jax.lax.scan(along, first, (A, local.b.T, gap.T, durations))
-    return starts.T, durations, jacobian
-
-
-def remesh(system: HybridSystem, steps: Segments, h, length: int) -> Segments:
-    """The same motion in at most `length` segments, equal within each phase.
-
-    They are no longer than h, if so few suffice, and shorter where friction is stiff.
-    """
-    weight = jnp.maximum(1, 2 * system.stiffness(steps.y, steps.s, 1 / 4)) * steps.duration
-    weight = jnp.where(steps.used, weight, 0)
-    ends_w, ends_t = cumulative(jnp.stack([weight, steps.duration]))
-    # The first and last step of each phase, and its weight.
-    ended = cumulative(steps.used & (steps.guard != NONE))
-    phases = jnp.arange(min(length, _PHASES))
-    exists = phases < ended[-1]
-    last_step = jnp.searchsorted(ended, phases, side="right")
-    last_step = jnp.where(exists, last_step, 0)
-    first_step = jnp.where(phases > 0, jnp.roll(last_step, 1) + 1, 0)
-    begin = (ends_w - weight)[first_step]
-    size = jnp.where(exists, ends_w[last_step] - begin, 0)
-    h = jnp.maximum(h, jnp.sum(size) / jnp.maximum(length - jnp.sum(exists), 1))
-    count = jnp.where(exists, jnp.ceil(jnp.maximum(size / h - 1e-6, 1)), 0)
-    count = count.astype(int)
-    until = cumulative(count)
-
-    number = jnp.arange(length)
-    used = number < until[-1]
-    p = jnp.where(used, jnp.sum(until[None] <= number[:, None], axis=1), 0)
-    # Gathered together: each gather is compiled on its own.
-    count, before, low, high = jnp.stack([count, until - count, first_step, last_step])[:, p]
-    begin, size = jnp.stack([begin, size])[:, p][:, None]
-    place = number - before
-    # Both ends of each new segment: the old step they lie in, and the time since its start.
-    w = begin + size * jnp.stack([place, place + 1]) / jnp.maximum(count, 1)[None]
-    step = jnp.clip(jnp.searchsorted(ends_w, w, side="right"), low[None], high[None])
-    old = jnp.stack([ends_w - weight, weight, steps.duration, ends_t - steps.duration])
-    start_w, weight, duration, start_t = old[:, step]
-    share = (w - start_w) / jnp.where(weight > 0, weight, 1)
-    after = jnp.clip(share, 0, 1) * duration
-    duration = jnp.where(used, jnp.diff(start_t + after, axis=0)[0], 0)
-    states = jnp.concatenate([steps.y, steps.s])[:, step[0]]
-    y, s = states[: len(steps.y)], states[len(steps.y) :]
-    moved = flow(system, y, jnp.where(used, after[0], 0), s)
-    guard = jnp.where(place + 1 == count, steps.guard[high], NONE)
-    last = jnp.argmax(jnp.where(used, number, -1))
-    return Segments(
-        y=jnp.where(used[None], moved, moved[:, :1]),
-        duration=duration,
-        s=jnp.where(used[None], s, s[:, last][:, None]),
-        guard=jnp.where(used, guard, UNUSED),
-    )
+    added = local.b * dt[None] + gap
+    _, starts = jax.lax.scan(along, first, (in_order(local.A), in_order(added)))
+    return jnp.moveaxis(starts, 0, -1), dt, jacobian
 
 
 def mean_square(system: HybridSystem, segments: Segments) -> Float[Array, " 2n"]:
@@ -234,67 +210,101 @@ def mean_square(system: HybridSystem, segments: Segments) -> Float[Array, " 2n"]
 
 
 class PeriodicOrbit(eqx.Module):
-    """The outcome of Newton's method for a periodic orbit."""
+    """The outcome of Newton's method for the periodic orbits of g lanes."""
 
     segments: Segments
-    converged: Bool[Array, ""]
-    return_jacobian: Float[Array, "2n 2n"]
-    error: Float[Array, ""]  # of period and states, relative, estimated by halving the steps
-    middle: Float[Array, "2n N"]  # states halfway through the segments
+    converged: Bool[Array, " g"]
+    return_jacobian: Float[Array, "2n 2n g"]
+    error: Float[Array, " g"]  # of period and states, relative, estimated by halving the steps
+    middle: Float[Array, "2n g N"]  # states halfway through the segments
 
     @classmethod
     def none(cls, segments: Segments) -> "PeriodicOrbit":
         """None yet; of the shapes that belong to those segments."""
         y = segments.y
-        eye, far = jnp.eye(len(y), dtype=y.dtype), jnp.asarray(jnp.inf, y.dtype)
-        return cls(segments, jnp.array(False), eye, far, jnp.zeros_like(y))
+        zero = jnp.zeros_like(y[0, :, 0])
+        jacobian = jnp.zeros((len(y), *y.shape[:2]), y.dtype)
+        return cls(segments, zero > 0, jacobian, zero + jnp.inf, jnp.zeros_like(y))
+
+    def where(self, lanes: Bool[Array, " g"], other: "PeriodicOrbit") -> "PeriodicOrbit":
+        """Itself in these lanes, in others the other."""
+
+        def chosen(new, old):
+            return jnp.where(lanes.reshape((1,) * (new.ndim - 1) + (-1,)), new, old)
+
+        def with_segments(new, old):
+            return jnp.where(lanes.reshape((1,) * (new.ndim - 2) + (-1, 1)), new, old)
+
+        return PeriodicOrbit(
+            jax.tree.map(with_segments, self.segments, other.segments),
+            chosen(self.converged, other.converged),
+            chosen(self.return_jacobian, other.return_jacobian),
+            chosen(self.error, other.error),
+            with_segments(self.middle, other.middle),
+        )
 
 
-def solve_periodic_orbit(system: HybridSystem, segments: Segments) -> PeriodicOrbit:
-    """The periodic orbit near those segments."""
-    y, s = segments.y, segments.s
+def solve_periodic_orbits(system: HybridSystem, segments: Segments, wanted, reach) -> PeriodicOrbit:
+    """The periodic orbits near the segments of g lanes, of those that are `wanted` (g,).
+
+    They are solved together: a lane that has converged waits for the others. One gives up where
+    its first state would move further than `reach` (g,).
+    """
+    y, s, guard = segments.y, segments.s, segments.guard
     if system.excited:
-        y = y.at[:, 0].set(system.with_excitation(system.own(y[:, 0]), 0.0))
-        segments = eqx.tree_at(lambda segments: segments.y, segments, y)
-    eps, big = jnp.finfo(y.dtype).eps, jnp.asarray(jnp.finfo(y.dtype).max, y.dtype)
-    tolerance = 1e3 * eps * (1 + jnp.max(jnp.abs(y)))
-
-    def settled(change, count):
-        limit = jnp.where(count < _ITERATIONS, tolerance, 10 * tolerance)
-        return change <= limit
+        y = y.at[..., :1].set(system.with_excitation(system.own(y[..., :1]), 0.0))
+    start, last = y[..., 0], last_of_phase(segments)
+    eps, big = jnp.finfo(y.dtype).eps, jnp.finfo(y.dtype).max
+    size = 1 + jnp.max(jnp.abs(y), axis=(0, -1))
+    tolerance = 1e3 * eps * size
+    nothing = Maps(jnp.zeros((len(y), *y.shape), y.dtype), jnp.zeros_like(y), jnp.zeros_like(y))
+    far = jnp.where(wanted, big, jnp.inf).astype(y.dtype)
 
     def running(carry):
-        found, change, count = carry
-        going = (count < _ITERATIONS) | settled(change, count)
-        return going & ~found.converged & (change < jnp.inf)
+        return carry[-1] <= _ITERATIONS
 
     def body(carry):
-        found, change, count = carry
-        segments, last = found.segments, settled(change, count)
-        y, h = segments.y, segments.duration
-        ends, local = maps(system, segments)
-        target = next_start(y)
-        guard = chosen_guard(system, target, s, segments.guard)
-
-        def halved():
-            end, starts = jax.lax.scan(lambda y, _: (flow(system, y, h / 2, s), y), y, length=2)
-            return end, starts[1]
-
+        found, local, change, before, count = carry
+        y, h = found.segments.y, found.segments.duration
+        going = (change > tolerance) & (change < jnp.inf)
         # The last iteration is for the error: what half the steps would change.
-        ends, middle = jax.lax.cond(last, halved, lambda: (ends, found.middle))
-        gap, guard = ends - target, jnp.where(last, 0, guard)
-        dy, dt, jacobian = corrections(local, segments, gap, guard, system.constant)
-        period, size = jnp.sum(h), jnp.max(jnp.abs(y))
-        error = jnp.maximum(jnp.abs(jnp.sum(dt)) / period, jnp.max(jnp.abs(dy)) / size)
-        new = jnp.maximum(jnp.max(jnp.abs(dy)), jnp.max(jnp.abs(dt)))
+        ends_here = ~jnp.any(going) | (count == _ITERATIONS)
+        # Near the orbit the maps serve again, while they do well.
+        stale = going & ((change > 1e-3 * size) | (change > before / 8))
+        local = jax.lax.cond(
+            jnp.any(stale) & ~ends_here,
+            lambda: maps(system, found.segments, coarse=True)[1],
+            lambda: local,
+        )
+        parts = jnp.where(ends_here, 2, 1)
+        ends, middle = jax.lax.fori_loop(
+            0, parts, lambda _, x: (flow(system, x[0], h / parts, s), x[0]), (y, y)
+        )
+        target = next_start(y)
+        off = jnp.where(ends_here, 0, chosen_guard(system, target, s, guard))
+        dy, dt, jacobian = corrections(
+            local, found.segments, last, ends - target, off, system.constant
+        )
+        largest, longest = jnp.max(jnp.abs(dy), axis=(0, -1)), jnp.max(jnp.abs(dt), axis=-1)
+        error = jnp.maximum(
+            jnp.abs(jnp.sum(dt, axis=-1)) / jnp.sum(h, axis=-1),
+            largest / jnp.max(jnp.abs(y), axis=(0, -1)),
+        )
+        new = jnp.maximum(largest, longest)
+        moved = jnp.max(jnp.abs(y[..., 0] + dy[..., 0] - start), axis=0)
+        new = jnp.where((moved <= reach) & (new < big), new, jnp.inf)
+        moves = going & ~ends_here & (new < jnp.inf)
         # Far from the orbit a full step may leave the region of convergence.
-        share = jnp.where(last, 0, jnp.minimum(1, 1 / new))
-        moved = Segments(y + share * dy, h + share * dt, s, segments.guard)
-        error = jnp.where(last, error, found.error)
-        change = jnp.where(last, change, new)
-        return PeriodicOrbit(moved, last, jacobian, error, middle), change, count + 1
+        share = jnp.minimum(1, 1 / new)[:, None]
+        y = jnp.where(moves[None, :, None], y + share[None] * dy, y)
+        h = jnp.where(moves[:, None], h + share * dt, h)
+        converged = change <= 10 * tolerance
+        found = PeriodicOrbit(Segments(y, h, s, guard), converged, jacobian, error, middle)
+        change, before = jnp.where(going, jnp.stack([new, change]), jnp.stack([change, before]))
+        return found, local, change, before, jnp.where(ends_here, _ITERATIONS, count) + 1
 
-    found, *_ = jax.lax.while_loop(running, body, (PeriodicOrbit.none(segments), big, 0))
+    none = PeriodicOrbit.none(Segments(y, segments.duration, s, guard))
+    found, *_ = jax.lax.while_loop(running, body, (none, nothing, far, far, 0))
     return found
 
 
@@ -320,8 +330,10 @@ def _orbit_jvp(primals, tangents):
     _, (gap, off) = jax.jvp(equations, (system,), (tangents[0],))
     _, local = maps(system, Segments(y, duration, s, guard))
 
+    last = last_of_phase(segments)
+
     def solution(gap, off):
-        return corrections(local, segments, gap, off, system.constant)[:2]
+        return corrections(local, segments, last, gap, off, system.constant)[:2]
 
     # Linear, hence its own derivative. Older versions of JAX transpose a scan only as a jvp.
     nothing = jax.tree.map(jnp.zeros_like, (gap, off))

@@ -15,17 +15,28 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from .events import Cubic, step
-from .hybrid import NONE, SECTION, UNUSED, HybridSystem
+from .events import Cubic
+from .hybrid import SECTION, UNUSED, HybridSystem
 from .orbit import (
     PeriodicOrbit,
     Segments,
     cumulative,
     next_start,
-    remesh,
-    solve_periodic_orbit,
+    product,
+    solve_periodic_orbits,
+)
+from .record import (
+    ENDED,
+    GUARD,
+    RETURNED,
+    TIME,
+    Mesh,
+    Record,
+    Stretch,
+    cut,
+    starts_along,
 )
 
 _MESHES = 4  # on which a candidate is solved, each finer, until it is accurate
@@ -43,6 +54,8 @@ class SearchOptions:
     longest: int = 16  # most returns in one period
     near: float = 0.15  # gap between returns below which an orbit is tried, relative
     accepted: float = 0.03  # distance from the orbit at which its multipliers decide, relative
+    reach: float = 0.5  # distance from the run beyond which Newton's method gives up, relative
+    group: int = 16  # orbits that are solved together, of those that many searches have at a time
     approaches: int = 3  # rounds in which the motion approaches an orbit that is not yet near
     eager: int = 64  # rounds after which orbits are tried less often
     linear: float = 0.5  # size below which a decay at the linear rate ends in equilibrium
@@ -64,56 +77,6 @@ class Attractor(eqx.Module):
     returns: Float[Array, "..."]  # of the run
 
 
-class _Run(eqx.Module):
-    """A coarse run with its last steps, in a ring of rounds, all in one array."""
-
-    y: Float[Array, "2n ..."]
-    s: Float[Array, "f ..."]
-    guard: Int[Array, "..."]  # that ended the last step
-    steps: Float[Array, "2n+f+2 record ..."]  # state, contact state, duration and guard
-
-
-class _Returns(eqx.Module):
-    """The returns of a run, newest first."""
-
-    at: Int[Array, " returns"]  # steps that ended at the section
-    y: Float[Array, "2n returns"]
-    time: Float[Array, " returns"]
-    exists: Array
-
-
-def _advance(system: HybridSystem, run: _Run, rounds, h, options: SearchOptions) -> _Run:
-    record = run.steps.shape[1]
-    place = rounds * options.round_steps % record
-
-    def body(k, carry):
-        y, s, guard, steps = carry
-        y_new, s_new, dt, guard = step(system, y, s, guard, h)
-        one = jnp.concatenate([y, s, dt[None], guard.astype(y.dtype)[None]])
-        steps = jax.lax.dynamic_update_index_in_dim(steps, one, place + k, 1)
-        return y_new, s_new, guard, steps
-
-    carry = run.y, run.s, run.guard, run.steps
-    return _Run(*jax.lax.fori_loop(0, options.round_steps, body, carry))
-
-
-def _segments(run: _Run, order) -> Segments:
-    """The last steps of one run as segments, in that order."""
-    n, f = len(run.y), len(run.s)
-    y, s, duration, guard = jnp.split(run.steps[:, order], [n, n + f, n + f + 1])
-    return Segments(y, duration[0], s, guard[0].astype(int))
-
-
-def _returns(run: _Run, order, guard, count: int) -> _Returns:
-    seen = cumulative(guard == SECTION)
-    number = seen[-1] - jnp.arange(count)
-    at = jnp.where(number > 0, jnp.searchsorted(seen, number), -1)
-    # A step ends where the next one starts.
-    following = run.steps[: len(run.y), order[(at + 1) % len(order)]]
-    y = jnp.where((at == len(order) - 1)[None], run.y[:, None], following)
-    return _Returns(at, y, cumulative(run.steps[-2, order])[at], at >= 0)
-
-
 def _quintic(y, d, x):
     """The quintic with values y (3, ...) and slopes d (3, ...) at 0, 1/2 and 1, at x."""
     u, v, w = x, x - 0.5, x - 1
@@ -123,8 +86,8 @@ def _quintic(y, d, x):
     return at_0 * first + at_m * (y[1] + v * d[1]) + at_1 * last
 
 
-def admissible(system: HybridSystem, segments: Segments, middle) -> Array:
-    """Whether an orbit obeys the friction law along its itinerary; `middle` are its midpoints.
+def admissible(system: HybridSystem, segments: Segments, middle) -> Bool[Array, " g"]:
+    """Whether orbits obey the friction law along their itinerary; `middle` are the midpoints.
 
     No guard is below zero inside a segment, and every switch leads to the next contact state.
     """
@@ -132,7 +95,7 @@ def admissible(system: HybridSystem, segments: Segments, middle) -> Array:
     at = jnp.stack([y, middle, ends])
     d = jax.vmap(lambda y: h[None] * system.field(y, s))(at)
     guards = jax.vmap(lambda y: system.guards(y, s)[1:])  # but the section
-    scale = 1 + jnp.max(jnp.abs(y))
+    scale = (1 + jnp.max(jnp.abs(y), axis=(0, -1)))[:, None]
     # Half a segment each: the cubic through a guard's ends and a point between says where it is
     # lowest. There the guard itself is evaluated.
     places = jnp.arange(7) / 6
@@ -146,86 +109,118 @@ def admissible(system: HybridSystem, segments: Segments, middle) -> Array:
         lowest.append(_quintic(at, d, (k + theta)[None] / 2))
     g = jnp.concatenate([g, guards(jnp.stack(lowest))])
     # The quintic is this good in a segment of the default length.
-    holds = jnp.all(g > -1e-8 * scale) & jnp.all(h > -1e-10)
+    holds = jnp.all(g > -1e-8 * scale[None, None], axis=(0, 1)) & (h > -1e-10)
     _, after = system.switch(ends, s, segments.guard)
-    return holds & jnp.all(after == jnp.roll(s, -1, axis=-1))
+    return jnp.all(holds & jnp.all(after == jnp.roll(s, -1, axis=-1), axis=0), axis=-1)
 
 
-def attracts(return_jacobian) -> Array:
+def attracts(return_jacobian) -> Bool[Array, " g"]:
     """Whether no eigenvalue exceeds 1 in modulus by more than 1e-3: by repeated squaring."""
 
     def square(_, power):
-        return power @ power
+        return product(power, power)
 
     power = jax.lax.fori_loop(0, 13, square, return_jacobian)
-    return jnp.max(jnp.abs(power)) < 1e3
+    return jnp.max(jnp.abs(power), axis=(0, 1)) < 1e3
 
 
-def _has_shorter_period(orbit: Segments, returns) -> Array:
-    """Whether the orbit is back at its start before its last return."""
-    start = orbit.y[:, :1]
+def _has_shorter_period(orbit: Segments, returns) -> Bool[Array, " g"]:
+    """Whether orbits are back at their start before the last of their returns (g,)."""
+    start = orbit.y[..., :1]
     away = jnp.max(jnp.abs(next_start(orbit.y) - start), axis=0)
     at_section = orbit.guard == SECTION
-    early = at_section & (cumulative(at_section) < returns)
-    return jnp.any(early & (away < 1e-5 * (1 + jnp.max(jnp.abs(start)))))
+    early = at_section & (cumulative(at_section) < returns[:, None])
+    return jnp.any(early & (away < 1e-5 * (1 + jnp.max(jnp.abs(start), axis=0))), axis=-1)
 
 
-def _candidate(system, steps: Segments, y, first, last, returns, h, rtol, *, length: int):
-    """The orbit near the steps after `first` up to `last`: segments, error, whether accepted.
+def _no_segments(y, faces: int, length: int) -> Segments:
+    """Unused ones, of orbits of the lanes of states y (2n, B)."""
+    shape = (y.shape[1], length)
+    return Segments(
+        y=jnp.zeros((len(y), *shape), y.dtype),
+        duration=jnp.zeros(shape, y.dtype),
+        s=jnp.ones((faces, *shape), y.dtype),
+        guard=jnp.full(shape, UNUSED),
+    )
+
+
+class _Candidates(eqx.Module):
+    """Steps of g lanes whose orbits are solved for, and what is found."""
+
+    y: Float[Array, "2n g"]  # state after them
+    first: Int[Array, " g"]  # the step before them
+    last: Int[Array, " g"]
+    returns: Int[Array, " g"]  # of one period
+    h: Float[Array, " g"]
+    rtol: Float[Array, " g"]
+
+
+def _solved(system, record, lane, wanted, given: _Candidates, *, length, options):
+    """The orbits near the steps of lanes (g,): segments, error, whether accepted.
 
     One of a shorter period is not: the same number of segments resolves that period better.
     """
-    number = jnp.arange(len(steps.duration))
-    chosen = (number > first) & (number <= last)
-    # The chosen steps come first, as a chain must.
-    order = jnp.roll(number, -(first + 1))
-    guard = jnp.where(chosen, steps.guard, UNUSED)[order]
-    duration = jnp.where(chosen, steps.duration, 0)[order]
-    steps = Segments(steps.y[:, order], duration, steps.s[:, order], guard)
+    stretch = Stretch.between(record, lane, given.first, given.last, length)
+    scale = 1 + jnp.max(jnp.abs(given.y), axis=0)
+
+    def unsettled(found):
+        return found.converged & ~(found.error <= given.rtol)
 
     def going(carry):
-        _, found, tries = carry
-        return (tries == 0) | ((tries < _MESHES) & found.converged & ~(found.error <= rtol))
+        _, found, _, tries = carry
+        return (tries == 0) | ((tries < _MESHES) & jnp.any(unsettled(found)))
 
     def solve(carry):
-        steps, _, tries = carry
-        found = solve_periodic_orbit(system, remesh(system, steps, h * 0.8**tries, length))
+        old, found, duration, tries = carry
+        own = wanted & ((tries == 0) | unsettled(found))
+        mesh = mesh_of(stretch.rate * duration, tries)
+        starts = jax.lax.cond(
+            tries == 0,
+            lambda: stretch.starts(mesh),
+            lambda: starts_along(found.segments, old, mesh),
+        )
+        segments = cut(system, stretch, mesh, starts)
+        new = solve_periodic_orbits(system, segments, own, options.reach * scale)
         # The orbit's phases have other lengths than those of the steps: they are cut anew.
-        steps = jax.tree.map(lambda x, new: x.at[..., :length].set(new), steps, found.segments)
-        used = jnp.where(number < length, steps.guard, UNUSED)
-        steps = Segments(steps.y, jnp.where(used == UNUSED, 0, steps.duration), steps.s, used)
-        return steps, found, tries + 1
+        return mesh, new.where(own, found), mesh.durations(new.segments), tries + 1
 
-    nothing = PeriodicOrbit.none(jax.tree.map(lambda x: x[..., :length], steps))
-    _, found, _ = jax.lax.while_loop(going, solve, (steps, nothing, 0))
-    orbit = found.segments
-    near = jnp.max(jnp.abs(orbit.y[:, 0] - y)) < 0.2 * (1 + jnp.max(jnp.abs(y)))
-    moves = jnp.max(jnp.abs(orbit.y[system.n :])) > 1e-4
-    ok = found.converged & near & moves & attracts(found.return_jacobian)
-    ok = ok & admissible(system, orbit, found.middle) & ~_has_shorter_period(orbit, returns)
-    return orbit, found.error, ok
+    def mesh_of(size, tries):
+        return Mesh.of(size, stretch.exists, given.h * 0.8**tries, length)
+
+    mesh = jax.tree.map(
+        lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(mesh_of, stretch.duration, 0)
+    )
+    nothing = PeriodicOrbit.none(_no_segments(given.y, len(record.s), length))
+    carry = mesh, nothing, stretch.duration, 0
+    _, found, *_ = jax.lax.while_loop(going, solve, carry)
+    orbit, n = found.segments, system.n
+    near = jnp.max(jnp.abs(orbit.y[..., 0] - given.y), axis=0) < 0.2 * scale
+    moves = jnp.max(jnp.abs(orbit.y[n:]), axis=(0, -1)) > 1e-4
+    ok = wanted & found.converged & near & moves & attracts(found.return_jacobian)
+    ok = ok & admissible(system, orbit, found.middle)
+    return orbit, found.error, ok & ~_has_shorter_period(orbit, given.returns)
 
 
 class _Progress(eqx.Module):
-    """What the search knows of one scene besides its run."""
+    """What the search knows of B lanes besides their record."""
 
-    status: Int[Array, "..."]
+    status: Int[Array, " B"]
     orbit: Segments
-    period_returns: Int[Array, "..."]
-    error: Float[Array, "..."]
-    distance: Float[Array, "..."]  # of the run from that orbit
-    approach: Int[Array, "..."]  # rounds in which it fell
-    widest: Float[Array, "..."]  # gap between returns, in the later half of the run
-    tried: Float[Array, "..."]  # gap at the last attempt
-    returns: Float[Array, "..."]
-    idle: Int[Array, "..."]  # rounds without a return
-    size: Float[Array, "..."]  # distance from the equilibrium at the last return
-    calm: Int[Array, "..."]  # rounds with a return in which it did not grow
+    period_returns: Int[Array, " B"]
+    error: Float[Array, " B"]
+    distance: Float[Array, " B"]  # of the run from that orbit
+    approach: Int[Array, " B"]  # rounds in which it fell
+    widest: Float[Array, " B"]  # gap between returns, in the later half of the run
+    tried: Float[Array, " B"]  # gap at the last attempt
+    returns: Float[Array, " B"]
+    idle: Int[Array, " B"]  # rounds without a return
+    size: Float[Array, " B"]  # distance from the equilibrium at the last return
+    calm: Int[Array, " B"]  # rounds with a return in which it did not grow
 
 
 def _assess(
     system,
-    run: _Run,
+    record: Record,
     known: _Progress,
     rounds,
     equilibrium,
@@ -237,50 +232,53 @@ def _assess(
     options: SearchOptions,
     length: int,
 ):
-    """One scene after a round: its run, perhaps extrapolated, and what is known of it."""
-    record = run.steps.shape[1]
-    oldest = (rounds + 1) * options.round_steps
-    order = (oldest + jnp.arange(record)) % record
-    guard = run.steps[-1, order].astype(int)
-    seen = _returns(run, order, guard, options.longest + 1)
+    """All lanes after a round: the record, perhaps extrapolated, and what is known of them."""
+    lane = jnp.arange(len(known.status))
+    at, exists = record.returns(options.longest + 1)
+    seen = record.after(at)
+    newest = record.length - options.round_steps  # number of the first new step
     active = known.status == RUNNING
-    tiny = jnp.finfo(run.y.dtype).tiny
-    new = jnp.arange(record) >= record - options.round_steps
-    returns = known.returns + jnp.sum(new & (guard == SECTION))
-    idle = jnp.where(seen.at[0] >= record - options.round_steps, 0, known.idle + 1)
+    tiny = jnp.finfo(seen.dtype).tiny
+    before = record.row(RETURNED, newest - 1, lane)
+    returns = known.returns - before
+    idle = jnp.where(before < 0, 0, known.idle + 1)
 
     # --- near the equilibrium ---
-    away = jnp.sqrt(jnp.sum((seen.y - equilibrium[:, None]) ** 2, axis=0))
-    size = jnp.sqrt(jnp.sum((run.y - equilibrium) ** 2)) + tiny
-    diverged = ~(size < options.divergence * (1 + jnp.max(jnp.abs(equilibrium))))
-    last_switch = jnp.max(jnp.where(guard > 0, jnp.arange(record), -1))
-    smooth = seen.exists[3] & (seen.at[3] > last_switch)
+    away = jnp.sqrt(jnp.sum((seen - equilibrium[:, None]) ** 2, axis=0))
+    size = jnp.sqrt(jnp.sum((record.y - equilibrium) ** 2, axis=0)) + tiny
+    largest = jnp.max(jnp.abs(equilibrium), axis=0)
+    diverged = ~(size < options.divergence * (1 + largest))
+    # The last three returns without a switch between them.
+    smooth = exists[3] & (record.row(ENDED, at[3], lane) == -3)
     log = jnp.log(away[:3] + tiny)
-    rate, before = log[0] - log[1], log[1] - log[2]
-    duration = seen.time[0] - seen.time[1]
+    rate, rate_before = log[0] - log[1], log[1] - log[2]
+    time = record.row(TIME, at[:2], lane[None])
     # An excited motion has no equilibrium.
-    steady = smooth & (jnp.abs(rate - before) < 0.1 * jnp.abs(rate)) & (not system.excited)
-    linear = steady & (away[0] < options.linear) & (rate < 0.7 * growth * duration)
+    steady = smooth & (jnp.abs(rate - rate_before) < 0.1 * jnp.abs(rate)) & (not system.excited)
+    linear = steady & (away[0] < options.linear) & (rate < 0.7 * growth * (time[0] - time[1]))
     decays = linear | (smooth & (away[0] < options.small) & (rate < 0))
     decays = (growth < 0) & (decays | (size < 1e-6))
     status = jnp.where(diverged, DIVERGED, jnp.where(decays, EQUILIBRIUM, RUNNING))
     # Amplitude extrapolation: a slow, steady change without switches skips many returns, but at
     # most half of the change that is left if it slows down geometrically.
-    left = jnp.abs(rate * before) / jnp.maximum(jnp.abs(before) - jnp.abs(rate), 1e-300)
+    slower = jnp.maximum(jnp.abs(rate_before) - jnp.abs(rate), 1e-300)
+    left = jnp.abs(rate * rate_before) / slower
     ahead = jnp.minimum(jnp.minimum(0.25, left / 2), 200 * jnp.abs(rate))
     extrapolates = steady & (jnp.abs(rate) < options.extrapolated) & (status == RUNNING) & active
     factor = jnp.where(extrapolates, jnp.exp(jnp.sign(rate) * ahead), 1)
-    y_on = jnp.where(extrapolates, equilibrium + factor * (run.y - equilibrium), run.y)
+    y_on = jnp.where(
+        extrapolates[None], equilibrium + factor[None] * (record.y - equilibrium), record.y
+    )
 
     # --- near a periodic orbit ---
-    scale = 1 + jnp.max(jnp.abs(seen.y[:, 0]))
-    apart = jnp.max(jnp.abs(seen.y[:, 1:] - seen.y[:, :1]), axis=0)
-    apart = jnp.where(seen.exists[1:], apart, jnp.inf)
-    closest = jnp.min(apart)
+    scale = 1 + jnp.max(jnp.abs(seen[:, 0]), axis=0)
+    apart = jnp.max(jnp.abs(seen[:, 1:] - seen[:, :1]), axis=0)
+    apart = jnp.where(exists[1:], apart, jnp.inf)
+    closest = jnp.min(apart, axis=0)
 
     def distance_from(orbit):
-        gap = jnp.max(jnp.abs(seen.y - orbit.y[:, :1]), axis=0)
-        return jnp.min(jnp.where(seen.exists, gap, jnp.inf))
+        gap = jnp.max(jnp.abs(seen - orbit.y[:, None, :, 0]), axis=0)
+        return jnp.min(jnp.where(exists, gap, jnp.inf), axis=0)
 
     # An earlier orbit is accepted once the motion has approached it in several rounds.
     now = distance_from(known.orbit)
@@ -289,7 +287,7 @@ def _assess(
     distance = jnp.where(closer, now, jnp.inf)
     ok = approach >= options.approaches
     # Alternately an orbit of one return and the one that the motion seems to repeat.
-    repeated = 1 + jnp.argmax(apart <= 2 * closest + 1e-6)
+    repeated = 1 + jnp.argmax(apart <= 2 * closest[None] + 1e-6, axis=0)
     period_returns = jnp.where(rounds % 2 == 0, 1, repeated)
     gap = jnp.where(period_returns == 1, apart[0], closest)
     ready = active & (status == RUNNING) & ~closer & ~extrapolates & (gap < options.near * scale)
@@ -298,21 +296,16 @@ def _assess(
     pause = jnp.where(rounds < options.eager, 8, 64)
     ready = ready & ((gap < 0.7 * known.tried) | (rounds % pause < 2))
 
-    def solve():
-        first, last = seen.at[period_returns], seen.at[0]
-        steps = _segments(run, order)
-        return *_candidate(
-            system, steps, seen.y[:, 0], first, last, period_returns, h, rtol, length=length
-        ), period_returns
-
-    def keep():
-        return known.orbit, known.error, jnp.array(False), known.period_returns
-
-    orbit, error, found, orbit_returns = jax.lax.cond(ready, solve, keep)
-    orbit, error, orbit_returns = jax.tree.map(
-        lambda new, old: jnp.where(found, new, old),
-        (orbit, error, orbit_returns),
-        (known.orbit, known.error, known.period_returns),
+    given = _Candidates(
+        y=seen[:, 0],
+        first=jnp.take_along_axis(at, period_returns[None], axis=0)[0],
+        last=at[0],
+        returns=period_returns,
+        h=h,
+        rtol=rtol,
+    )
+    orbit, error, found = _in_groups(
+        system, record, ready, gap, given, known.orbit, known.error, options=options, length=length
     )
     now = distance_from(orbit)
     # This near, the multipliers decide whether it attracts.
@@ -326,16 +319,14 @@ def _assess(
     # A period that the record does not hold is never seen to repeat.
     grows = away[0] > 1.01 * known.size
     calm = jnp.where(idle > 0, known.calm, jnp.where(grows, 0, known.calm + 1))
-    short = ~seen.exists[1] & (calm >= options.settling)
-    short = short | (ended & ~seen.exists[options.longest // 4])
-    too_long = jnp.all(guard != UNUSED) & short
+    short = ~exists[1] & (calm >= options.settling)
+    short = short | (ended & ~exists[options.longest // 4])
+    too_long = (record.row(GUARD, 0, lane) != UNUSED) & short
     over = jnp.where(too_long, TOO_LONG, over)
     status = jnp.where(status == RUNNING, jnp.where(ok, CONVERGED, over), status)
     progress = _Progress(
         status=status,
-        orbit=orbit,
-        period_returns=orbit_returns,
-        error=error,
+        period_returns=jnp.where(found, period_returns, known.period_returns),
         distance=distance,
         approach=approach,
         widest=widest,
@@ -344,61 +335,108 @@ def _assess(
         idle=idle,
         size=jnp.where(idle > 0, known.size, away[0]),
         calm=calm,
+        orbit=known.orbit,
+        error=known.error,
     )
-    progress = jax.tree.map(lambda new, old: jnp.where(active, new, old), progress, known)
-    return y_on, extrapolates, progress
+    progress = jax.tree.map(
+        lambda new, old: jnp.where(active, new, old) if new.ndim == 1 else old, progress, known
+    )
+    # Where an orbit was found its lane was active.
+    progress = eqx.tree_at(lambda known: (known.orbit, known.error), progress, (orbit, error))
+    return record.moved(y_on, extrapolates), progress
+
+
+def _in_groups(system, record, ready, gap, given, orbit, error, *, options, length):
+    """The orbits of all lanes, new where found; those that are ready are solved in groups."""
+    lanes = len(ready)
+    size = min(lanes, options.group)
+    # Similar ones together, so that few wait for others.
+    order = jnp.argsort(jnp.where(ready, gap, jnp.inf)) if lanes > 1 else jnp.zeros(1, int)
+    order = jnp.pad(order, (0, -lanes % size), constant_values=lanes)
+
+    def going(carry):
+        return carry[-1] < jnp.sum(ready)
+
+    def solve(carry):
+        orbit, error, found, start = carry
+        lane = jax.lax.dynamic_slice(order, (start,), (size,))
+        own = jnp.minimum(lane, lanes - 1)
+        wanted = ready[own] & (lane < lanes)
+        batched = system.omega.ndim > 0
+        new, new_error, ok = _solved(
+            jax.tree.map(lambda x: x[..., own, None], system) if batched else system,
+            record,
+            own,
+            wanted,
+            jax.tree.map(lambda x: x[..., own], given),
+            length=length,
+            options=options,
+        )
+        lane = jnp.where(ok, lane, lanes)  # beyond the last one nothing is written
+        orbit = Segments(
+            *(
+                old.at[..., lane, :].set(x, mode="drop")
+                for old, x in zip(
+                    (orbit.y, orbit.duration, orbit.s, orbit.guard),
+                    (new.y, new.duration, new.s, new.guard),
+                    strict=True,
+                )
+            )
+        )
+        error = error.at[lane].set(new_error, mode="drop")
+        return orbit, error, found.at[lane].set(True, mode="drop"), start + size
+
+    carry = orbit, error, jnp.zeros(lanes, bool), 0
+    return jax.lax.while_loop(going, solve, carry)[:3]
 
 
 def _find(
     system, start, equilibrium, growth, max_returns, h, rtol, *, length, options
 ) -> Attractor:
-    shape, n = start.shape[1:], len(start)
-    s = system.contact_state(start)
-    record = max(32 * length, options.record)
-    blank = jnp.zeros((n + len(s) + 2, record, *shape), start.dtype).at[-1].set(UNUSED)
-    run = _Run(y=start, s=s, guard=jnp.full(shape, NONE), steps=blank)
-    none, far = jnp.zeros(shape, int), jnp.full(shape, jnp.inf, start.dtype)
-    zero = jnp.zeros(shape, start.dtype)
-    empty = Segments(
-        y=jnp.zeros((n, length, *shape), start.dtype),
-        duration=jnp.zeros((length, *shape), start.dtype),
-        s=jnp.ones((len(s), length, *shape), start.dtype),
-        guard=jnp.full((length, *shape), UNUSED),
-    )
+    lanes = start.shape[1]
+    record = Record.begin(system, start, max(32 * length, options.record))
+    none, far = jnp.zeros(lanes, int), jnp.full(lanes, jnp.inf, start.dtype)
+    zero = jnp.zeros(lanes, start.dtype)
     known = _Progress(
-        none + RUNNING, empty, none, zero, far, none, zero, far, zero, none, zero, none
+        status=none + RUNNING,
+        orbit=_no_segments(start, len(record.s), length),
+        period_returns=none,
+        error=zero,
+        distance=far,
+        approach=none,
+        widest=zero,
+        tried=far,
+        returns=zero,
+        idle=none,
+        size=zero,
+        calm=none,
     )
-    assess = functools.partial(_assess, options=options, length=length)
 
     def running(carry):
         return jnp.any(carry[1].status == RUNNING)
 
     def body(carry):
-        run, known, rounds = carry
+        record, known, rounds = carry
         # A run that takes long to settle may be near the boundary of two basins.
         finer = sum(rounds >= after for after in options.finer_after)
         h_run = (options.step / 2.0**finer).astype(start.dtype)
-        run = _advance(system, run, rounds, h_run, options)
-        arguments = system, run, known, equilibrium, growth, max_returns, h, rtol
+        record = record.advance(system, h_run, options.round_steps)
+        record, known = _assess(
+            system,
+            record,
+            known,
+            rounds,
+            equilibrium,
+            growth,
+            max_returns,
+            h,
+            rtol,
+            options=options,
+            length=length,
+        )
+        return record, known, rounds + 1
 
-        def one(arguments):
-            system, run, known, *rest = arguments
-            return assess(system, run, known, rounds, *rest)
-
-        if shape:
-            # Each scene on its own: it has its own number of iterations.
-            first = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), arguments)
-            y, moved, known = jax.tree.map(
-                lambda x: jnp.moveaxis(x, 0, -1), jax.lax.map(one, first)
-            )
-        else:
-            y, moved, known = one(arguments)
-        # Steps from before an extrapolation are not of this motion.
-        guards = jnp.where(moved[None], UNUSED, run.steps[-1])
-        steps = run.steps.at[-1].set(guards)
-        return _Run(y, run.s, run.guard, steps), known, rounds + 1
-
-    _, known, _ = jax.lax.while_loop(running, body, (run, known, 0))
+    _, known, _ = jax.lax.while_loop(running, body, (record, known, 0))
     return Attractor(known.orbit, known.status, known.period_returns, known.error, known.returns)
 
 
@@ -421,9 +459,16 @@ def find(
     """
     search = functools.partial(_find, length=length, options=options)
 
+    def lanes_first(found):
+        lane_first = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), found)
+        segments = jax.tree.map(lambda x: jnp.moveaxis(x, -2, 0), found.segments)
+        return eqx.tree_at(lambda found: found.segments, lane_first, segments)
+
     @custom_vmap
     def one(arguments):
-        return search(*arguments)
+        system, *rest = arguments
+        found = search(system, *(x[..., None] for x in rest))
+        return jax.tree.map(lambda x: x[0], lanes_first(found))
 
     @one.def_vmap
     def rule(axis_size, in_batched, arguments):
@@ -436,9 +481,7 @@ def find(
             arguments,
             in_batched[0],
         )
-        found = search(*arguments)
-        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), found), jax.tree.map(
-            lambda _: True, found
-        )
+        found = lanes_first(search(*arguments))
+        return found, jax.tree.map(lambda _: True, found)
 
     return one((system, start, equilibrium, growth, max_returns, h, rtol))
