@@ -34,21 +34,27 @@ def first_reached(reaches: Callable[[Array], Array], shape: tuple[int, ...], cou
 
 
 class Record(eqx.Module):
-    """The last steps of coarse runs in B lanes, numbered from the oldest."""
+    """The last steps of coarse runs in B lanes, numbered from the oldest.
+
+    What changes the array anywhere but in the loop that steps would copy it, which takes longer
+    than the steps.
+    """
 
     y: Float[Array, "2n B"]  # state after the last step
     s: Float[Array, "f B"]
     guard: Int[Array, " B"]  # that ended it
+    sums: Float[Array, "4 B"]
     steps: Float[Array, "2n+f+5 record B"]  # a ring: state and contact state before, and `_ROWS`
     oldest: Int[Array, ""]  # place of the oldest
+    count: Int[Array, " B"]  # steps that are known to be of one motion
 
     @classmethod
     def begin(cls, system: HybridSystem, y, length: int) -> "Record":
         """Of runs from y, with room for so many steps."""
-        s = system.contact_state(y)
-        rows = len(y) + len(s) + len(_ROWS)
-        steps = jnp.zeros((rows, length, *y.shape[1:]), y.dtype).at[GUARD].set(UNUSED)
-        return cls(y, s, jnp.full(y.shape[1:], NONE), steps, jnp.asarray(0))
+        s, lanes = system.contact_state(y), y.shape[1]
+        steps = jnp.zeros((len(y) + len(s) + len(_ROWS), length, lanes), y.dtype)
+        none = jnp.zeros(lanes, int)
+        return cls(y, s, none + NONE, jnp.zeros_like(steps[TIME:, 0]), steps, none[0], none)
 
     @property
     def length(self) -> int:
@@ -56,8 +62,12 @@ class Record(eqx.Module):
         return self.steps.shape[1]
 
     def row(self, row, number, lane) -> Array:
-        """Rows (an index or a slice) of the steps of those numbers in those lanes."""
+        """A row of the steps of those numbers in those lanes, or of `slice` several."""
         return self.steps[row, (self.oldest + number) % self.length, lane]
+
+    def past(self, row, number, lane) -> Array:
+        """A row of sums as of now, which are zero after the last step."""
+        return self.row(row, number, lane) - self.sums[row - TIME, lane]
 
     def advance(self, system: HybridSystem, h, count: int) -> "Record":
         """After `count` more steps, no longer than h; the length is a multiple of `count`."""
@@ -72,31 +82,30 @@ class Record(eqx.Module):
             steps = jax.lax.dynamic_update_index_in_dim(steps, one, self.oldest + k, 1)
             return y_new, s_new, guard, sums, steps
 
-        sums = jnp.zeros((len(_ROWS) - 1, *self.guard.shape), self.y.dtype)
-        carry = self.y, self.s, self.guard, sums, self.steps
-        y, s, guard, sums, steps = jax.lax.fori_loop(0, count, body, carry)
-        steps = steps.at[TIME:].add(-sums[:, None])
-        return Record(y, s, guard, steps, (self.oldest + count) % self.length)
+        carry = self.y, self.s, self.guard, self.sums, self.steps
+        carry = jax.lax.fori_loop(0, count, body, carry)
+        known = jnp.minimum(self.count + count, self.length)
+        return Record(*carry, (self.oldest + count) % self.length, known)
 
     def moved(self, y, where) -> "Record":
         """With the states y, where steps from before are not of the same motion."""
-        guards = jnp.where(where[None], UNUSED, self.steps[GUARD])
-        return Record(y, self.s, self.guard, self.steps.at[GUARD].set(guards), self.oldest)
+        known = jnp.where(where, 0, self.count)
+        return eqx.tree_at(lambda record: (record.y, record.count), self, (y, known))
 
     def returns(self, count: int) -> tuple[Array, Array]:
         """The steps (count, B) that ended at the last returns, newest first, and which exist."""
-        k = jnp.arange(count)[:, None]
-        lane = jnp.arange(self.guard.shape[0])[None]
-        shape = (count, *self.guard.shape)
+        k, lane = jnp.arange(count)[:, None], jnp.arange(len(self.guard))[None]
         at = first_reached(
-            lambda number: self.row(RETURNED, number, lane) >= -k, shape, self.length
+            lambda number: self.past(RETURNED, number, lane) >= -k,
+            (count, len(self.guard)),
+            self.length,
         )
-        exists = self.row(GUARD, at, lane) == SECTION
-        return at, exists & (self.row(RETURNED, at, lane) == -k)
+        exists = (self.row(GUARD, at, lane) == SECTION) & (self.past(RETURNED, at, lane) == -k)
+        return at, exists & (at >= self.length - self.count[None])
 
     def after(self, number) -> Array:
         """The states (2n, k, B) after steps (k, B)."""
-        lane = jnp.arange(self.guard.shape[0])[None]
+        lane = jnp.arange(len(self.guard))[None]
         following = self.row(slice(len(self.y)), number + 1, lane)
         return jnp.where((number == self.length - 1)[None], self.y[:, None], following)
 
@@ -124,10 +133,10 @@ class Mesh(eqx.Module):
         phase = jnp.where(used, phase, 0)
         return cls(count, until, phase, number[None] - _take(until - count, phase), used)
 
-    @property
-    def share(self) -> Float[Array, "g N"]:
+    def share(self, dtype) -> Float[Array, "g N"]:
         """Where in its phase each segment starts, from 0 to 1."""
-        return self.place / jnp.maximum(_take(self.count, self.phase), 1)
+        count = jnp.maximum(_take(self.count, self.phase), 1)
+        return self.place.astype(dtype) / count.astype(dtype)
 
     def durations(self, segments: Segments) -> Float[Array, "g p"]:
         """Of the phases of segments on this mesh."""
@@ -186,7 +195,7 @@ class Stretch(eqx.Module):
         low, high, size = (
             _take(x, mesh.phase) for x in (self.first, self.last, self.rate * self.duration)
         )
-        weight = record.row(WEIGHT, low - 1, lane) + size * mesh.share
+        weight = record.row(WEIGHT, low - 1, lane) + size * mesh.share(size.dtype)
         number = first_reached(
             lambda number: record.row(WEIGHT, number, lane) > weight, low.shape, record.length
         )
@@ -201,7 +210,7 @@ class Stretch(eqx.Module):
 def starts_along(segments: Segments, old: Mesh, new: Mesh) -> Starts:
     """Of segments on a new mesh in the motion along those on an old one."""
     count, until = _take(old.count, new.phase), _take(old.until, new.phase)
-    number = new.share * count
+    number = new.share(segments.y.dtype) * count
     whole = jnp.clip(number.astype(int), 0, jnp.maximum(count - 1, 0))
     at = until - count + whole
     ends = cumulative(segments.duration)

@@ -29,7 +29,6 @@ from .orbit import (
 )
 from .record import (
     ENDED,
-    GUARD,
     RETURNED,
     TIME,
     Mesh,
@@ -239,7 +238,7 @@ def _assess(
     newest = record.length - options.round_steps  # number of the first new step
     active = known.status == RUNNING
     tiny = jnp.finfo(seen.dtype).tiny
-    before = record.row(RETURNED, newest - 1, lane)
+    before = record.past(RETURNED, newest - 1, lane)
     returns = known.returns - before
     idle = jnp.where(before < 0, 0, known.idle + 1)
 
@@ -249,7 +248,7 @@ def _assess(
     largest = jnp.max(jnp.abs(equilibrium), axis=0)
     diverged = ~(size < options.divergence * (1 + largest))
     # The last three returns without a switch between them.
-    smooth = exists[3] & (record.row(ENDED, at[3], lane) == -3)
+    smooth = exists[3] & (record.past(ENDED, at[3], lane) == -3)
     log = jnp.log(away[:3] + tiny)
     rate, rate_before = log[0] - log[1], log[1] - log[2]
     time = record.row(TIME, at[:2], lane[None])
@@ -321,7 +320,7 @@ def _assess(
     calm = jnp.where(idle > 0, known.calm, jnp.where(grows, 0, known.calm + 1))
     short = ~exists[1] & (calm >= options.settling)
     short = short | (ended & ~exists[options.longest // 4])
-    too_long = (record.row(GUARD, 0, lane) != UNUSED) & short
+    too_long = (record.count == record.length) & short
     over = jnp.where(too_long, TOO_LONG, over)
     status = jnp.where(status == RUNNING, jnp.where(ok, CONVERGED, over), status)
     progress = _Progress(
