@@ -107,7 +107,7 @@ def maps(system: HybridSystem, segments: Segments, *, coarse: bool = False) -> t
     columns = jnp.concatenate([y[:, None], jnp.broadcast_to(eye, (len(y), *y.shape))], axis=1)
     duration = segments.duration[None, None]
     if coarse:
-        parts = jnp.maximum(jnp.ceil(jnp.max(duration) / _COARSE), 1)
+        parts = jnp.maximum(jnp.ceil(jnp.nanmax(duration) / _COARSE), 1)
         step = functools.partial(runge_kutta, coarse_tableau(), field, h=duration / parts)
         columns = jax.lax.fori_loop(0, parts.astype(int), lambda _, x: step(x), columns)
     else:
@@ -251,6 +251,8 @@ def solve_periodic_orbits(system: HybridSystem, segments: Segments, wanted, reac
     its first state would move further than `reach` (g,).
     """
     y, s, guard = segments.y, segments.s, segments.guard
+    # Those of other lanes may be anything, and all lanes' coarse maps take as many parts.
+    duration = jnp.where(wanted[:, None], segments.duration, 0)
     if system.excited:
         y = y.at[..., :1].set(system.with_excitation(system.own(y[..., :1]), 0.0))
     start, last = y[..., 0], last_of_phase(segments)
@@ -303,7 +305,7 @@ def solve_periodic_orbits(system: HybridSystem, segments: Segments, wanted, reac
         change, before = jnp.where(going, jnp.stack([new, change]), jnp.stack([change, before]))
         return found, local, change, before, jnp.where(ends_here, _ITERATIONS, count) + 1
 
-    none = PeriodicOrbit.none(Segments(y, segments.duration, s, guard))
+    none = PeriodicOrbit.none(Segments(y, duration, s, guard))
     found, *_ = jax.lax.while_loop(running, body, (none, nothing, far, far, 0))
     return found
 
