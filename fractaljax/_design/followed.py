@@ -15,7 +15,7 @@ import numpy as np
 from .._base.quick import quick_jit
 from .._dynamics.cycle import CycleResult
 from .._dynamics.limit_cycle import extreme_values, limit_cycle
-from .._dynamics.orbit import Segments, mean_square, orbit, solve_periodic_orbit
+from .._dynamics.orbit import Segments, mean_square, orbit, solve_periodic_orbits
 from .._dynamics.scaled import check_rtol, hybrid_system
 from .._dynamics.search import admissible, attracts
 from .._stability.stability import growth_rate
@@ -153,8 +153,10 @@ def _followed(problem, u, segments: Segments):
     def measured(u):
         system = hybrid_system(problem.moved(u, problem.own_condition))
         frozen = jax.lax.stop_gradient(system)
-        found = jax.lax.stop_gradient(solve_periodic_orbit(frozen, segments))
-        y, duration = orbit(system, found.segments)
+        lane = jax.tree.map(lambda x: x[..., None, :], segments)  # the only one
+        wanted, reach = jnp.array([True]), jnp.array([jnp.inf], u.dtype)
+        found = jax.lax.stop_gradient(solve_periodic_orbits(frozen, lane, wanted, reach))
+        y, duration = orbit(system, jax.tree.map(lambda x: x[..., 0, :], found.segments))
         closed = Segments(y, duration, segments.s, segments.guard)
         rows = jnp.eye(len(y) // 2, len(y), dtype=y.dtype)
         low, high = extreme_values(system, closed, rows)
@@ -162,8 +164,9 @@ def _followed(problem, u, segments: Segments):
         velocity = jnp.sqrt(mean_square(system, closed)[n:])
         measures = jnp.stack([(high - low) * units[:n], velocity * units[n:]])
         moved = jnp.max(jnp.abs(y - segments.y)) < _NEAR * (1 + jnp.max(jnp.abs(y)))
-        ok = found.converged & (found.error <= rtol) & moved & jnp.all(jnp.isfinite(measures))
-        ok = ok & attracts(found.return_jacobian) & admissible(frozen, closed, found.middle)
+        ok = found.converged & (found.error <= rtol) & attracts(found.return_jacobian)
+        ok = jnp.all(ok & admissible(frozen, found.segments, found.middle))
+        ok = ok & moved & jnp.all(jnp.isfinite(measures))
         return measures, (measures, (closed, y[:, 0] * units, ok))
 
     slopes, (measures, orbit_of) = jax.jacfwd(measured, has_aux=True)(u)

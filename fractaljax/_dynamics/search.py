@@ -27,16 +27,7 @@ from .orbit import (
     product,
     solve_periodic_orbits,
 )
-from .record import (
-    ENDED,
-    RETURNED,
-    TIME,
-    Mesh,
-    Record,
-    Stretch,
-    cut,
-    starts_along,
-)
+from .record import ENDED, RETURNED, TIME, Record, Steps, cut
 
 _MESHES = 4  # on which a candidate is solved, each finer, until it is accurate
 
@@ -159,39 +150,34 @@ def _solved(system, record, lane, wanted, given: _Candidates, *, length, options
 
     One of a shorter period is not: the same number of segments resolves that period better.
     """
-    stretch = Stretch.between(record, lane, given.first, given.last, length)
     scale = 1 + jnp.max(jnp.abs(given.y), axis=0)
 
     def unsettled(found):
         return found.converged & ~(found.error <= given.rtol)
 
     def going(carry):
-        _, found, _, tries = carry
+        found, tries = carry
         return (tries == 0) | ((tries < _MESHES) & jnp.any(unsettled(found)))
 
     def solve(carry):
-        old, found, duration, tries = carry
+        found, tries = carry
+
+        def of_the_run():
+            return cut(system, record, lane, given.first, given.last, given.h, length)
+
+        def of_the_orbit():
+            # Its phases have other lengths and weights than those of the steps.
+            steps, number = Steps.along(system, found.segments), jnp.arange(len(lane))
+            last = jnp.sum(found.segments.used, axis=-1)
+            return cut(system, steps, number, 0 * last, last, given.h * 0.8**tries, length)
+
         own = wanted & ((tries == 0) | unsettled(found))
-        mesh = mesh_of(stretch.rate * duration, tries)
-        starts = jax.lax.cond(
-            tries == 0,
-            lambda: stretch.starts(mesh),
-            lambda: starts_along(found.segments, old, mesh),
-        )
-        segments = cut(system, stretch, mesh, starts)
+        segments = jax.lax.cond(tries == 0, of_the_run, of_the_orbit)
         new = solve_periodic_orbits(system, segments, own, options.reach * scale)
-        # The orbit's phases have other lengths than those of the steps: they are cut anew.
-        return mesh, new.where(own, found), mesh.durations(new.segments), tries + 1
+        return new.where(own, found), tries + 1
 
-    def mesh_of(size, tries):
-        return Mesh.of(size, stretch.exists, given.h * 0.8**tries, length)
-
-    mesh = jax.tree.map(
-        lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(mesh_of, stretch.duration, 0)
-    )
     nothing = PeriodicOrbit.none(_no_segments(given.y, len(record.s), length))
-    carry = mesh, nothing, stretch.duration, 0
-    _, found, *_ = jax.lax.while_loop(going, solve, carry)
+    found, _ = jax.lax.while_loop(going, solve, (nothing, 0))
     orbit, n = found.segments, system.n
     near = jnp.max(jnp.abs(orbit.y[..., 0] - given.y), axis=0) < 0.2 * scale
     moves = jnp.max(jnp.abs(orbit.y[n:]), axis=(0, -1)) > 1e-4
