@@ -17,7 +17,7 @@ from .._dynamics.cycle import CycleResult
 from .._dynamics.limit_cycle import extreme_values, limit_cycle
 from .._dynamics.orbit import Segments, mean_square, orbit, solve_periodic_orbits
 from .._dynamics.scaled import check_rtol, hybrid_system
-from .._dynamics.search import admissible, attracts
+from .._dynamics.search import HARDLY, admissible, growth_of
 from .._stability.stability import growth_rate
 from .constraints import CycleConstraint
 
@@ -153,10 +153,10 @@ def _followed(problem, u, segments: Segments):
     def measured(u):
         system = hybrid_system(problem.moved(u, problem.own_condition))
         frozen = jax.lax.stop_gradient(system)
-        lane = jax.tree.map(lambda x: x[..., None, :], segments)  # the only one
+        lane = jax.tree.map(lambda x: x[..., None], segments)  # the only one
         wanted, reach = jnp.array([True]), jnp.array([jnp.inf], u.dtype)
         found = jax.lax.stop_gradient(solve_periodic_orbits(frozen, lane, wanted, reach))
-        y, duration = orbit(system, jax.tree.map(lambda x: x[..., 0, :], found.segments))
+        y, duration = orbit(system, jax.tree.map(lambda x: x[..., 0], found.segments))
         closed = Segments(y, duration, segments.s, segments.guard)
         rows = jnp.eye(len(y) // 2, len(y), dtype=y.dtype)
         low, high = extreme_values(system, closed, rows)
@@ -164,7 +164,7 @@ def _followed(problem, u, segments: Segments):
         velocity = jnp.sqrt(mean_square(system, closed)[n:])
         measures = jnp.stack([(high - low) * units[:n], velocity * units[n:]])
         moved = jnp.max(jnp.abs(y - segments.y)) < _NEAR * (1 + jnp.max(jnp.abs(y)))
-        ok = found.converged & (found.error <= rtol) & attracts(found.return_jacobian)
+        ok = found.converged & (found.error <= rtol) & (growth_of(frozen, found) < HARDLY)
         ok = jnp.all(ok & admissible(frozen, found.segments, found.middle))
         ok = ok & moved & jnp.all(jnp.isfinite(measures))
         return measures, (measures, (closed, y[:, 0] * units, ok))

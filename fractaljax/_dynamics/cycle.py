@@ -12,9 +12,10 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from .._base.parts import Record, concrete
 from .._base.quick import command_jit
 from .hybrid import OPEN, UNUSED, HybridSystem
+from .lanes import log_spectral_radius
 from .orbit import Segments, flow, mean_square
 
-_SQUARINGS = 40  # of a monodromy matrix
+SQUARINGS = 40  # of a monodromy matrix
 _SAMPLES = 1024  # of a smooth orbit, for a mean
 VELOCITY_REFERENCE = 1e-9  # [m/s], of levels
 STATE_NAMES = {1: "+", -1: "-", 0: "stick", OPEN: "open"}  # of contact states, in a `Switch`
@@ -56,17 +57,9 @@ def repels(
     missed = jnp.max(jnp.abs(jnp.sum(monodromy * along[None], axis=1) - along))
     across = jnp.eye(len(along), dtype=along.dtype) - along[:, None] * along[None]
 
-    def square(_, carry):
-        # The matrix to the power of 2^k, scaled to 1, and the logarithm of its scale.
-        power, log = carry
-        size = jnp.max(jnp.abs(power))
-        power = power / jnp.where(size > 0, size, 1)
-        return power @ power, 2 * (log + jnp.log(size))
-
-    start = across @ monodromy @ across, jnp.zeros_like(error)
-    _, log = jax.lax.fori_loop(0, _SQUARINGS, square, start)
+    log = log_spectral_radius(across @ monodromy @ across, SQUARINGS)
     tolerance = 10 * (missed + error) + 1e3 * jnp.finfo(along.dtype).eps
-    return log / 2.0**_SQUARINGS > tolerance
+    return log > tolerance
 
 
 class Switch(Record):

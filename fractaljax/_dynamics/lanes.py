@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+_SMALL = 8  # rows up to which products of matrices are sums
 _WRITTEN_OUT = 6  # unknowns up to which elimination is no loop, which runs faster
 
 
@@ -61,3 +62,27 @@ def solve_positive(W, b) -> Array:
     for k in range(len(b)):
         A = eliminated(k, A)
     return A[:, -1]
+
+
+def product(A, B) -> Array:
+    """A @ B of each lane; a small one as a sum, which compiles into one loop with the rest."""
+    if len(A) <= _SMALL:
+        return jnp.sum(A[:, :, None] * B[None], axis=1)
+    return jnp.einsum("ij...,jk...->ik...", A, B)
+
+
+def log_spectral_radius(matrix, squarings: int) -> Array:
+    """ln of the largest modulus of the eigenvalues of matrices (k, k, ...), by squaring them.
+
+    At most the logarithm of the size of the last power over 2^squarings too large.
+    """
+
+    def square(_, carry):
+        # The matrix to the power of 2^k, scaled to 1, and the logarithm of its scale.
+        power, log = carry
+        size = jnp.max(jnp.abs(power), axis=(0, 1))
+        power = power / jnp.where(size > 0, size, 1)[None, None]
+        return product(power, power), 2 * (log + jnp.log(size))
+
+    carry = matrix, jnp.zeros_like(matrix[0, 0])
+    return jax.lax.fori_loop(0, squarings, square, carry)[1] / 2.0**squarings

@@ -7,6 +7,7 @@ maps of all segments.
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -16,13 +17,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .hybrid import NONE, UNUSED, HybridSystem
-from .lanes import row_numbers, solve
+from .lanes import product, row_numbers, solve
 from .runge_kutta import runge_kutta
 
 _ITERATIONS = 20
 _COARSE = 0.5  # longest step of a coarse map
 _BLOCK = 32  # of sums
-_SMALL = 8  # states up to which products of matrices are sums
+_TOGETHER, _LEAST = 256, 16  # segments of all lanes that Newton's method takes at a time
 
 
 class Segments(eqx.Module):
@@ -31,13 +32,13 @@ class Segments(eqx.Module):
     The end of the last one is the start of the first.
     """
 
-    y: Float[Array, "2n ... N"]  # state at the start of each
-    duration: Float[Array, "... N"]
-    s: Float[Array, "f ... N"]  # contact state
-    guard: Int[Array, "... N"]  # which guard ends it: a number, NONE within a phase, or UNUSED
+    y: Float[Array, "2n N ..."]  # state at the start of each
+    duration: Float[Array, "N ..."]
+    s: Float[Array, "f N ..."]  # contact state
+    guard: Int[Array, "N ..."]  # which guard ends it: a number, NONE within a phase, or UNUSED
 
     @property
-    def used(self) -> Bool[Array, "... N"]:
+    def used(self) -> Bool[Array, "N ..."]:
         """Which segments are not padding of zero duration."""
         return self.guard != UNUSED
 
@@ -45,9 +46,9 @@ class Segments(eqx.Module):
 class Maps(eqx.Module):
     """Derivatives of each segment's end, and of the guard that ends it."""
 
-    A: Float[Array, "2n 2n ... N"]  # of the end by the state at its start
-    b: Float[Array, "2n ... N"]  # of the end by its duration
-    c: Float[Array, "2n ... N"]  # of the guard by the state it ends in; 0 where none ends it
+    A: Float[Array, "2n 2n N ..."]  # of the end by the state at its start
+    b: Float[Array, "2n N ..."]  # of the end by its duration
+    c: Float[Array, "2n N ..."]  # of the guard by the state it ends in; 0 where none ends it
 
 
 def tableau():
@@ -81,7 +82,7 @@ def _field(system: HybridSystem, s, y) -> Array:
 
 def next_start(y) -> Array:
     """The states at which segments must end: the starts of the next ones."""
-    return jnp.roll(y, -1, axis=-1)
+    return jnp.roll(y, -1, axis=1)
 
 
 def chosen_guard(system: HybridSystem, y, s, guard) -> Array:
@@ -95,6 +96,12 @@ def maps(system: HybridSystem, segments: Segments, *, coarse: bool = False) -> t
 
     The `coarse` ones, which Newton's method converges with as well, take a third of the time.
     """
+    ends, A, b = _maps(system, segments, coarse=coarse)
+    return ends, Maps(A, b, _guard_slopes(system, segments))
+
+
+def _maps(system: HybridSystem, segments: Segments, *, coarse: bool):
+    """The ends of segments that need not be neighbours, and their derivatives A and b."""
     y, s = segments.y, segments.s
 
     def field(columns):
@@ -113,10 +120,41 @@ def maps(system: HybridSystem, segments: Segments, *, coarse: bool = False) -> t
     else:
         columns = runge_kutta(tableau(), field, columns, duration)
     ends, A = columns[:, 0], columns[:, 1:]
-    target = next_start(y)
-    _, pull = jax.vjp(lambda end: chosen_guard(system, end, s, segments.guard), target)
-    (c,) = pull(jnp.ones_like(segments.duration))
-    return ends, Maps(A, system.field(ends, s), c)
+    return ends, A, system.field(ends, s)
+
+
+def _guard_slopes(system: HybridSystem, segments: Segments) -> Array:
+    """Derivatives (2n, N, ...) of the guards that end segments by the states they end in."""
+    _, pull = jax.vjp(
+        lambda end: chosen_guard(system, end, segments.s, segments.guard), next_start(segments.y)
+    )
+    return pull(jnp.ones_like(segments.duration))[0]
+
+
+def _of_the_first(function: Callable, segments: Segments, count) -> Any:
+    """What `function` gives of segments, of the first `count`: some at a time, zero beyond."""
+    length, lanes = len(segments.duration), segments.duration[0].size
+    size = min(length, max(_TOGETHER // lanes, _LEAST))
+
+    def along(x):
+        return x.ndim - segments.duration.ndim
+
+    def some(k, found):
+        first = jnp.minimum(k * size, length - size)
+        part = jax.tree.map(
+            lambda x: jax.lax.dynamic_slice_in_dim(x, first, size, along(x)), segments
+        )
+        return jax.tree.map(
+            lambda x, new: jax.lax.dynamic_update_slice_in_dim(x, new, first, along(x)),
+            found,
+            function(part),
+        )
+
+    shapes = jax.eval_shape(function, segments)
+    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    if size == length:
+        return function(segments)
+    return jax.lax.fori_loop(0, -(-count // size), some, blank)
 
 
 def cumulative(x) -> Array:
@@ -130,73 +168,91 @@ def cumulative(x) -> Array:
     return (inside + before[..., None]).reshape(x.shape)
 
 
-def product(A, B) -> Array:
-    """A @ B of each lane; a small one as a sum, which compiles into one loop with the rest."""
-    if len(A) <= _SMALL:
-        return jnp.sum(A[:, :, None] * B[None], axis=1)
-    return jnp.einsum("ij...,jk...->ik...", A, B)
-
-
-def last_of_phase(segments: Segments) -> Int[Array, "... N"]:
+def last_of_phase(segments: Segments) -> Int[Array, "N ..."]:
     """For each segment the last one of its phase."""
-    ends = segments.used & (segments.guard != NONE)
+    ends = (segments.used & (segments.guard != NONE)).T
     ended = cumulative(ends)
     phase = ended - ends
     last = jnp.sum(ended[..., None, :] <= phase[..., None], axis=-1)
-    return jnp.minimum(last, ends.shape[-1] - 1)
+    return jnp.minimum(last, ends.shape[-1] - 1).T
 
 
-def corrections(local: Maps, segments: Segments, last, gap, guard, constant: int | None = None):
+def _chain(body: Callable, carry, arrays: tuple, lanes: int, count=None) -> tuple[Any, Array]:
+    """`jax.lax.scan` over segments, the axis of each array before those of lanes.
+
+    With `count` over so many: that takes no longer than it must, but has no reverse mode.
+    """
+    if count is None:
+        front = [jnp.moveaxis(x, x.ndim - 1 - lanes, 0) for x in arrays]
+        carry, found = jax.lax.scan(body, carry, tuple(front))
+        return carry, jnp.moveaxis(found, 0, found.ndim - 1 - lanes)
+
+    def at(k):
+        return tuple(
+            jax.lax.dynamic_index_in_dim(x, k, x.ndim - 1 - lanes, keepdims=False) for x in arrays
+        )
+
+    one = jax.eval_shape(body, carry, at(0))[1]
+    shape = list(one.shape)
+    shape.insert(len(shape) - lanes, arrays[0].shape[arrays[0].ndim - 1 - lanes])
+
+    def step(k, so_far):
+        carry, found = so_far
+        carry, one = body(carry, at(k))
+        return carry, jax.lax.dynamic_update_index_in_dim(found, one, k, one.ndim - lanes)
+
+    return jax.lax.fori_loop(0, count, step, (carry, jnp.zeros(shape, one.dtype)))
+
+
+def corrections(
+    local: Maps, segments: Segments, last, gap, guard, constant: int | None = None, count=None
+):
     """Changes of states and durations that close the gaps and bring the guards to zero.
 
     They solve dy_next = A dy + b dt + gap on every segment of the chain, with the same dt in a
     phase, which ends with the segment `last`, and c dy_next = -guard at its end. Of the first state
     the component `constant`, which repeats whatever it is, does not change. Returns them and the
-    product of all maps (2n, 2n), the Jacobian of the return map.
+    product of all maps (2n, 2n), the Jacobian of the return map. No segment from `count` on is
+    used.
     """
-    n, used = len(gap), segments.used
+    n, used, lanes = len(gap), segments.used, segments.duration.ndim - 1
     ends = used & (segments.guard != NONE)
 
-    def chain(W, segment):
+    def through(W, segment):
         """The affine map from the first state to this end, and what the phase's dt adds.
 
         The columns of W are the derivatives by the first state, the shift, and those by the
         dt of the phase so far, which is known at its end: r dy_first + d.
         """
-        A, added, c, guard, last = segment
-        W = product(A, W) + added
-        off = jnp.sum(c[:, None] * W, axis=0) + guard
+        A, gap, b, c, guard, last = segment
+        W = product(A, W) + shifts[None] * gap[:, None] + durations[None] * b[:, None]
+        off = jnp.sum(c[:, None] * W, axis=0) + shifts * guard[None]
         off = jnp.where(last[None], off / jnp.where(last, -off[-1], 1)[None], 0)
         return W + W[:, -1:] * off[None], off[:-1]
 
-    def in_order(x):
-        return jnp.moveaxis(x, -1, 0)
-
-    zero, b = jnp.zeros_like(local.A), jnp.where(used[None], local.b, 0)
-    added = jnp.concatenate([zero, gap[:, None], b[:, None]], axis=1)
-    guards = jnp.concatenate([zero[0], guard[None], jnp.zeros_like(guard)[None]])
-    eye = jnp.eye(n, dtype=gap.dtype).reshape(n, n, *(1,) * (gap.ndim - 2))
-    W = jnp.broadcast_to(eye, zero.shape[:-1])
-    W = jnp.concatenate([W, jnp.zeros_like(W[:, :2])], axis=1)
-    W, dt = jax.lax.scan(chain, W, jax.tree.map(in_order, (local.A, added, local.c, guards, ends)))
+    b = jnp.where(used[None], local.b, 0)
+    columns = jnp.eye(n + 2, dtype=gap.dtype).reshape(n + 2, n + 2, *(1,) * lanes)
+    shifts, durations = columns[n], columns[n + 1]
+    eye = jnp.eye(n, n + 2, dtype=gap.dtype).reshape(n, n + 2, *(1,) * lanes)
+    W = jnp.broadcast_to(eye, (n, n + 2, *gap.shape[2:]))
+    W, dt = _chain(through, W, (local.A, gap, b, local.c, guard, ends), lanes, count)
     jacobian, shift = W[:, :n], W[:, n]
     # Without segments the equations would be singular.
-    jacobian = jnp.where(jnp.any(ends, axis=-1)[None, None], jacobian, 0)
-    matrix = eye - jacobian
+    jacobian = jnp.where(jnp.any(ends, axis=0)[None, None], jacobian, 0)
+    matrix = eye[:, :n] - jacobian
     if constant is not None:
-        matrix = matrix.at[constant].set(jnp.broadcast_to(eye[constant], shift.shape))
+        matrix = matrix.at[constant].set(jnp.broadcast_to(eye[constant, :n], shift.shape))
         shift = shift.at[constant].set(0)
     first = solve(matrix, shift)
-    dt = jnp.moveaxis(jnp.sum(dt[:, :n] * first[None], axis=1) + dt[:, n], 0, -1)
-    dt = jnp.where(used, jnp.take_along_axis(dt, last, axis=-1), 0)
+    dt = jnp.sum(dt[:n] * first[:, None], axis=0) + dt[n]
+    dt = jnp.where(used, jnp.take_along_axis(dt, last, axis=0), 0)
 
     def along(dy, segment):
         A, added = segment
         return product(A, dy[:, None])[:, 0] + added, dy
 
-    added = local.b * dt[None] + gap
-    _, starts = jax.lax.scan(along, first, (in_order(local.A), in_order(added)))
-    return jnp.moveaxis(starts, 0, -1), dt, jacobian
+    _, dy = _chain(along, first, (local.A, local.b * dt[None] + gap), lanes, count)
+    return dy, dt, jacobian
 
 
 def mean_square(system: HybridSystem, segments: Segments) -> Float[Array, " 2n"]:
@@ -216,14 +272,14 @@ class PeriodicOrbit(eqx.Module):
     converged: Bool[Array, " g"]
     return_jacobian: Float[Array, "2n 2n g"]
     error: Float[Array, " g"]  # of period and states, relative, estimated by halving the steps
-    middle: Float[Array, "2n g N"]  # states halfway through the segments
+    middle: Float[Array, "2n N g"]  # states halfway through the segments
 
     @classmethod
     def none(cls, segments: Segments) -> "PeriodicOrbit":
         """None yet; of the shapes that belong to those segments."""
         y = segments.y
-        zero = jnp.zeros_like(y[0, :, 0])
-        jacobian = jnp.zeros((len(y), *y.shape[:2]), y.dtype)
+        zero = jnp.zeros_like(y[0, 0])
+        jacobian = jnp.zeros((len(y), len(y), *zero.shape), y.dtype)
         return cls(segments, zero > 0, jacobian, zero + jnp.inf, jnp.zeros_like(y))
 
     def where(self, lanes: Bool[Array, " g"], other: "PeriodicOrbit") -> "PeriodicOrbit":
@@ -232,16 +288,7 @@ class PeriodicOrbit(eqx.Module):
         def chosen(new, old):
             return jnp.where(lanes.reshape((1,) * (new.ndim - 1) + (-1,)), new, old)
 
-        def with_segments(new, old):
-            return jnp.where(lanes.reshape((1,) * (new.ndim - 2) + (-1, 1)), new, old)
-
-        return PeriodicOrbit(
-            jax.tree.map(with_segments, self.segments, other.segments),
-            chosen(self.converged, other.converged),
-            chosen(self.return_jacobian, other.return_jacobian),
-            chosen(self.error, other.error),
-            with_segments(self.middle, other.middle),
-        )
+        return jax.tree.map(chosen, self, other)
 
 
 def solve_periodic_orbits(system: HybridSystem, segments: Segments, wanted, reach) -> PeriodicOrbit:
@@ -250,14 +297,15 @@ def solve_periodic_orbits(system: HybridSystem, segments: Segments, wanted, reac
     They are solved together: a lane that has converged waits for the others. One gives up where
     its first state would move further than `reach` (g,).
     """
-    y, s, guard = segments.y, segments.s, segments.guard
+    y, s, guard, used = segments.y, segments.s, segments.guard, segments.used
     # Those of other lanes may be anything, and all lanes' coarse maps take as many parts.
-    duration = jnp.where(wanted[:, None], segments.duration, 0)
+    duration = jnp.where(wanted[None], segments.duration, 0)
     if system.excited:
-        y = y.at[..., :1].set(system.with_excitation(system.own(y[..., :1]), 0.0))
-    start, last = y[..., 0], last_of_phase(segments)
+        y = y.at[:, :1].set(system.with_excitation(system.own(y[:, :1]), 0.0))
+    start, last = y[:, 0], last_of_phase(segments)
+    many = jnp.max(jnp.sum(used & wanted[None], axis=0))
     eps, big = jnp.finfo(y.dtype).eps, jnp.finfo(y.dtype).max
-    size = 1 + jnp.max(jnp.abs(y), axis=(0, -1))
+    size = 1 + jnp.max(jnp.abs(y), axis=(0, 1))
     tolerance = 1e3 * eps * size
     nothing = Maps(jnp.zeros((len(y), *y.shape), y.dtype), jnp.zeros_like(y), jnp.zeros_like(y))
     far = jnp.where(wanted, big, jnp.inf).astype(y.dtype)
@@ -265,42 +313,53 @@ def solve_periodic_orbits(system: HybridSystem, segments: Segments, wanted, reac
     def running(carry):
         return carry[-1] <= _ITERATIONS
 
+    def coarse_maps(segments):
+        _, A, b = _of_the_first(functools.partial(_maps, system, coarse=True), segments, many)
+        return Maps(A, b, _guard_slopes(system, segments))
+
     def body(carry):
         found, local, change, before, count = carry
         y, h = found.segments.y, found.segments.duration
-        going = (change > tolerance) & (change < jnp.inf)
+        # Each step is this much shorter than the last one, and the next one may be.
+        left = change * jnp.clip(change / before, 1e-3, 1)
+        going = (left > tolerance) & (change < jnp.inf)
         # The last iteration is for the error: what half the steps would change.
         ends_here = ~jnp.any(going) | (count == _ITERATIONS)
         # Near the orbit the maps serve again, while they do well.
         stale = going & ((change > 1e-3 * size) | (change > before / 8))
         local = jax.lax.cond(
-            jnp.any(stale) & ~ends_here,
-            lambda: maps(system, found.segments, coarse=True)[1],
-            lambda: local,
+            jnp.any(stale) & ~ends_here, lambda: coarse_maps(found.segments), lambda: local
         )
         parts = jnp.where(ends_here, 2, 1)
-        ends, middle = jax.lax.fori_loop(
-            0, parts, lambda _, x: (flow(system, x[0], h / parts, s), x[0]), (y, y)
-        )
+
+        def flows(some):
+            def half(_, x):
+                return flow(system, x[0], some.duration / parts, some.s), x[0]
+
+            return jax.lax.fori_loop(0, parts, half, (some.y, some.y))
+
+        ends, middle = _of_the_first(flows, found.segments, many)
         target = next_start(y)
         off = jnp.where(ends_here, 0, chosen_guard(system, target, s, guard))
         dy, dt, jacobian = corrections(
-            local, found.segments, last, ends - target, off, system.constant
+            local, found.segments, last, ends - target, off, system.constant, many
         )
-        largest, longest = jnp.max(jnp.abs(dy), axis=(0, -1)), jnp.max(jnp.abs(dt), axis=-1)
+        largest, longest = jnp.max(jnp.abs(dy), axis=(0, 1)), jnp.max(jnp.abs(dt), axis=0)
         error = jnp.maximum(
-            jnp.abs(jnp.sum(dt, axis=-1)) / jnp.sum(h, axis=-1),
-            largest / jnp.max(jnp.abs(y), axis=(0, -1)),
+            jnp.abs(jnp.sum(dt, axis=0)) / jnp.sum(h, axis=0),
+            largest / jnp.max(jnp.abs(y), axis=(0, 1)),
         )
         new = jnp.maximum(largest, longest)
-        moved = jnp.max(jnp.abs(y[..., 0] + dy[..., 0] - start), axis=0)
+        moved = jnp.max(jnp.abs(y[:, 0] + dy[:, 0] - start), axis=0)
         new = jnp.where((moved <= reach) & (new < big), new, jnp.inf)
         moves = going & ~ends_here & (new < jnp.inf)
         # Far from the orbit a full step may leave the region of convergence.
-        share = jnp.minimum(1, 1 / new)[:, None]
-        y = jnp.where(moves[None, :, None], y + share[None] * dy, y)
-        h = jnp.where(moves[:, None], h + share * dt, h)
-        converged = change <= 10 * tolerance
+        share = jnp.minimum(1, 1 / new)[None]
+        y = jnp.where(moves[None, None], y + share[None] * dy, y)
+        y = jnp.where(used[None], y, y[:, :1])
+        h = jnp.where(moves[None], h + share * dt, h)
+        converged = left <= 10 * tolerance
+        middle = jnp.where(used[None], middle, y)
         found = PeriodicOrbit(Segments(y, h, s, guard), converged, jacobian, error, middle)
         change, before = jnp.where(going, jnp.stack([new, change]), jnp.stack([change, before]))
         return found, local, change, before, jnp.where(ends_here, _ITERATIONS, count) + 1
@@ -308,6 +367,13 @@ def solve_periodic_orbits(system: HybridSystem, segments: Segments, wanted, reac
     none = PeriodicOrbit.none(Segments(y, duration, s, guard))
     found, *_ = jax.lax.while_loop(running, body, (none, nothing, far, far, 0))
     return found
+
+
+def accurate_return_jacobian(system: HybridSystem, segments: Segments) -> Float[Array, "2n 2n g"]:
+    """The Jacobian of the return map of periodic orbits, as exact as they are."""
+    ends, local = maps(system, segments)
+    nothing = jnp.zeros_like(segments.duration)
+    return corrections(local, segments, last_of_phase(segments), 0 * ends, nothing)[2]
 
 
 @jax.custom_jvp

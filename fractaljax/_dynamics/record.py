@@ -47,10 +47,10 @@ class Steps(eqx.Module):
         time = jnp.where(used, segments.duration, 0)
         ended = used & (segments.guard != NONE), used & (segments.guard == SECTION)
         sums = [time, step_weight(system, segments.y, segments.s) * time]
-        sums = cumulative(jnp.stack([*sums, *(x.astype(time.dtype) for x in ended)]))
+        sums = jnp.stack([*sums, *(x.astype(time.dtype) for x in ended)])
+        sums = jnp.swapaxes(cumulative(jnp.swapaxes(sums, 1, 2)), 1, 2)
         steps = jnp.concatenate([rows.astype(time.dtype), sums])
-        steps = jnp.pad(steps, ((0, 0), (0, 0), (1, 0)))
-        return cls(jnp.swapaxes(steps, 1, 2), jnp.asarray(0))
+        return cls(jnp.pad(steps, ((0, 0), (1, 0), (0, 0))), jnp.asarray(0))
 
     @property
     def length(self) -> int:
@@ -192,17 +192,20 @@ def cut(system: HybridSystem, steps: Steps, lane, first, last, h, length: int) -
     time, begin = steps.row(both, at - 1, lane)
     duration, own = steps.row(both, at, lane) - jnp.stack([time, begin])
     after = jnp.clip((weight - begin) / jnp.where(own > 0, own, 1), 0, 1) * duration
-    y, s = jnp.split(steps.row(slice(GUARD), at, lane), [n])
-    y = flow(system, y, jnp.where(used, after, 0), s)
     end = steps.row(TIME, last[:, None], lane)
+    duration = jnp.diff(jnp.where(used, time + after, end), axis=-1, append=end)
     guard = steps.row(GUARD, high, lane).astype(int)
-    unused_s = _take(s, jnp.maximum(until[:, -1:] - 1, 0)[None])
-    return Segments(
-        y=jnp.where(used[None], y, y[..., :1]),
-        duration=jnp.diff(jnp.where(used, time + after, end), axis=-1, append=end),
-        s=jnp.where(used[None], s, unused_s),
-        guard=jnp.where(used, jnp.where(place + 1 == count, guard, NONE), UNUSED),
+    guard = jnp.where(used, jnp.where(place + 1 == count, guard, NONE), UNUSED)
+    states = steps.row(slice(GUARD), at, lane)
+    # An unused segment stays in the last contact state, at the first state.
+    final = _take(states, jnp.maximum(until[:, -1:] - 1, 0)[None])
+    states = jnp.where(used[None], states, final)
+    states, duration, guard, used, after = (
+        jnp.swapaxes(x, -1, -2) for x in (states, duration, guard, used, after)
     )
+    y, s = jnp.split(states, [n])
+    y = flow(system, y, jnp.where(used, after, 0), s)
+    return Segments(jnp.where(used[None], y, y[:, :1]), duration, s, guard)
 
 
 def _take(x, number) -> Array:

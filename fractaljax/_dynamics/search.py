@@ -17,18 +17,22 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
+from .cycle import SQUARINGS
 from .events import Cubic
 from .hybrid import SECTION, UNUSED, HybridSystem
+from .lanes import log_spectral_radius
 from .orbit import (
     PeriodicOrbit,
     Segments,
+    accurate_return_jacobian,
     cumulative,
     next_start,
-    product,
     solve_periodic_orbits,
 )
 from .record import ENDED, RETURNED, TIME, Record, Steps, cut
 
+HARDLY = 1e-3  # growth in a period up to which an orbit that repels is kept
+_FEW_SQUARINGS, _UNSURE = 13, 1e-2  # of coarse Jacobians, and growth that they do not tell from 0
 _MESHES = 4  # on which a candidate is solved, each finer, until it is accurate
 
 RUNNING, CONVERGED, EQUILIBRIUM, DIVERGED, NOT_PERIODIC, EXHAUSTED, TOO_LONG = range(7)
@@ -43,6 +47,8 @@ class SearchOptions:
     finer_after: tuple[int, int] = (16, 48)  # rounds after which the step is halved
     longest: int = 16  # most returns in one period
     near: float = 0.15  # gap between returns below which an orbit is tried, relative
+    ends_near: float = 0.06  # distance that single returns have left, relative
+    patient: int = 4  # rounds in which that is asked of them
     accepted: float = 0.03  # distance from the orbit at which its multipliers decide, relative
     reach: float = 0.5  # distance from the run beyond which Newton's method gives up, relative
     group: int = 16  # orbits that are solved together, of those that many searches have at a time
@@ -64,6 +70,7 @@ class Attractor(eqx.Module):
     status: Int[Array, "..."]
     period_returns: Int[Array, "..."]  # in one period
     error: Float[Array, "..."]  # of the periodic orbit, relative
+    growth: Float[Array, "..."]  # ln of its largest multiplier
     returns: Float[Array, "..."]  # of the run
 
 
@@ -85,7 +92,7 @@ def admissible(system: HybridSystem, segments: Segments, middle) -> Bool[Array, 
     at = jnp.stack([y, middle, ends])
     d = jax.vmap(lambda y: h[None] * system.field(y, s))(at)
     guards = jax.vmap(lambda y: system.guards(y, s)[1:])  # but the section
-    scale = (1 + jnp.max(jnp.abs(y), axis=(0, -1)))[:, None]
+    scale = 1 + jnp.max(jnp.abs(y), axis=(0, 1), keepdims=True)
     # Half a segment each: the cubic through a guard's ends and a point between says where it is
     # lowest. There the guard itself is evaluated.
     places = jnp.arange(7) / 6
@@ -99,33 +106,35 @@ def admissible(system: HybridSystem, segments: Segments, middle) -> Bool[Array, 
         lowest.append(_quintic(at, d, (k + theta)[None] / 2))
     g = jnp.concatenate([g, guards(jnp.stack(lowest))])
     # The quintic is this good in a segment of the default length.
-    holds = jnp.all(g > -1e-8 * scale[None, None], axis=(0, 1)) & (h > -1e-10)
+    holds = jnp.all(g > -1e-8 * scale[None], axis=(0, 1)) & (h > -1e-10)
     _, after = system.switch(ends, s, segments.guard)
-    return jnp.all(holds & jnp.all(after == jnp.roll(s, -1, axis=-1), axis=0), axis=-1)
+    return jnp.all(holds & jnp.all(after == next_start(s), axis=0), axis=0)
 
 
-def attracts(return_jacobian) -> Bool[Array, " g"]:
-    """Whether no eigenvalue exceeds 1 in modulus by more than 1e-3: by repeated squaring."""
+def growth_of(system: HybridSystem, orbit: PeriodicOrbit) -> Float[Array, " g"]:
+    """ln of the largest Floquet multiplier, but the one of the motion itself, in modulus."""
+    growth = log_spectral_radius(orbit.return_jacobian, _FEW_SQUARINGS)
+    unsure = orbit.converged & (jnp.abs(growth) < _UNSURE)
 
-    def square(_, power):
-        return product(power, power)
+    def exactly():
+        jacobian = accurate_return_jacobian(system, orbit.segments)
+        return jnp.where(unsure, log_spectral_radius(jacobian, SQUARINGS), growth)
 
-    power = jax.lax.fori_loop(0, 13, square, return_jacobian)
-    return jnp.max(jnp.abs(power), axis=(0, 1)) < 1e3
+    return jax.lax.cond(jnp.any(unsure), exactly, lambda: growth)
 
 
 def _has_shorter_period(orbit: Segments, returns) -> Bool[Array, " g"]:
     """Whether orbits are back at their start before the last of their returns (g,)."""
-    start = orbit.y[..., :1]
+    start = orbit.y[:, :1]
     away = jnp.max(jnp.abs(next_start(orbit.y) - start), axis=0)
     at_section = orbit.guard == SECTION
-    early = at_section & (cumulative(at_section) < returns[:, None])
-    return jnp.any(early & (away < 1e-5 * (1 + jnp.max(jnp.abs(start), axis=0))), axis=-1)
+    early = at_section & (returns[None] > cumulative(at_section.T).T)
+    return jnp.any(early & (away < 1e-5 * (1 + jnp.max(jnp.abs(start), axis=0))), axis=0)
 
 
 def _no_segments(y, faces: int, length: int) -> Segments:
     """Unused ones, of orbits of the lanes of states y (2n, B)."""
-    shape = (y.shape[1], length)
+    shape = (length, y.shape[1])
     return Segments(
         y=jnp.zeros((len(y), *shape), y.dtype),
         duration=jnp.zeros(shape, y.dtype),
@@ -146,7 +155,7 @@ class _Candidates(eqx.Module):
 
 
 def _solved(system, record, lane, wanted, given: _Candidates, *, length, options):
-    """The orbits near the steps of lanes (g,): segments, error, whether accepted.
+    """The orbits near the steps of lanes (g,): segments, error and growth, whether accepted.
 
     One of a shorter period is not: the same number of segments resolves that period better.
     """
@@ -156,34 +165,39 @@ def _solved(system, record, lane, wanted, given: _Candidates, *, length, options
         return found.converged & ~(found.error <= given.rtol)
 
     def going(carry):
-        found, tries = carry
+        found, _, tries = carry
         return (tries == 0) | ((tries < _MESHES) & jnp.any(unsettled(found)))
 
     def solve(carry):
-        found, tries = carry
+        found, h, tries = carry
 
         def of_the_run():
-            return cut(system, record, lane, given.first, given.last, given.h, length)
+            return cut(system, record, lane, given.first, given.last, h, length)
 
         def of_the_orbit():
             # Its phases have other lengths and weights than those of the steps.
             steps, number = Steps.along(system, found.segments), jnp.arange(len(lane))
-            last = jnp.sum(found.segments.used, axis=-1)
-            return cut(system, steps, number, 0 * last, last, given.h * 0.8**tries, length)
+            last = jnp.sum(found.segments.used, axis=0)
+            return cut(system, steps, number, 0 * last, last, h, length)
 
         own = wanted & ((tries == 0) | unsettled(found))
         segments = jax.lax.cond(tries == 0, of_the_run, of_the_orbit)
         new = solve_periodic_orbits(system, segments, own, options.reach * scale)
-        return new.where(own, found), tries + 1
+        # The method is of order 8; where the motion is not as smooth, halves do.
+        known = new.error > 0  # a number
+        finer = 0.9 * (given.rtol / jnp.where(known, new.error, 1)) ** 0.125
+        finer = jnp.where(known, finer, 0.8)
+        return new.where(own, found), h * jnp.clip(finer, 0.5, 0.8), tries + 1
 
     nothing = PeriodicOrbit.none(_no_segments(given.y, len(record.s), length))
-    found, _ = jax.lax.while_loop(going, solve, (nothing, 0))
+    found, *_ = jax.lax.while_loop(going, solve, (nothing, given.h, 0))
     orbit, n = found.segments, system.n
-    near = jnp.max(jnp.abs(orbit.y[..., 0] - given.y), axis=0) < 0.2 * scale
-    moves = jnp.max(jnp.abs(orbit.y[n:]), axis=(0, -1)) > 1e-4
-    ok = wanted & found.converged & near & moves & attracts(found.return_jacobian)
+    near = jnp.max(jnp.abs(orbit.y[:, 0] - given.y), axis=0) < 0.2 * scale
+    moves = jnp.max(jnp.abs(orbit.y[n:]), axis=(0, 1)) > 1e-4
+    growth = growth_of(system, found)
+    ok = wanted & found.converged & near & moves & (growth < HARDLY)
     ok = ok & admissible(system, orbit, found.middle)
-    return orbit, found.error, ok & ~_has_shorter_period(orbit, given.returns)
+    return orbit, jnp.stack([found.error, growth]), ok & ~_has_shorter_period(orbit, given.returns)
 
 
 class _Progress(eqx.Module):
@@ -192,7 +206,7 @@ class _Progress(eqx.Module):
     status: Int[Array, " B"]
     orbit: Segments
     period_returns: Int[Array, " B"]
-    error: Float[Array, " B"]
+    error: Float[Array, "2 B"]  # of that orbit, and its growth in a period
     distance: Float[Array, " B"]  # of the run from that orbit
     approach: Int[Array, " B"]  # rounds in which it fell
     widest: Float[Array, " B"]  # gap between returns, in the later half of the run
@@ -262,7 +276,7 @@ def _assess(
     closest = jnp.min(apart, axis=0)
 
     def distance_from(orbit):
-        gap = jnp.max(jnp.abs(seen - orbit.y[:, None, :, 0]), axis=0)
+        gap = jnp.max(jnp.abs(seen - orbit.y[:, :1]), axis=0)
         return jnp.min(jnp.where(exists, gap, jnp.inf), axis=0)
 
     # An earlier orbit is accepted once the motion has approached it in several rounds.
@@ -280,6 +294,11 @@ def _assess(
     # without a period often comes near itself.
     pause = jnp.where(rounds < options.eager, 8, 64)
     ready = ready & ((gap < 0.7 * known.tried) | (rounds % pause < 2))
+    # At first not before returns that approach one another geometrically end near enough.
+    before = jnp.max(jnp.abs(seen[:, 2] - seen[:, 1]), axis=0)
+    left = gap**2 / jnp.maximum(before - gap, 1e-300)
+    ends_near = (left < options.ends_near * scale) | (gap < options.accepted / 8 * scale)
+    ready = ready & (ends_near | (period_returns > 1) | (rounds >= options.patient))
 
     given = _Candidates(
         y=seen[:, 0],
@@ -349,7 +368,7 @@ def _in_groups(system, record, ready, gap, given, orbit, error, *, options, leng
         wanted = ready[own] & (lane < lanes)
         batched = system.omega.ndim > 0
         new, new_error, ok = _solved(
-            jax.tree.map(lambda x: x[..., own, None], system) if batched else system,
+            jax.tree.map(lambda x: x[..., None, own], system) if batched else system,
             record,
             own,
             wanted,
@@ -360,7 +379,7 @@ def _in_groups(system, record, ready, gap, given, orbit, error, *, options, leng
         lane = jnp.where(ok, lane, lanes)  # beyond the last one nothing is written
         orbit = Segments(
             *(
-                old.at[..., lane, :].set(x, mode="drop")
+                old.at[..., lane].set(x, mode="drop")
                 for old, x in zip(
                     (orbit.y, orbit.duration, orbit.s, orbit.guard),
                     (new.y, new.duration, new.s, new.guard),
@@ -368,7 +387,7 @@ def _in_groups(system, record, ready, gap, given, orbit, error, *, options, leng
                 )
             )
         )
-        error = error.at[lane].set(new_error, mode="drop")
+        error = error.at[:, lane].set(new_error, mode="drop")
         return orbit, error, found.at[lane].set(True, mode="drop"), start + size
 
     carry = orbit, error, jnp.zeros(lanes, bool), 0
@@ -386,7 +405,7 @@ def _find(
         status=none + RUNNING,
         orbit=_no_segments(start, len(record.s), length),
         period_returns=none,
-        error=zero,
+        error=jnp.stack([zero, zero]),
         distance=far,
         approach=none,
         widest=zero,
@@ -422,7 +441,8 @@ def _find(
         return record, known, rounds + 1
 
     _, known, _ = jax.lax.while_loop(running, body, (record, known, 0))
-    return Attractor(known.orbit, known.status, known.period_returns, known.error, known.returns)
+    error, growth = known.error
+    return Attractor(known.orbit, known.status, known.period_returns, error, growth, known.returns)
 
 
 def find(
@@ -445,9 +465,7 @@ def find(
     search = functools.partial(_find, length=length, options=options)
 
     def lanes_first(found):
-        lane_first = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), found)
-        segments = jax.tree.map(lambda x: jnp.moveaxis(x, -2, 0), found.segments)
-        return eqx.tree_at(lambda found: found.segments, lane_first, segments)
+        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), found)
 
     @custom_vmap
     def one(arguments):
