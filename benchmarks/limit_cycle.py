@@ -27,7 +27,7 @@ OPTIONAL = ("heyoka", "numbalsoda")
 PACKAGES = ("numpy", "scipy", "diffrax", "numba", *OPTIONAL)
 LONG = 3.0  # s: a call that takes longer is timed once, and no tighter tolerance is tried
 OFTEN = 0.03  # s: what takes longer is repeated three times only
-EQUAL, WANTED = 1e-9, 10  # the error at which the package meets its best peer; the ratio wanted
+EQUAL, WANTED = 1e-9, 4  # the error at which the package meets its best peer; the ratio wanted
 OWN, OWN_TANH, EVENTS = "fractaljax, exact", "fractaljax, tanh", "heyoka, exact, by events"
 # Peers on the tanh law; those by an implicit solver are not run at the last tolerance.
 PEERS = (
