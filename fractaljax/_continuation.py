@@ -53,6 +53,7 @@ class Continuation:
     longest: float = 1 / 64  # steps
     shortest: float = 1e-7
     settled: float = 0.0  # Newton step after which none is made to see whether it shrinks further
+    small: float = np.inf  # largest residual there: it may be large however close the zero is
     most: int = 5000  # points each way
 
     def tangent(self, jacobian: np.ndarray) -> np.ndarray:
@@ -66,19 +67,20 @@ class Continuation:
         By steps of least length, with the coordinate `fixed` held.
         """
         free = np.arange(len(u)) != (-1 if fixed is None else fixed)
-        best, found = np.inf, None
+        best, least, found = np.inf, np.inf, None
         for _ in range(_NEWTON_STEPS):
             residual, jacobian = self.equations(u)
             if not (np.isfinite(residual).all() and np.isfinite(jacobian).all()):
                 return None
             step, _, rank, _ = np.linalg.lstsq(jacobian[:, free], -residual)
-            size = np.linalg.norm(step)
-            if size >= best and best <= self.tolerance:
+            size, left = np.linalg.norm(step), np.abs(residual).max()
+            falls = least > self.small and left < least / 10
+            if size >= best and best <= self.tolerance and not falls:
                 break  # down to rounding
             if rank < len(residual) or size > 4 * self.longest:
                 return None
-            best, found = size, (u, jacobian)
-            if size <= self.settled:
+            best, least, found = size, left, (u, jacobian)
+            if size <= self.settled and left <= self.small:
                 break
             u = u.copy()
             u[free] += step

@@ -59,6 +59,7 @@ def test_figures_page_has_the_numbers_that_are_found_now():
         assert f" {critical_friction_of_the_model}" in pages("figures_7_to_10")[0]
 
 
+@pytest.mark.slow
 def test_verdicts_follow_from_the_numbers():
     """What the verdicts claim, asked of the maps themselves."""
     made = script("figures_7_to_10")
@@ -112,6 +113,47 @@ def test_contact_laws_are_judged_as_the_page_says(monkeypatch):
     assert 1 < float(factor) < 2
     assert made.PAGE.with_name("contact_laws.png").stat().st_size < 100_000
     assert_whole(made.picture(seeds=2, n=64))
+
+
+def kicks():
+    """Rows of the committed page: surface, the numbers of its equilibrium, and shares by radius."""
+    made = script("kicks")
+    rows = [row for row in made.PAGE.read_text().splitlines() if row.startswith("| 2.")]
+    cells = [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
+    assert [row[0] for row in cells] == [f"{D:g}, {G:g}" for D, G in made.SURFACES]
+    for surface, row in zip(made.SURFACES, cells, strict=True):
+        shares = [
+            {outcome: float(share) for outcome, share in map(by_name, cell.split(", "))}
+            for cell in row[3:]
+        ]
+        yield surface, row[1:3], dict(zip(made.RADII, shares, strict=True))
+
+
+def by_name(text):
+    return text.rsplit(" ", 1)
+
+
+def test_kicks_page_accounts_for_all_kicks():
+    """The equilibrium's numbers to the digits shown; below 0.5 % are undecided."""
+    for surface, shown, by_radius in kicks():
+        assert shown == script("kicks").row(*surface, radii=())[1:]
+        for shares in by_radius.values():
+            assert sum(shares.values()) == pytest.approx(1, abs=0.0021)  # rounded
+            assert shares.get("undecided", 0) < 0.005
+
+
+@pytest.mark.slow
+def test_kicks_end_as_the_page_says():
+    """A quarter of them, on a sphere of rest and two cycles, and on one of rest alone."""
+    made, count = script("kicks"), 256
+    for number, radius in ((0, 1.0), (4, 2.0)):
+        surface, _, by_radius = list(kicks())[number]
+        cell = made.cell(fj.brake_scene().replace(D=surface[0], G=surface[1]), radius, count)
+        found = dict(map(by_name, cell.split(", ")))
+        assert found.keys() == by_radius[radius].keys()
+        for outcome, share in by_radius[radius].items():
+            error = np.sqrt(share * (1 - share) / count)
+            assert float(found[outcome]) == pytest.approx(share, abs=4 * error + 5e-4)
 
 
 def test_identification_is_drawn_as_it_is_shown_and_finds_the_surface(tmp_path):

@@ -345,7 +345,7 @@ def basin(
     each decays at 0.6 of its linear rate or faster. A start that gets no label is searched in full
     by `limit_cycle`, and an orbit that this finds is known from then on. Starts that are still
     without a label after `max_returns` are undecided, with the reason of the last full search
-    that found nothing.
+    that found nothing, their own one where there was one.
 
     **Arguments:**
 
@@ -386,7 +386,7 @@ def _label_all(system, lanes, known, reasons, search, modes, max_returns, progre
 
     k = len(lanes.label)
     searched, failures, patience = np.zeros(k, bool), 0, _PATIENCE
-    failure = CycleResult.exhausted
+    failure, own = CycleResult.exhausted, {}  # of the last full search, and of each start's
     bar = tqdm(total=k, desc="basin", unit="start", disable=not progress)
     with bar, concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
         while (running := np.flatnonzero(lanes.label == _RUNNING)).size:
@@ -404,7 +404,7 @@ def _label_all(system, lanes, known, reasons, search, modes, max_returns, progre
             left = lanes.label == _RUNNING
             over = left & ((lanes.returns >= max_returns) | (lanes.rounds >= max_returns))
             lanes.label[over] = _UNDECIDED
-            reasons |= dict.fromkeys(np.flatnonzero(over).tolist(), failure)
+            reasons |= {i: own.get(i, failure) for i in np.flatnonzero(over).tolist()}
             # A motion without switches is slow, but not lost.
             slow = (lanes.smooth >= _WINDOW) & (lanes.rounds < 16 * patience)
             lost = left & ~over & ~searched & (lanes.rounds >= patience)
@@ -424,9 +424,9 @@ def _label_all(system, lanes, known, reasons, search, modes, max_returns, progre
             elif bool(result == CycleResult.diverged):
                 lanes.label[i] = _DIVERGES
             else:
+                # A long transient, perhaps: the coarse run of it goes on.
                 failures, failure = failures + 1, result
-                if bool(result != CycleResult.unstable):
-                    lanes.label[i], reasons[i] = _UNDECIDED, result
+                own[i] = result
             # What brings nothing new is done less and less often.
             patience = _PATIENCE if len(known.cycles) > before else 2 * patience
         bar.update(k - bar.n)

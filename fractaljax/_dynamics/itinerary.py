@@ -108,6 +108,7 @@ class Shooting:
     gap = 1e-7  # between segments, above which a zero is none
     apart = 1e-3  # gap that Newton's method may close, and between which a cubic serves
     linear = 1e-10  # distance within which an evaluation's derivatives say what another would
+    closed = 1e-8  # gap between the segments of a solution
 
     def __init__(self, family: Family, old: Solution, phases, times):
         """`phases` begin at `times` (m,) on an old orbit; the last one ends after those."""
@@ -148,6 +149,7 @@ class Shooting:
             valid=lambda z: bool(np.isfinite(z).all()),
             tolerance=1e-9,
             settled=1e-11,
+            small=1e-9,  # a cycle may repel so much inside that its start says little of its end
             oriented=False,
             longest=self.family.step,
             shortest=1e-8,
@@ -317,9 +319,16 @@ class Shooting:
         return residual, jacobian * self.scale
 
     def solution(self, z) -> Solution:
-        u = self.full(z)
-        lifted = self.near(self.key(u, z[-1]))
-        return Solution(self.mechanism(z), self.phases, self.chain, lifted, u)
+        """The orbit at z, without gaps even where the evaluation of z has been one with gaps."""
+        u, x = self.full(z), self.mechanism(z)
+        key = self.key(u, z[-1])
+        i = self._nearest(key)
+        lifted, gap = self.memory[i], max(np.abs(self.keys[i] - key).max(), self.gaps[i])
+        for _ in range(_CLOSINGS):
+            if gap <= self.closed:
+                break
+            *_, lifted, gap = condensed(x, self.family.window, self.chain, lifted, u)
+        return Solution(x, self.phases, self.chain, lifted, u)
 
     def multipliers(self, z) -> np.ndarray:
         """Floquet multipliers (2n,) by size, and 1 last."""

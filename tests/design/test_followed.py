@@ -97,6 +97,7 @@ def test_followed_cycles_are_those_of_the_search():
     assert len(itineraries) > 1
 
 
+@pytest.mark.slow
 def test_a_cycle_that_ends():
     """At rest the measures are 0, of one that the motion reaches by itself they are not."""
     asked = problem(objective=CycleAmplitude(), constraints=[VelocityLevel(90.0)])

@@ -121,6 +121,7 @@ def test_bounds_and_requirements_hold_it_as_well():
     assert found.held_by == pytest.approx({"growth_rate <= target": 1.0, "most": 0.05}, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_every_law_has_its_modes():
     """A structure of two joints under its own law and another: rates as of each by itself."""
     from fractaljax._design.joints import under

@@ -140,7 +140,8 @@ def test_residuals_inform_on_both_sides_of_regime_boundaries():
         np.testing.assert_allclose(jacobian, reverse, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("form", [True, pytest.param("linear", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("form", [True, "linear"])
 def test_load_curves_are_kept(form):
     """A design of a joint that follows its load curve asks for the growth rate on that curve."""
     brake = fj.brake_scene()

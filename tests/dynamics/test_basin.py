@@ -10,6 +10,8 @@ from scipy.integrate import solve_ivp
 
 import fractaljax as fj
 import hybrid_truth
+from fractaljax._dynamics.basin import ellipsoid
+from fractaljax._dynamics.scaled import hybrid_system
 from mechanisms import PROBLEMS, changed
 from structures import of_problem
 from tools import reference_scene
@@ -208,6 +210,30 @@ def test_starts_in_an_ellipsoid():
     centre = friction(V), 0.0
     np.testing.assert_allclose(found.starts - centre, (ball - centre) * [3, 2], atol=1e-15)
     assert found.shares["equilibrium"] == 1
+
+
+@pytest.mark.slow
+def test_long_transients_come_to_rest():
+    """Starts of docs/kicks.md for which the full search finds nothing: no start is given up.
+
+    In the independent solver they switch for the last time within 700/omega, and decay.
+    """
+    scene = fj.brake_scene().replace(D=2.70, G=5e-9)
+    ways = np.random.default_rng(0).standard_normal((4, 4))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    system = hybrid_system(scene)
+    centre, axes = ellipsoid(system, 1.0)
+    starts = (centre + ways * axes)[[0, 3]]
+    found = fj.basin(scene, starts=starts, progress=False)
+    assert found.outcomes[found.labels[0]] == "equilibrium" and not found.labels.any()
+    mechanism = hybrid_truth.Mechanism.of(problem_of(scene))
+    rest = np.asarray(system.equilibrium())[:4]
+    for start in starts:
+        *_, last = hybrid_truth.phases(mechanism.scaled, start / mechanism.units, 1e-8, 4000.0)
+        assert last.t0 < 700 and last.event == ()
+        times = np.linspace(1000, 4000, 4000)
+        sizes = abs(last.dense(times).T - rest).max(axis=1).reshape(4, -1).max(axis=1)
+        assert (np.diff(sizes) < 0).all()
 
 
 def test_undecided_with_the_reason():

@@ -153,7 +153,7 @@ def assert_truth(problem, quantity, found, i):
 @pytest.mark.parametrize(
     ("name", "window", "kinds"),
     [
-        ("leine_1998", (0.15, 1.2), ["grazing"]),
+        pytest.param("leine_1998", (0.15, 1.2), ["grazing"], marks=pytest.mark.slow),
         # Without the phase that vanishes two faces would have to switch at once.
         pytest.param("released", (0.9, 0.95), ["grazing"], marks=pytest.mark.slow),
         pytest.param(
@@ -175,6 +175,7 @@ def test_points(name, window, kinds):
             assert_truth(PROBLEMS[name], "V", found, (before + after) // 2)
 
 
+@pytest.mark.slow
 def test_a_branch_meets_the_search():
     """What `limit_cycle` finds beside a branch of stable cycles lies on it."""
     found = branch("leine_1998", "V", 0.15, 1.2)

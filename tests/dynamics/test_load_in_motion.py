@@ -160,6 +160,7 @@ def cycle():
     return fj.limit_cycle(coupled())
 
 
+@pytest.mark.slow
 def test_cycle():
     """A cycle that sticks and lifts off closes in the other solver, with its forces and shares."""
     found, exact = cycle(), Truth(COUPLING)
@@ -249,6 +250,7 @@ def test_only_a_load_curve_is_looked_up():
         assert ("gather" in str(jax.make_jaxpr(system.field)(*ones))) == tabled
 
 
+@pytest.mark.slow
 def test_many_scenes_side_by_side():
     """vmap over scenes gives each its own table."""
     loads = jnp.array([2000.0, 3000.0, 4500.0])

@@ -19,7 +19,7 @@ from tools import both_modes
 
 TABLE = json.loads((Path(__file__).parents[1] / "reference" / "mechanisms.json").read_text())
 ROWS = {row["name"]: row for row in TABLE["rows"]}
-QUICK = ("papangelo_2017", "lift_off")
+QUICK = ("papangelo_2017",)
 # A joint slides forwards (V > 0). Backwards, with a second face along n, it is another joint.
 BACKWARDS = {
     name

@@ -1,8 +1,11 @@
-"""Derivatives of limit cycles of random mechanisms, against differences of the independent solver.
+"""Cycles of random mechanisms: derivatives and branches, against the independent solver.
 
 Three degrees of freedom and one joint with oblique lever arms, which sticks, lifts off and rubs
 along its normal. Each direction of the derivative changes every number of the mechanism.
 """
+
+import itertools
+import math
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +20,7 @@ from tools import both_modes
 TANGENTIAL, NORMAL = [1.0, 0.0, -0.4], [0.3, 1.0, 0.0]
 SEEDS = 0, 1, 2, 3, 10, 11  # 1, 3 and 10 lift off
 STEPS = 1e-3, 5e-4
+KICK = 1e-7  # scaled
 
 
 def numbers(seed) -> dict:
@@ -126,3 +130,78 @@ def assert_derivatives(seed):
         scale = 1e-6 * (abs(expected) + size)
         assert (abs(forward[:, k] - expected) < scale).all()
     np.testing.assert_allclose(reverse, forward, rtol=0, atol=1e-9 * abs(forward).max())
+
+
+# --- branches ---
+
+
+def followed(seed, quantity) -> fj.Branch | None:
+    """The branch through the limit cycle of a random mechanism, where it has one."""
+    given = numbers(seed)
+    x, start = of_problem(problem(given)), np.random.default_rng([seed, 2]).standard_normal(6)
+    cycle = fj.limit_cycle(x, start, max_returns=1500, throw=False)
+    if not bool(cycle.result == fj.CycleResult.converged):
+        return None
+    window = 0.6 * given[quantity], 1.6 * given[quantity]
+    return fj.continue_cycle(x, quantity, window, cycle)
+
+
+def closed(seed, quantity, found, i):
+    """The mechanism and one period from point i, in scaled units, at whose end it is closed."""
+    given = numbers(seed) | {quantity: float(found.parameter[i])}
+    mechanism = hybrid_truth.Mechanism.of(problem(given))
+    core, z = mechanism.scaled, found.state[i] / mechanism.units
+    T = float(found.period[i]) * mechanism.omega
+    strength = max(1.0, np.abs(found.multipliers[i]).max())
+    trip = list(hybrid_truth.phases(core, z, 1e-12, T))
+    np.testing.assert_allclose(trip[-1].end, z, rtol=0, atol=1e-8 * strength * abs(z).max())
+    return core, z, T, trip
+
+
+def assert_point(seed, quantity, found, i):
+    """Closed, multipliers, and the change of a small kick over some periods."""
+    core, z, T, trip = closed(seed, quantity, found, i)
+    multipliers = np.abs(found.multipliers[i])
+    values, vectors = np.linalg.eig(hybrid_truth.monodromy(core, trip))
+    moving = abs(values - 1).argsort()[1:]
+    k = moving[abs(values[moving]).argmax()]
+    size = abs(values[k])
+    assert np.sort(multipliers)[-2:] == pytest.approx(np.sort(abs(values))[-2:], rel=1e-5, abs=1e-5)
+    assert bool(found.stable[i]) == (size < 1)
+    periods = 4 if size < 1 else min(6, max(1, math.floor(math.log(30) / math.log(size))))
+    if size < 1:
+        *_, last = hybrid_truth.phases(core, z, 1e-12, periods * T)
+        np.testing.assert_allclose(last.end, z, atol=1e-7 * abs(z).max())
+    if size > 0.03:
+        left = np.linalg.inv(vectors)[k]
+        kick = KICK * (vectors[:, k] / abs(vectors[:, k]).max()).real
+        away = []
+        for sign in (1, -1):
+            *_, last = hybrid_truth.phases(core, z + sign * kick, 1e-12, periods * T)
+            away.append(last.end)
+        change = left @ (away[0] - away[1]) / (left @ (2 * kick))
+        # The kick is the real part of a complex vector: with its conjugate's share.
+        assert abs(change) == pytest.approx(size**periods, rel=2e-3)
+
+
+@pytest.mark.slow
+def test_motions_from_points_of_branches():
+    """From a stable point they stay; beside any they leave or return at its multiplier's rate.
+
+    One point between two events each. All that repel strongly are closed. Beyond a multiplier of
+    100 rounding has too large a say.
+    """
+    tested = []
+    for seed, quantity in ((2, "V"), (3, "V"), (4, "V"), (10, "P")):
+        found = followed(seed, quantity)
+        assert found is not None
+        sizes = np.abs(found.multipliers).max(axis=1)
+        for i in np.flatnonzero((sizes > 10) & (sizes < 100)):
+            closed(seed, quantity, found, i)
+        edges = sorted({0, *(e.index for e in found.events), len(found.parameter) - 1})
+        for before, after in itertools.pairwise(edges):
+            i = (before + after) // 2
+            if after - before > 3 and sizes[i] < 100:
+                assert_point(seed, quantity, found, i)
+                tested.append(bool(found.stable[i]))
+    assert tested.count(True) >= 6 and tested.count(False) >= 8

@@ -295,9 +295,6 @@ def test_the_row_without_a_part_traces_fewer_operations(quick):
 
 
 # The quick run of the page measures two others, tests/contact all quantities of the joint.
-BY_HAND = ("mechanism", "critical friction")
-
-
 @pytest.mark.slow
 def test_scipys_user_has_the_same_brake():
     """The joint and the growth rate by other code, in two regimes and at the reference."""
@@ -309,7 +306,9 @@ def test_scipys_user_has_the_same_brake():
         np.testing.assert_allclose(scipy_user.growth_rate(D, G), fj.growth_rate(moved), rtol=1e-9)
 
 
-@pytest.mark.parametrize("name", BY_HAND)
+@pytest.mark.parametrize(
+    "name", [pytest.param("mechanism", marks=pytest.mark.slow), "critical friction"]
+)
 def test_a_family_is_exact_to_what_its_inputs_allow(name):
     (family,) = (family for family in FAMILIES if family.name == name)
     tight = {"margin": 1e-12, "growth_rate": 1e-12, "real": 1e-12}

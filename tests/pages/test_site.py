@@ -13,6 +13,7 @@ from tools import DOCS, ROOT, load_script
 BUILD = load_script(DOCS / "build.py")
 SITE = ROOT / "build" / "site" / "html"
 SOURCES = sorted((DOCS / "site").rglob("*.md"))
+SETTINGS = (DOCS / "site" / "zensical.toml").read_text(encoding="utf-8")
 
 
 # --- what it is made of ---------------------------------------------------------------------
@@ -36,7 +37,11 @@ def test_sources_name_what_there_is(path):
     for name in re.findall(r"\]\[fractaljax\.([\w.]+)\]", text):
         assert hasattr(fj, name), name
     page = path.relative_to(DOCS / "site").as_posix()
-    assert f'"{page}"' in (DOCS / "site" / "zensical.toml").read_text(encoding="utf-8")
+    assert f'"{page}"' in SETTINGS
+
+
+def test_every_page_of_docs_is_in_the_navigation():
+    assert [path.name for path in DOCS.glob("*.md") if f'"docs/{path.name}"' not in SETTINGS] == []
 
 
 def test_notebooks_become_pages(tmp_path):
