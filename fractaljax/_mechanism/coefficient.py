@@ -38,6 +38,8 @@ class Expression(NamedTuple):
 def coefficient_of(name: str, given: Any, parameters: Parameters) -> Callable | ArrayLike:
     """A number, or a function of the parameters; a text becomes an `Expression`.
 
+    What reads none of them is a number.
+
     **Raises:** `ValueError` or `TypeError`, calling it `name`, for anything else, and for a
     function that does not give a finite number of these parameters.
     """
@@ -45,14 +47,32 @@ def coefficient_of(name: str, given: Any, parameters: Parameters) -> Callable | 
         given = Expression(given)
     if not callable(given):
         return scalar(name, given)
+    seen = _Watched(parameters)
     try:
-        value: Any = given(parameters)
+        value: Any = given(seen)
     except (KeyError, NameError) as error:
         raise ValueError(
             f"{name} needs the parameter {error.args[0]!r}; given are {_listed(parameters)}"
         ) from None
-    scalar(name, value)
-    return given
+    value = scalar(name, value)
+    return given if seen.read else value
+
+
+class _Watched(Mapping):
+    """Parameters, and whether any of them was read."""
+
+    def __init__(self, parameters: Parameters):
+        self.parameters, self.read = parameters, False
+
+    def __getitem__(self, name: str):
+        self.read = True
+        return self.parameters[name]
+
+    def __iter__(self):
+        return iter(self.parameters)
+
+    def __len__(self) -> int:
+        return len(self.parameters)
 
 
 def evaluated(coefficient: Callable | None, p: Parameters) -> Any:

@@ -13,6 +13,15 @@ from .mesh import Mesh
 from .structure import ParametricStructure
 
 
+class CoarseSpace:
+    """A part of a reduced space that knows the modes roughly; two are the same if one object."""
+
+    def __init__(self, V: np.ndarray, W: np.ndarray, tol: float):
+        self.V = V  # (r, k): q = V p
+        self.W = W  # (r, k)
+        self.tol = tol  # an eigenvalue s of it is within tol |s| of one of the reduced structure
+
+
 class Reduction:
     """How a reduced structure was made; two are the same if they are one object."""
 
@@ -29,6 +38,7 @@ class Reduction:
         error: float,
         points: Sequence[dict[str, float]] = (),
         touched: np.ndarray | None = None,
+        coarse: CoarseSpace | None = None,
     ):
         self.V = V  # (n, r): x = V q
         self.W = W  # (n, r)
@@ -40,6 +50,7 @@ class Reduction:
         self.residuals = residuals  # L^T Q^-1 R of the residuals of all terms, see `_Space`
         self.points = list(points)  # where eigenvectors were taken
         self.touched = touched  # (m, n), `Structure._touched` of the large one
+        self.coarse = coarse  # None where it would save no time
         self.error = error  # the largest found at candidates and fresh points, of |s|
 
 
@@ -63,6 +74,11 @@ class ReducedStructure(ParametricStructure):
     def band(self) -> tuple[float, float]:
         """Where eigenvalues are those of the large structure, in |Im s| [rad/s]."""
         return self.reduction.band
+
+    @property
+    def coarse(self) -> CoarseSpace | None:
+        """Where its modes are known roughly, if that saves time."""
+        return self.reduction.coarse
 
     def _full_n(self, n: int) -> int:
         return len(self.reduction.V)
@@ -99,6 +115,8 @@ class ReducedStructure(ParametricStructure):
         about["band"] = tuple(about["band"])
         about["residuals"] = about["residuals"][0] + 1j * about["residuals"][1]
         about["names"] = None if names is None else tuple(names)
+        coarse: Any = [about.pop(f"coarse_{key}", None) for key in ("V", "W", "tol")]
+        about["coarse"] = None if any(x is None for x in coarse) else CoarseSpace(*coarse)
         try:
             reduction = Reduction(**about)
         except TypeError:
@@ -108,8 +126,10 @@ class ReducedStructure(ParametricStructure):
 
     def _more_tables(self):
         of = self.reduction
+        coarse = {} if of.coarse is None else {"coarse_tol": of.coarse.tol}
         return {
             "reduced": {
+                **coarse,
                 "band": of.band,
                 "tol": of.tol,
                 "error": of.error,
@@ -122,9 +142,11 @@ class ReducedStructure(ParametricStructure):
 
     def _more_arrays(self):
         of = self.reduction
-        touched = {} if of.touched is None else {"touched": of.touched}
+        more = {} if of.touched is None else {"touched": of.touched}
+        if of.coarse is not None:
+            more |= {"coarse_V": of.coarse.V, "coarse_W": of.coarse.W}
         return {
-            **touched,
+            **more,
             "V": of.V,
             "W": of.W,
             "residuals": np.stack([np.real(of.residuals), np.imag(of.residuals)]),

@@ -158,6 +158,11 @@ class Structure(Mechanism):
         return None
 
     @property
+    def coarse(self) -> Any:
+        """A space in which modes are known roughly, of a reduced structure; else None."""
+        return None
+
+    @property
     def is_sparse(self) -> bool:
         """Whether the matrices are large and sparse: then `reduce` comes first."""
         return any(held.sparse for held in self.sums.values())

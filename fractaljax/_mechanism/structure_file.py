@@ -21,7 +21,8 @@ from .matrix_file import read_matrices
 from .mesh import Mesh
 
 _LARGEST_FILE = 2**30
-_MATRICES, _BASES = ("M", "C", "K"), ("V", "W", "residuals", "touched")
+_MATRICES = ("M", "C", "K")
+_BASES = ("V", "W", "residuals", "touched", "coarse_V", "coarse_W")
 _MESH = "mesh."  # what its arrays begin with, beside the matrices
 _TABLES = ("structure", "parameters", "joints", "reduction", "reduced")
 _SPARSE = ("data", "indices", "indptr", "shape")  # of a matrix in compressed rows

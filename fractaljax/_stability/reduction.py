@@ -34,7 +34,7 @@ from .._mechanism.quantities import (
     substituted,
     with_optional,
 )
-from .._mechanism.reduced import ReducedStructure, Reduction
+from .._mechanism.reduced import CoarseSpace, ReducedStructure, Reduction
 from .._mechanism.structure import Joint, ParametricStructure, Structure, require_single
 from .band import in_band
 from .linearise import attachments
@@ -55,6 +55,8 @@ _SPURIOUS = 0.02  # of |s|: an error beyond which a mode may be none
 _SIZES = 10  # degrees of freedom less, among which there are none without
 _BEYOND = 0.02  # of the band: modes beyond its ends that may enter it
 _SAFE = 0.2  # of tol: the estimate is of leading order
+_COARSE = 1e-3  # of |s|: to this the coarse space knows the modes
+_WORTH = 40, 0.6  # degrees of freedom from which a coarse space of such a share saves time
 _POWERS = {"M": 2, "C": 1, "K": 0}  # of s
 
 
@@ -352,7 +354,8 @@ class _Space:
         else:
             self.V = self.W = _decomposed([*right, *left], weight, cut)
         self.oblique = snapshots.oblique
-        self.mass = self.W.T @ (_plain(structure, "M") @ self.V)
+        self.M = _plain(structure, "M")
+        self.mass = self.W.T @ (self.M @ self.V)
         # L^T Q^-1 R of the residuals of every term: R = [X_1 V, ..., D], L = [X_1^T W, ..., D].
         R, L = [], []
         for _, _, X in _terms(structure):
@@ -374,6 +377,15 @@ class _Space:
         """
         size = np.linalg.svd(self.mass[:r, :r], compute_uv=False)
         return not self.oblique or size[-1] > _REGULAR
+
+    def coarse(self, r: int, smaller: int, tol: float) -> CoarseSpace:
+        """The `smaller` most important directions, in coordinates of those of the r."""
+        if not self.oblique:
+            V = W = np.eye(r)[:, :smaller]
+            return CoarseSpace(V, W, tol)
+        (V, W, _), (v, w, _) = self.bases(r), self.bases(smaller)
+        M = self.M
+        return CoarseSpace(W.T @ (M @ v), V.T @ (M.T @ w), tol)
 
     def bases(self, r: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """V and W (n, r) by the r most important directions, and their residuals (k, k).
@@ -450,6 +462,9 @@ def _estimated(
     return s, np.abs(error) / np.maximum(np.abs(slope), np.finfo(float).tiny)
 
 
+_Estimates = list[tuple[np.ndarray, np.ndarray]]  # eigenvalues and their errors at each point
+
+
 class _Greedy:
     """Points one after the other, where the error is largest, until it is small everywhere."""
 
@@ -492,7 +507,8 @@ class _Greedy:
         while True:
             known = self.snapshots, self.taken, self.weight, self.cut, self.factors
             space = _Space(*known)
-            reduced, errors = self.sound(space)
+            reduced, estimates = self.sound(space)
+            errors = _largest(estimates)
             self.bar.set_postfix_str(f"error {errors.max():.1e}, {reduced.n} degrees of freedom")
             worst, _ = self.candidates[errors.argmax()]
             if errors.max() > _SAFE * self.tol:
@@ -504,16 +520,23 @@ class _Greedy:
                     raise ValueError(f"tol = {self.tol:g} is below what rounding allows")
                 self.cut *= _FINER
                 continue
-            reduced, estimate = self.trimmed(space, reduced, float(errors.max()))
+            wanted = [s for s, _ in estimates]
+            trimmed = self.trimmed(space, wanted, self.tol)
+            reduced, estimate = trimmed or (reduced, float(errors.max()))
             compared = self.compared(reduced)
             if compared <= self.tol:
                 break
         self.bar.close()
         reduced.reduction.error = max(estimate, compared)
+        least, share = _WORTH
+        if self.tol < _COARSE and reduced.n >= least:
+            coarse = self.trimmed(space, wanted, _COARSE)
+            if coarse and coarse[0].n <= share * reduced.n:
+                reduced.reduction.coarse = space.coarse(reduced.n, coarse[0].n, _COARSE)
         return reduced
 
-    def sound(self, space: _Space) -> tuple[ReducedStructure, np.ndarray]:
-        """The largest structure without spurious modes in the band, and the error at candidates.
+    def sound(self, space: _Space) -> tuple[ReducedStructure, _Estimates]:
+        """The largest structure without spurious modes in the band, and the errors at candidates.
 
         A spurious mode has an error of its own size, and comes and goes with the directions kept.
         """
@@ -522,18 +545,22 @@ class _Greedy:
             if found is not None and not space.regular(r):
                 continue
             reduced = self.reduced(space, r)
-            errors = self.errors(reduced, self.candidates)
-            if found is None or errors.max() < found[1].max():
-                found = reduced, errors
-            if errors.max() < _SPURIOUS:
+            estimates = [self.estimated(reduced, at) for at in self.candidates]
+            largest = _largest(estimates).max()
+            if found is None or largest < found[0]:
+                found = largest, reduced, estimates
+            if largest < _SPURIOUS:
                 break
-        return found
+        return found[1:]
 
-    def trimmed(self, space: _Space, reduced, error: float) -> tuple[ReducedStructure, float]:
-        """The smallest that meets the tolerance at all candidates, and its error there."""
-        enough = _SAFE * self.tol
-        wanted = [self.estimated(reduced, at)[0] for at in self.candidates]
-        fails, holds = 0, space.size
+    def trimmed(
+        self, space: _Space, wanted: list[np.ndarray], tol: float
+    ) -> tuple[ReducedStructure, float] | None:
+        """The smallest that has the eigenvalues `wanted` of all candidates, and its error there.
+
+        None if that is the space itself.
+        """
+        fails, holds, found = 0, space.size, None
         while holds - fails > 1:
             r = (fails + holds) // 2
             if not space.regular(r):
@@ -541,16 +568,16 @@ class _Greedy:
                 continue
             smaller, largest = self.reduced(space, r), 0.0
             for at, s in zip(self.candidates, wanted, strict=True):
-                found, errors = self.estimated(smaller, at)
+                there, errors = self.estimated(smaller, at)
                 # A mode that is lost has no error.
-                largest = max(largest, _relative(errors, found), _apart(found, s))
-                if largest > enough:
+                largest = max(largest, _relative(errors, there), _apart(there, s))
+                if largest > _SAFE * tol:
                     break
-            if largest <= enough:
-                holds, reduced, error = r, smaller, largest
+            if largest <= _SAFE * tol:
+                holds, found = r, (smaller, largest)
             else:
                 fails = r
-        return reduced, error
+        return found
 
     def reduced(self, space: _Space, r: int) -> ReducedStructure:
         """The structure in a space of r degrees of freedom."""
@@ -572,11 +599,6 @@ class _Greedy:
         small = _projected(snapshots.structure, V, W)
         return ReducedStructure(**small, reduction=reduction, mesh=snapshots.structure.mesh)
 
-    def errors(self, reduced, points) -> np.ndarray:
-        """The largest error at each point, of |s|."""
-        found = [self.estimated(reduced, at) for at in points]
-        return np.array([_relative(errors, s) for s, errors in found])
-
     def estimated(self, reduced, at: tuple[np.ndarray, np.ndarray]):
         """Eigenvalues and their errors at a point with these numbers of the joints."""
         u, numbers = at
@@ -585,7 +607,7 @@ class _Greedy:
     def compared(self, reduced) -> float:
         """The largest error at the worst of fresh points, of |s|, by their own eigenvalues."""
         largest = 0.0
-        worst = np.argsort(-self.errors(reduced, self.fresh))
+        worst = np.argsort(-_largest([self.estimated(reduced, at) for at in self.fresh]))
         low, high = self.snapshots.band
         for i in worst[: _CHECKED if self.snapshots.ranges else 0]:
             u, _ = self.fresh[i]
@@ -599,6 +621,11 @@ class _Greedy:
             well_inside &= in_band(exact, self.snapshots.band)
             largest = max(largest, _apart(s, exact[well_inside]))
         return largest
+
+
+def _largest(estimates: _Estimates) -> np.ndarray:
+    """The largest error at each point, of |s|."""
+    return np.array([_relative(errors, s) for s, errors in estimates])
 
 
 def _relative(errors: np.ndarray, s: np.ndarray) -> float:

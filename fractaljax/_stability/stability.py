@@ -32,6 +32,7 @@ from .linearise import (
 )
 from .margin import damping_ratios, least_damping_ratio, margin_of
 from .quadratic import solve
+from .rightmost import rightmost
 
 
 class Mode(NamedTuple):
@@ -159,9 +160,8 @@ def growth_rate(scene: Mechanism, friction_slope: bool = True) -> Float[Array, "
 @functools.partial(command_jit, static_argnames="friction_slope", once=True)
 def _growth_rate(scene, friction_slope):
     if isinstance(scene, Structure):
-        s = solve(*assembled(scene, friction_slope).matrices).s
-        # An argmax: sorting would double the time to compile.
-        return s.real[jnp.argmax(_rank(s, scene.band))]
+        attached = assembled(scene, friction_slope)
+        return rightmost(attached.matrices[:3], scene.band, scene.coarse).real
     return quartic.rightmost_root(linearised(scene, friction_slope)).real
 
 

@@ -132,3 +132,12 @@ def test_refused_changes():
         x.replace(Omega=0.0)
     with pytest.raises(ValueError, match=r"structure has no quantity 'omega'; it has .*Omega"):
         fj.sweep(fj.growth_rate, x, omega=[1.0], progress=False)
+
+
+@pytest.mark.parametrize("coefficient", [2.0, "2", lambda p: 2.0, lambda p: 1.0 + (len(p) > 0)])
+def test_a_coefficient_that_reads_no_parameter_is_a_number(coefficient):
+    x = fj.ParametricStructure([(coefficient, np.eye(2))], None, np.eye(2), (), {"Omega": 1.0})
+    assert x.sums["M"].coefficients == (None,)
+    np.testing.assert_array_equal(x.M, 2 * np.eye(2))
+    x = fj.ParametricStructure([("2*Omega", np.eye(2))], None, np.eye(2), (), {"Omega": 1.0})
+    assert x.sums["M"].coefficients != (None,)
