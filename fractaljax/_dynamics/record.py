@@ -107,9 +107,10 @@ class Record(Steps):
             return y_new, s_new, guard, sums, steps
 
         carry = self.y, self.s, self.guard, self.sums, self.steps
-        *carry, steps = jax.lax.fori_loop(0, count, body, carry)
+        y, s, guard, sums, steps = jax.lax.fori_loop(0, count, body, carry)
         known = jnp.minimum(self.count + count, self.length)
-        return Record(steps, (self.oldest + count) % self.length, *carry, known)
+        oldest = (self.oldest + count) % self.length
+        return Record(steps, oldest, y, s, guard, sums, known)
 
     def moved(self, y, where) -> "Record":
         """With the states y, where steps from before are not of the same motion."""

@@ -294,7 +294,6 @@ def test_the_row_without_a_part_traces_fewer_operations(quick):
 # Extremes ----------------------------------------------------------------------------------------
 
 
-# The quick run of the page measures two others, tests/contact all quantities of the joint.
 @pytest.mark.slow
 def test_scipys_user_has_the_same_brake():
     """The joint and the growth rate by other code, in two regimes and at the reference."""
@@ -306,6 +305,7 @@ def test_scipys_user_has_the_same_brake():
         np.testing.assert_allclose(scipy_user.growth_rate(D, G), fj.growth_rate(moved), rtol=1e-9)
 
 
+# The quick run of the page measures two others, tests/contact all quantities of the joint.
 @pytest.mark.parametrize(
     "name", [pytest.param("mechanism", marks=pytest.mark.slow), "critical friction"]
 )
