@@ -32,7 +32,7 @@ FULL |= {"batches": (1, 16, 256)}
 QUICK = {"cycles": 64, "sample": 8, "repeats": 1, "segments": (None,), "batches": ()}
 RANGE = (2e8, 6e8)  # of K_n [N/m]
 DEVICES = 2
-FINE = 96  # segments of the truth
+FINE, FINEST = 96, 1e-12  # segments of the truth, and the tolerance by which all are used
 TOGETHER = 32  # cycles whose loops run together: each loop waits for the slowest of them
 EQUAL, WANTED = 1e-9, 15  # the error at which the package meets its peer, and the ratio wanted
 SETTLED = (6e-10, 2e-10, 1e-10, 1e-11)  # how well three maxima of the peer agree, in V/omega
@@ -41,11 +41,11 @@ Row = dict[str, Any]
 Timed = tuple[Row, Callable]  # a row without times, and its call
 
 
-def many(segments: int | None = None) -> Callable:
+def many(segments: int | None = None, rtol: float | None = None) -> Callable:
     """Period, peak to peak of x1 and result, by K_n (n,)."""
 
     def one(K):
-        cycle = fj.limit_cycle(reference(K), segments=segments, throw=False)
+        cycle = fj.limit_cycle(reference(K), segments=segments, rtol=rtol, throw=False)
         return cycle.period, cycle.amplitude[0], cycle.result
 
     return functools.partial(jax.lax.map, one, batch_size=TOGETHER)
@@ -159,7 +159,7 @@ def by_count(count: int, repeats: int) -> Row:
 def in_this_process(cycles: int, sample: int, repeats: int, segments, batches) -> Row:
     """All numbers, in a process that has the virtual devices; the peer gets a sample."""
     K_n = jnp.linspace(*RANGE, cycles)
-    *truth, results = jax.jit(many(FINE))(K_n)
+    *truth, results = jax.jit(many(FINE, rtol=FINEST))(K_n)
     truth, every = np.stack(truth, axis=1), cycles // sample
     spawn = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(DEVICES, mp_context=spawn) as pool:

@@ -26,7 +26,7 @@ from .scaled import check_rtol, degrees_of_freedom, scaled_start, start_state
 if TYPE_CHECKING:
     from diffrax import AbstractSolver
 
-_SEGMENTS = 64  # one return takes some 26 at rtol 1e-9
+_SEGMENTS = 64  # one return takes some 35 at rtol 1e-9
 _MOST_SEGMENTS = 4096
 _CROSSINGS = 16  # segments in which x2 may change sign
 _MINIMA = 4  # nearly equal ones of a displacement or a velocity
@@ -138,7 +138,7 @@ def _limit_cycle(
         (system, system.equilibrium(), growth / system.omega)
     )
     y = scaled_start(system, start)
-    h = jnp.asarray(0.35 * (rtol / 1e-9) ** 0.125, y.dtype)
+    h = jnp.asarray(0.25 * (rtol / 1e-9) ** 0.125, y.dtype)
     max_returns = max_returns.astype(y.dtype)
     found = search.find(
         frozen, y, equilibrium, growth, max_returns, h, jnp.asarray(rtol, y.dtype), segments
@@ -266,7 +266,7 @@ def limit_cycle(
       float32 both are 4.9e-4. It sets the number of segments.
     - `max_returns`: returns of the coarse run after which it gives up.
     - `segments`: most pieces that the orbit is cut into, 64 by default, and 512 where a joint
-      follows its load curve; one return takes some 26.
+      follows its load curve; one return takes some 35.
       Outside of compiled programs a longer period gets more; inside, the result says that it
       needs them.
     - `throw`: raise unless the result is `converged`. Otherwise `result` says what was found, and
