@@ -49,7 +49,7 @@ class Model(NamedTuple):
 
     def matrices(self, p: Mapping[str, float]) -> list[Any]:
         """M, C and K, sparse, without the package."""
-        return [sum(c(p) * X for c, X in self.terms[name]) for name in "MCK"]
+        return [sum(float(c(p)) * X for c, X in self.terms[name]) for name in "MCK"]
 
     def points(self, count: int) -> list[dict[str, float]]:
         """Places inside the ranges, drawn at random."""
