@@ -13,6 +13,8 @@ import fractaljax as fj
 from filippov import PLAIN, return_slopes
 from fractaljax._base.parts import substitute
 from fractaljax._dynamics.cycle import repels
+from fractaljax._dynamics.orbit import PeriodicOrbit
+from fractaljax._dynamics.search import growth_of
 from tools import both_modes, motionless_scene, reference_cycle, reference_scene
 
 ROWS = json.loads((Path(__file__).parents[1] / "reference" / "cycle.json").read_text())["rows"]
@@ -168,6 +170,12 @@ def test_orbit_that_repels():
     assert expected[-1] > 1.0001 and np.isfinite(cycle.amplitude).all()
     with pytest.raises(RuntimeError, match="but it repels"):
         fj.limit_cycle(scene_of(vars(m)))
+    # So near to 1 its growth is not taken from the derivatives of Newton's method.
+    segments = jax.tree.map(lambda x: x[..., None], cycle._orbit.segments)
+    rough = 1.0005 * jnp.eye(4)[..., None]
+    lane = PeriodicOrbit(segments, jnp.array([True]), rough, jnp.zeros(1), segments.y)
+    (growth,) = growth_of(cycle._system, lane)
+    np.testing.assert_allclose(growth, np.log(expected[-1]), rtol=1e-4)
 
 
 # --- the orbit ----------------------------------------------------------------------------
