@@ -249,11 +249,8 @@ class Shooting:
 
     # --- equations ---
 
-    def near(self, key) -> Lifted:
-        """The evaluation that says best where the states are: nearby, and then without gaps."""
-        return self.memory[self._nearest(key)]
-
     def _nearest(self, key) -> int:
+        """The evaluation that says best where the states are: nearby, and then without gaps."""
         return int(np.argmin(np.abs(self.keys - key).max(axis=1) ** 2 + self.gaps**2))
 
     def extrapolated(self, key, u) -> Lifted:

@@ -135,6 +135,8 @@ def _of_the_first(function: Callable, segments: Segments, count) -> Any:
     """What `function` gives of segments, of the first `count`: some at a time, zero beyond."""
     length, lanes = len(segments.duration), segments.duration[0].size
     size = min(length, max(_TOGETHER // lanes, _LEAST))
+    if size == length:
+        return function(segments)
 
     def along(x):
         return x.ndim - segments.duration.ndim
@@ -152,8 +154,6 @@ def _of_the_first(function: Callable, segments: Segments, count) -> Any:
 
     shapes = jax.eval_shape(function, segments)
     blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    if size == length:
-        return function(segments)
     return jax.lax.fori_loop(0, -(-count // size), some, blank)
 
 

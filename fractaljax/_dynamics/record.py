@@ -42,14 +42,14 @@ class Steps(eqx.Module):
     @classmethod
     def along(cls, system: HybridSystem, segments: Segments) -> "Steps":
         """The segments of orbits as steps 1, 2, ...; of step 0 all is zero."""
-        rows = jnp.concatenate([segments.y, segments.s, segments.guard[None].astype(float)])
         used = segments.used
         time = jnp.where(used, segments.duration, 0)
         ended = used & (segments.guard != NONE), used & (segments.guard == SECTION)
         sums = [time, step_weight(system, segments.y, segments.s) * time]
         sums = jnp.stack([*sums, *(x.astype(time.dtype) for x in ended)])
         sums = jnp.swapaxes(cumulative(jnp.swapaxes(sums, 1, 2)), 1, 2)
-        steps = jnp.concatenate([rows.astype(time.dtype), sums])
+        guard = segments.guard[None].astype(time.dtype)
+        steps = jnp.concatenate([segments.y, segments.s, guard, sums])
         return cls(jnp.pad(steps, ((0, 0), (1, 0), (0, 0))), jnp.asarray(0))
 
     @property
