@@ -199,6 +199,7 @@ def in_this_process(
         timed[f"{key}_compile_s"] = seconds(program, places[0])[0]
         each = [seconds(program, place)[0] for place in places[:repeats]]
         timed[f"{key}_ms"] = 1e3 * statistics.median(each)
+    fj.stability(reduced)  # compiled once, before it is timed
     rows = [
         one_point(model, reduced, p, jax.jit(jax.value_and_grad(growth))) for p in points[:checked]
     ]

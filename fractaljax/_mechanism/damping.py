@@ -6,20 +6,35 @@ from jax import Array
 from jaxtyping import ArrayLike, Float
 
 from .._base.parts import concrete, nan_where, number, scalar
-from .matrices import MatrixLike, fitting, mass_matrix, mass_normalised, square
+from .matrices import (
+    MatrixLike,
+    array_of,
+    fitting,
+    fitting_or_sparse,
+    is_sparse,
+    mass_matrix,
+    mass_normalised,
+    square,
+    square_or_sparse,
+)
 
 
 def rayleigh_damping(
     M: MatrixLike, K: MatrixLike, alpha: ArrayLike, beta: ArrayLike
-) -> Float[Array, "n n"]:
+) -> MatrixLike:
     """C = alpha M + beta K (n, n) [N s/m], alpha in 1/s and beta in s.
+
+    Of two sparse matrices with more than 2000 rows it is sparse as well.
 
     **Raises:** `ValueError` unless alpha >= 0 and beta >= 0 are scalars and M and K are square
     matrices of one size; `TypeError` for anything but real numbers.
     """
-    M = square("M", M)
-    K = fitting("K", K, M.shape)
-    return scalar("alpha", alpha, at_least=0) * M + scalar("beta", beta, at_least=0) * K
+    M = square_or_sparse("M", M)
+    K = fitting_or_sparse("K", K, M.shape)
+    a, b = (scalar(name, x, at_least=0) for name, x in (("alpha", alpha), ("beta", beta)))
+    if is_sparse(M) != is_sparse(K):
+        M, K = (array_of(name, X) for name, X in (("M", M), ("K", K)))
+    return float(a) * M + float(b) * K if is_sparse(M) else a * M + b * K
 
 
 def modal_damping(M: MatrixLike, K: MatrixLike, ratio: ArrayLike) -> Float[Array, "n n"]:

@@ -116,6 +116,19 @@ def test_rayleigh_damping():
     np.testing.assert_allclose(ratios, (2.0 / omega + 3e-6 * omega) / 2, rtol=1e-10)
 
 
+def test_rayleigh_damping_of_large_sparse_matrices():
+    """Of a size whose dense matrix would take gigabytes."""
+    n = 30_000
+    X = scipy.sparse.diags_array([2.0 + np.arange(n), -np.ones(n - 1)], offsets=[0, 1])
+    eye = scipy.sparse.eye_array(n)
+    C = fj.rayleigh_damping(eye, X, 3.0, 1e-3)
+    assert scipy.sparse.issparse(C)
+    assert abs((C - (3.0 * eye + 1e-3 * X)).tocsr()).max() == 0
+    few = scipy.sparse.eye_array(2500)
+    mixed = fj.rayleigh_damping(few, 2 * np.eye(2500), 3.0, 0.5)
+    np.testing.assert_array_equal(mixed, 4.0 * np.eye(2500))
+
+
 @pytest.mark.parametrize("ratio", [0.01, RATIOS])
 def test_modal_damping(ratio):
     """Every mode has the ratio that was asked for."""
