@@ -19,9 +19,7 @@ from .matrices import (
 )
 
 
-def rayleigh_damping(
-    M: MatrixLike, K: MatrixLike, alpha: ArrayLike, beta: ArrayLike
-) -> MatrixLike:
+def rayleigh_damping(M: MatrixLike, K: MatrixLike, alpha: ArrayLike, beta: ArrayLike) -> MatrixLike:
     """C = alpha M + beta K (n, n) [N s/m], alpha in 1/s and beta in s.
 
     Of two sparse matrices with more than 2000 rows it is sparse as well.
