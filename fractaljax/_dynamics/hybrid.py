@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from .._contact.load_curve import LoadTable, loaded_equilibrium
 from .._friction import Friction
-from .lanes import first_least, row_numbers, rows, solve, solve_positive
+from .lanes import SMALL, first_least, row_numbers, rows, solve, solve_positive
 
 OPEN = 2
 # Guards, by number: the section of the Poincare map, two for each face, one for each joint that
@@ -61,6 +61,11 @@ class HybridSystem(eqx.Module):
         if not self.excited:
             return y
         return jnp.concatenate([y[: self.n - 1], y[self.n : -1]])
+
+    @property
+    def affine(self) -> bool:
+        """Whether the field of every contact state is affine."""
+        return not any(self.curves) and not any(law.velocity_dependent for law in self.laws)
 
     @property
     def constant(self) -> int | None:
@@ -254,7 +259,13 @@ class HybridSystem(eqx.Module):
         W = self._leaf(jnp.sum(self.T[:, :, None] * self.B[None], axis=1), held.ndim - 1)
         own = jnp.eye(len(W), dtype=W.dtype).reshape(len(W), len(W), *(1,) * (held.ndim - 1))
         W = jnp.where(held[:, None] & held[None], W, own)
-        return jnp.where(held, solve_positive(W, wanted), 0)
+
+        def solved():
+            return jnp.where(held, solve_positive(W, wanted), 0)
+
+        if len(W) <= SMALL:
+            return solved()
+        return jax.lax.cond(jnp.any(held), solved, lambda: jnp.zeros_like(wanted))
 
     def field(self, y, s) -> Array:
         """dy/dt in contact state s. A sticking face must have w = 0."""

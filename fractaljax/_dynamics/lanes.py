@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-_SMALL = 8  # rows up to which products of matrices are sums
-_WRITTEN_OUT = 6  # unknowns up to which elimination is no loop, which runs faster
+SMALL = 6  # unknowns up to which elimination is no loop, which runs faster
+_SUMMED = 8  # rows up to which products of matrices are sums
 
 
 def rows(x, numbers: Sequence[int] | np.ndarray) -> Array:
@@ -51,22 +51,36 @@ def solve_positive(W, b) -> Array:
     """`solve` of a symmetric positive definite W: elimination, which then needs no pivots."""
     if len(b) < 3:
         return solve(W, b)
+    if len(b) > SMALL:
+        # Many right-hand sides, such as tangents, share the inverse.
+        return product(_positive_inverse(W), b[:, None])[:, 0]
     A = jnp.concatenate([W, b[:, None]], axis=1)
-
-    def eliminated(k, A):
-        row = (A[k] / A[k, k][None])[None]
-        return jnp.where(row_numbers(A) == k, row, A - A[:, k, None] * row)
-
-    if len(b) > _WRITTEN_OUT:
-        return jax.lax.fori_loop(0, len(b), eliminated, A)[:, -1]
     for k in range(len(b)):
-        A = eliminated(k, A)
+        A = _eliminated(k, A)
     return A[:, -1]
+
+
+def _eliminated(k, A) -> Array:
+    row = (A[k] / A[k, k][None])[None]
+    return jnp.where(row_numbers(A) == k, row, A - A[:, k, None] * row)
+
+
+@jax.custom_jvp
+def _positive_inverse(W) -> Array:
+    eye = jnp.eye(len(W), dtype=W.dtype).reshape(len(W), len(W), *(1,) * (W.ndim - 2))
+    A = jnp.concatenate([W, jnp.broadcast_to(eye, W.shape)], axis=1)
+    return jax.lax.fori_loop(0, len(W), _eliminated, A)[:, len(W) :]
+
+
+@_positive_inverse.defjvp
+def _positive_inverse_jvp(primals, tangents):
+    inverse = _positive_inverse(*primals)
+    return inverse, -product(inverse, product(tangents[0], inverse))
 
 
 def product(A, B) -> Array:
     """A @ B of each lane; a small one as a sum, which compiles into one loop with the rest."""
-    if len(A) <= _SMALL:
+    if len(A) <= _SUMMED:
         return jnp.sum(A[:, :, None] * B[None], axis=1)
     return jnp.einsum("ij...,jk...->ik...", A, B)
 

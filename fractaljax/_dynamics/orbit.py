@@ -21,6 +21,7 @@ from .lanes import product, row_numbers, solve
 from .runge_kutta import runge_kutta
 
 _ITERATIONS = 20
+_HOPELESS = 8  # iterations after which steps must be small, relative to the orbit
 _COARSE = 0.5  # longest step of a coarse map
 _BLOCK = 32  # of sums
 _TOGETHER, _LEAST = 256, 16  # segments of all lanes that Newton's method takes at a time
@@ -351,7 +352,8 @@ def solve_periodic_orbits(system: HybridSystem, segments: Segments, wanted, reac
         )
         new = jnp.maximum(largest, longest)
         moved = jnp.max(jnp.abs(y[:, 0] + dy[:, 0] - start), axis=0)
-        new = jnp.where((moved <= reach) & (new < big), new, jnp.inf)
+        hopeless = (count >= _HOPELESS) & (new > 1e-2 * size)
+        new = jnp.where((moved <= reach) & (new < big) & ~hopeless, new, jnp.inf)
         moves = going & ~ends_here & (new < jnp.inf)
         # Far from the orbit a full step may leave the region of convergence.
         share = jnp.minimum(1, 1 / new)[None]

@@ -48,6 +48,7 @@ class SearchOptions:
     longest: int = 16  # most returns in one period
     near: float = 0.15  # gap between returns below which an orbit is tried, relative
     ends_near: float = 0.06  # distance that single returns have left, relative
+    own_scale: float = 4.0  # most that gaps are relative to, in distances from the equilibrium
     patient: int = 4  # rounds in which that is asked of them
     accepted: float = 0.03  # distance from the orbit at which its multipliers decide, relative
     reach: float = 0.5  # distance from the run beyond which Newton's method gives up, relative
@@ -271,6 +272,9 @@ def _assess(
 
     # --- near a periodic orbit ---
     scale = 1 + jnp.max(jnp.abs(seen[:, 0]), axis=0)
+    if not system.excited:
+        # A motion that is much smaller than the preload's displacement repeats no sooner.
+        scale = jnp.minimum(scale, options.own_scale * away[0])
     apart = jnp.max(jnp.abs(seen[:, 1:] - seen[:, :1]), axis=0)
     apart = jnp.where(exists[1:], apart, jnp.inf)
     closest = jnp.min(apart, axis=0)
@@ -290,6 +294,14 @@ def _assess(
     period_returns = jnp.where(rounds % 2 == 0, 1, repeated)
     gap = jnp.where(period_returns == 1, apart[0], closest)
     ready = active & (status == RUNNING) & ~closer & ~extrapolates & (gap < options.near * scale)
+    # Without switches an affine motion has no orbit; nor has another that leaves the equilibrium
+    # at the linear rate.
+    first = jnp.take_along_axis(at, period_returns[None], axis=0)[0]
+    if system.affine and not system.excited:
+        ended_in_it = record.past(ENDED, at[0], lane) - record.past(ENDED, first, lane)
+        ready = ready & (ended_in_it > period_returns)
+    elif not system.excited:
+        ready = ready & ~(smooth & (growth > 0) & (rate > 0.5 * growth * (time[0] - time[1])))
     # After a failure again, once the returns are closer together or some rounds later; a motion
     # without a period often comes near itself.
     pause = jnp.where(rounds < options.eager, 8, 64)
@@ -302,7 +314,7 @@ def _assess(
 
     given = _Candidates(
         y=seen[:, 0],
-        first=jnp.take_along_axis(at, period_returns[None], axis=0)[0],
+        first=first,
         last=at[0],
         returns=period_returns,
         h=h,

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
+import hybrid_truth
+from tools import ROOT, load_script
 
 N = 8  # masses of each of two rods at right angles
 TIPS = [N - 1, 2 * N - 1]
@@ -59,3 +61,67 @@ def test_derivative_of_the_period_of_a_reduction():
 
     slope, wanted = (float(jax.jacfwd(period(x))(0.5)) for x in (reduced, rods()))
     assert abs(wanted) > 1e-2 and slope == pytest.approx(wanted, rel=1e-7)
+
+
+@functools.cache
+def brake():
+    """Nine rough joints under a beam, 45 of 150 degrees of freedom; one unstable mode, 12.7 kHz."""
+    made = load_script(ROOT / "notebooks" / "brakes.py").beam_on_pad()
+    surface, lining = fj.Surface(2.4, 1e-8, 1.5), fj.Material(2e9, 0.25, 5e7, 1.5e8)
+    joints = {
+        f"pair_{i}": fj.Joint(
+            fj.FractalContact(surface, lining, P=4000 * share),
+            fj.Coulomb(0.35),
+            *pair,
+            V=1.0,
+            preload=True,
+        )
+        for i, (pair, share) in enumerate(zip(made.pairs, made.shares, strict=True), start=1)
+    }
+    M, K = made.matrices["M"], made.matrices["K"]
+    structure = fj.Structure(M, fj.rayleigh_damping(M, K, 20.0, 1e-6), K, joints)
+    return fj.reduce(structure, {}, (0, 2 * np.pi * 15000), tol=1e-6, progress=False)
+
+
+def truth(reduced):
+    """The same small structure in the terms of the independent solver."""
+    joints = []
+    for j in reduced.joints:
+        t, n = (np.asarray(reduced.direction(d)) for d in (j.tangential, j.normal))
+        K_n, K_t = map(float, j.stiffness())
+        law = functools.partial(lambda w, mu: mu + 0 * w, mu=float(j.friction.mu_s))
+        joints.append(hybrid_truth.Joint(t, 1.0, law, n, float(j.normal_load), K_n, K_t))
+    M, C, K = (np.asarray(x) for x in (reduced.M, reduced.C, reduced.K))
+    return hybrid_truth.Mechanism(M, C, K, np.zeros(reduced.n), tuple(joints))
+
+
+@pytest.mark.slow
+def test_squeal_of_nine_joints():
+    """From the default start, through 600 periods of growth; two of the joints lift off."""
+    reduced = brake()
+    cycle = fj.limit_cycle(reduced)
+    unit = truth(reduced).units
+
+    def closed(mu):
+        mechanism = truth(reduced.replace(**{"pair_3.mu": mu}))
+        z, T = cycle.state / unit, float(cycle.period) * mechanism.omega
+        z, T = hybrid_truth.close(mechanism.scaled, np.asarray(z), T, 1e-12)
+        return mechanism, z, T
+
+    mechanism, z, T = closed(0.35)
+    assert T / mechanism.omega == pytest.approx(float(cycle.period), rel=1e-11)
+    np.testing.assert_allclose(cycle.state, z * unit, rtol=0, atol=1e-10 * abs(z * unit).max())
+    trip = list(hybrid_truth.phases(mechanism.scaled, z, 1e-12, T))
+    stick, _, opened = hybrid_truth.shares(mechanism.scaled, trip) / T
+    np.testing.assert_allclose(cycle.stick_fraction, stick, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(cycle.open_fraction, opened, rtol=0, atol=1e-10)
+    assert np.flatnonzero(opened).tolist() == [0, 2] and stick[0] > 0.05
+    sizes = np.sort(abs(np.linalg.eigvals(hybrid_truth.monodromy(mechanism.scaled, trip))))
+    np.testing.assert_allclose(np.sort(abs(cycle.multipliers))[-6:], sizes[-6:], rtol=1e-7)
+
+    def period(mu):
+        return fj.limit_cycle(reduced.replace(**{"pair_3.mu": mu}), cycle.state).period
+
+    slope, h = float(jax.jacfwd(period)(0.35)), 1e-4
+    ends = [x / mechanism.omega for _, _, x in map(closed, (0.35 - h, 0.35 + h))]
+    assert slope == pytest.approx((ends[1] - ends[0]) / (2 * h), rel=1e-5)
