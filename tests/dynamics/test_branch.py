@@ -26,6 +26,7 @@ from tools import (
     load_script,
 )
 
+pytestmark = pytest.mark.usefixtures("unoptimised")
 BELT = PROBLEMS["papangelo_2017"]
 
 

@@ -17,6 +17,7 @@ from fractaljax._dynamics.orbit import PeriodicOrbit
 from fractaljax._dynamics.search import growth_of
 from tools import both_modes, motionless_scene, reference_cycle, reference_scene
 
+pytestmark = pytest.mark.usefixtures("unoptimised")
 ROWS = json.loads((Path(__file__).parents[1] / "reference" / "cycle.json").read_text())["rows"]
 CYCLES = [row for row in ROWS if row["kind"] == "cycle"]
 NAMES = ("m", "omega_1", "omega_2", "xi_1", "xi_2", "F", "V", "K_n", "K_t", "mu_s", "mu_m", "v_m")
