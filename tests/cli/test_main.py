@@ -73,8 +73,15 @@ def assert_same_orbit(rows, cycle):
     assert (abs(found - wanted) <= 4e-15 * abs(wanted).max(axis=0)).all()
 
 
-def test_cycle(capsys):
+@pytest.mark.parametrize(
+    "searched",
+    # The command compiles the search anew, with other options: seconds of the default run.
+    [False, pytest.param(True, marks=pytest.mark.slow)],
+)
+def test_cycle(capsys, monkeypatch, searched):
     """The table, the picture, and one period as numbers that are those of the orbit."""
+    if not searched:
+        monkeypatch.setattr(_SEARCH, lambda *_, **__: reference_cycle())
     reference_scene().save("mine.toml")
     status, out, err = run(capsys, "cycle", "mine.toml")
     table = cycle_table(reference_scene(), reference_cycle())
