@@ -60,6 +60,7 @@ def test_eigenvalues_and_normal_forces(name, slope):
 
 
 @slow
+@pytest.mark.usefixtures("unoptimised")
 @EACH
 def test_gradients(name):
     """By every quantity of every joint, in both modes, against differences in 40 digits."""
