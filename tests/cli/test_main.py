@@ -73,16 +73,8 @@ def assert_same_orbit(rows, cycle):
     assert (abs(found - wanted) <= 4e-15 * abs(wanted).max(axis=0)).all()
 
 
-@pytest.mark.parametrize(
-    "searched",
-    # The command compiles the search anew, with other options: seconds of the default run.
-    [False, pytest.param(True, marks=pytest.mark.slow)],
-)
-def test_cycle(capsys, monkeypatch, searched):
+def test_cycle(capsys):
     """The table, the picture, and one period as numbers that are those of the orbit."""
-    cycle = reference_cycle()  # with the search itself
-    if not searched:
-        monkeypatch.setattr(_SEARCH, lambda *_, **__: cycle)
     reference_scene().save("mine.toml")
     status, out, err = run(capsys, "cycle", "mine.toml")
     table = cycle_table(reference_scene(), reference_cycle())
