@@ -52,6 +52,21 @@ def pytest_configure(config):
     gc.set_threshold(50_000, 20, 50)
 
 
+@pytest.fixture
+def unoptimised(monkeypatch):
+    """Programs of a test are compiled as in the default run: it compiles much and computes little.
+
+    In a run with slow tests optimisation would take as long again.
+    """
+    from fractaljax._base import quick
+
+    monkeypatch.setattr(quick, "_available", lambda: False)
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
+
+
 @pytest.fixture(autouse=True, scope="module")
 def bounded_memory():
     """Files share what is compiled. Beyond 2.5 GB of memory each lets go of what there is."""

@@ -47,7 +47,7 @@ class Reduction:
         self.band = band  # [rad/s]
         self.tol = tol
         self.friction_slope = friction_slope
-        self.residuals = residuals  # L^T Q^-1 R of the residuals of all terms, see `_Space`
+        self.residuals = residuals  # L^T Q^-1 R of the residuals of all terms, see `Space`
         self.points = list(points)  # where eigenvectors were taken
         self.touched = touched  # (m, n), `Structure._touched` of the large one
         self.coarse = coarse  # None where it would save no time

@@ -27,6 +27,7 @@ from tools import (
 )
 
 BELT = PROBLEMS["papangelo_2017"]
+UNOPTIMISED = pytest.mark.usefixtures("unoptimised")
 
 
 @functools.cache
@@ -97,6 +98,7 @@ def value_of_event(kind, x, quantity, window, start):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["grazing", "Hopf"])
+@UNOPTIMISED
 def test_derivatives_of_the_belt(kind):
     """In both modes against central differences."""
 
@@ -164,6 +166,7 @@ def assert_truth(problem, quantity, found, i):
         ),
     ],
 )
+@UNOPTIMISED
 def test_points(name, window, kinds):
     """Cycles of every itinerary on the way, and the kinds of events between them."""
     found = branch(name, "V", *window)

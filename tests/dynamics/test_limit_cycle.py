@@ -28,6 +28,7 @@ REPELLING = PLAIN.__class__(
     1.0, 7040.0, 5190.0, 0.000154, 0.000735, 2.51, 0.307, 5.08e8, 3.23e8, 0.251, 0.14, 0.535
 )
 SLOW = pytest.mark.slow
+UNOPTIMISED = pytest.mark.usefixtures("unoptimised")
 
 
 def scene_of(row) -> fj.Scene:
@@ -112,6 +113,7 @@ def test_forty_digits():
 
 
 @SLOW
+@UNOPTIMISED
 def test_derivatives_of_forty_digits():
     """By K_n at fixed K_t/K_n, of period and amplitude in SI, in forward and in reverse mode."""
     _, *jacobians = solved(CYCLES[0], CYCLES[0]["start"])
@@ -121,6 +123,7 @@ def test_derivatives_of_forty_digits():
         np.testing.assert_allclose(by_K_n, truth, rtol=1e-8)
 
 
+@UNOPTIMISED
 def test_cycles_of_one_return():
     """Random and special scenes: all numbers, multipliers, and derivatives in both modes."""
     simple = [row for row in CYCLES if row["returns"] == 1]
@@ -130,6 +133,7 @@ def test_cycles_of_one_return():
 
 
 @SLOW
+@UNOPTIMISED
 def test_cycles_of_several_returns():
     """Up to four in one period, on more segments, from a state on the cycle."""
     several = [row for row in CYCLES if row["returns"] > 1]
@@ -139,6 +143,7 @@ def test_cycles_of_several_returns():
 
 
 @SLOW
+@UNOPTIMISED
 def test_motions_without_a_cycle():
     """The equilibrium attracts, the motion diverges, or it never repeats: three results."""
     R = fj.CycleResult
@@ -212,6 +217,7 @@ def test_orbit():
         pytest.param({"K_n": 8e8, "omega_1": 295.0, "xi_1": 0.01}, marks=SLOW),
     ],
 )
+@UNOPTIMISED
 def test_mass_on_a_belt_under_constant_load(slow):
     """K_t = 0 and F < 0: x2 does not move, and x1 is the classic stick-slip oscillator.
 
@@ -267,6 +273,7 @@ def test_repels(largest):
 
 
 @SLOW
+@UNOPTIMISED
 def test_error_falls_with_the_eighth_power():
     """Order of convergence in the number of segments, and the estimate that comes with it."""
     counts = (20, 40)
