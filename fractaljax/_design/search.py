@@ -18,14 +18,16 @@ import numpy as np
 from .._base.parts import brief, scalar
 from .._base.ranges import low_discrepancy
 from .envelope import ALONE, Envelope
-from .problem import DesignProblem, evaluate, linearise
+from .problem import DesignProblem, evaluate, limits_of_joints, linearise
 
 Solver = Callable[[Callable, Callable, np.ndarray, np.ndarray], np.ndarray]
 
 _LIKELY = 8  # conditions of a first guess at the worst
 _ROUNDS = 12  # of the exchange
 _FEW = 2  # variables, in which a lattice of starts leaves nothing to restore
+_INSIDE, _INSIDE_STEPS = 0.01, 40  # by how much designs that are screened are inside the limits
 _RESTORING = 30  # steps from a start to where all requirements are met
+_STEP, _STEPS, _STEP_ITERATIONS = 0.25, 12, 10  # of a design among many joints, in its bounds
 _NEW = 1e-7  # by which a condition must be worse than the working ones
 _NEAR = 0.05  # a requirement met by more than this on the grid is met between its points
 _UNKNOWN = 1e3  # stands for a residual without a number
@@ -40,12 +42,42 @@ def slsqp(objective: Callable, constraints: Callable, start: np.ndarray, bounds:
     `constraints(z)` residuals (k,), at most 0 where met, and their Jacobian (k, n); `start` (n,),
     `bounds` (n, 2). It returns a point (n,).
     """
+    return _slsqp(objective, constraints, start, bounds).x
+
+
+def slsqp_in_steps(
+    objective: Callable, constraints: Callable, start: np.ndarray, bounds: np.ndarray
+):
+    """`slsqp` within a box about the design, which goes along with it.
+
+    Far from the requirements of many joints their slopes promise too much: without a box most
+    starts end where joints are plastic, which have no slope that leads back.
+    """
+    z = np.asarray(start, float)
+    for _ in range(_STEPS):
+        box = _box(z, bounds)
+        found = _slsqp(objective, constraints, z, box, _STEP_ITERATIONS)
+        z = found.x
+        held = (z <= box[:, 0]) & (box[:, 0] > bounds[:, 0])
+        held |= (z >= box[:, 1]) & (box[:, 1] < bounds[:, 1])
+        if found.success and not held.any():
+            break
+    return _slsqp(objective, constraints, z, _box(z, bounds)).x
+
+
+def _box(z: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """Bounds no further from z than a step; what has none, such as a largest residual, is free."""
+    step = np.where(np.isfinite(bounds).all(axis=1), _STEP, np.inf)
+    return np.stack([np.maximum(bounds[:, 0], z - step), np.minimum(bounds[:, 1], z + step)], 1)
+
+
+def _slsqp(objective, constraints, start, bounds, iterations: int = 100) -> Any:
     from scipy.optimize import minimize
 
     fun, jac = (lambda z: -constraints(z)[0]), (lambda z: -constraints(z)[1])
     limits = {"type": "ineq", "fun": fun, "jac": jac}
-    more: Any = {"method": "SLSQP", "options": {"ftol": 1e-12, "maxiter": 100}}
-    return minimize(objective, start, jac=True, bounds=bounds, constraints=limits, **more).x
+    more: Any = {"method": "SLSQP", "options": {"ftol": 1e-12, "maxiter": iterations}}
+    return minimize(objective, start, jac=True, bounds=bounds, constraints=limits, **more)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -252,6 +284,35 @@ def screened_designs(lattice: int, variables: int) -> np.ndarray:
     side = (np.arange(lattice) + 0.5) / lattice
     axes = np.meshgrid(*[side] * variables, indexing="ij")
     return np.stack([axis.ravel() for axis in axes], axis=1)
+
+
+def within_joints(problem: DesignProblem, us: np.ndarray) -> np.ndarray:
+    """Designs us (n, v) moved to where every joint is inside its limits, as far as that goes.
+
+    Of many joints a design that is drawn has nearly always one outside, where no growth rate says
+    anything. Their limits take no eigenvalues. By Levenberg and Marquardt's method.
+    """
+
+    def lacking(us):
+        residuals, slopes = limits_of_joints(problem, us)
+        r = np.maximum(np.nan_to_num(residuals, nan=_UNKNOWN) + _INSIDE, 0)
+        return r, np.nan_to_num(slopes) * (r > 0)[:, :, None]
+
+    (r, slopes), damping = lacking(us), np.ones(len(us))
+    for _ in range(_INSIDE_STEPS):
+        if not r.any():
+            break
+        normal = np.einsum("nkv,nkw->nvw", slopes, slopes)
+        normal += damping[:, None, None] * np.eye(us.shape[1])
+        step = np.linalg.solve(normal, np.einsum("nkv,nk->nv", slopes, r)[:, :, None])[:, :, 0]
+        tried = np.clip(us - step, 0, 1)
+        other, other_slopes = lacking(tried)
+        better = (other**2).sum(axis=1) < (r**2).sum(axis=1)
+        us = np.where(better[:, None], tried, us)
+        r = np.where(better[:, None], other, r)
+        slopes = np.where(better[:, None, None], other_slopes, slopes)
+        damping = np.clip(np.where(better, damping / 5, damping * 3), 1e-6, 1e6)
+    return us
 
 
 def choose_starts(own: np.ndarray, designs: np.ndarray, rows: np.ndarray, count: int):
@@ -490,6 +551,13 @@ class Search:
         again = [starts[i][None] for i in lost]
         for i, way in zip(lost, self._ways(again, growing, others, restored=True), strict=True):
             paths[i] = way
+        return paths, self._ends(paths)
+
+    def least_unmet(self, starts: Sequence[np.ndarray]) -> tuple[list[np.ndarray], Evaluation]:
+        """As `least_growth`, to the least of the largest other residual, whatever grows."""
+        others = self.evaluator.problem.asked & ~self.growing
+        others[0] = False
+        paths = self._ways([start[None] for start in starts], others, np.zeros_like(others))
         return paths, self._ends(paths)
 
     @property
