@@ -583,8 +583,10 @@ class Search:
             aim[asked] = np.append(False, violated)
             limited &= asked & (columns < aim.argmax())
         elif problem.least_growth:
-            # The largest of many modes has kinks where they change places; each has none.
-            aim, limited = ~asked, limited & asked
+            # The largest of many modes has kinks where they change places; each has none. What
+            # is minimised needs no limit of its own.
+            own = self.growing & (columns < problem.growth_columns.start + problem.modes)
+            aim, limited = ~asked, limited & asked & ~own
         elif problem.smooth:
             limited &= ~self.growing
         return self._ways(paths, aim, limited, progress, restored)
