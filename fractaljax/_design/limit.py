@@ -86,13 +86,11 @@ def least_growth(search: Search, paths: list[np.ndarray], found: Evaluation) -> 
     named = np.arange(1 + len(problem.residual_names))
     growing = search.growing[: len(named)]
     others = ~growing & (named > 0)
-    unmet = found.rows[:, others].max(axis=1, initial=-np.inf)
-    possible = unmet <= 0
-    if not possible.any():
+    growth, unmet = search.growth_and_rest(found)
+    if not (unmet <= 0).any():
         paths, found = search.least_unmet([path[-1] for path in paths])
-        unmet = found.rows[:, others].max(axis=1)
-        possible = unmet <= 0  # after all
-    rates = target + scale * np.sinh(found.rows[:, growing].max(axis=1))
+        growth, unmet = search.growth_and_rest(found)
+    possible, rates = unmet <= 0, target + scale * np.sinh(growth)
     best = int(np.lexsort((rates, ~possible, np.maximum(unmet, 0) * ~possible))[0])
     u, residuals = paths[best][-1], found.residuals[best]
     if possible[best]:

@@ -57,10 +57,10 @@ def slsqp_in_steps(
     for _ in range(_STEPS):
         box = _box(z, bounds)
         found = _slsqp(objective, constraints, z, box, _STEP_ITERATIONS)
-        z = found.x
+        stuck, z = np.array_equal(found.x, z), found.x
         held = (z <= box[:, 0]) & (box[:, 0] > bounds[:, 0])
         held |= (z >= box[:, 1]) & (box[:, 1] < bounds[:, 1])
-        if found.success and not held.any():
+        if stuck or (found.success and not held.any()):
             break
     return _slsqp(objective, constraints, z, _box(z, bounds)).x
 
@@ -473,15 +473,28 @@ class Search:
         The first of those whose ends are equally good: the given design leads the starts, and its
         way begins where the reader does. Last, ways and ends of `least_growth`, if all failed.
         """
-        paths, found = self._solve(starts, progress)
+        problem, lowest = self.evaluator.problem, None
+        paths, found = self._landed(starts, progress)
+        plain = problem.cuts is None and problem.cycles is None
+        if (found.worst > 0).all():
+            if plain and problem.modes:
+                # Of structures each landing takes long. With all else met no other design is as
+                # close to the target.
+                near = paths[int(found.worst.argmin())][-1]
+                lowest = self.least_growth([*starts, near])
+                growth, unmet = self.growth_and_rest(lowest[1])
+                least = int(np.where(unmet <= 0, growth, np.inf).argmin())
+                if unmet[least] <= 0 < growth[least]:
+                    return lowest[0][least], lowest[1].of(least), len(starts), lowest
+            if lowest is None or not (lowest[1].worst <= 0).any():
+                paths, found = self._closest(paths, found)
         failed = found.worst > 0
         if failed.all():
-            model = found.residuals[:, : self.evaluator.problem.model_residuals]
+            model = found.residuals[:, : problem.model_residuals]
             best = int(np.lexsort((found.worst, model.max(axis=1, initial=0)))[0])
-            problem, lowest = self.evaluator.problem, None
-            if problem.cuts is None and problem.cycles is None:
+            if lowest is None and plain:
                 lowest = self.least_growth([*starts, paths[best][-1]])
-                met = lowest[1].worst <= 0
+            met = np.zeros(0, bool) if lowest is None else lowest[1].worst <= 0
             if lowest is None or not met.any():
                 return paths[best], found.of(best), len(starts), lowest
             # There is a design that meets all after all.
@@ -500,12 +513,8 @@ class Search:
             return again, polished, count, None
         return paths[best], found.of(best), count, None
 
-    def _solve(self, starts, progress):
-        """The ways from all starts, and what their ends are.
-
-        Where none meets every requirement they end inside the model, if that is possible, and
-        there as close as can be to all the rest.
-        """
+    def _landed(self, starts, progress):
+        """The ways from all starts, and what their ends are."""
         problem = self.evaluator.problem
         paths = self._land([start[None] for start in starts], progress=progress)
         found = self._ends(paths)
@@ -516,8 +525,14 @@ class Search:
             for i, path in zip(lost, landed, strict=True):
                 paths[i] = path
             found = self._ends(paths)
-        if (found.worst <= 0).any():
-            return paths, found
+        return paths, found
+
+    def _closest(self, paths, found):
+        """Ways of which none ends where all is met, on to as close as can be, and their ends.
+
+        Inside the model, if that is possible, and there as close as can be to all the rest.
+        """
+        problem = self.evaluator.problem
         model = np.arange(len(problem.residual_names)) < problem.model_residuals
         # Into the model, on to the rest of the requirements, and if they hold to the objective.
         for violated in (model, ~model, None):
@@ -545,9 +560,7 @@ class Search:
         others = self.evaluator.problem.asked & ~growing
         others[0] = False
         paths = self._ways([start[None] for start in starts], growing, others)
-        found = self._ends(paths)
-        unmet = found.rows[:, others[: found.rows.shape[1]]].max(axis=1, initial=-np.inf) > 0
-        lost = np.flatnonzero(unmet).tolist()
+        lost = np.flatnonzero(self.growth_and_rest(self._ends(paths))[1] > 0).tolist()
         again = [starts[i][None] for i in lost]
         for i, way in zip(lost, self._ways(again, growing, others, restored=True), strict=True):
             paths[i] = way
@@ -559,6 +572,14 @@ class Search:
         others[0] = False
         paths = self._ways([start[None] for start in starts], others, np.zeros_like(others))
         return paths, self._ends(paths)
+
+    def growth_and_rest(self, found: Evaluation) -> tuple[np.ndarray, np.ndarray]:
+        """The largest residuals (n,) of growth rates, and of all other requirements."""
+        growing = self.growing[: found.rows.shape[1]]
+        others = ~growing & (np.arange(len(growing)) > 0)
+        return found.rows[:, growing].max(axis=1), found.rows[:, others].max(
+            axis=1, initial=-np.inf
+        )
 
     @property
     def growing(self) -> np.ndarray:
