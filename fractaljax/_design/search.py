@@ -56,8 +56,8 @@ def slsqp_in_steps(
     z = np.asarray(start, float)
     for _ in range(_STEPS):
         box = _box(z, bounds)
-        found = _slsqp(objective, constraints, z, box, _STEP_ITERATIONS)
-        stuck, z = np.array_equal(found.x, z), found.x
+        found = _slsqp(objective, constraints, z, box, _STEP_ITERATIONS, 1e-8)
+        stuck, z = np.abs(found.x - z).max() < 1e-8, found.x
         held = (z <= box[:, 0]) & (box[:, 0] > bounds[:, 0])
         held |= (z >= box[:, 1]) & (box[:, 1] < bounds[:, 1])
         if stuck or (found.success and not held.any()):
@@ -71,12 +71,12 @@ def _box(z: np.ndarray, bounds: np.ndarray) -> np.ndarray:
     return np.stack([np.maximum(bounds[:, 0], z - step), np.minimum(bounds[:, 1], z + step)], 1)
 
 
-def _slsqp(objective, constraints, start, bounds, iterations: int = 100) -> Any:
+def _slsqp(objective, constraints, start, bounds, iterations=100, ftol=1e-12) -> Any:
     from scipy.optimize import minimize
 
     fun, jac = (lambda z: -constraints(z)[0]), (lambda z: -constraints(z)[1])
     limits = {"type": "ineq", "fun": fun, "jac": jac}
-    more: Any = {"method": "SLSQP", "options": {"ftol": 1e-12, "maxiter": iterations}}
+    more: Any = {"method": "SLSQP", "options": {"ftol": ftol, "maxiter": iterations}}
     return minimize(objective, start, jac=True, bounds=bounds, constraints=limits, **more)
 
 
