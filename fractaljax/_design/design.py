@@ -41,6 +41,8 @@ from .search import (
     evaluator_of,
     screened_designs,
     slsqp,
+    slsqp_in_steps,
+    within_joints,
 )
 from .summary import comparison_table
 from .tolerance import Tolerance, squeal_probability
@@ -51,6 +53,7 @@ _LATTICE = {False: (1024, 48), True: (256, 24)}  # whether a design takes long
 _LATTICE_MAX = 1_000_000, 1000
 _STARTS_OF_STRUCTURES = 8
 _STARTS_MAX = 10_000
+_FEW_JOINTS = 2  # of more, nearly no design of an even spread is inside all limits
 _SEED_MAX = 2**63 - 1  # of a JAX key
 _ACTIVE = 1e-4  # a requirement met by less than this is called active
 _WAVELENGTHS = (1e-3, 1e-6)  # [m], of the roughness that is reported
@@ -292,9 +295,11 @@ def design(
     from `starts` designs, by default 12, or 8 of a structure: those given, the most promising of
     `lattice` a side (48, or 24 of a structure, with an envelope or a tolerance; 1024 or 256 in one
     variable; lattice^2 designs of a low-discrepancy set in more than two variables), and an even
-    spread. The same arguments give the same design. A request that cannot be met is a result, not
-    an error: see `Design.result`. Then `Design.least_growth` is the least growth rate that was
-    found with all else met, where, what holds it there, and how many starts agree.
+    spread. Of more than two joints these are moved inside the limits of each, and SLSQP goes in
+    steps of at most a quarter of the bounds. The same arguments give the same design. A request
+    that cannot be met is a result, not an error: see `Design.result`. Then `Design.least_growth` is
+    the least growth rate that was found with all else met, where, what holds it there, and how many
+    starts agree; or, if that cannot be met either, what of it and why.
 
     **Raises:** `ValueError` for bounds on what `x` lacks, empty, inverted or without its own value,
     for an envelope of what it lacks or the design moves, and for options outside their domain.
@@ -330,7 +335,9 @@ def design(
         us, scale = choose_starts(own, designs, evaluator.screen(designs), count)
         if problem.cycles is not None:
             scale = abs(float(before.values[0])) or 1.0
-        search = Search(evaluator, solver or slsqp, 1.0 if objective is None else scale)
+        search = Search(
+            evaluator, solver or solver_of(problem), 1.0 if objective is None else scale
+        )
         path, after, failed, lowest = search.best(us, progress)
         limit = None if lowest is None else least_growth(search, *lowest)
         return Found(path, after, len(us), failed, limit)
@@ -359,7 +366,14 @@ def screened(problem: DesignProblem, starts: int | None, lattice: int | None):
     starts = whole("starts", min(default, count) if starts is None else starts, 1, _STARTS_MAX)
     if starts > count:
         raise ValueError(f"starts must be at most the {count} of the lattice, got {starts}")
-    return starts, screened_designs(lattice, variables)
+    designs = screened_designs(lattice, variables)
+    many = len(problem.contacts) > _FEW_JOINTS
+    return starts, within_joints(problem, designs) if many else designs
+
+
+def solver_of(problem: DesignProblem) -> Solver:
+    """The solver that lands where none is given."""
+    return slsqp_in_steps if len(problem.contacts) > _FEW_JOINTS else slsqp
 
 
 def _conclude(

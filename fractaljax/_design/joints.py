@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -17,6 +18,8 @@ from .._mechanism.quantities import joints_of, moved_by, own_quantities
 from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
 from .._stability.band import in_band
+
+_FEW = 2  # joints, of which each has its own program
 
 
 def of_joint(name: str) -> str:
@@ -33,12 +36,39 @@ class _Stiffness(NamedTuple):
     slip_ratio: None = None
 
 
+class _Part(NamedTuple):
+    """What `state_of` asks of a scene or a joint."""
+
+    contact: Any
+    friction: Any
+
+
 def state_of(part) -> Any:
     """The `ContactState` of a scene or a joint, of other laws their stiffness."""
     law, friction = part.contact, part.friction
     if law.fractal:
         return law.state(friction.mu_s, friction.mu_m)
     return _Stiffness(*law.stiffness(friction.mu_s, friction.mu_m))
+
+
+def states_of(parts: Mapping[str, Any]) -> dict[str, Any]:
+    """`state_of` of many, by name: a law that more than two share is compiled once."""
+    alike: dict[Any, list[str]] = {}
+    pairs = {name: (part.contact, part.friction) for name, part in parts.items()}
+    for name, pair in pairs.items():
+        leaves, structure = jax.tree.flatten(pair)
+        kind = structure, tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
+        alike.setdefault(kind, []).append(name)
+    states = {}
+    for names in alike.values():
+        if len(names) <= _FEW:
+            states |= {name: state_of(parts[name]) for name in names}
+            continue
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(pairs[name] for name in names))
+        found = jax.vmap(lambda contact, friction: state_of(_Part(contact, friction)))(*stacked)
+        for i, name in enumerate(names):
+            states[name] = jax.tree.map(lambda leaf, i=i: leaf[i], found)
+    return {name: states[name] for name in parts}
 
 
 def is_fractal(x, name) -> bool:

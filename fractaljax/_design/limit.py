@@ -3,7 +3,8 @@
 At a least largest growth rate the slopes of those that are largest, with weights that sum to 1,
 and of the requirements and bounds that are met with nothing to spare cancel (Karush, Kuhn and
 Tucker): no small change lowers all of them. This is a proof for small changes. For large ones
-there is only how many starts end at the same growth rate.
+there is only how many starts end at the same growth rate. Where the other requirements cannot be
+met either, it is the largest of their residuals that is as small as can be, whatever grows.
 """
 
 from collections.abc import Mapping
@@ -29,17 +30,26 @@ class LeastGrowth(Record):
     where one of them, a residual or a share of the bounds, is loosened by 1. `slope` is what these
     leave of the slopes, by designed quantities as shares of their bounds, and `steepest` the
     steepest slope among the growth rates that are largest [1/s].
+
+    Where no design was found to meet the others, `unmet` are their residuals at the design whose
+    largest is least, and that takes the place of the growth rate in `held_by`, `slope`, `steepest`
+    and `agreed`.
     """
 
     growth_rate: float  # [1/s], of all modes, laws and conditions that are required
     target: float
     values: Mapping[str, float]  # of the designed quantities
-    met: bool  # whether the other requirements are
+    unmet: Mapping[str, float]  # other requirements that are not met, the worst first
     held_by: Mapping[str, float]
     slope: float
     steepest: float
     agreed: int  # how many starts ended within 1 % of it
     starts: int
+
+    @property
+    def met(self) -> bool:
+        """Whether every other requirement is."""
+        return not self.unmet
 
     @property
     def margin(self) -> float:
@@ -52,61 +62,80 @@ class LeastGrowth(Record):
         return self.slope <= _LEVEL * self.steepest
 
     def __repr__(self) -> str:
-        others = "every other requirement met" if self.met else "others not met either"
         held = ", ".join(f"{name} ({by:.3g})" for name, by in self.held_by.items())
+        cancel = f"the slopes cancel to {self.slope:.2g} of {self.steepest:.3g}"
+        there = f"there {condition_text(self.values)}"
+        held = f"held by, with multipliers: {held or 'nothing'}"
+        agreed = f"{self.agreed} of {self.starts} starts end within 1 % of it"
         can = "no small change lowers it" if self.stationary else "a small change may lower it"
-        return "\n".join(
-            [
-                f"least growth rate found, with {others}: {self.growth_rate:+.6g} 1/s; "
-                f"the target is {self.target:+.6g}",
-                f"there {condition_text(self.values)}",
-                f"held by, with multipliers: {held or 'nothing'}",
-                f"{can}: the slopes cancel to {self.slope:.2g} of {self.steepest:.3g} 1/s",
-                f"{self.agreed} of {self.starts} starts end within 1 % of it",
-            ]
-        )
+        if self.met:
+            what = "least growth rate found, with every other requirement met"
+            first = f"{what}: {self.growth_rate:+.6g} 1/s; the target is {self.target:+.6g}"
+            return "\n".join([first, there, held, f"{can}: {cancel} 1/s", agreed])
+        most, residual = next(iter(self.unmet.items()))
+        first = f"no design was found to meet, whatever grows: {', '.join(self.unmet)}"
+        least = f"least residual found, of {most}: {residual:.6g}; 0 is asked"
+        grows = f"growth rate there: {self.growth_rate:+.6g} 1/s; the target is {self.target:+.6g}"
+        return "\n".join([first, least, grows, there, held, f"{can}: {cancel}", agreed])
 
 
 def least_growth(search: Search, paths: list[np.ndarray], found: Evaluation) -> LeastGrowth:
     """What holds the least growth rate at the ends of `Search.least_growth`."""
-    evaluator = search.evaluator
-    problem = evaluator.problem
-    growing = search.growing[: found.rows.shape[1]]
-    scale = float(problem.growth_scale)
-    rates = float(problem.target) + scale * np.sinh(found.rows[:, growing].max(axis=1))
-    unmet = found.residuals[:, ~growing[1:]].max(axis=1, initial=-np.inf)
-    possible = unmet <= 0
+    problem = search.evaluator.problem
+    target, scale = float(problem.target), float(problem.growth_scale)
+    named = np.arange(1 + len(problem.residual_names))
+    growing = search.growing[: len(named)]
+    others = ~growing & (named > 0)
+    growth, unmet = search.growth_and_rest(found)
+    if not (unmet <= 0).any():
+        paths, found = search.least_unmet([path[-1] for path in paths])
+        growth, unmet = search.growth_and_rest(found)
+    possible, rates = unmet <= 0, target + scale * np.sinh(growth)
     best = int(np.lexsort((rates, ~possible, np.maximum(unmet, 0) * ~possible))[0])
-    u = paths[best][-1]
-    near = _AGREE * max(abs(rates[best]), abs(rates[best] - float(problem.target)), scale)
-    held, slope, steepest = _held_by(evaluator, u, growing)
+    u, residuals = paths[best][-1], found.residuals[best]
+    if possible[best]:
+        near = _AGREE * max(abs(rates[best]), abs(rates[best] - target), scale)
+        agreed = possible & (np.abs(rates - rates[best]) <= near)
+        held, slope, steepest = _held_by(search.evaluator, u, growing, others)
+    else:
+        agreed = unmet <= (1 + _AGREE) * unmet[best]
+        held, slope, steepest = _held_by(search.evaluator, u, others, np.zeros_like(others))
+    lacking = {
+        name: float(residual)
+        for name, residual, other in zip(problem.residual_names, residuals, others[1:], strict=True)
+        if other and residual > 0
+    }
     return LeastGrowth(
         growth_rate=float(rates[best]),
-        target=float(problem.target),
+        target=target,
         values={name: float(x) for name, x in problem.quantities(u).items()},
-        met=bool(possible[best]),
+        unmet=dict(sorted(lacking.items(), key=lambda item: -item[1])),
         held_by=held,
         slope=slope,
         steepest=steepest,
-        agreed=int((possible == possible[best])[np.abs(rates - rates[best]) <= near].sum()),
+        agreed=int(agreed.sum()),
         starts=len(paths),
     )
 
 
-def _held_by(evaluator: Evaluator, u: np.ndarray, growing: np.ndarray) -> Any:
-    """Multipliers by name, what they leave of the slopes, and the steepest slope [1/s]."""
+def _held_by(evaluator: Evaluator, u: np.ndarray, aim: np.ndarray, limited: np.ndarray) -> Any:
+    """Multipliers by name, what they leave of the slopes, and the steepest slope.
+
+    Of the largest in `aim` (1 + k,), of what is `limited`, and of bounds; of growth rates [1/s].
+    """
     from scipy.optimize import nnls
 
     problem = evaluator.problem
     row, slopes = _linearised(evaluator, u)
     names = ["objective", *problem.residual_names]
     row, slopes = row[: len(names)], slopes[: len(names)]
+    growing = np.zeros(len(names), bool)
+    growing[problem.growth_columns] = True
     with np.errstate(over="ignore"):  # far from any target
         scale = np.where(growing, float(problem.growth_scale) * np.cosh(row), 1.0)
     slopes = slopes * scale[:, None]
-    largest = growing & (row >= row[growing].max() - _ACTIVE)
-    others = ~growing & (np.abs(row) <= _ACTIVE)
-    others[0] = False
+    largest = aim & (row >= row[aim].max() - _ACTIVE)
+    others = limited & (np.abs(row) <= _ACTIVE)
     v = len(u)
     low, high = u <= _ACTIVE, u >= 1 - _ACTIVE
     columns = [*slopes[largest], *slopes[others], *-np.eye(v)[low], *np.eye(v)[high]]
@@ -119,7 +148,7 @@ def _held_by(evaluator: Evaluator, u: np.ndarray, growing: np.ndarray) -> Any:
         f"{name} <= upper bound" for name, here in zip(problem.names, high, strict=True) if here
     ]
     steepest = float(np.linalg.norm(slopes[largest], axis=1).max())
-    # Weights of the largest growth rates sum to 1, by a row that outweighs all others.
+    # Weights of the largest sum to 1, by a row that outweighs all others.
     unit = max(steepest, 1e-300)
     matrix = np.array(columns).T / unit
     weight = 1e4 * (np.arange(matrix.shape[1]) < largest.sum())

@@ -15,9 +15,9 @@ from .._base.parts import Record, brief, flag, scalar, whole
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import replaced
 from .constraints import Constraint
-from .design import Design, design, screened
+from .design import Design, design, screened, solver_of
 from .problem import DesignProblem, describe, state_problem
-from .search import Evaluator, Search, slsqp
+from .search import Evaluator, Search
 
 _STARTS = 6  # of each member of the front
 _POINTS_MAX = 1000
@@ -121,7 +121,7 @@ def pareto(
         raise ValueError(f"the least {names[0]} and the least {names[1]} are one design")
     _, designs = screened(problem, None, made["lattice"])
     known = Evaluator(problem).evaluate(designs)
-    solver = made["solver"] or slsqp
+    solver = made["solver"] or solver_of(problem)
     found = []
     for share in tqdm(np.linspace(1, 0, points), desc="pareto", disable=not progress):
         limit = low + share * (high - low)

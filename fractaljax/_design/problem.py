@@ -51,7 +51,7 @@ from .joints import (
     moved_contacts,
     of_joint,
     slips,
-    state_of,
+    states_of,
     under,
     with_stiffness,
 )
@@ -124,11 +124,12 @@ class DesignProblem(eqx.Module):
     def _row(self, u, condition, shift=None):
         """Objective and residuals (1 + k,), and the numbers that describe a design, by name."""
         x = self.moved(u, condition, shift)
-        states = {
-            name: state_of(part)
+        asked = {
+            name: part
             for name, part in joints_of(x).items()
             if part.contact.fractal or name in self.contacts
         }
+        states = states_of(asked)
         # The load curve of a joint is that of its own law.
         known = {
             name: state
@@ -153,14 +154,7 @@ class DesignProblem(eqx.Module):
                     each, self.friction_slope, rates[-1], self.target, self.growth_scale
                 )
         growth = rates[0]
-        model, stiff = [], []
-        for name, K_n_min in zip(self.contacts, self.K_n_min, strict=True):
-            state = states[name]
-            if state.log_area_ratio is not None:
-                model.append(2 * (jnp.log(self.area_ratio_min) - state.log_area_ratio))
-            if state.slip_ratio is not None:
-                model.append(10 * (state.slip_ratio - self.slip_ratio_max))
-            stiff.append((K_n_min - state.K_n) / jnp.where(K_n_min > 0, K_n_min, 1))
+        model, stiff = self.of_joints(states)
         pressing = [jnp.arcsinh((rate - self.target) / self.growth_scale) for rate in rates]
         # Cycles are followed outside of this program.
         own = [
@@ -183,6 +177,18 @@ class DesignProblem(eqx.Module):
                     numbers[of_joint(name) + key] = getattr(state, key)
         row = [jnp.asarray(value, growth.dtype), *model, *pressing, *stiff, *own]
         return jnp.stack(row + smooth * self.smooth), numbers
+
+    def of_joints(self, states: Mapping[str, Any]) -> tuple[list[Array], list[Array]]:
+        """Residuals of contacts in known states: inside the model, and stiff enough."""
+        model, stiff = [], []
+        for name, K_n_min in zip(self.contacts, self.K_n_min, strict=True):
+            state = states[name]
+            if state.log_area_ratio is not None:
+                model.append(2 * (jnp.log(self.area_ratio_min) - state.log_area_ratio))
+            if state.slip_ratio is not None:
+                model.append(10 * (state.slip_ratio - self.slip_ratio_max))
+            stiff.append((K_n_min - state.K_n) / jnp.where(K_n_min > 0, K_n_min, 1))
+        return model, stiff
 
     def at(self, u: Float[Array, " v"], condition: Float[Array, " c"]):
         """As `_row`; quantiles, and no more than the row, where quantities scatter.
@@ -282,6 +288,12 @@ def evaluate(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray) -> 
     return _in_batches(_evaluate, problem, us, conditions).astype(float)
 
 
+def limits_of_joints(problem: DesignProblem, us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What joints alone require (n, r) of designs us (n, v), and Jacobians: no eigenvalues."""
+    us = np.asarray(us, problem.low.dtype)
+    return in_batches(functools.partial(_limits_of_joints, problem), _BATCH, us)
+
+
 def describe(problem: DesignProblem, us: np.ndarray) -> dict[str, np.ndarray]:
     """Quantities and results (n,) of designs us (n, v), as they are, without scatter."""
     nominal = dataclasses.replace(problem, scatter=None)
@@ -319,6 +331,22 @@ _linearise, _linearise_light = quick_jit(linearised), quick_jit(linearised, once
 @quick_jit
 def _evaluate(problem: DesignProblem, us, conditions):
     return jax.vmap(lambda u, condition: problem.at(u, condition)[0])(us, conditions)
+
+
+@quick_jit
+def _limits_of_joints(problem: DesignProblem, us):
+    def residuals(u):
+        joints = joints_of(problem.moved(u, problem.own_condition))
+        states = states_of({name: joints[name] for name in problem.contacts})
+        model, stiff = problem.of_joints(states)
+        both = jnp.stack([*model, *stiff])
+        return both, both
+
+    def one(u):
+        slopes, values = jax.jacfwd(residuals, has_aux=True)(u)
+        return values, slopes
+
+    return jax.vmap(one)(us)
 
 
 # --- checks --------------------------------------------------------------------------------

@@ -18,14 +18,16 @@ import numpy as np
 from .._base.parts import brief, scalar
 from .._base.ranges import low_discrepancy
 from .envelope import ALONE, Envelope
-from .problem import DesignProblem, evaluate, linearise
+from .problem import DesignProblem, evaluate, limits_of_joints, linearise
 
 Solver = Callable[[Callable, Callable, np.ndarray, np.ndarray], np.ndarray]
 
 _LIKELY = 8  # conditions of a first guess at the worst
 _ROUNDS = 12  # of the exchange
 _FEW = 2  # variables, in which a lattice of starts leaves nothing to restore
+_INSIDE, _INSIDE_STEPS = 0.01, 40  # by how much designs that are screened are inside the limits
 _RESTORING = 30  # steps from a start to where all requirements are met
+_STEP, _STEPS, _STEP_ITERATIONS = 0.25, 12, 10  # of a design among many joints, in its bounds
 _NEW = 1e-7  # by which a condition must be worse than the working ones
 _NEAR = 0.05  # a requirement met by more than this on the grid is met between its points
 _UNKNOWN = 1e3  # stands for a residual without a number
@@ -40,12 +42,42 @@ def slsqp(objective: Callable, constraints: Callable, start: np.ndarray, bounds:
     `constraints(z)` residuals (k,), at most 0 where met, and their Jacobian (k, n); `start` (n,),
     `bounds` (n, 2). It returns a point (n,).
     """
+    return _slsqp(objective, constraints, start, bounds).x
+
+
+def slsqp_in_steps(
+    objective: Callable, constraints: Callable, start: np.ndarray, bounds: np.ndarray
+):
+    """`slsqp` within a box about the design, which goes along with it.
+
+    Far from the requirements of many joints their slopes promise too much: without a box most
+    starts end where joints are plastic, which have no slope that leads back.
+    """
+    z = np.asarray(start, float)
+    for _ in range(_STEPS):
+        box = _box(z, bounds)
+        found = _slsqp(objective, constraints, z, box, _STEP_ITERATIONS, 1e-8)
+        stuck, z = np.abs(found.x - z).max() < 1e-8, found.x
+        held = (z <= box[:, 0]) & (box[:, 0] > bounds[:, 0])
+        held |= (z >= box[:, 1]) & (box[:, 1] < bounds[:, 1])
+        if stuck or (found.success and not held.any()):
+            break
+    return _slsqp(objective, constraints, z, _box(z, bounds)).x
+
+
+def _box(z: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """Bounds no further from z than a step; what has none, such as a largest residual, is free."""
+    step = np.where(np.isfinite(bounds).all(axis=1), _STEP, np.inf)
+    return np.stack([np.maximum(bounds[:, 0], z - step), np.minimum(bounds[:, 1], z + step)], 1)
+
+
+def _slsqp(objective, constraints, start, bounds, iterations=100, ftol=1e-12) -> Any:
     from scipy.optimize import minimize
 
     fun, jac = (lambda z: -constraints(z)[0]), (lambda z: -constraints(z)[1])
     limits = {"type": "ineq", "fun": fun, "jac": jac}
-    more: Any = {"method": "SLSQP", "options": {"ftol": 1e-12, "maxiter": 100}}
-    return minimize(objective, start, jac=True, bounds=bounds, constraints=limits, **more).x
+    more: Any = {"method": "SLSQP", "options": {"ftol": ftol, "maxiter": iterations}}
+    return minimize(objective, start, jac=True, bounds=bounds, constraints=limits, **more)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -254,6 +286,35 @@ def screened_designs(lattice: int, variables: int) -> np.ndarray:
     return np.stack([axis.ravel() for axis in axes], axis=1)
 
 
+def within_joints(problem: DesignProblem, us: np.ndarray) -> np.ndarray:
+    """Designs us (n, v) moved to where every joint is inside its limits, as far as that goes.
+
+    Of many joints a design that is drawn has nearly always one outside, where no growth rate says
+    anything. Their limits take no eigenvalues. By Levenberg and Marquardt's method.
+    """
+
+    def lacking(us):
+        residuals, slopes = limits_of_joints(problem, us)
+        r = np.maximum(np.nan_to_num(residuals, nan=_UNKNOWN) + _INSIDE, 0)
+        return r, np.nan_to_num(slopes) * (r > 0)[:, :, None]
+
+    (r, slopes), damping = lacking(us), np.ones(len(us))
+    for _ in range(_INSIDE_STEPS):
+        if not r.any():
+            break
+        normal = np.einsum("nkv,nkw->nvw", slopes, slopes)
+        normal += damping[:, None, None] * np.eye(us.shape[1])
+        step = np.linalg.solve(normal, np.einsum("nkv,nk->nv", slopes, r)[:, :, None])[:, :, 0]
+        tried = np.clip(us - step, 0, 1)
+        other, other_slopes = lacking(tried)
+        better = (other**2).sum(axis=1) < (r**2).sum(axis=1)
+        us = np.where(better[:, None], tried, us)
+        r = np.where(better[:, None], other, r)
+        slopes = np.where(better[:, None, None], other_slopes, slopes)
+        damping = np.clip(np.where(better, damping / 5, damping * 3), 1e-6, 1e6)
+    return us
+
+
 def choose_starts(own: np.ndarray, designs: np.ndarray, rows: np.ndarray, count: int):
     """Starts (count, v) and the scale of the objective.
 
@@ -297,19 +358,19 @@ class _Functions:
     scale: float  # of the objective
     extra: bool
     seen: list[np.ndarray] = dataclasses.field(default_factory=list)  # where rows were asked for
-    _rows: Any = None
+    _known: dict[bytes, Any] = dataclasses.field(default_factory=dict)
 
     def at(self, z):
         """Rows and their Jacobians at z, which is u (v,) or, with the extra variable, (u, t)."""
         u = np.clip(z[:-1] if self.extra else z, 0, 1)
-        if self._rows is None or not np.array_equal(self.seen[-1], u):
+        if u.tobytes() not in self._known:
             rows, jacobians = self.rows_at(u)
             rows = np.nan_to_num(rows, nan=_UNKNOWN, posinf=_UNKNOWN, neginf=-_UNKNOWN)
             scale = np.where(np.arange(rows.shape[1]) == 0, self.scale, 1)
             jacobians = np.nan_to_num(jacobians, posinf=0, neginf=0)
-            self._rows = rows / scale, jacobians / scale[:, None]
+            self._known[u.tobytes()] = rows / scale, jacobians / scale[:, None]
             self.seen.append(u.copy())
-        return self._rows
+        return self._known[u.tobytes()]
 
     def objective(self, z):
         """Value and gradient."""
@@ -412,15 +473,28 @@ class Search:
         The first of those whose ends are equally good: the given design leads the starts, and its
         way begins where the reader does. Last, ways and ends of `least_growth`, if all failed.
         """
-        paths, found = self._solve(starts, progress)
+        problem, lowest = self.evaluator.problem, None
+        paths, found = self._landed(starts, progress)
+        plain = problem.cuts is None and problem.cycles is None
+        if (found.worst > 0).all():
+            if plain and problem.modes:
+                # Of structures each landing takes long. With all else met no other design is as
+                # close to the target.
+                near = paths[int(found.worst.argmin())][-1]
+                lowest = self.least_growth([*starts, near])
+                growth, unmet = self.growth_and_rest(lowest[1])
+                least = int(np.where(unmet <= 0, growth, np.inf).argmin())
+                if unmet[least] <= 0 < growth[least]:
+                    return lowest[0][least], lowest[1].of(least), len(starts), lowest
+            if lowest is None or not (lowest[1].worst <= 0).any():
+                paths, found = self._closest(paths, found)
         failed = found.worst > 0
         if failed.all():
-            model = found.residuals[:, : self.evaluator.problem.model_residuals]
+            model = found.residuals[:, : problem.model_residuals]
             best = int(np.lexsort((found.worst, model.max(axis=1, initial=0)))[0])
-            problem, lowest = self.evaluator.problem, None
-            if problem.cuts is None and problem.cycles is None:
+            if lowest is None and plain:
                 lowest = self.least_growth([*starts, paths[best][-1]])
-                met = lowest[1].worst <= 0
+            met = np.zeros(0, bool) if lowest is None else lowest[1].worst <= 0
             if lowest is None or not met.any():
                 return paths[best], found.of(best), len(starts), lowest
             # There is a design that meets all after all.
@@ -439,12 +513,8 @@ class Search:
             return again, polished, count, None
         return paths[best], found.of(best), count, None
 
-    def _solve(self, starts, progress):
-        """The ways from all starts, and what their ends are.
-
-        Where none meets every requirement they end inside the model, if that is possible, and
-        there as close as can be to all the rest.
-        """
+    def _landed(self, starts, progress):
+        """The ways from all starts, and what their ends are."""
         problem = self.evaluator.problem
         paths = self._land([start[None] for start in starts], progress=progress)
         found = self._ends(paths)
@@ -455,8 +525,14 @@ class Search:
             for i, path in zip(lost, landed, strict=True):
                 paths[i] = path
             found = self._ends(paths)
-        if (found.worst <= 0).any():
-            return paths, found
+        return paths, found
+
+    def _closest(self, paths, found):
+        """Ways of which none ends where all is met, on to as close as can be, and their ends.
+
+        Inside the model, if that is possible, and there as close as can be to all the rest.
+        """
+        problem = self.evaluator.problem
         model = np.arange(len(problem.residual_names)) < problem.model_residuals
         # Into the model, on to the rest of the requirements, and if they hold to the objective.
         for violated in (model, ~model, None):
@@ -484,13 +560,26 @@ class Search:
         others = self.evaluator.problem.asked & ~growing
         others[0] = False
         paths = self._ways([start[None] for start in starts], growing, others)
-        found = self._ends(paths)
-        unmet = found.rows[:, others[: found.rows.shape[1]]].max(axis=1, initial=-np.inf) > 0
-        lost = np.flatnonzero(unmet).tolist()
+        lost = np.flatnonzero(self.growth_and_rest(self._ends(paths))[1] > 0).tolist()
         again = [starts[i][None] for i in lost]
         for i, way in zip(lost, self._ways(again, growing, others, restored=True), strict=True):
             paths[i] = way
         return paths, self._ends(paths)
+
+    def least_unmet(self, starts: Sequence[np.ndarray]) -> tuple[list[np.ndarray], Evaluation]:
+        """As `least_growth`, to the least of the largest other residual, whatever grows."""
+        others = self.evaluator.problem.asked & ~self.growing
+        others[0] = False
+        paths = self._ways([start[None] for start in starts], others, np.zeros_like(others))
+        return paths, self._ends(paths)
+
+    def growth_and_rest(self, found: Evaluation) -> tuple[np.ndarray, np.ndarray]:
+        """The largest residuals (n,) of growth rates, and of all other requirements."""
+        growing = self.growing[: found.rows.shape[1]]
+        others = ~growing & (np.arange(len(growing)) > 0)
+        return found.rows[:, growing].max(axis=1), found.rows[:, others].max(
+            axis=1, initial=-np.inf
+        )
 
     @property
     def growing(self) -> np.ndarray:
@@ -515,8 +604,10 @@ class Search:
             aim[asked] = np.append(False, violated)
             limited &= asked & (columns < aim.argmax())
         elif problem.least_growth:
-            # The largest of many modes has kinks where they change places; each has none.
-            aim, limited = ~asked, limited & asked
+            # The largest of many modes has kinks where they change places; each has none. What
+            # is minimised needs no limit of its own.
+            own = self.growing & (columns < problem.growth_columns.start + problem.modes)
+            aim, limited = ~asked, limited & asked & ~own
         elif problem.smooth:
             limited &= ~self.growing
         return self._ways(paths, aim, limited, progress, restored)

@@ -121,6 +121,30 @@ def test_bounds_and_requirements_hold_it_as_well():
     assert found.held_by == pytest.approx({"growth_rate <= target": 1.0, "most": 0.05}, abs=1e-6)
 
 
+def test_requirements_that_contradict_one_another_are_named():
+    """p <= 0.2 and p >= 0.6: both lack 0.2 at p = 0.4, where half the weight is on each."""
+    x = one_damper(p=0.1, q=0.2, r=0.3)
+
+    def small(x):
+        return x.parameters["p"] - 0.2
+
+    def large(x):
+        return 0.6 - x.parameters["p"]
+
+    asked: Any = dict(constraints=[small, large], starts=2, lattice=4, progress=False)
+    best = fj.design(x, BOUNDS, None, -0.1, **asked)
+    found = best.least_growth
+    assert best.result == DesignResult.infeasible and found is not None and not found.met
+    assert found.values["p"] == pytest.approx(0.4, abs=1e-6)
+    assert found.unmet == pytest.approx({"small": 0.2, "large": 0.2}, abs=1e-6)
+    assert found.held_by == pytest.approx({"small": 0.5, "large": 0.5}, abs=1e-6)
+    assert found.stationary and found.steepest == pytest.approx(1.99)
+    assert found.agreed == found.starts == 3
+    words = str(best)
+    assert "no design was found to meet, whatever grows: " in words
+    assert "small (0.5), large (0.5)" in words and "0 is asked" in words
+
+
 @pytest.mark.slow
 def test_every_law_has_its_modes():
     """A structure of two joints under its own law and another: rates as of each by itself."""
