@@ -72,6 +72,12 @@ def test_columns_are_aligned():
     assert text == "            a   b\nrow         1   3\nlonger row  22  4"
 
 
+def test_many_columns_are_rows():
+    """So that lines stay short."""
+    lines = table([*"abcdef"], [{"row": str(i), "longer row": "22"} for i in range(6)]).splitlines()
+    assert lines[:2] == ["   row  longer row", "a  0    22"] and len(lines) == 7
+
+
 def cells(text):
     """The lines of a table, cut where two or more spaces stand."""
     return [re.split(r"  +", line.strip()) for line in text.splitlines()]

@@ -1,8 +1,16 @@
 """Aligned text."""
 
+_ABREAST = 5  # columns that fit on a line
+
 
 def table(titles: list[str], columns: list[dict[str, str]]) -> str:
-    """Columns with the same rows as aligned text, row names at the left."""
+    """Columns with the same rows as aligned text, row names at the left; more than five as rows."""
+    if len(titles) > _ABREAST:
+        cells = (
+            [title, *(c[name] for name in columns[0])]
+            for title, c in zip(titles, columns, strict=True)
+        )
+        return aligned([["", *columns[0]], *cells])
     lines = [["", *titles], *([name, *(c[name] for c in columns)] for name in columns[0])]
     return aligned(lines if any(titles) else lines[1:])
 
