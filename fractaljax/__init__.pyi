@@ -100,7 +100,11 @@ from ._stability.stability import (
     growth_rate as growth_rate,
     stability as stability,
 )
-from ._stability.tracks import ModeTracks as ModeTracks, track_modes as track_modes
+from ._stability.tracks import (
+    ModeCrossing as ModeCrossing,
+    ModeTracks as ModeTracks,
+    track_modes as track_modes,
+)
 from ._surface.roughness import Roughness as Roughness, roughness as roughness
 from ._surface.surface import Surface as Surface
 from ._surface.topography import topography as topography

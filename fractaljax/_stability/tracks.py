@@ -14,7 +14,7 @@ becomes small.
 
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -39,10 +39,20 @@ from .quadratic import solve
 
 _SURE = 0.8  # a MAC from which on two modes are the same
 _HALVINGS = 12  # of a step, at most
+_NEUTRAL = 1e-9  # growth rate, of |s|, that does not count
 _PART = 0.48  # of a step, its first "half": a round number would meet the places of coalescence
 _INDEPENDENT = 1e4  # condition of shapes below which they are no single one
 _NONE = complex(np.nan, np.nan)
 _TIE = 0.1  # overlaps of two ways to pair modes that differ by less do not decide
+
+
+class ModeCrossing(NamedTuple):
+    """Where a mode starts to grow, or ceases to, over the quantity of `ModeTracks`."""
+
+    mode: int  # its column
+    value: float  # of the quantity
+    frequency: float  # [Hz]; 0 where static divergence begins
+    starts: bool  # whether it grows above the value
 
 
 class ModeTracks(Record):
@@ -59,6 +69,7 @@ class ModeTracks(Record):
     shapes: Complex[np.ndarray, "p k n"]  # displacements, the largest of each 1
     mac: Float[np.ndarray, "p-1 k"]  # the least within each step; below 0.8 it is no certain match
     x: Any = eqx.field(repr=False)  # the Scene or Structure
+    friction_slope: bool = eqx.field(static=True, default=True)
 
     @property
     def growth_rates(self) -> Float[np.ndarray, "p k"]:
@@ -74,6 +85,33 @@ class ModeTracks(Record):
     def damping_ratios(self) -> Float[np.ndarray, "p k"]:
         """-Re/|s| of each eigenvalue s."""
         return -np.real(self.eigenvalues) / np.abs(self.eigenvalues)
+
+    def crossings(self) -> list[ModeCrossing]:
+        """Where growth rates change sign between two of the values, in the order of the values.
+
+        Each is the root of the growth rate of its own mode, to the rounding of the eigenvalues. A
+        growth rate that is 0 to rounding, as of undamped modes, changes no sign, and two changes
+        between neighbouring values are not seen.
+        """
+        from scipy.optimize import brentq
+
+        growth = self.growth_rates
+        growth = np.where(np.abs(growth) > _NEUTRAL * np.abs(self.eigenvalues), growth, 0)
+        at, found = _modes_of(self.x, self.name, self.friction_slope), []
+        for i, k in np.argwhere(growth[:-1] * growth[1:] < 0).tolist():
+            begin = at(self.values[i])
+            own = int(np.abs(begin.s - self.eigenvalues[i, k]).argmin())
+
+            def eigenvalue(value, begin=begin, own=own):
+                return complex(_step(begin, at(value), at, _HALVINGS)[0].s[own])
+
+            ends = self.values[i], self.values[i + 1]
+            more: Any = {"xtol": 1e-300, "rtol": 1e-14}
+            value: Any = brentq(lambda value: eigenvalue(value).real, *ends, **more)
+            frequency = abs(eigenvalue(value).imag) / (2 * np.pi)
+            starts = (growth[i + 1, k] > 0) == (ends[0] < ends[1])
+            found.append(ModeCrossing(k, float(value), frequency, bool(starts)))
+        return found
 
     def _shown(self):
         yield f"{self.name}: {len(self.values)} values"
@@ -112,11 +150,7 @@ def track_modes(
     flag("friction_slope", friction_slope)
     grid = np.asarray(axis_values(x, name, values), float)
     require_inside(x, {name: grid})
-    whole = with_optional(x, [name])
-
-    def at(value):
-        return _Modes(value, *map(np.asarray, _states(whole, name, value, friction_slope)))
-
+    at = _modes_of(x, name, friction_slope)
     modes, steps, last = [], [], None
     for value in grid:
         found, mac = at(value), np.nan
@@ -149,7 +183,18 @@ def track_modes(
         shapes=np.where(there[..., None], shapes, _NONE),
         mac=np.where(there[1:] & there[:-1], np.stack(steps)[1:, columns], np.nan),
         x=x,
+        friction_slope=friction_slope,
     )
+
+
+def _modes_of(x: Scene | Structure, name: str, friction_slope: bool) -> Callable[[Any], "_Modes"]:
+    """All modes as a function of the quantity's value."""
+    whole = with_optional(x, [name])
+
+    def at(value):
+        return _Modes(value, *map(np.asarray, _states(whole, name, value, friction_slope)))
+
+    return at
 
 
 @functools.partial(jax.jit, static_argnames=("name", "friction_slope"))

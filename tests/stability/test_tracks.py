@@ -115,6 +115,44 @@ def test_coalescence(name, backward):
     np.testing.assert_array_equal(found.damping_ratios, ratio)
 
 
+@pytest.mark.parametrize("c", [1e-3, 0.1])
+@pytest.mark.parametrize("backward", [False, True])
+def test_crossing_of_flutter(c, backward):
+    """s^2 + c s + 2 -+ (1 - 4 mu/3)^.5 = 0 has the root i sqrt(2) where mu = 3/4 (1 + 2 c^2)."""
+    mu = np.linspace(0.4, 1.2, 6)[:: -1 if backward else 1]
+    found = track(hoffmann(c * np.eye(2)), "mu", mu)
+    (crossing,) = found.crossings()
+    assert crossing.value == pytest.approx(0.75 * (1 + 2 * c**2), rel=1e-12)
+    assert crossing.frequency == pytest.approx(np.sqrt(2) / (2 * np.pi), rel=1e-10)
+    assert crossing.starts
+    grows = found.growth_rates[0 if backward else -1] > 0
+    assert np.flatnonzero(grows).tolist() == [crossing.mode]
+
+
+@pytest.mark.parametrize("c", [0.02, 3.0])
+def test_crossing_of_divergence(c):
+    """A spring that loses its stiffness, with little damping and with much."""
+    K = [(None, [[0.3, 0.0], [0.0, 2.0]]), ("-a", [[1.0, 0.0], [0.0, 0.0]])]
+    structure = fj.ParametricStructure(np.eye(2), c * np.eye(2), K, parameters={"a": 0.0})
+    (crossing,) = track(structure, "a", np.linspace(0, 1, 4)).crossings()
+    assert crossing.value == pytest.approx(0.3, abs=1e-12)
+    assert crossing.frequency == 0 and crossing.starts
+
+
+def test_crossings_without_damping():
+    """Neutral modes change no sign, whatever their rounding."""
+    assert track(hoffmann(), "mu", np.linspace(0.1, 0.7, 6)).crossings() == []
+
+
+def test_crossing_of_a_joint_is_its_critical_friction():
+    found = track(two_joints(6), "mu_s", np.linspace(0.31, 1.2, 6))
+    for crossing in found.crossings():
+        s: Any = np.asarray(fj.stability(two_joints(6).replace(mu_s=crossing.value)).eigenvalues)
+        near = s[np.abs(s - 2j * np.pi * crossing.frequency).argmin()]
+        assert abs(near.real) < 1e-11 * abs(near)
+    assert len(found.crossings()) > 0
+
+
 def brute_force(structure, name, values, steps):
     """Eigenvalues (p, k) at the values, each nearest to its own one small step before."""
     at = np.arange((len(values) - 1) * steps + 1) / steps
