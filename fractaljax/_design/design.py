@@ -32,18 +32,9 @@ from .envelope import Envelope, condition_text
 from .limit import LeastGrowth, least_growth
 from .problem import DEFAULT_BOUNDS, DesignProblem, describe, state_problem
 from .quiet import VERIFIED, Kicks, quiet
-from .search import (
-    Evaluation,
-    Found,
-    Search,
-    Solver,
-    choose_starts,
-    evaluator_of,
-    screened_designs,
-    slsqp,
-    slsqp_in_steps,
-    within_joints,
-)
+from .search import Evaluation, Found, Search, evaluator_of
+from .solvers import Solver, slsqp, slsqp_in_steps
+from .starts import choose_starts, screened_designs, within_joints
 from .summary import comparison_table
 from .tolerance import Tolerance, squeal_probability
 

@@ -83,9 +83,8 @@ def least_growth(search: Search, paths: list[np.ndarray], found: Evaluation) -> 
     """What holds the least growth rate at the ends of `Search.least_growth`."""
     problem = search.evaluator.problem
     target, scale = float(problem.target), float(problem.growth_scale)
-    named = np.arange(1 + len(problem.residual_names))
-    growing = search.growing[: len(named)]
-    others = ~growing & (named > 0)
+    count = 1 + len(problem.residual_names)
+    growing, others = search.growing[:count], search.others[:count]
     growth, unmet = search.growth_and_rest(found)
     if not (unmet <= 0).any():
         paths, found = search.least_unmet([path[-1] for path in paths])
@@ -96,10 +95,10 @@ def least_growth(search: Search, paths: list[np.ndarray], found: Evaluation) -> 
     if possible[best]:
         near = _AGREE * max(abs(rates[best]), abs(rates[best] - target), scale)
         agreed = possible & (np.abs(rates - rates[best]) <= near)
-        held, slope, steepest = _held_by(search.evaluator, u, growing, others)
+        held, slope, steepest = _held_by(search, u, growing, others)
     else:
         agreed = unmet <= (1 + _AGREE) * unmet[best]
-        held, slope, steepest = _held_by(search.evaluator, u, others, np.zeros_like(others))
+        held, slope, steepest = _held_by(search, u, others, np.zeros_like(others))
     lacking = {
         name: float(residual)
         for name, residual, other in zip(problem.residual_names, residuals, others[1:], strict=True)
@@ -118,19 +117,18 @@ def least_growth(search: Search, paths: list[np.ndarray], found: Evaluation) -> 
     )
 
 
-def _held_by(evaluator: Evaluator, u: np.ndarray, aim: np.ndarray, limited: np.ndarray) -> Any:
+def _held_by(search: Search, u: np.ndarray, aim: np.ndarray, limited: np.ndarray) -> Any:
     """Multipliers by name, what they leave of the slopes, and the steepest slope.
 
     Of the largest in `aim` (1 + k,), of what is `limited`, and of bounds; of growth rates [1/s].
     """
     from scipy.optimize import nnls
 
-    problem = evaluator.problem
-    row, slopes = _linearised(evaluator, u)
+    problem = search.evaluator.problem
+    row, slopes = _linearised(search.evaluator, u)
     names = ["objective", *problem.residual_names]
     row, slopes = row[: len(names)], slopes[: len(names)]
-    growing = np.zeros(len(names), bool)
-    growing[problem.growth_columns] = True
+    growing = search.growing[: len(names)]
     with np.errstate(over="ignore"):  # far from any target
         scale = np.where(growing, float(problem.growth_scale) * np.cosh(row), 1.0)
     slopes = slopes * scale[:, None]

@@ -61,6 +61,7 @@ DEFAULT_BOUNDS: dict[str, tuple[float, float]] = {"D": (2.1, 2.9), "G": (1e-12, 
 
 _LOOKED_AT = 15  # designs, besides the given one, in which growing modes are counted
 _MODES_MOST = 16  # that requirements are made of
+UNKNOWN = 1e3  # stands for a residual without a number
 _BATCH = 32  # designs, each at one condition, evaluated at once
 # Structures take so long that filling up a batch costs more than a call.
 _BATCH_OF_STRUCTURES, _SMALL = 8, 16  # of at most so many degrees of freedom; of larger ones 1

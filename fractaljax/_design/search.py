@@ -16,68 +16,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._base.parts import brief, scalar
-from .._base.ranges import low_discrepancy
 from .envelope import ALONE, Envelope
-from .problem import DesignProblem, evaluate, limits_of_joints, linearise
-
-Solver = Callable[[Callable, Callable, np.ndarray, np.ndarray], np.ndarray]
+from .problem import UNKNOWN, DesignProblem, evaluate, linearise
+from .solvers import Solver
 
 _LIKELY = 8  # conditions of a first guess at the worst
 _ROUNDS = 12  # of the exchange
 _FEW = 2  # variables, in which a lattice of starts leaves nothing to restore
-_INSIDE, _INSIDE_STEPS = 0.01, 40  # by how much designs that are screened are inside the limits
 _RESTORING = 30  # steps from a start to where all requirements are met
-_STEP, _STEPS, _STEP_ITERATIONS = 0.25, 12, 10  # of a design among many joints, in its bounds
 _NEW = 1e-7  # by which a condition must be worse than the working ones
 _NEAR = 0.05  # a requirement met by more than this on the grid is met between its points
-_UNKNOWN = 1e3  # stands for a residual without a number
-_PENALTY = 10.0  # of unmet requirements, by which starts are ranked
 _TEMPERATURE = 0.02  # of the smooth maximum over an envelope
-
-
-def slsqp(objective: Callable, constraints: Callable, start: np.ndarray, bounds: np.ndarray):
-    """The default solver: SciPy's sequential quadratic programming.
-
-    Any other has this signature: `objective(z)` gives a value and its gradient (n,),
-    `constraints(z)` residuals (k,), at most 0 where met, and their Jacobian (k, n); `start` (n,),
-    `bounds` (n, 2). It returns a point (n,).
-    """
-    return _slsqp(objective, constraints, start, bounds).x
-
-
-def slsqp_in_steps(
-    objective: Callable, constraints: Callable, start: np.ndarray, bounds: np.ndarray
-):
-    """`slsqp` within a box about the design, which goes along with it.
-
-    Far from the requirements of many joints their slopes promise too much: without a box most
-    starts end where joints are plastic, which have no slope that leads back.
-    """
-    z = np.asarray(start, float)
-    for _ in range(_STEPS):
-        box = _box(z, bounds)
-        found = _slsqp(objective, constraints, z, box, _STEP_ITERATIONS, 1e-8)
-        stuck, z = np.abs(found.x - z).max() < 1e-8, found.x
-        held = (z <= box[:, 0]) & (box[:, 0] > bounds[:, 0])
-        held |= (z >= box[:, 1]) & (box[:, 1] < bounds[:, 1])
-        if stuck or (found.success and not held.any()):
-            break
-    return _slsqp(objective, constraints, z, _box(z, bounds)).x
-
-
-def _box(z: np.ndarray, bounds: np.ndarray) -> np.ndarray:
-    """Bounds no further from z than a step; what has none, such as a largest residual, is free."""
-    step = np.where(np.isfinite(bounds).all(axis=1), _STEP, np.inf)
-    return np.stack([np.maximum(bounds[:, 0], z - step), np.minimum(bounds[:, 1], z + step)], 1)
-
-
-def _slsqp(objective, constraints, start, bounds, iterations=100, ftol=1e-12) -> Any:
-    from scipy.optimize import minimize
-
-    fun, jac = (lambda z: -constraints(z)[0]), (lambda z: -constraints(z)[1])
-    limits = {"type": "ineq", "fun": fun, "jac": jac}
-    more: Any = {"method": "SLSQP", "options": {"ftol": ftol, "maxiter": iterations}}
-    return minimize(objective, start, jac=True, bounds=bounds, constraints=limits, **more)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -277,68 +226,6 @@ def expected_shortfall(count: int, alpha: float) -> np.ndarray:
 # --- starts --------------------------------------------------------------------------------
 
 
-def screened_designs(lattice: int, variables: int) -> np.ndarray:
-    """Scaled designs (n, v): a lattice, in more than two variables a low-discrepancy set."""
-    if variables > 2:
-        return low_discrepancy(lattice**2, variables)
-    side = (np.arange(lattice) + 0.5) / lattice
-    axes = np.meshgrid(*[side] * variables, indexing="ij")
-    return np.stack([axis.ravel() for axis in axes], axis=1)
-
-
-def within_joints(problem: DesignProblem, us: np.ndarray) -> np.ndarray:
-    """Designs us (n, v) moved to where every joint is inside its limits, as far as that goes.
-
-    Of many joints a design that is drawn has nearly always one outside, where no growth rate says
-    anything. Their limits take no eigenvalues. By Levenberg and Marquardt's method.
-    """
-
-    def lacking(us):
-        residuals, slopes = limits_of_joints(problem, us)
-        r = np.maximum(np.nan_to_num(residuals, nan=_UNKNOWN) + _INSIDE, 0)
-        return r, np.nan_to_num(slopes) * (r > 0)[:, :, None]
-
-    (r, slopes), damping = lacking(us), np.ones(len(us))
-    for _ in range(_INSIDE_STEPS):
-        if not r.any():
-            break
-        normal = np.einsum("nkv,nkw->nvw", slopes, slopes)
-        normal += damping[:, None, None] * np.eye(us.shape[1])
-        step = np.linalg.solve(normal, np.einsum("nkv,nk->nv", slopes, r)[:, :, None])[:, :, 0]
-        tried = np.clip(us - step, 0, 1)
-        other, other_slopes = lacking(tried)
-        better = (other**2).sum(axis=1) < (r**2).sum(axis=1)
-        us = np.where(better[:, None], tried, us)
-        r = np.where(better[:, None], other, r)
-        slopes = np.where(better[:, None, None], other_slopes, slopes)
-        damping = np.clip(np.where(better, damping / 5, damping * 3), 1e-6, 1e6)
-    return us
-
-
-def choose_starts(own: np.ndarray, designs: np.ndarray, rows: np.ndarray, count: int):
-    """Starts (count, v) and the scale of the objective.
-
-    The given design first, then the most promising of distinct basins, then an even spread.
-    """
-    from scipy.spatial import KDTree
-
-    values, finite, scale = rows[:, 0], np.isfinite(rows[:, 0]), 1.0
-    if finite.any():
-        low, high = np.quantile(values[finite], [0.1, 0.9])
-        scale = float(high - low) or 1.0
-    merit = values / scale + _PENALTY * np.maximum(rows[:, 1:], 0).sum(axis=1)
-    merit = np.where(finite, merit, np.inf)
-    variables = designs.shape[1]
-    neighbours = min(3**variables if variables < 3 else 4 * variables, len(designs))
-    near = KDTree(designs).query(designs, neighbours)[1].reshape(len(designs), -1)
-    basin = np.isfinite(merit) & (merit <= merit[near].min(axis=1))
-    ranked = np.argsort(merit, kind="stable")
-    ranked = np.concatenate([ranked[basin[ranked]], ranked[~basin[ranked]]])
-    promising, rest = ranked[: count // 2], np.sort(ranked[count // 2 :])
-    even = rest[np.linspace(0, len(rest) - 1, count - count // 2).astype(int)][1:]
-    return np.concatenate([own[None], designs[promising], designs[even]])[:count], scale
-
-
 # --- landing on the constraints ------------------------------------------------------------
 
 
@@ -365,7 +252,7 @@ class _Functions:
         u = np.clip(z[:-1] if self.extra else z, 0, 1)
         if u.tobytes() not in self._known:
             rows, jacobians = self.rows_at(u)
-            rows = np.nan_to_num(rows, nan=_UNKNOWN, posinf=_UNKNOWN, neginf=-_UNKNOWN)
+            rows = np.nan_to_num(rows, nan=UNKNOWN, posinf=UNKNOWN, neginf=-UNKNOWN)
             scale = np.where(np.arange(rows.shape[1]) == 0, self.scale, 1)
             jacobians = np.nan_to_num(jacobians, posinf=0, neginf=0)
             self._known[u.tobytes()] = rows / scale, jacobians / scale[:, None]
@@ -556,9 +443,7 @@ class Search:
 
         The largest of all growth rates is minimised, whatever the target.
         """
-        growing = self.growing
-        others = self.evaluator.problem.asked & ~growing
-        others[0] = False
+        growing, others = self.growing, self.others
         paths = self._ways([start[None] for start in starts], growing, others)
         lost = np.flatnonzero(self.growth_and_rest(self._ends(paths))[1] > 0).tolist()
         again = [starts[i][None] for i in lost]
@@ -568,24 +453,28 @@ class Search:
 
     def least_unmet(self, starts: Sequence[np.ndarray]) -> tuple[list[np.ndarray], Evaluation]:
         """As `least_growth`, to the least of the largest other residual, whatever grows."""
-        others = self.evaluator.problem.asked & ~self.growing
-        others[0] = False
+        others = self.others
         paths = self._ways([start[None] for start in starts], others, np.zeros_like(others))
         return paths, self._ends(paths)
 
     def growth_and_rest(self, found: Evaluation) -> tuple[np.ndarray, np.ndarray]:
         """The largest residuals (n,) of growth rates, and of all other requirements."""
-        growing = self.growing[: found.rows.shape[1]]
-        others = ~growing & (np.arange(len(growing)) > 0)
-        return found.rows[:, growing].max(axis=1), found.rows[:, others].max(
-            axis=1, initial=-np.inf
-        )
+        k = found.rows.shape[1]
+        growing, others = (found.rows[:, mask[:k]] for mask in (self.growing, self.others))
+        return growing.max(axis=1), others.max(axis=1, initial=-np.inf)
 
     @property
     def growing(self) -> np.ndarray:
         """Which columns of a row are growth rates."""
         columns = np.arange(len(self.evaluator.problem.asked))
         return np.isin(columns, columns[self.evaluator.problem.growth_columns])
+
+    @property
+    def others(self) -> np.ndarray:
+        """Which columns of a row are requirements, but of growth rates."""
+        others = self.evaluator.problem.asked & ~self.growing
+        others[0] = False  # the objective
+        return others
 
     def _ends(self, paths) -> Evaluation:
         return self.evaluator.evaluate(np.array([path[-1] for path in paths]))

@@ -9,7 +9,8 @@ import fractaljax as fj
 from fractaljax._design.design import screened, solver_of
 from fractaljax._design.joints import state_of, states_of
 from fractaljax._design.problem import limits_of_joints, linearise, state_problem
-from fractaljax._design.search import screened_designs, slsqp, slsqp_in_steps
+from fractaljax._design.solvers import slsqp, slsqp_in_steps
+from fractaljax._design.starts import screened_designs
 from structures import two_joints
 
 NONE: dict[str, Any] = dict.fromkeys(("objective", "target", "envelope", "tolerance"))

@@ -7,16 +7,9 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
-from fractaljax._design.search import (
-    _Functions,
-    averaged,
-    choose_starts,
-    expected_shortfall,
-    in_lockstep,
-    screened_designs,
-    slsqp,
-    slsqp_in_steps,
-)
+from fractaljax._design.search import _Functions, averaged, expected_shortfall, in_lockstep
+from fractaljax._design.solvers import slsqp, slsqp_in_steps
+from fractaljax._design.starts import choose_starts, screened_designs
 from tools import reference_scene
 
 

@@ -1,0 +1,71 @@
+"""Designs that are screened, and those of them from which a search starts."""
+
+import numpy as np
+
+from .._base.ranges import low_discrepancy
+from .problem import UNKNOWN, DesignProblem, limits_of_joints
+
+_INSIDE, _INSIDE_STEPS = 0.01, 40  # by how much designs that are screened are inside the limits
+_PENALTY = 10.0  # of unmet requirements, by which starts are ranked
+
+
+def screened_designs(lattice: int, variables: int) -> np.ndarray:
+    """Scaled designs (n, v): a lattice, in more than two variables a low-discrepancy set."""
+    if variables > 2:
+        return low_discrepancy(lattice**2, variables)
+    side = (np.arange(lattice) + 0.5) / lattice
+    axes = np.meshgrid(*[side] * variables, indexing="ij")
+    return np.stack([axis.ravel() for axis in axes], axis=1)
+
+
+def within_joints(problem: DesignProblem, us: np.ndarray) -> np.ndarray:
+    """Designs us (n, v) moved to where every joint is inside its limits, as far as that goes.
+
+    Of many joints a design that is drawn has nearly always one outside, where no growth rate says
+    anything. Their limits take no eigenvalues. By Levenberg and Marquardt's method.
+    """
+
+    def lacking(us):
+        residuals, slopes = limits_of_joints(problem, us)
+        r = np.maximum(np.nan_to_num(residuals, nan=UNKNOWN) + _INSIDE, 0)
+        return r, np.nan_to_num(slopes) * (r > 0)[:, :, None]
+
+    (r, slopes), damping = lacking(us), np.ones(len(us))
+    for _ in range(_INSIDE_STEPS):
+        if not r.any():
+            break
+        normal = np.einsum("nkv,nkw->nvw", slopes, slopes)
+        normal += damping[:, None, None] * np.eye(us.shape[1])
+        step = np.linalg.solve(normal, np.einsum("nkv,nk->nv", slopes, r)[:, :, None])[:, :, 0]
+        tried = np.clip(us - step, 0, 1)
+        other, other_slopes = lacking(tried)
+        better = (other**2).sum(axis=1) < (r**2).sum(axis=1)
+        us = np.where(better[:, None], tried, us)
+        r = np.where(better[:, None], other, r)
+        slopes = np.where(better[:, None, None], other_slopes, slopes)
+        damping = np.clip(np.where(better, damping / 5, damping * 3), 1e-6, 1e6)
+    return us
+
+
+def choose_starts(own: np.ndarray, designs: np.ndarray, rows: np.ndarray, count: int):
+    """Starts (count, v) and the scale of the objective.
+
+    The given design first, then the most promising of distinct basins, then an even spread.
+    """
+    from scipy.spatial import KDTree
+
+    values, finite, scale = rows[:, 0], np.isfinite(rows[:, 0]), 1.0
+    if finite.any():
+        low, high = np.quantile(values[finite], [0.1, 0.9])
+        scale = float(high - low) or 1.0
+    merit = values / scale + _PENALTY * np.maximum(rows[:, 1:], 0).sum(axis=1)
+    merit = np.where(finite, merit, np.inf)
+    variables = designs.shape[1]
+    neighbours = min(3**variables if variables < 3 else 4 * variables, len(designs))
+    near = KDTree(designs).query(designs, neighbours)[1].reshape(len(designs), -1)
+    basin = np.isfinite(merit) & (merit <= merit[near].min(axis=1))
+    ranked = np.argsort(merit, kind="stable")
+    ranked = np.concatenate([ranked[basin[ranked]], ranked[~basin[ranked]]])
+    promising, rest = ranked[: count // 2], np.sort(ranked[count // 2 :])
+    even = rest[np.linspace(0, len(rest) - 1, count - count // 2).astype(int)][1:]
+    return np.concatenate([own[None], designs[promising], designs[even]])[:count], scale
