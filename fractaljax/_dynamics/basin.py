@@ -182,7 +182,7 @@ def _advance(system: HybridSystem, modes: _Modes, lanes: _Lanes) -> _Lanes:
 
     def one(_, carry):
         y, s, guard, seen, returns, switches = carry
-        y, s, _, guard = step(system, y, s, guard, h)
+        y, s, _, guard, _ = step(system, y, s, guard, h)
         returned = guard == SECTION
         seen = jnp.where(returned[None], y, seen)
         return y, s, guard, seen, returns + returned, switches + (guard > 0)

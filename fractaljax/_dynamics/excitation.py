@@ -144,4 +144,5 @@ def excited_system(mechanism: Any, excitation: Excitation | None) -> HybridSyste
         L=jnp.pad(system.L * r**2, ((0, 0), (0, 1))),
         P=system.P * r,
         excited=True,
-    )
+        fastest=None if system.fastest is None else jnp.maximum(system.fastest * r, Omega),
+    ).with_products()

@@ -9,6 +9,7 @@ or 2 (open, both faces of a joint together). Components are the first axis; lane
 
 import functools
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -27,6 +28,14 @@ OPEN = 2
 SECTION, NONE, UNUSED = 0, -1, -2
 _SMOOTH = 1e-4  # of the way to the opening: nearer, what a load curve adds is below rounding
 _FEW = 4  # degrees of freedom up to which products are written out, which compile into one loop
+
+
+class Products(eqx.Module):
+    """What a field takes of a state in one product: each would take as long as all together."""
+
+    matrix: Float[Array, "3f+n 2n"]  # L x, T u, T (K x + C u), K x + C u
+    W: Float[Array, "f f"]  # T B
+    F: Float[Array, " f"]  # T F
 
 
 class HybridSystem(eqx.Module):
@@ -50,6 +59,19 @@ class HybridSystem(eqx.Module):
     opens: tuple[bool, ...] = eqx.field(static=True)  # whether a joint can open
     # Whether the last degree of freedom is the phase of an excitation: excitation.py.
     excited: bool = eqx.field(static=True, default=False)
+    # Of many degrees of freedom: what no rate of the mechanism without friction exceeds, by little.
+    # Steps then follow the motion's own rates. None: 1.
+    fastest: Float[Array, ""] | None = None
+    products: "Products | None" = None  # of many degrees of freedom
+
+    def with_products(self) -> "HybridSystem":
+        """With them, if it has many degrees of freedom; T, B, K and C are matrices then."""
+        if self.fastest is None:
+            return self
+        both, zero = jnp.concatenate([self.K, self.C], axis=1), jnp.zeros_like(self.T)
+        seen = [jnp.concatenate([self.L, zero], axis=1), jnp.concatenate([zero, self.T], axis=1)]
+        matrix = jnp.concatenate([*seen, self.T @ both, both])
+        return replace(self, products=Products(matrix, self.T @ self.B, self.T @ self.F))
 
     @property
     def n(self) -> int:
@@ -220,24 +242,25 @@ class HybridSystem(eqx.Module):
                 forces[normal] = forces[normal] + linear[tangential] - P * curve(e)
             friction = jnp.stack(forces)
         if s is not None and any(self.opens):
-            # An open joint has no springs: their forces, which K holds, are taken back.
-            loads = self.linear_loads(x)
-            if all(self.opens):
-                pairs = loads.reshape(-1, 2, *loads.shape[1:])
-                taken = jnp.stack([-pairs[:, 1], pairs[:, 0]], axis=1).reshape(loads.shape)
-            else:
-                taken = list(loads)
-                for tangential, normal in (self.faces[j] for j in self._opening):
-                    taken[normal], taken[tangential] = loads[tangential], -loads[normal]
-                taken = jnp.stack(taken)
-            friction = jnp.where(s == OPEN, taken, friction)
+            friction = jnp.where(s == OPEN, self._taken_back(self.linear_loads(x)), friction)
         free = self._leaf(self.F, x.ndim - 1) - self._times(self.K, x) - self._times(self.C, u)
         return free + self._acceleration(friction)
 
+    def _taken_back(self, loads) -> Array:
+        """The spring forces (f, ...), which K holds and an open joint does not have."""
+        if all(self.opens):
+            pairs = loads.reshape(-1, 2, *loads.shape[1:])
+            return jnp.stack([-pairs[:, 1], pairs[:, 0]], axis=1).reshape(loads.shape)
+        taken = list(loads)
+        for tangential, normal in (self.faces[j] for j in self._opening):
+            taken[normal], taken[tangential] = loads[tangential], -loads[normal]
+        return jnp.stack(taken)
+
     def _friction(self, y, signs) -> Array:
         """The friction forces of the faces (f, ...) with these signs of sliding."""
-        w, loads = self.sliding(y[self.n :]), self.loads(y[: self.n])
+        return self._by_laws(self.sliding(y[self.n :]), self.loads(y[: self.n]), signs)
 
+    def _by_laws(self, w, loads, signs) -> Array:
         def force(law, w, load, sign):
             if law.velocity_dependent:
                 # A coarse step may overshoot far beyond w = 0, where a law means nothing.
@@ -267,8 +290,34 @@ class HybridSystem(eqx.Module):
             return solved()
         return jax.lax.cond(jnp.any(held), solved, lambda: jnp.zeros_like(wanted))
 
+    @property
+    def _at_faces(self) -> bool:
+        """Whether forces are found from what is seen of the motion at the faces."""
+        return self.products is not None and not any(self.curves)
+
+    def _seen(self, y, s, rows: slice) -> tuple[Array, ...]:
+        """Loads, w, forces and those of sticking faces (f, ...), and the rest of those products."""
+        f, products, leaf = (
+            len(self.P),
+            self.products,
+            functools.partial(self._leaf, lanes=y.ndim - 1),
+        )
+        loads, along, driven, rest = jnp.split(
+            self._times(products.matrix[rows], y), [f, 2 * f, 3 * f]
+        )
+        loads, w = loads + leaf(self.P), leaf(self.V) - along
+        forces = jnp.where(jnp.abs(s) == 1, self._by_laws(w, loads, s), 0)
+        if any(self.opens):
+            forces = jnp.where(s == OPEN, self._taken_back(loads), forces)
+        accelerations = leaf(products.F) - driven + self._times(products.W, forces)
+        return loads, w, forces, self.held(accelerations, s == 0), rest
+
     def field(self, y, s) -> Array:
         """dy/dt in contact state s. A sticking face must have w = 0."""
+        if self._at_faces:
+            _, _, forces, held, driven = self._seen(y, s, slice(None))
+            free = self._leaf(self.F, y.ndim - 1) - driven
+            return jnp.concatenate([y[self.n :], free + self._acceleration(forces + held)])
         acceleration = self._driven(y, self._slipping(y, s), s)
         stick = s == 0
         if self.B is None:
@@ -304,12 +353,15 @@ class HybridSystem(eqx.Module):
         its two limits; of a joint that can open its closure, or minus that while open.
         """
         x, u = y[: self.n], y[self.n :]
-        w, loads = self.sliding(u), self.loads(x)
-        one = jnp.ones_like(w)
-        if self.B is None:
-            force = -self._driven(y, jnp.zeros_like(w), s)
+        if self._at_faces:
+            loads, w, _, force, _ = self._seen(y, s, slice(3 * len(self.P)))
         else:
-            force = self.held(self.along(self._driven(y, self._slipping(y, s), s)), s == 0)
+            w, loads = self.sliding(u), self.loads(x)
+            if self.B is None:
+                force = -self._driven(y, jnp.zeros_like(w), s)
+            else:
+                force = self.held(self.along(self._driven(y, self._slipping(y, s), s)), s == 0)
+        one = jnp.ones_like(w)
         limits, slip, stick = self.limits(loads), jnp.abs(s) == 1, s == 0
         lower = jnp.where(slip, s * w, jnp.where(stick, limits - force, one))
         upper = jnp.where(stick, limits + force, one)

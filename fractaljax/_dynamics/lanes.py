@@ -82,6 +82,10 @@ def product(A, B) -> Array:
     """A @ B of each lane; a small one as a sum, which compiles into one loop with the rest."""
     if len(A) <= _SUMMED:
         return jnp.sum(A[:, :, None] * B[None], axis=1)
+    if A[0, 0].size == B[0, 0].size == 1:
+        # Of one lane the library's product, which takes no other axes as they lie.
+        lanes = jnp.broadcast_shapes(A.shape[2:], B.shape[2:])
+        return (A.reshape(A.shape[:2]) @ B.reshape(B.shape[:2])).reshape(len(A), B.shape[1], *lanes)
     return jnp.einsum("ij...,jk...->ik...", A, B)
 
 

@@ -21,7 +21,7 @@ from .events import Cubic, first_root, rounding
 from .excitation import Excitation, excited_system
 from .hybrid import NONE, OPEN, HybridSystem
 from .orbit import Maps, Segments, flow, maps, next_start, orbit
-from .scaled import check_rtol, degrees_of_freedom, scaled_start, start_state
+from .scaled import FEW, check_rtol, degrees_of_freedom, scaled_start, start_state
 
 if TYPE_CHECKING:
     from diffrax import AbstractSolver
@@ -122,7 +122,7 @@ def _monodromy(system: HybridSystem, segments: Segments, local: Maps) -> Float[A
     speed = jnp.where(switches, jnp.sum(local.c * before, axis=0), 1)
     jump = jnp.where(switches[None], (after - before) / speed[None], 0)
     eye = jnp.eye(len(ends), dtype=ends.dtype)
-    M = jnp.einsum("ijn,jkn->nik", eye[:, :, None] + jump[:, None] * local.c[None], local.A)
+    M = jnp.einsum("ijn,njk->nik", eye[:, :, None] + jump[:, None] * local.c[None], local.A)
     product, _ = jax.lax.scan(lambda product, M: (M @ product, None), eye, M)
     return product
 
@@ -138,7 +138,8 @@ def _limit_cycle(
         (system, system.equilibrium(), growth / system.omega)
     )
     y = scaled_start(system, start)
-    h = jnp.asarray(0.25 * (rtol / 1e-9) ** 0.125, y.dtype)
+    h = 0.25 if system.fastest is None else 0.2  # a finer mesh would take a second solution
+    h = jnp.asarray(h * (rtol / 1e-9) ** 0.125, y.dtype)
     max_returns = max_returns.astype(y.dtype)
     found = search.find(
         frozen, y, equilibrium, growth, max_returns, h, jnp.asarray(rtol, y.dtype), segments
@@ -216,8 +217,8 @@ def _needs_more_segments(cycle: LimitCycle, count: int) -> bool:
     """Known only of one cycle outside of a compiled program."""
     if concrete(cycle.period) is None or cycle.period.ndim:
         return False
-    # Eight times the default keeps 16,384 steps: a motion without a period shall not take longer.
-    too_long = bool(cycle.result == CycleResult.too_long) and count == _SEGMENTS
+    # 512 segments keep 16,384 steps: a motion without a period shall not take longer.
+    too_long = bool(cycle.result == CycleResult.too_long) and count < 8 * _SEGMENTS
     return too_long or bool(cycle.result == CycleResult.inaccurate)
 
 
@@ -265,8 +266,9 @@ def limit_cycle(
     - `rtol`: relative tolerance of period and states, 1e-9 by default and at least 9.1e-13; in
       float32 both are 4.9e-4. It sets the number of segments.
     - `max_returns`: returns of the coarse run after which it gives up.
-    - `segments`: most pieces that the orbit is cut into, 64 by default, and 512 where a joint
-      follows its load curve; one return takes some 35.
+    - `segments`: most pieces that the orbit is cut into, 64 by default, 256 for more than 8 degrees
+      of freedom, and 512 where a joint follows its load curve; one return takes some 35, more where
+      the highest frequency is far above that of the motion.
       Outside of compiled programs a longer period gets more; inside, the result says that it
       needs them.
     - `throw`: raise unless the result is `converged`. Otherwise `result` says what was found, and
@@ -286,6 +288,8 @@ def limit_cycle(
     count = _SEGMENTS if segments is None else whole("segments", segments, 16)
     if segments is None and any(x.follows_load_curve for x in joints_of(mechanism).values()):
         count *= 8  # towards an opening segments are short: less than a second compilation
+    elif segments is None and n > FEW:
+        count *= 4  # a period may be long beside that of the highest frequency
     arguments = mechanism, start, excitation, returns
     cycle = _limit_cycle(*arguments, segments=count, rtol=tolerance)
     while segments is None and count < _MOST_SEGMENTS and _needs_more_segments(cycle, count):

@@ -18,11 +18,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .hybrid import NONE, UNUSED, HybridSystem
 from .lanes import product, row_numbers, solve
-from .runge_kutta import runge_kutta
+from .runge_kutta import runge_kutta, stability_polynomial
 
 _ITERATIONS = 20
 _HOPELESS = 8  # iterations after which steps must be small, relative to the orbit
 _COARSE = 0.5  # longest step of a coarse map
+_POWERS = 4  # of a matrix in a polynomial of it
 _BLOCK = 32  # of sums
 _TOGETHER, _LEAST = 256, 16  # segments of all lanes that Newton's method takes at a time
 
@@ -47,7 +48,7 @@ class Segments(eqx.Module):
 class Maps(eqx.Module):
     """Derivatives of each segment's end, and of the guard that ends it."""
 
-    A: Float[Array, "2n 2n N ..."]  # of the end by the state at its start
+    A: Float[Array, "N 2n 2n ..."]  # of the end by the state at its start
     b: Float[Array, "2n N ..."]  # of the end by its duration
     c: Float[Array, "2n N ..."]  # of the guard by the state it ends in; 0 where none ends it
 
@@ -92,16 +93,45 @@ def chosen_guard(system: HybridSystem, y, s, guard) -> Array:
     return jnp.sum(jnp.where(row_numbers(guards) == guard[None], guards, 0), axis=0)
 
 
-def maps(system: HybridSystem, segments: Segments, *, coarse: bool = False) -> tuple[Array, Maps]:
-    """The ends of the segments and their derivatives.
-
-    The `coarse` ones, which Newton's method converges with as well, take a third of the time.
-    """
-    ends, A, b = _maps(system, segments, coarse=coarse)
+def maps(system: HybridSystem, segments: Segments) -> tuple[Array, Maps]:
+    """The ends of the segments and their derivatives."""
+    if system.fastest is None:
+        ends, A, b = _maps(system, segments)
+    else:
+        # The stages of many degrees of freedom fill the cache: one segment at a time.
+        ends, A, b = _one_by_one(functools.partial(_maps, system), segments)
+        ends, b = (jnp.moveaxis(x[:, :, 0], 0, 1) for x in (ends, b))
+        A = A[:, 0]
     return ends, Maps(A, b, _guard_slopes(system, segments))
 
 
-def _maps(system: HybridSystem, segments: Segments, *, coarse: bool):
+def coarse_maps(system: HybridSystem, segments: Segments, count) -> Maps:
+    """Derivatives of the first `count`, less exact, which Newton's method converges with as well.
+
+    They take a third of the time, those of many degrees of freedom a tenth.
+    """
+    if system.fastest is None:
+        given = functools.partial(_maps, system, coarse=True)
+        _, A, b = _of_the_first(given, segments, count)
+    else:
+        A, b = _polynomial_maps(system, segments)
+    return Maps(A, b, _guard_slopes(system, segments))
+
+
+def _one_by_one(function: Callable, segments: Segments) -> Any:
+    """What `function` gives of every segment alone, of an unused one that of no motion."""
+    lanes = segments.duration.ndim - 1
+
+    def one(segment):
+        part = jax.tree.map(lambda x: jnp.expand_dims(x, x.ndim - lanes), segment)
+        nothing = part.y, jnp.moveaxis(_identity(part.y), 2, 0), jnp.zeros_like(part.y)
+        return jax.lax.cond(jnp.any(part.used), lambda: function(part), lambda: nothing)
+
+    front = jax.tree.map(lambda x: jnp.moveaxis(x, _axis(x, lanes), 0), segments)
+    return jax.lax.map(one, front)
+
+
+def _maps(system: HybridSystem, segments: Segments, *, coarse: bool = False):
     """The ends of segments that need not be neighbours, and their derivatives A and b."""
     y, s = segments.y, segments.s
 
@@ -111,8 +141,7 @@ def _maps(system: HybridSystem, segments: Segments, *, coarse: bool):
         tangents = jax.vmap(slope, in_axes=1, out_axes=1)(columns[:, 1:])
         return jnp.concatenate([along[:, None], tangents], axis=1)
 
-    eye = jnp.eye(len(y), dtype=y.dtype).reshape(len(y), len(y), *(1,) * (y.ndim - 1))
-    columns = jnp.concatenate([y[:, None], jnp.broadcast_to(eye, (len(y), *y.shape))], axis=1)
+    columns = jnp.concatenate([y[:, None], _identity(y)], axis=1)
     duration = segments.duration[None, None]
     if coarse:
         parts = jnp.maximum(jnp.ceil(jnp.nanmax(duration) / _COARSE), 1)
@@ -121,7 +150,45 @@ def _maps(system: HybridSystem, segments: Segments, *, coarse: bool):
     else:
         columns = runge_kutta(tableau(), field, columns, duration)
     ends, A = columns[:, 0], columns[:, 1:]
-    return ends, A, system.field(ends, s)
+    return ends, jnp.moveaxis(A, 2, 0), system.field(ends, s)
+
+
+def _polynomial_maps(system: HybridSystem, segments: Segments) -> tuple[Array, Array]:
+    """A and b of neighbours: the step's stability polynomial of the mean Jacobian, and the rate.
+
+    Exact if the field is affine. (In powers of its fourth power, by Paterson and Stockmeyer.)
+    """
+    lanes, eye = segments.duration.ndim - 1, jnp.eye(len(segments.y), dtype=segments.y.dtype)
+    coefficients = stability_polynomial(tableau())
+    blocks = [coefficients[k : k + _POWERS] for k in range(0, len(coefficients), _POWERS)]
+
+    def one(segment):
+        y, end, h, s, used = segment
+
+        def found():
+            _, slope = jax.linearize(lambda y: system.field(y, s), (y + end) / 2)
+            mean = jax.vmap(slope, in_axes=1, out_axes=1)(_identity(y)) * h[None, None]
+            powers = [eye, jnp.moveaxis(mean, (0, 1), (-2, -1))]
+            for _ in range(_POWERS - 1):
+                powers.append(jnp.matmul(powers[-1], powers[1]))
+            A = jnp.zeros_like(powers[1])
+            for block in reversed(blocks):
+                own = sum(c * power for c, power in zip(block.tolist(), powers, strict=False))
+                A = jnp.matmul(A, powers[-1]) + own
+            return jnp.moveaxis(A, (-2, -1), (0, 1)), system.field(end, s)
+
+        return jax.lax.cond(jnp.any(used), found, lambda: (_identity(y), jnp.zeros_like(y)))
+
+    y, s = (jnp.moveaxis(x, _axis(x, lanes), 0) for x in (segments.y, segments.s))
+    given = y, jnp.roll(y, -1, axis=0), segments.duration, s, segments.used
+    A, b = jax.lax.map(one, given)
+    return A, jnp.moveaxis(b, 0, 1)
+
+
+def _identity(y) -> Array:
+    """The tangents (2n, 2n, ...) at states y (2n, ...)."""
+    eye = jnp.eye(len(y), dtype=y.dtype).reshape(len(y), len(y), *(1,) * (y.ndim - 1))
+    return jnp.broadcast_to(eye, (len(y), *y.shape))
 
 
 def _guard_slopes(system: HybridSystem, segments: Segments) -> Array:
@@ -132,6 +199,12 @@ def _guard_slopes(system: HybridSystem, segments: Segments) -> Array:
     return pull(jnp.ones_like(segments.duration))[0]
 
 
+def _axis(x, lanes: int) -> int:
+    """The axis of segments in x (..., N, ...) of so many axes of lanes; of matrices the first."""
+    before = x.ndim - 1 - lanes
+    return before if before < 2 else 0
+
+
 def _of_the_first(function: Callable, segments: Segments, count) -> Any:
     """What `function` gives of segments, of the first `count`: some at a time, zero beyond."""
     length, lanes = len(segments.duration), segments.duration[0].size
@@ -139,8 +212,7 @@ def _of_the_first(function: Callable, segments: Segments, count) -> Any:
     if size == length:
         return function(segments)
 
-    def along(x):
-        return x.ndim - segments.duration.ndim
+    along = functools.partial(_axis, lanes=segments.duration.ndim - 1)
 
     def some(k, found):
         first = jnp.minimum(k * size, length - size)
@@ -179,30 +251,28 @@ def last_of_phase(segments: Segments) -> Int[Array, "N ..."]:
 
 
 def _chain(body: Callable, carry, arrays: tuple, lanes: int, count=None) -> tuple[Any, Array]:
-    """`jax.lax.scan` over segments, the axis of each array before those of lanes.
+    """`jax.lax.scan` over segments.
 
     With `count` over so many: that takes no longer than it must, but has no reverse mode.
     """
+    front = [jnp.moveaxis(x, _axis(x, lanes), 0) for x in arrays]
     if count is None:
-        front = [jnp.moveaxis(x, x.ndim - 1 - lanes, 0) for x in arrays]
         carry, found = jax.lax.scan(body, carry, tuple(front))
         return carry, jnp.moveaxis(found, 0, found.ndim - 1 - lanes)
 
     def at(k):
-        return tuple(
-            jax.lax.dynamic_index_in_dim(x, k, x.ndim - 1 - lanes, keepdims=False) for x in arrays
-        )
+        return tuple(jax.lax.dynamic_index_in_dim(x, k, keepdims=False) for x in front)
 
     one = jax.eval_shape(body, carry, at(0))[1]
-    shape = list(one.shape)
-    shape.insert(len(shape) - lanes, arrays[0].shape[arrays[0].ndim - 1 - lanes])
+    blank = jnp.zeros((len(front[0]), *one.shape), one.dtype)
 
     def step(k, so_far):
         carry, found = so_far
         carry, one = body(carry, at(k))
-        return carry, jax.lax.dynamic_update_index_in_dim(found, one, k, one.ndim - lanes)
+        return carry, jax.lax.dynamic_update_index_in_dim(found, one, k, 0)
 
-    return jax.lax.fori_loop(0, count, step, (carry, jnp.zeros(shape, one.dtype)))
+    carry, found = jax.lax.fori_loop(0, count, step, (carry, blank))
+    return carry, jnp.moveaxis(found, 0, found.ndim - 1 - lanes)
 
 
 def corrections(
@@ -307,16 +377,18 @@ def solve_periodic_orbits(system: HybridSystem, segments: Segments, wanted, reac
     many = jnp.max(jnp.sum(used & wanted[None], axis=0))
     eps, big = jnp.finfo(y.dtype).eps, jnp.finfo(y.dtype).max
     size = 1 + jnp.max(jnp.abs(y), axis=(0, 1))
+    longest_step = jnp.ones_like(size)
+    if system.fastest is not None:
+        # The motion of many degrees of freedom may be far slower than 1.
+        extent = jnp.max(jnp.max(y, axis=1) - jnp.min(y, axis=1), axis=0)
+        longest_step = jnp.maximum(longest_step, extent / 8)
     tolerance = 1e3 * eps * size
-    nothing = Maps(jnp.zeros((len(y), *y.shape), y.dtype), jnp.zeros_like(y), jnp.zeros_like(y))
+    A = jnp.zeros((y.shape[1], len(y), *y[:, 0].shape), y.dtype)
+    nothing = Maps(A, jnp.zeros_like(y), jnp.zeros_like(y))
     far = jnp.where(wanted, big, jnp.inf).astype(y.dtype)
 
     def running(carry):
         return carry[-1] <= _ITERATIONS
-
-    def coarse_maps(segments):
-        _, A, b = _of_the_first(functools.partial(_maps, system, coarse=True), segments, many)
-        return Maps(A, b, _guard_slopes(system, segments))
 
     def body(carry):
         found, local, change, before, count = carry
@@ -329,7 +401,9 @@ def solve_periodic_orbits(system: HybridSystem, segments: Segments, wanted, reac
         # Near the orbit the maps serve again, while they do well.
         stale = going & ((change > 1e-3 * size) | (change > before / 8))
         local = jax.lax.cond(
-            jnp.any(stale) & ~ends_here, lambda: coarse_maps(found.segments), lambda: local
+            jnp.any(stale) & ~ends_here,
+            lambda: coarse_maps(system, found.segments, many),
+            lambda: local,
         )
         parts = jnp.where(ends_here, 2, 1)
 
@@ -356,7 +430,7 @@ def solve_periodic_orbits(system: HybridSystem, segments: Segments, wanted, reac
         new = jnp.where((moved <= reach) & (new < big) & ~hopeless, new, jnp.inf)
         moves = going & ~ends_here & (new < jnp.inf)
         # Far from the orbit a full step may leave the region of convergence.
-        share = jnp.minimum(1, 1 / new)[None]
+        share = jnp.minimum(1, longest_step / new)[None]
         y = jnp.where(moves[None, None], y + share[None] * dy, y)
         y = jnp.where(used[None], y, y[:, :1])
         h = jnp.where(moves[None], h + share * dt, h)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .events import step
+from .events import MOST, step
 from .hybrid import NONE, SECTION, UNUSED, HybridSystem
 from .orbit import Segments, cumulative, flow
 
@@ -40,12 +40,24 @@ class Steps(eqx.Module):
     oldest: Int[Array, ""]  # place of the oldest
 
     @classmethod
-    def along(cls, system: HybridSystem, segments: Segments) -> "Steps":
-        """The segments of orbits as steps 1, 2, ...; of step 0 all is zero."""
+    def along(cls, system: HybridSystem, segments: Segments, h) -> "Steps":
+        """The segments of orbits as steps 1, 2, ...; of step 0 all is zero.
+
+        Of a system whose steps follow the motion the weight is by the errors, and h on average.
+        """
         used = segments.used
         time = jnp.where(used, segments.duration, 0)
         ended = used & (segments.guard != NONE), used & (segments.guard == SECTION)
-        sums = [time, step_weight(system, segments.y, segments.s) * time]
+        if system.fastest is None:
+            weight = step_weight(system, segments.y, segments.s) * time
+        else:
+            _, error = flow(system, segments.y, time, segments.s, error=True)
+            weight = jnp.max(jnp.abs(error), axis=0) ** 0.125
+            weight = jnp.where(used, weight, 0)
+            mean = jnp.sum(weight, axis=0) / jnp.sum(used, axis=0)
+            weight = h * jnp.maximum(weight / mean, 0.1)
+            weight = jnp.where(used, jnp.maximum(weight, time * system.fastest / MOST), 0)
+        sums = [time, weight]
         sums = jnp.stack([*sums, *(x.astype(time.dtype) for x in ended)])
         sums = jnp.swapaxes(cumulative(jnp.swapaxes(sums, 1, 2)), 1, 2)
         guard = segments.guard[None].astype(time.dtype)
@@ -62,9 +74,9 @@ class Steps(eqx.Module):
         return self.steps[row, (self.oldest + number) % self.length, lane]
 
 
-def step_weight(system: HybridSystem, y, s) -> Array:
+def step_weight(system: HybridSystem, y, s, least=1) -> Array:
     """By how much shorter than elsewhere segments should be, where friction is stiff (...)."""
-    return jnp.maximum(1, 2 * system.stiffness(y, s, 1 / 4))
+    return jnp.maximum(least, 2 * system.stiffness(y, s, 1 / 4))
 
 
 class Record(Steps):
@@ -78,6 +90,7 @@ class Record(Steps):
     s: Float[Array, "f B"]
     guard: Int[Array, " B"]  # that ended it
     sums: Float[Array, "4 B"]
+    reach: Float[Array, " B"] | None  # of the next step, where steps follow the motion
     count: Int[Array, " B"]  # steps that are known to be of one motion
 
     @classmethod
@@ -87,7 +100,8 @@ class Record(Steps):
         steps = jnp.zeros((len(y) + len(s) + len(_ROWS), length, lanes), y.dtype)
         none = jnp.zeros(lanes, int)
         sums = jnp.zeros_like(steps[TIME:, 0])
-        return cls(steps, none[0], y, s, none + NONE, sums, none)
+        reach = None if system.fastest is None else jnp.zeros_like(y[0]) + 0.1 / system.fastest
+        return cls(steps, none[0], y, s, none + NONE, sums, reach, none)
 
     def past(self, row, number, lane) -> Array:
         """A row of sums as of now, which are zero after the last step."""
@@ -97,20 +111,20 @@ class Record(Steps):
         """After `count` more steps, no longer than h; the length is a multiple of `count`."""
 
         def body(k, carry):
-            y, s, guard, sums, steps = carry
-            y_new, s_new, dt, guard = step(system, y, s, guard, h)
-            weight = step_weight(system, y, s) * dt
+            y, s, guard, sums, reach, steps = carry
+            y_new, s_new, dt, guard, reach = step(system, y, s, guard, h, reach)
+            weight = step_weight(system, y, s, 1 if reach is None else h / reach) * dt
             ended = guard != NONE, guard == SECTION
             sums = sums + jnp.stack([dt, weight, *(x.astype(dt.dtype) for x in ended)])
             one = jnp.concatenate([y, s, guard.astype(y.dtype)[None], sums])
             steps = jax.lax.dynamic_update_index_in_dim(steps, one, self.oldest + k, 1)
-            return y_new, s_new, guard, sums, steps
+            return y_new, s_new, guard, sums, reach, steps
 
-        carry = self.y, self.s, self.guard, self.sums, self.steps
-        y, s, guard, sums, steps = jax.lax.fori_loop(0, count, body, carry)
+        carry = self.y, self.s, self.guard, self.sums, self.reach, self.steps
+        y, s, guard, sums, reach, steps = jax.lax.fori_loop(0, count, body, carry)
         known = jnp.minimum(self.count + count, self.length)
         oldest = (self.oldest + count) % self.length
-        return Record(steps, oldest, y, s, guard, sums, known)
+        return Record(steps, oldest, y, s, guard, sums, reach, known)
 
     def moved(self, y, where) -> "Record":
         """With the states y, where steps from before are not of the same motion."""

@@ -39,3 +39,15 @@ def runge_kutta(tableau, field: Callable, y, h, *, error: bool = False) -> Any:
     slopes, _ = jax.lax.scan(stage, none, (jnp.arange(stages), jnp.asarray(rows, y.dtype)))
     end = y + h * weighted(jnp.asarray(tableau.b_sol, y.dtype), slopes)
     return (end, h * weighted(jnp.asarray(tableau.b_error, y.dtype), slopes)) if error else end
+
+
+def stability_polynomial(tableau) -> np.ndarray:
+    """Coefficients, from that of z^0 on, of a step's factor for dy/dt = a y, where z = a h."""
+    stages, power, found = len(tableau.b_sol), np.ones(len(tableau.b_sol)), [1.0]
+    rows = np.zeros((stages, stages))
+    for i, row in enumerate(tableau.a_lower):
+        rows[i + 1, : len(row)] = row
+    for _ in range(stages):
+        found.append(float(tableau.b_sol @ power))
+        power = rows @ power
+    return np.array(found)

@@ -16,6 +16,10 @@ from .._mechanism.mechanism import Mechanism
 from .._mechanism.scene import Scene, stiffness
 from .._mechanism.structure import Structure, require_single
 from .hybrid import HybridSystem
+from .lanes import log_spectral_radius
+
+FEW = 8  # degrees of freedom up to which steps are those of the highest frequency
+_SQUARINGS = 10  # of the matrix whose spectral radius bounds all rates
 
 
 def degrees_of_freedom(mechanism: Mechanism) -> int:
@@ -144,7 +148,16 @@ def _of_structure(structure: Structure) -> HybridSystem:
         faces=tuple(faces),
         sharing=sharing,
         opens=tuple(bool(joint.preload) and joint.normal is not None for joint in structure.joints),
-    )
+        fastest=_fastest(K / omega**2, C / omega) if n > FEW else None,
+    ).with_products()
+
+
+def _fastest(K, C) -> Float[Array, ""]:
+    """A bound on the moduli of the eigenvalues of x'' + C x' + K x = 0, a few per cent above."""
+    n = len(K)
+    eye, zero = jnp.eye(n, dtype=K.dtype), jnp.zeros_like(K)
+    A = jax.lax.stop_gradient(jnp.block([[zero, eye], [-K, -C]]))
+    return jnp.exp(log_spectral_radius(A, _SQUARINGS))
 
 
 def _shared(laws: Sequence[Friction], faces: Sequence[tuple[int, ...]]):

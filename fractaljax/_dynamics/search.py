@@ -45,6 +45,7 @@ class SearchOptions:
     step: float = 0.3  # of the coarse run; no eigenfrequency exceeds 1
     round_steps: int = 128  # between two looks at the returns
     finer_after: tuple[int, int] = (16, 48)  # rounds after which the step is halved
+    round_returns: int = 12  # in a round, usually, where it does not hold only part of one
     longest: int = 16  # most returns in one period
     near: float = 0.15  # gap between returns below which an orbit is tried, relative
     ends_near: float = 0.06  # distance that single returns have left, relative
@@ -177,7 +178,7 @@ def _solved(system, record, lane, wanted, given: _Candidates, *, length, options
 
         def of_the_orbit():
             # Its phases have other lengths and weights than those of the steps.
-            steps, number = Steps.along(system, found.segments), jnp.arange(len(lane))
+            steps, number = Steps.along(system, found.segments, h), jnp.arange(len(lane))
             last = jnp.sum(found.segments.used, axis=0)
             return cut(system, steps, number, 0 * last, last, h, length)
 
@@ -310,6 +311,10 @@ def _assess(
     before = jnp.max(jnp.abs(seen[:, 2] - seen[:, 1]), axis=0)
     left = gap**2 / jnp.maximum(before - gap, 1e-300)
     ends_near = (left < options.ends_near * scale) | (gap < options.accepted / 8 * scale)
+    if system.fastest is not None:
+        # Of many degrees of freedom a return takes many rounds, and an attempt long.
+        rounds = returns / options.round_returns
+        ready = ready & exists[3]
     ready = ready & (ends_near | (period_returns > 1) | (rounds >= options.patient))
 
     given = _Candidates(
@@ -434,7 +439,11 @@ def _find(
     def body(carry):
         record, known, rounds = carry
         # A run that takes long to settle may be near the boundary of two basins.
-        finer = sum(rounds >= after for after in options.finer_after)
+        passed = rounds
+        if system.fastest is not None:
+            # Of many degrees of freedom a return takes many steps.
+            passed = jnp.max(known.returns) / options.round_returns
+        finer = sum(passed >= after for after in options.finer_after)
         h_run = (options.step / 2.0**finer).astype(start.dtype)
         record = record.advance(system, h_run, options.round_steps)
         record, known = _assess(
