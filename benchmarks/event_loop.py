@@ -99,9 +99,9 @@ def loop():
     def rk(y, h, k, s, system, end):
         for i in range(1, 7):
             end[:] = y
-            for l in range(i):
-                if a[i, l] != 0.0:
-                    end += h * a[i, l] * k[l]
+            for j in range(i):
+                if a[i, j] != 0.0:
+                    end += h * a[i, j] * k[j]
             field(end, s, system, k[i])
 
     @jit
@@ -230,8 +230,8 @@ def loop():
     return run
 
 
-def arguments(structure: Any) -> tuple[np.ndarray, np.ndarray, tuple, float]:
-    """Start, contact state, numbers of the scaled system, and omega."""
+def arguments(structure: Any) -> tuple[tuple, float, float]:
+    """The numbers of the scaled system, omega [1/s] and V [m/s]."""
     n = structure.n
     M, C, K = (np.asarray(x, float) for x in (structure.M, structure.C, structure.K))
     T, N, P, K_n, V, laws = [], [], [], [], [], []
@@ -261,4 +261,4 @@ def arguments(structure: Any) -> tuple[np.ndarray, np.ndarray, tuple, float]:
         V / V[0],
         laws / [1, 1, V[0]],
     )
-    return T, omega, system, V[0]
+    return system, omega, V[0]

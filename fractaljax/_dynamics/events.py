@@ -121,10 +121,10 @@ def step(system: HybridSystem, y, s, last, h, reach=None):
     step h of a harmonic motion with frequency 1.
     """
     stiff = 2 * system.stiffness(y, s)
+    unit, allowed = h if reach is None else h / system.fastest, (0.9 * h) ** 4 / 72
     if reach is None:
-        h, allowed = h / jnp.maximum(1, stiff), None
+        h = h / jnp.maximum(1, stiff)
     else:
-        allowed, unit = (0.9 * h) ** 4 / 72, h / system.fastest
         h = jnp.minimum(jnp.minimum(reach, STABLE * unit), h / jnp.maximum(stiff, 1e-6))
     step = h[None]
     f_0 = system.field(y, s)

@@ -59,14 +59,14 @@ class HybridSystem(eqx.Module):
     opens: tuple[bool, ...] = eqx.field(static=True)  # whether a joint can open
     # Whether the last degree of freedom is the phase of an excitation: excitation.py.
     excited: bool = eqx.field(static=True, default=False)
-    # Of many degrees of freedom: what no rate of the mechanism without friction exceeds, by little.
-    # Steps then follow the motion's own rates. None: 1.
+    # Of many degrees of freedom the largest rate of the mechanism without friction, within a per
+    # cent: steps then follow the motion, as far as that allows. None: steps are those of rate 1.
     fastest: Float[Array, ""] | None = None
     products: "Products | None" = None  # of many degrees of freedom
 
     def with_products(self) -> "HybridSystem":
         """With them, if it has many degrees of freedom; T, B, K and C are matrices then."""
-        if self.fastest is None:
+        if self.fastest is None or self.T is None or self.B is None:
             return self
         both, zero = jnp.concatenate([self.K, self.C], axis=1), jnp.zeros_like(self.T)
         seen = [jnp.concatenate([self.L, zero], axis=1), jnp.concatenate([zero, self.T], axis=1)]
@@ -291,20 +291,15 @@ class HybridSystem(eqx.Module):
         return jax.lax.cond(jnp.any(held), solved, lambda: jnp.zeros_like(wanted))
 
     @property
-    def _at_faces(self) -> bool:
-        """Whether forces are found from what is seen of the motion at the faces."""
-        return self.products is not None and not any(self.curves)
+    def _at_faces(self) -> Products | None:
+        """What is seen of the motion at the faces, where forces are found from that."""
+        return None if any(self.curves) else self.products
 
-    def _seen(self, y, s, rows: slice) -> tuple[Array, ...]:
+    def _seen(self, products: Products, y, s, rows: slice) -> tuple[Array, ...]:
         """Loads, w, forces and those of sticking faces (f, ...), and the rest of those products."""
-        f, products, leaf = (
-            len(self.P),
-            self.products,
-            functools.partial(self._leaf, lanes=y.ndim - 1),
-        )
-        loads, along, driven, rest = jnp.split(
-            self._times(products.matrix[rows], y), [f, 2 * f, 3 * f]
-        )
+        f, leaf = len(self.P), functools.partial(self._leaf, lanes=y.ndim - 1)
+        seen = self._times(products.matrix[rows], y)
+        loads, along, driven, rest = jnp.split(seen, [f, 2 * f, 3 * f])
         loads, w = loads + leaf(self.P), leaf(self.V) - along
         forces = jnp.where(jnp.abs(s) == 1, self._by_laws(w, loads, s), 0)
         if any(self.opens):
@@ -314,8 +309,9 @@ class HybridSystem(eqx.Module):
 
     def field(self, y, s) -> Array:
         """dy/dt in contact state s. A sticking face must have w = 0."""
-        if self._at_faces:
-            _, _, forces, held, driven = self._seen(y, s, slice(None))
+        products = self._at_faces
+        if products is not None:
+            _, _, forces, held, driven = self._seen(products, y, s, slice(None))
             free = self._leaf(self.F, y.ndim - 1) - driven
             return jnp.concatenate([y[self.n :], free + self._acceleration(forces + held)])
         acceleration = self._driven(y, self._slipping(y, s), s)
@@ -353,8 +349,9 @@ class HybridSystem(eqx.Module):
         its two limits; of a joint that can open its closure, or minus that while open.
         """
         x, u = y[: self.n], y[self.n :]
-        if self._at_faces:
-            loads, w, _, force, _ = self._seen(y, s, slice(3 * len(self.P)))
+        products = self._at_faces
+        if products is not None:
+            loads, w, _, force, _ = self._seen(products, y, s, slice(3 * len(self.P)))
         else:
             w, loads = self.sliding(u), self.loads(x)
             if self.B is None:

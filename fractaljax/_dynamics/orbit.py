@@ -158,7 +158,7 @@ def _polynomial_maps(system: HybridSystem, segments: Segments) -> tuple[Array, A
 
     Exact if the field is affine. (In powers of its fourth power, by Paterson and Stockmeyer.)
     """
-    lanes, eye = segments.duration.ndim - 1, jnp.eye(len(segments.y), dtype=segments.y.dtype)
+    lanes = segments.duration.ndim - 1
     coefficients = stability_polynomial(tableau())
     blocks = [coefficients[k : k + _POWERS] for k in range(0, len(coefficients), _POWERS)]
 
@@ -168,7 +168,7 @@ def _polynomial_maps(system: HybridSystem, segments: Segments) -> tuple[Array, A
         def found():
             _, slope = jax.linearize(lambda y: system.field(y, s), (y + end) / 2)
             mean = jax.vmap(slope, in_axes=1, out_axes=1)(_identity(y)) * h[None, None]
-            powers = [eye, jnp.moveaxis(mean, (0, 1), (-2, -1))]
+            powers = [jnp.moveaxis(x, (0, 1), (-2, -1)) for x in (_identity(y), mean)]
             for _ in range(_POWERS - 1):
                 powers.append(jnp.matmul(powers[-1], powers[1]))
             A = jnp.zeros_like(powers[1])

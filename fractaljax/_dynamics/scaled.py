@@ -153,7 +153,7 @@ def _of_structure(structure: Structure) -> HybridSystem:
 
 
 def _fastest(K, C) -> Float[Array, ""]:
-    """A bound on the moduli of the eigenvalues of x'' + C x' + K x = 0, a few per cent above."""
+    """The largest modulus of the eigenvalues of x'' + C x' + K x = 0, within a per cent."""
     n = len(K)
     eye, zero = jnp.eye(n, dtype=K.dtype), jnp.zeros_like(K)
     A = jax.lax.stop_gradient(jnp.block([[zero, eye], [-K, -C]]))

@@ -114,6 +114,13 @@ def many_cycles(numbers):
         assert row.get("results", {}).keys() <= {"converged"}
 
 
+def many_dofs(numbers):
+    """The same cycle by a loop that shares no code; times are of the machine."""
+    for row in numbers["rows"]:
+        assert row["error"] is None or row["error"] < 1e-8
+    assert bool(numbers["not_installed"]) == (len(numbers["headline"]) == 1)
+
+
 def reduction(numbers):
     """Errors within the tolerance, beside SciPy and the full matrices; times are of the machine."""
     for model in numbers["models"]:

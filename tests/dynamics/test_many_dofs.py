@@ -1,0 +1,102 @@
+"""Of many degrees of freedom steps and segments follow the motion, far slower than the fastest."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fractaljax as fj
+import hybrid_truth
+from benchmarks.many_dofs import rods
+from fractaljax._dynamics.excitation import excited_system
+from fractaljax._dynamics.orbit import flow, tableau
+from fractaljax._dynamics.runge_kutta import stability_polynomial
+from fractaljax._dynamics.scaled import hybrid_system
+
+
+def system_of(n):
+    return jax.jit(hybrid_system)(rods(n))
+
+
+def test_largest_rate():
+    """Within a per cent; damping makes some modes faster than their frequency."""
+    system = system_of(40)
+    eye, zero = np.eye(40), np.zeros((40, 40))
+    rates = abs(np.linalg.eigvals(np.block([[zero, eye], [-system.K, -system.C]])))
+    assert rates.max() > 1.2
+    assert system.fastest == pytest.approx(rates.max(), rel=1e-2)
+    assert system_of(8).fastest is None and system_of(8).products is None
+    excited = excited_system(rods(16), fj.Excitation([1.0], 1e3, dofs=[0]))
+    assert excited.products.matrix.shape == (3 * 6 + 17, 34)
+    assert excited.fastest == pytest.approx(2e3 * np.pi / float(excited.omega))
+
+
+@pytest.mark.parametrize("s", [(1, 1, 1, 1, 1, 1), (0, 0, -1, -1, 2, 2), (0, 1, 0, 1, 1, 1)])
+def test_field_and_guards_by_what_is_seen_at_the_faces(s):
+    """As of the same system without those products, in every contact state."""
+    system = system_of(12)
+    plain = hybrid_system(rods(12))
+    plain = plain.__class__(**{**vars(plain), "products": None})
+    rng = np.random.default_rng(1)
+    y, s = jnp.asarray(rng.standard_normal((24, 3))), jnp.tile(jnp.array(s, float)[:, None], 3)
+    for found, wanted in ((system.field, plain.field), (system.guards, plain.guards)):
+        np.testing.assert_allclose(found(y, s), wanted(y, s), rtol=1e-11, atol=1e-11)
+
+
+def test_stability_polynomial_is_the_factor_of_a_step():
+    """Of a linear field; to eighth order the exponential's."""
+    found = stability_polynomial(tableau())
+    np.testing.assert_allclose(found[:9] * np.cumprod([1, *range(1, 9)]), 1, rtol=1e-12)
+    system = system_of(12)
+    y, s = jnp.ones((24, 1)), jnp.ones((6, 1))
+    slope = jax.jacfwd(lambda y: system.field(y[:, None], s)[:, 0])(y[:, 0])
+    rest = np.linalg.solve(slope, system.field(0 * y, s)[:, 0])
+    z, A = 1.5 * np.asarray(slope), np.zeros((24, 24))
+    for c in found[::-1]:
+        A = A @ z + c * np.eye(24)
+    # Friction falls with speed: its slope is not the same everywhere.
+    gap = np.asarray(flow(system, y, jnp.full(1, 1.5), s))[:, 0] - (A @ (1 + rest) - rest)
+    assert abs(gap).max() < 0.05
+
+
+@pytest.mark.slow
+def test_cycle_of_forty_degrees_of_freedom_in_a_compiled_program():
+    """Period, state, shares and slope beside the independent solver; 300/omega a period."""
+    structure = rods(40)
+
+    @jax.jit
+    def found(P):
+        cycle = fj.limit_cycle(structure.replace(**{"tip.P": P}), throw=False)
+        return cycle.period, cycle.state, cycle.stick_fraction, cycle.result
+
+    def truth(P):
+        own, joints = structure.replace(**{"tip.P": P}), []
+        for j in own.joints:
+            t, n = (np.asarray(own.direction(d)) for d in (j.tangential, j.normal))
+            law = functools.partial(hybrid_truth.LAWS["exponential"], mu_s=0.6, mu_d=0.45, v_0=0.5)
+            K_n, K_t = map(float, j.stiffness())
+            joints.append(hybrid_truth.Joint(t, 0.5, law, n, float(j.normal_load), K_n, K_t))
+        M, C, K = (np.asarray(x) for x in (own.M, own.C, own.K))
+        return hybrid_truth.Mechanism(M, C, K, np.zeros(40), tuple(joints))
+
+    period, state, stick, result = found(1.0)
+    assert result == fj.CycleResult.converged
+    assert float(period) * float(hybrid_system(structure).omega) > 300
+
+    def closed(P):
+        own = truth(P)
+        z, T = np.asarray(state) / own.units, float(period) * own.omega
+        return own, *hybrid_truth.close(own.scaled, z, T, 1e-12)
+
+    own, z, T = closed(1.0)
+    assert T / own.omega == pytest.approx(float(period), rel=1e-9)
+    np.testing.assert_allclose(state, z * own.units, rtol=0, atol=1e-8 * abs(state).max())
+    trip = list(hybrid_truth.phases(own.scaled, z, 1e-12, T))
+    np.testing.assert_allclose(stick, hybrid_truth.shares(own.scaled, trip)[0] / T, atol=1e-8)
+    assert stick[0] > 0.1 and stick[2] > 0.05
+
+    _, slope = jax.jvp(lambda P: found(P)[0], (1.0,), (1.0,))
+    ends = [T / own.omega for own, _, T in map(closed, (1 - 1e-4, 1 + 1e-4))]
+    assert slope == pytest.approx((ends[1] - ends[0]) / 2e-4, rel=1e-6)
