@@ -518,9 +518,7 @@ class Search:
             limited &= ~self.growing
         return self._ways(paths, aim, limited, progress, restored, first, kept)
 
-    def _ways(
-        self, paths, aim, limited, progress=False, restored=False, first=ROUGH, kept=_KEPT
-    ):
+    def _ways(self, paths, aim, limited, progress=False, restored=False, first=ROUGH, kept=_KEPT):
         """Ways continued to the least of the columns in `aim` with those in `limited` met.
 
         Of many in a trust region the most promising alone go on to the end.
@@ -575,7 +573,8 @@ class Search:
             largest = functions.at(np.append(start, 0))[0][:, functions.aim].max()
             start = np.append(start, largest)
             bounds = np.append(bounds, [[-np.inf, np.inf]], axis=0)
-        z = self.solver(functions.objective, functions.constraints, start, bounds)
+        solver: Any = self.solver
+        z = solver(functions.objective, functions.constraints, start, bounds)
         return np.clip(np.asarray(z, float)[:v], 0, 1)
 
     def _stepped(self, functions: _Functions, start: np.ndarray, accuracy: Accuracy):
@@ -608,11 +607,11 @@ class Search:
 
         if keep and limits(start)[0].max() > 0:
             start = within_joints(problem, start[None])[0]
+        # Of a distance little is lost for a growth rate.
         distance = not extra and problem.objective is None
+        curvature, penalty = (2.0 / self.scale, 2.0) if distance else (0.0, 10.0)
         met = float(np.min(np.broadcast_to(functions.slack, limited.shape)[limited], initial=1) / 2)
-        end = in_trust_region(
-            at, limits, start, 2.0 / self.scale if distance else 0.0, accuracy, met
-        )
+        end = in_trust_region(at, limits, start, curvature, accuracy, penalty, met)
         return end, at(end).merit(1.0)
 
     def _answer(self, questions):

@@ -15,7 +15,8 @@ Limits = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 _RADIUS_MAX = 0.25  # of a step, in the bounds
 _STEEPEST = 1e3  # curvature that is believed
-_PENALTY, _HARDER, _TIMES = 2.0, 10.0, 4  # of what is unmet, and by how much and how often more
+_HARDER, _TIMES = 100.0, 2  # penalties of what is unmet
+_NEARLY = 0.1  # unmet by so little, it is worth a way of its own
 _INSIDE, _HELD = 1e-7, 1e-6  # by how much steps are inside limits, and within what one holds them
 _STEP_ITERATIONS = 40
 _FLAT = 1e-8  # of a change of slopes and a step: nothing is learnt
@@ -26,12 +27,12 @@ class Accuracy(NamedTuple):
 
     first: float  # radius of the first step, in the bounds
     radius: float  # below which steps are not tried
-    gain: float  # of objective and penalty, below which steps are not worth it
+    gain: float  # as a share of what is lowered, below which steps are not worth it
     steps: int
 
 
-ROUGH, NEAR = Accuracy(0.1, 3e-3, 1e-4, 40), Accuracy(0.03, 1e-3, 1e-5, 40)
-FINE = Accuracy(0.02, 1e-6, 1e-8, 100)
+ROUGH, NEAR = Accuracy(0.1, 3e-3, 1e-2, 40), Accuracy(0.03, 1e-3, 1e-3, 40)
+FINE = Accuracy(0.02, 1e-6, 1e-7, 100)
 
 
 class Local(NamedTuple):
@@ -77,19 +78,20 @@ def in_trust_region(
     start: np.ndarray,
     curvature: float,
     accuracy: Accuracy,
+    penalty: float,
     met: float = 0.0,
 ) -> np.ndarray:
     """A design (v,) in [0, 1]^v with the least objective that meets all, from `start`.
 
     `limits` gives residuals (l,) that every step keeps to, and their slopes (l, v); `curvature` is
-    that of the objective at least. What is unmet by no more than `met` counts as met.
+    that of the objective at least. `penalty` is that of what is unmet at first, above `met`.
     """
-    u, radius, penalty = start, accuracy.first, _PENALTY
+    u, radius = start, accuracy.first
     learnt = curvature * np.eye(len(start))
     for _ in range(_TIMES if accuracy is FINE else 1):
         learning = limits, curvature, accuracy, radius, penalty
         u, learnt, excess = _descended(at, u, learnt, *learning)
-        if excess > met and accuracy is FINE:
+        if met < excess <= _NEARLY and accuracy is FINE:
             # To where all is met, if that is near.
             nearest = functools.partial(_nearest, at, u)
             u, _, excess = _descended(nearest, u, 2 * np.eye(len(u)), *learning)
@@ -114,7 +116,7 @@ def _descended(at, u, learnt, limits, curvature, accuracy, radius, penalty):
         if held is None or promised <= 0:  # none was found inside the limits
             radius /= 4
             continue
-        if promised <= accuracy.gain:
+        if promised <= accuracy.gain * abs(here.merit(penalty)):
             break
         there, steps = at(u + step), steps + 1
         learnt = _learnt(here, there, expected, step, bounds, held, learnt, curvature, penalty)
