@@ -287,11 +287,13 @@ def design(
     from `starts` designs, by default 12, or 8 of a structure: those given, the most promising of
     `lattice` a side (48, or 24 of a structure, with an envelope or a tolerance; 1024 or 256 in one
     variable; lattice^2 designs of a low-discrepancy set in more than two variables), and an even
-    spread. Of more than two joints these are moved inside the limits of each, and SLSQP goes in
-    steps of at most a quarter of the bounds. The same arguments give the same design. A request
-    that cannot be met is a result, not an error: see `Design.result`. Then `Design.least_growth` is
-    the least growth rate that was found with all else met, where, what holds it there, and how many
-    starts agree; or, if that cannot be met either, what of it and why.
+    spread. Of more than two joints there are 32, drawn around the given design, the most promising
+    of lattice^2 if that is given; by default steps in a trust region keep to the limits of every
+    joint, the eight best of their ends go on, and more designs are tried around the best.
+    The same arguments give the same design. A request that cannot be met is a result, not an error:
+    see `Design.result`. Then `Design.least_growth` is the least growth rate that was found with all
+    else met, where, what holds it there, and how many starts agree; or, if that cannot be met
+    either, what of it and why.
 
     **Raises:** `ValueError` for bounds on what `x` lacks, empty, inverted or without its own value,
     for an envelope of what it lacks or the design moves, and for options outside their domain.

@@ -32,7 +32,7 @@ class Accuracy(NamedTuple):
 
 
 ROUGH, NEAR = Accuracy(0.1, 3e-3, 1e-2, 40), Accuracy(0.03, 1e-3, 1e-3, 40)
-FINE = Accuracy(0.02, 1e-6, 1e-7, 100)
+FINE = Accuracy(0.02, 1e-7, 1e-7, 100)
 
 
 class Local(NamedTuple):
