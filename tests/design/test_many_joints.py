@@ -68,6 +68,9 @@ def test_designs_that_are_screened_are_inside_the_limits_of_all_joints():
     _, moved = screened(problem, 8, 12)
     assert ((moved >= 0) & (moved <= 1)).all()
     assert (limits_of_joints(problem, moved)[0].max(axis=1) <= 0).mean() > 0.7
+    # One in three is near the given design.
+    away = np.abs(moved - np.asarray(problem.start)).mean(axis=1)
+    assert np.median(away[::3]) < 0.1 < np.median(away[2::3])
     # They are those of the whole problem, in an order of their own: model first.
     row, jacobian, _ = linearise(problem, drawn[:1], np.zeros((1, 0)))
     k = problem.model_residuals

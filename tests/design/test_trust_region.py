@@ -48,6 +48,8 @@ def free(u):
             lambda u: np.array([0.25 - u[0] * u[1], u[0] ** 2 - 0.36]),
             (0.6, 0.25 / 0.6),
         ),
+        # The first penalty is too small.
+        (lambda u: 100 * u[0] + (u[1] - 0.5) ** 2, lambda u: 0.5 - u[0], (0.5, 0.5)),
         # The bounds alone decide.
         (lambda u: u[0] - u[1], lambda u: -1 + 0 * u[0], (0.0, 1.0)),
         # Nothing decides: a smooth minimum inside.
