@@ -32,6 +32,7 @@ _TEMPERATURE = 0.02  # of the smooth maximum over an envelope
 _KEPT = 8  # of many ways in a trust region, which go on to the end
 # Around the best end of such ways: rounds of new starts, how many, within what share of the bounds.
 _AGAIN, _AROUND, _SHARE = 3, 8, 0.06
+_GAINED = 1e-3  # of the objective in such a round, for another
 
 
 @dataclasses.dataclass(frozen=True)
@@ -399,20 +400,20 @@ class Search:
         best = int(np.flatnonzero(values <= values.min() + 1e-8 * abs(values.min()))[0])
         path, end, count = paths[best], found.of(best), max(len(starts) - int((~failed).sum()), 0)
         for again in range(1 if self.solver else _AGAIN):
-            if self.solver:
-                # A solver may have stopped early: once more from where it is.
-                ways = self._land([path])
-            else:
+            # A solver may have stopped early: once more from where it is.
+            ways = [path]
+            if self.solver is None:
                 # What is better is often near.
                 near = designs_around(problem, path[-1], _AROUND, (_SHARE,), again)
-                ways = [np.concatenate([path, u[None]]) for u in near]
-                ways = self._land(ways, first=NEAR, kept=2)
-            polished = self._ends(ways)
-            values = np.where(polished.worst > 0, np.inf, polished.values)
-            best = int(values.argmin())
-            if not values[best] < end.values[0]:
+                ways += [np.concatenate([path, u[None]]) for u in near]
+            ways = self._land(ways, first=NEAR, kept=3)
+            ended = self._ends(ways)
+            values = np.where(ended.worst > 0, np.inf, ended.values)
+            best, before = int(values.argmin()), float(end.values[0])
+            if values[best] < before:
+                path, end = ways[best], ended.of(best)
+            if not values[best] < before - _GAINED * abs(before):
                 break
-            path, end = ways[best], polished.of(best)
         return path, end, count, None
 
     def _landed(self, starts, progress):
