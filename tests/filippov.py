@@ -182,7 +182,7 @@ def extrema(c) -> list[float]:
 
 def zeros(c, falling=False) -> list[float]:
     """Where in 0..1 a polynomial changes sign, or only where it falls through 0."""
-    corners = BERNSTEIN @ np.pad(c, (0, 8 - len(c)))
+    corners = BERNSTEIN[:, : len(c)] @ c
     if corners.min() > 0 or corners.max() < 0:
         return []
     found = []
@@ -223,6 +223,7 @@ def phases(mechanism, y, rtol, t1=np.inf, maxima=False) -> Iterator[Phase]:
                 watch += [(i, s, row, 0) for s, row in zip((1, -1), mechanism.hold(i), strict=True)]
         if maxima and signs[0] == 1:
             watch.append((2, 0, UNIT[0] - UNIT[3], int(y[2] == 1)))
+        rows = np.array([row for *_, row, _ in watch])
         solver = DOP853(slope, t, y, t1, max_step=longest, rtol=rtol, atol=rtol)
         start, t0, steps, pieces, events = y, t, [], [], []
         while not events and solver.status == "running":
@@ -232,9 +233,13 @@ def phases(mechanism, y, rtol, t1=np.inf, maxima=False) -> Iterator[Phase]:
                 raise Diverged
             pieces.append(solver.dense_output())
             c, h = BASIS @ np.vstack([y, pieces[-1].F]), solver.t - t
-            for i, after, row, order in watch:
-                p = c @ row[1:] + row[0] * np.eye(8)[0]
-                p = p if steps else p[order:]
+            g = c @ rows[:, 1:].T
+            g[0] += rows[:, 0]
+            above = (BERNSTEIN @ g).min(axis=0) > 0
+            for k, (i, after, row, order) in enumerate(watch):
+                if above[k] and (steps or not order):
+                    continue
+                p = g[0 if steps else order :, k]
                 late = i < 2 and len(p) == 8 and p[0] < 0 and p[1] < 0  # by rounding
                 events += [(x, i, after, row) for x in ([0.0] if late else zeros(p, True)[:1])]
             end, used = solver.y, h

@@ -5,6 +5,7 @@ displacement and velocity, differentiates them by differences in 50 digits, and 
 as roots of the determinant.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -13,6 +14,7 @@ import mpmath as mp
 import numpy as np
 
 import fractaljax as fj
+from tools import ROOT, load_script
 
 DIGITS = 50
 _BRAKE = fj.brake_scene()
@@ -51,6 +53,20 @@ def fractal_joints() -> fj.Structure:
         for name, joint in zip(plain.joint_names, plain.joints, strict=True)
     }
     return fj.Structure(plain.M, plain.C, plain.K, joints, F=plain.F)
+
+
+def beam_on_pad(contact: Callable, mu: float, damping: Callable, **joint: Any) -> fj.Structure:
+    """A beam on its pad, of 150 degrees of freedom, with nine joints pair_1 to pair_9.
+
+    `contact(share)` is that of a joint with its share of the load, and `damping(M, K)` gives C.
+    """
+    made = load_script(ROOT / "notebooks" / "brakes.py").beam_on_pad()
+    joints = {
+        f"pair_{i}": fj.Joint(contact(share), fj.Coulomb(mu), *pair, **joint)
+        for i, (pair, share) in enumerate(zip(made.pairs, made.shares, strict=True), start=1)
+    }
+    M, K = made.matrices["M"], made.matrices["K"]
+    return fj.Structure(M, damping(M, K), K, joints)
 
 
 def beam(elements: int, free: bool = False, height: float = 0.01):

@@ -138,26 +138,34 @@ def differences(function, numbers):
     return found
 
 
+@jax.jit
+def of_law(law, speeds):
+    """Values, slopes at both signs, one by one, mu_s, mu_m and mu(0), and of twice the law."""
+    twice = law.times(2.0)
+    slopes = jnp.stack([law.slope(speeds), law.slope(-speeds)])
+    ends, doubled = (law.mu_s, law.mu_m, law.mu(0.0)), (twice.mu_s, twice.mu_m)
+    return law.mu(speeds), slopes, jax.vmap(law.mu)(speeds), ends, (twice.mu(speeds), doubled)
+
+
 @EACH
 def test_every_law(name):
     """Values, both derivatives in both modes against 60 digits, mu(0), the least value, scaling."""
-    kind, numbers, exact, least = LAW_TABLE[name]
-    law = kind(*numbers)
-    speeds = [0.0, 1e-3, 0.03, 0.2, 0.9]
-    slopes = jax.jit(lambda x: both_modes(lambda x: kind(*x[:-1]).mu(x[-1]), x)[1:])
-    for w in speeds:
-        assert float(law.mu(w)) == pytest.approx(float(exact(*map(mpf, (*numbers, w)))), rel=1e-14)
+    kind, numbers, exact, lowest = LAW_TABLE[name]
+    law, speeds = kind(*numbers), [0.0, 1e-3, 0.03, 0.2, 0.9]
+    by_all = jax.jit(jax.vmap(lambda x: both_modes(lambda x: kind(*x[:-1]).mu(x[-1]), x)[1:]))
+    derivatives = by_all(np.array([[*numbers, w] for w in speeds]))
+    values, slopes, each, (mu_s, mu_m, at_rest), (doubled, ends) = of_law(law, np.array(speeds))
+    for i, w in enumerate(speeds):
+        assert float(values[i]) == pytest.approx(float(exact(*map(mpf, (*numbers, w)))), rel=1e-14)
         wanted = differences(exact, (*numbers, w))
-        for found in slopes(jnp.array([*numbers, w])):
-            np.testing.assert_allclose(found, wanted, rtol=1e-12, atol=1e-14)
-        for v in (w, -w):
-            assert float(law.slope(v)) == pytest.approx(wanted[-1], rel=1e-12, abs=1e-15)
-    np.testing.assert_array_equal(jax.vmap(law.mu)(np.array(speeds)), law.mu(np.array(speeds)))
-    assert float(law.mu_s) == numbers[0] == float(law.mu(0.0))
-    assert float(law.mu_m) == pytest.approx(least, rel=1e-14)
-    twice = law.times(2.0)
-    np.testing.assert_allclose(twice.mu(np.array(speeds)), 2 * law.mu(np.array(speeds)), rtol=1e-15)
-    np.testing.assert_allclose((twice.mu_s, twice.mu_m), (2 * law.mu_s, 2 * law.mu_m), rtol=1e-14)
+        for found in derivatives:
+            np.testing.assert_allclose(found[i], wanted, rtol=1e-12, atol=1e-14)
+        np.testing.assert_allclose(slopes[:, i], wanted[-1], rtol=1e-12, atol=1e-15)
+    np.testing.assert_array_equal(each, values)
+    assert float(law.mu_s) == float(mu_s) == numbers[0] == float(at_rest)
+    assert float(mu_m) == pytest.approx(lowest, rel=1e-14)
+    np.testing.assert_allclose(doubled, 2 * values, rtol=1e-15)
+    np.testing.assert_allclose(ends, (2 * mu_s, 2 * mu_m), rtol=1e-14)
     leaves, structure = jax.tree.flatten(law)
     assert len(leaves) >= len(numbers) and type(jax.tree.unflatten(structure, leaves)) is kind
     assert {leaf.dtype for leaf in leaves} == {jnp.dtype(float)}

@@ -33,8 +33,8 @@ from .limit import LeastGrowth, least_growth
 from .problem import DEFAULT_BOUNDS, DesignProblem, describe, state_problem
 from .quiet import VERIFIED, Kicks, quiet
 from .search import Evaluation, Found, Search, evaluator_of
-from .solvers import Solver, slsqp, slsqp_in_steps
-from .starts import choose_starts, screened_designs, within_joints
+from .solvers import Solver, slsqp
+from .starts import choose_starts, designs_around, screened_designs
 from .summary import comparison_table
 from .tolerance import Tolerance, squeal_probability
 
@@ -42,7 +42,8 @@ _STARTS, _FOLLOWED = 12, 1  # the latter where cycles are followed
 # Designs a side that are screened, in one variable and in more, and what memory holds of them.
 _LATTICE = {False: (1024, 48), True: (256, 24)}  # whether a design takes long
 _LATTICE_MAX = 1_000_000, 1000
-_STARTS_OF_STRUCTURES = 8
+_STARTS_OF_STRUCTURES, _STARTS_OF_MANY_JOINTS = 8, 32
+_SHARES = (0.2, 0.6, 1.0)  # of the bounds, about the given design, in which the latter are
 _STARTS_MAX = 10_000
 _FEW_JOINTS = 2  # of more, nearly no design of an even spread is inside all limits
 _SEED_MAX = 2**63 - 1  # of a JAX key
@@ -286,11 +287,13 @@ def design(
     from `starts` designs, by default 12, or 8 of a structure: those given, the most promising of
     `lattice` a side (48, or 24 of a structure, with an envelope or a tolerance; 1024 or 256 in one
     variable; lattice^2 designs of a low-discrepancy set in more than two variables), and an even
-    spread. Of more than two joints these are moved inside the limits of each, and SLSQP goes in
-    steps of at most a quarter of the bounds. The same arguments give the same design. A request
-    that cannot be met is a result, not an error: see `Design.result`. Then `Design.least_growth` is
-    the least growth rate that was found with all else met, where, what holds it there, and how many
-    starts agree; or, if that cannot be met either, what of it and why.
+    spread. Of more than two joints there are 32, drawn around the given design, the most promising
+    of lattice^2 if that is given; by default steps in a trust region keep to the limits of every
+    joint, the eight best of their ends go on, and more designs are tried around the best.
+    The same arguments give the same design. A request that cannot be met is a result, not an error:
+    see `Design.result`. Then `Design.least_growth` is the least growth rate that was found with all
+    else met, where, what holds it there, and how many starts agree; or, if that cannot be met
+    either, what of it and why.
 
     **Raises:** `ValueError` for bounds on what `x` lacks, empty, inverted or without its own value,
     for an envelope of what it lacks or the design moves, and for options outside their domain.
@@ -346,25 +349,29 @@ def design(
 
 def screened(problem: DesignProblem, starts: int | None, lattice: int | None):
     """How many designs to start from, and those (n, v) to choose them from."""
-    variables = len(problem.names)
+    variables, many_joints = len(problem.names), len(problem.contacts) > _FEW_JOINTS
+    default = _STARTS_OF_STRUCTURES if problem.modes else _STARTS
+    default = _STARTS_OF_MANY_JOINTS if many_joints else default
+    default = default if problem.cycles is None else _FOLLOWED
+    given = lattice is not None
     if lattice is None:
         many = problem.robust or problem.modes > 0  # each design takes long
         lattice = _LATTICE[many][min(variables, 2) - 1]
     lattice = whole("lattice", lattice, 1, _LATTICE_MAX[min(variables, 2) - 1])
     count = lattice ** min(variables, 2)
-    default = _STARTS_OF_STRUCTURES if problem.modes else _STARTS
-    default = default if problem.cycles is None else _FOLLOWED
     starts = whole("starts", min(default, count) if starts is None else starts, 1, _STARTS_MAX)
     if starts > count:
         raise ValueError(f"starts must be at most the {count} of the lattice, got {starts}")
-    designs = screened_designs(lattice, variables)
-    many = len(problem.contacts) > _FEW_JOINTS
-    return starts, within_joints(problem, designs) if many else designs
+    if not many_joints:
+        return starts, screened_designs(lattice, variables)
+    # Near the given design more is met, and an objective is often that of few changes.
+    drawn = count if given else max(1, starts - 1)
+    return starts, designs_around(problem, np.asarray(problem.start, float), drawn, _SHARES, 0)
 
 
-def solver_of(problem: DesignProblem) -> Solver:
-    """The solver that lands where none is given."""
-    return slsqp_in_steps if len(problem.contacts) > _FEW_JOINTS else slsqp
+def solver_of(problem: DesignProblem) -> Solver | None:
+    """The solver that lands where none is given; None: steps in a trust region."""
+    return None if len(problem.contacts) > _FEW_JOINTS else slsqp
 
 
 def _conclude(

@@ -227,6 +227,14 @@ class DesignProblem(eqx.Module):
         return slice(first, first + max(self.modes, 1) * (1 + len(self.laws)))
 
     @property
+    def joint_columns(self) -> np.ndarray:
+        """Which columns (1 + k,) of a row `limits_of_joints` gives."""
+        columns = np.arange(len(self.asked))
+        last = self.growth_columns.stop
+        stiff = (columns >= last) & (columns < last + len(self.contacts))
+        return stiff | ((columns > 0) & (columns <= self.model_residuals))
+
+    @property
     def asked(self) -> np.ndarray:
         """Which columns (1 + k,) of a row are the objective and the requirements by name."""
         named, laws = 1 + len(self.residual_names), 1 + len(self.laws)
@@ -290,7 +298,10 @@ def evaluate(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray) -> 
 
 
 def limits_of_joints(problem: DesignProblem, us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What joints alone require (n, r) of designs us (n, v), and Jacobians: no eigenvalues."""
+    """What joints alone require (n, r) of designs us (n, v), and Jacobians: no eigenvalues.
+
+    Stiffness counts by its logarithm, which many steps of a design change evenly.
+    """
     us = np.asarray(us, problem.low.dtype)
     return in_batches(functools.partial(_limits_of_joints, problem), _BATCH, us)
 
@@ -340,7 +351,7 @@ def _limits_of_joints(problem: DesignProblem, us):
         joints = joints_of(problem.moved(u, problem.own_condition))
         states = states_of({name: joints[name] for name in problem.contacts})
         model, stiff = problem.of_joints(states)
-        both = jnp.stack([*model, *stiff])
+        both = jnp.stack([*model, *(-jnp.log1p(-lacking) for lacking in stiff)])
         return both, both
 
     def one(u):

@@ -17,8 +17,10 @@ import numpy as np
 
 from .._base.parts import brief, scalar
 from .envelope import ALONE, Envelope
-from .problem import UNKNOWN, DesignProblem, evaluate, linearise
+from .problem import UNKNOWN, DesignProblem, evaluate, limits_of_joints, linearise
 from .solvers import Solver
+from .starts import designs_around, within_joints
+from .trust_region import FINE, NEAR, ROUGH, Accuracy, Local, in_trust_region
 
 _LIKELY = 8  # conditions of a first guess at the worst
 _ROUNDS = 12  # of the exchange
@@ -27,6 +29,10 @@ _RESTORING = 30  # steps from a start to where all requirements are met
 _NEW = 1e-7  # by which a condition must be worse than the working ones
 _NEAR = 0.05  # a requirement met by more than this on the grid is met between its points
 _TEMPERATURE = 0.02  # of the smooth maximum over an envelope
+_KEPT = 8  # of many ways in a trust region, which go on to the end
+# Around the best end of such ways: rounds of new starts, how many, within what share of the bounds.
+_AGAIN, _AROUND, _SHARE = 3, 8, 0.06
+_GAINED = 1e-3  # of the objective in such a round, for another
 
 
 @dataclasses.dataclass(frozen=True)
@@ -223,9 +229,6 @@ def expected_shortfall(count: int, alpha: float) -> np.ndarray:
     return np.diff(edges) / (1 - alpha)
 
 
-# --- starts --------------------------------------------------------------------------------
-
-
 # --- landing on the constraints ------------------------------------------------------------
 
 
@@ -270,16 +273,19 @@ class _Functions:
         """Residuals and their Jacobian, compressed where they are not of order one."""
         (rows, jacobians), v = self.at(z), len(z) - self.extra
         c = (rows + self.slack)[:, self.limited].ravel()
-        slopes = jacobians[:, self.limited].reshape(-1, v)
-        size = np.maximum(np.abs(c), 1)
-        c = np.where(size > 1, np.sign(c) * (1 + np.log(size)), c)
-        slopes = slopes / size[:, None]
+        c, slopes = _compressed(c, jacobians[:, self.limited].reshape(-1, v))
         if self.extra:
             aimed, aim_slopes = rows[:, self.aim].ravel(), jacobians[:, self.aim].reshape(-1, v)
             c = np.append(c, aimed - z[-1])
             by_t = np.append(np.zeros(len(slopes)), -np.ones(len(aimed)))
             slopes = np.column_stack([np.concatenate([slopes, aim_slopes]), by_t])
         return c, slopes
+
+
+def _compressed(c: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (k,) and slopes (k, v), by logarithms where they are beyond order one."""
+    size = np.maximum(np.abs(c), 1)
+    return np.where(size > 1, np.sign(c) * (1 + np.log(size)), c), slopes / size[:, None]
 
 
 def _least_violated(functions: _Functions, start: np.ndarray) -> np.ndarray:
@@ -340,7 +346,7 @@ class Search:
     """Solves from many starts side by side."""
 
     evaluator: Evaluator
-    solver: Solver
+    solver: Solver | None  # None: in a trust region, for designs of many joints
     scale: float = 1.0  # of the objective
 
     @property
@@ -392,13 +398,23 @@ class Search:
             failed = found.worst > 0
         values = np.where(failed, np.inf, found.values)
         best = int(np.flatnonzero(values <= values.min() + 1e-8 * abs(values.min()))[0])
-        # A solver may have stopped early: once more from where it is.
-        (again,) = self._land([paths[best]])
-        polished = self._ends([again])
-        count = max(len(starts) - int((~failed).sum()), 0)
-        if polished.worst[0] <= 0 and polished.values[0] < values[best]:
-            return again, polished, count, None
-        return paths[best], found.of(best), count, None
+        path, end, count = paths[best], found.of(best), max(len(starts) - int((~failed).sum()), 0)
+        for again in range(1 if self.solver else _AGAIN):
+            # A solver may have stopped early: once more from where it is.
+            ways = [path]
+            if self.solver is None:
+                # What is better is often near.
+                near = designs_around(problem, path[-1], _AROUND, (_SHARE,), again)
+                ways += [np.concatenate([path, u[None]]) for u in near]
+            ways = self._land(ways, first=NEAR, kept=3)
+            ended = self._ends(ways)
+            values = np.where(ended.worst > 0, np.inf, ended.values)
+            best, before = int(values.argmin()), float(end.values[0])
+            if values[best] < before:
+                path, end = ways[best], ended.of(best)
+            if not values[best] < before - _GAINED * abs(before):
+                break
+        return path, end, count, None
 
     def _landed(self, starts, progress):
         """The ways from all starts, and what their ends are."""
@@ -406,7 +422,7 @@ class Search:
         paths = self._land([start[None] for start in starts], progress=progress)
         found = self._ends(paths)
         lost = np.flatnonzero(found.worst > 0)
-        if len(lost) and len(problem.names) > _FEW:
+        if self.solver and len(lost) and len(problem.names) > _FEW:
             # Far from many requirements a solver may stop: first to where all are met.
             landed = self._land([starts[i][None] for i in lost], restored=True)
             for i, path in zip(lost, landed, strict=True):
@@ -445,6 +461,8 @@ class Search:
         """
         growing, others = self.growing, self.others
         paths = self._ways([start[None] for start in starts], growing, others)
+        if self.solver is None:
+            return paths, self._ends(paths)
         lost = np.flatnonzero(self.growth_and_rest(self._ends(paths))[1] > 0).tolist()
         again = [starts[i][None] for i in lost]
         for i, way in zip(lost, self._ways(again, growing, others, restored=True), strict=True):
@@ -479,7 +497,7 @@ class Search:
     def _ends(self, paths) -> Evaluation:
         return self.evaluator.evaluate(np.array([path[-1] for path in paths]))
 
-    def _land(self, paths, violated=None, progress=False, restored=False):
+    def _land(self, paths, violated=None, progress=False, restored=False, first=ROUGH, kept=_KEPT):
         """Ways (s, v) continued to the least objective that meets every requirement.
 
         With some requirements (k,) marked as violated, to the least of their largest residual that
@@ -499,45 +517,103 @@ class Search:
             aim, limited = ~asked, limited & asked & ~own
         elif problem.smooth:
             limited &= ~self.growing
-        return self._ways(paths, aim, limited, progress, restored)
+        return self._ways(paths, aim, limited, progress, restored, first, kept)
 
-    def _ways(self, paths, aim, limited, progress=False, restored=False):
-        """Ways continued to the least of the columns in `aim` with those in `limited` met."""
+    def _ways(self, paths, aim, limited, progress=False, restored=False, first=ROUGH, kept=_KEPT):
+        """Ways continued to the least of the columns in `aim` with those in `limited` met.
+
+        Of many in a trust region the most promising alone go on to the end.
+        """
         from tqdm import tqdm
 
-        with tqdm(total=len(paths), desc="design", unit="start", disable=not progress) as bar:
+        def run(paths, how):
+            with tqdm(total=len(paths), desc="design", unit="start", disable=not progress) as bar:
 
-            def task(path, ask):
-                found = self._continued(path, aim, limited, ask, restored)
-                bar.update()
-                return found
+                def task(path, ask):
+                    found = self._continued(path, aim, limited, ask, how)
+                    bar.update()
+                    return found
 
-            return in_lockstep([functools.partial(task, path) for path in paths], self._answer)
+                return in_lockstep([functools.partial(task, path) for path in paths], self._answer)
 
-    def _continued(self, path, aim, limited, ask, restored):
-        """One way, continued by a solver that asks for rows and for new conditions."""
+        if self.solver:
+            return [path for path, _ in run(paths, restored)]
+        found = run(paths, first)
+        best = np.argsort([merit for _, merit in found], kind="stable")[:kept].tolist()
+        for i, ended in zip(best, run([found[i][0] for i in best], FINE), strict=True):
+            found[i] = ended
+        return [path for path, _ in found]
+
+    def _continued(self, path, aim, limited, ask, how):
+        """One way, continued by asking for rows and for new conditions, and its merit."""
         path, working = list(path), self.evaluator.working
-        extra = not aim[0] or self.evaluator.minimax
+        extra, merit = not aim[0] or self.evaluator.minimax, 0.0
         for _ in range(_ROUNDS):
 
             def rows_at(u, working=working):
                 return ask((self._linearise, u, working))
 
             functions = _Functions(rows_at, aim, limited, self.slack, self.scale, extra)
-            start, bounds = path[-1], np.tile([0.0, 1.0], (len(path[-1]), 1))
-            if restored:
-                start = _least_violated(dataclasses.replace(functions, extra=False), start)
-            if extra:
-                largest = functions.at(np.append(start, 0))[0][:, aim].max()
-                start = np.append(start, largest)
-                bounds = np.append(bounds, [[-np.inf, np.inf]], axis=0)
-            z = self.solver(functions.objective, functions.constraints, start, bounds)
-            path += [*functions.seen, np.clip(np.asarray(z, float)[: len(path[-1])], 0, 1)]
+            if self.solver:
+                end = self._solved(functions, path[-1], how)
+            else:
+                end, merit = self._stepped(functions, path[-1], how)
+            path += [*functions.seen, end]
             new = ask((self.evaluator.exchange, path[-1], working))
             if not len(new):
                 break
             working = np.concatenate([working, new])
-        return np.array(path)
+        return np.array(path), merit
+
+    def _solved(self, functions: _Functions, start: np.ndarray, restored: bool) -> np.ndarray:
+        """Where the solver ends, perhaps from the nearest design that violates all the least."""
+        v, bounds = len(start), np.tile([0.0, 1.0], (len(start), 1))
+        if restored:
+            start = _least_violated(dataclasses.replace(functions, extra=False), start)
+        if functions.extra:
+            largest = functions.at(np.append(start, 0))[0][:, functions.aim].max()
+            start = np.append(start, largest)
+            bounds = np.append(bounds, [[-np.inf, np.inf]], axis=0)
+        solver: Any = self.solver
+        z = solver(functions.objective, functions.constraints, start, bounds)
+        return np.clip(np.asarray(z, float)[:v], 0, 1)
+
+    def _stepped(self, functions: _Functions, start: np.ndarray, accuracy: Accuracy):
+        """Where steps in a trust region end, and what is left there to lower."""
+        problem, extra, v = self.evaluator.problem, functions.extra, len(start)
+        functions = dataclasses.replace(functions, extra=False)
+        exact = problem.joint_columns
+        # Scatter and conditions have joints of their own; and where a limit is the aim it is not
+        # yet met.
+        keep = not problem.robust and bool(functions.limited[exact].all())
+        aimed, limited = functions.aim & extra, functions.limited & ~(exact & keep)
+
+        def at(u):
+            rows, slopes = functions.at(u)
+            unmet = (rows + functions.slack)[:, limited].ravel()
+            return Local(
+                0.0 if extra else float(rows[0, 0]),
+                np.zeros(v) if extra else slopes[0, 0],
+                rows[:, aimed].ravel(),
+                slopes[:, aimed].reshape(-1, v),
+                *_compressed(unmet, slopes[:, limited].reshape(-1, v)),
+            )
+
+        def limits(u):
+            if not keep:
+                return np.zeros(0), np.zeros((0, v))
+            residuals, slopes = (x[0] for x in limits_of_joints(problem, u[None]))
+            residuals = np.nan_to_num(residuals, nan=UNKNOWN, posinf=UNKNOWN, neginf=-UNKNOWN)
+            return _compressed(residuals, np.nan_to_num(slopes, posinf=0, neginf=0))
+
+        if keep and limits(start)[0].max() > 0:
+            start = within_joints(problem, start[None])[0]
+        # Of a distance little is lost for a growth rate.
+        distance = not extra and problem.objective is None
+        curvature, penalty = (2.0 / self.scale, 2.0) if distance else (0.0, 10.0)
+        met = float(np.min(np.broadcast_to(functions.slack, limited.shape)[limited], initial=1) / 2)
+        end = in_trust_region(at, limits, start, curvature, accuracy, penalty, met)
+        return end, at(end).merit(1.0)
 
     def _answer(self, questions):
         """What (method, design (v,), working conditions (m, c)) ask, each method once for all."""

@@ -18,6 +18,18 @@ def screened_designs(lattice: int, variables: int) -> np.ndarray:
     return np.stack([axis.ravel() for axis in axes], axis=1)
 
 
+def designs_around(
+    problem: DesignProblem, centre: np.ndarray, count: int, shares: tuple[float, ...], seed: int
+) -> np.ndarray:
+    """Designs (count, v) drawn from the bounds, drawn to a centre (v,), and inside of all joints.
+
+    In turn they are in boxes around the centre of such shares of the bounds.
+    """
+    drawn = np.random.default_rng(seed).random((count, len(centre)))
+    share = np.resize(shares, count)[:, None]
+    return within_joints(problem, centre + share * (drawn - centre))
+
+
 def within_joints(problem: DesignProblem, us: np.ndarray) -> np.ndarray:
     """Designs us (n, v) moved to where every joint is inside its limits, as far as that goes.
 
@@ -27,7 +39,7 @@ def within_joints(problem: DesignProblem, us: np.ndarray) -> np.ndarray:
 
     def lacking(us):
         residuals, slopes = limits_of_joints(problem, us)
-        r = np.maximum(np.nan_to_num(residuals, nan=UNKNOWN) + _INSIDE, 0)
+        r = np.clip(np.nan_to_num(residuals, nan=UNKNOWN) + _INSIDE, 0, UNKNOWN)
         return r, np.nan_to_num(slopes) * (r > 0)[:, :, None]
 
     (r, slopes), damping = lacking(us), np.ones(len(us))

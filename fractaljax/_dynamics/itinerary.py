@@ -351,10 +351,13 @@ class Shooting:
 
 
 def bucket(count: int, least: int) -> int:
-    """The next `least` times a power of four: few shapes, hence few compilations."""
+    """The next `least` times a power of four: few shapes, hence few compilations.
+
+    Beyond 256 a power of two: an evaluation takes so long there that half of it pays for another.
+    """
     size = least
     while size < count:
-        size *= 4
+        size *= 4 if size < 256 else 2
     return size
 
 

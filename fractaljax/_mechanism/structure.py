@@ -25,6 +25,7 @@ from .._base.parts import (
     require_scalar,
     scalar,
 )
+from .._base.quick import quick_jit
 from .._base.toml import naming, read_toml
 from .joint import Direction, Dof, Joint, stored_direction
 from .matrices import (
@@ -40,6 +41,7 @@ from .matrices import (
 )
 from .mechanism import Mechanism
 from .mesh import Mesh
+from .oscillator import Oscillator
 from .scene import Scene
 from .structure_file import npz_bytes, read_structure, structure_text
 
@@ -117,18 +119,15 @@ class Structure(Mechanism):
     @classmethod
     def from_scene(cls, scene: Scene) -> "Structure":
         """The mass on a belt (Eq. 39) as a structure of two degrees of freedom, x1 and x2."""
-        oscillator = scene.oscillator
-        m, f = oscillator.m, oscillator.F / jnp.sqrt(2.0)
-        omega = jnp.stack([oscillator.omega_1, oscillator.omega_2])
-        xi = jnp.stack([oscillator.xi_1, oscillator.xi_2])
+        M, C, K, F = _of_oscillator(scene.oscillator)
         return cls(
-            M=m * jnp.eye(2, dtype=m.dtype),
-            C=jnp.diag(2 * xi * omega * m),
-            K=jnp.diag(m * omega**2),
+            M=M,
+            C=C,
+            K=K,
             joints=Joint(
-                scene.contact, scene.friction, "x1", "x2", oscillator.V, preload=scene.preload
+                scene.contact, scene.friction, "x1", "x2", scene.oscillator.V, preload=scene.preload
             ),
-            F=jnp.stack([f, -f]),
+            F=F,
             names=("x1", "x2"),
         )
 
@@ -365,6 +364,16 @@ class ParametricStructure(Structure):
                 raise ValueError(f"a parameter's name must be like Omega or k_1, got {name!r}")
             if name in taken:
                 raise ValueError(f"the parameter {name} has the name of another quantity")
+
+
+@quick_jit
+def _of_oscillator(oscillator: Oscillator):
+    """M, C, K and F of the mass on a belt."""
+    m, f = oscillator.m, oscillator.F / jnp.sqrt(2.0)
+    omega = jnp.stack([oscillator.omega_1, oscillator.omega_2])
+    xi = jnp.stack([oscillator.xi_1, oscillator.xi_2])
+    M, C = m * jnp.eye(2, dtype=m.dtype), jnp.diag(2 * xi * omega * m)
+    return M, C, jnp.diag(m * omega**2), jnp.stack([f, -f])
 
 
 def too_large(structure: Structure) -> str:

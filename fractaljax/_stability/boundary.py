@@ -38,7 +38,7 @@ from .linearise import Pressed, assembled, linearised_at, pressed, with_equilibr
 from .quadratic import solve
 from .quartic import rightmost_root
 
-_BATCH = 512  # points evaluated at once
+_FEW, _MANY = 64, 512  # points evaluated at once: bisections have few, a fine lattice has many
 _LINES_MAX = 2000  # of the lattice, whose points grow with the square
 _UNDAMPED = 1e-12  # negative damping over sqrt(a + b) that may be rounding
 _COALESCED = 1e2  # times sqrt(eps): negative damping ratio that may be rounding, in a structure
@@ -300,7 +300,8 @@ class _Field:
         def program(us):
             return _tests(self.plane, jnp.asarray(us, self.dtype))
 
-        tests, gradients, lifted = map(np.asarray, in_batches(program, _BATCH, us))
+        batch = _FEW if len(us) <= _FEW**2 else _MANY
+        tests, gradients, lifted = map(np.asarray, in_batches(program, batch, us))
         lost = np.isnan(tests)
         if not self.entered:
             # Beyond a static divergence the force has the other sign: it passed through infinity.

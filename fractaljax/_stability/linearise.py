@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from .._base.lapack import solve
 from .._base.parts import concrete, flag
+from .._base.quick import quick_jit
 from .._contact.load_curve import LoadCurve, loaded_equilibrium
 from .._mechanism.oscillator import Linearised, linearise, static_normal_force
 from .._mechanism.quantities import sliding_friction
@@ -248,6 +249,10 @@ def assembled(structure: Structure, friction_slope: bool, refuse: bool = True) -
     return found._replace(C=C, K=K)
 
 
+# One program: operation by operation the first call would compile sixty.
+_assembled = quick_jit(assembled, ("friction_slope", "refuse"), once=True)
+
+
 def _with_joint(K, K_n, K_t, mu, t, n) -> Array:
     """K (n, n) with the springs of a joint and their friction."""
     K = K + K_t * jnp.outer(t, t)
@@ -295,7 +300,8 @@ def with_equilibrium(structure: Structure, friction_slope: bool) -> Assembled:
 
     **Raises:** `ValueError` in a line if the structure has no equilibrium, unless it is traced.
     """
-    found = assembled(structure, friction_slope)
+    require_single(structure)
+    found = _assembled(structure, flag("friction_slope", friction_slope))
     supported = None if found.supported is None else concrete(found.supported)
     if supported is not None and not supported:
         loaded = any(joint.normal_load is not None for joint in structure.joints)

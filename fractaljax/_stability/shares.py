@@ -23,7 +23,7 @@ from .._mechanism.coefficient import evaluated
 from .._mechanism.quantities import require_one
 from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
-from .linearise import attachments
+from .snapshots import joint_numbers
 from .stability import Stability, stability
 
 _ROWS = 8  # of the table, at most, beside the unstable modes
@@ -126,9 +126,9 @@ def _forms(structure: Structure, x: np.ndarray, friction_slope: bool) -> dict[st
             form = form * (1.0 if value is None else float(value))
             part = name if len(terms) == 1 else f"{name} {i}"
             found[part] = [form if place == other else 0.0 for other in range(3)]
-    attached = attachments(structure, friction_slope).each
+    attached = np.asarray(joint_numbers(structure, friction_slope))
     for name, joint, by in zip(structure.joint_names, structure.joints, attached, strict=True):
-        K_n, K_t, mu, c_t, c_n = (float(number) for number in by)
+        K_n, K_t, mu, c_t, c_n = map(float, by)
         t = x @ structure.direction(joint.tangential)
         n = 0 * t if joint.normal is None else x @ structure.direction(joint.normal)
         # As `assemble` adds them.

@@ -524,7 +524,7 @@ def test_robust_designs_beat_a_refined_grid():
         conditions = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
 
         def excess(us, conditions, scene=scene, K_n=K_n):
-            # Two shapes are compiled: many, and one.
+            # Three shapes are compiled: many at a corner or anywhere, and one.
             padding = np.repeat(us[-1:], -len(us) % 256 if len(us) > 1 else 0, axis=0)
             surfaces = jnp.asarray(low + np.concatenate([us, padding]) * (high - low))
             found = excess_on_grid(scene, jnp.array(-math.pi), K_n, surfaces, conditions)
@@ -537,8 +537,9 @@ def test_robust_designs_beat_a_refined_grid():
 
         ordered = points[np.argsort(((points - own) ** 2).sum(axis=1))]
         for us in np.array_split(ordered, 625):
-            # Most fall at the four corners already.
-            us = us[excess(us, conditions[[0, 10, 110, 120]]) <= 0]
+            # Nearly all fall at a corner already, most at the least load with the most friction.
+            for corner in (110, 120, 0, 10):
+                us = us[excess(us, conditions[[corner]]) <= 0] if len(us) else us
             holding = us[excess(us, conditions) <= 0] if len(us) else us
             if len(holding):
                 break

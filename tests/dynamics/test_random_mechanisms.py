@@ -135,14 +135,17 @@ def assert_derivatives(seed):
 # --- branches ---
 
 
-def followed(seed, quantity) -> fj.Branch | None:
-    """The branch through the limit cycle of a random mechanism, where it has one."""
+def followed(seed, quantity, low) -> fj.Branch | None:
+    """The branch through the limit cycle of a random mechanism, where it has one.
+
+    From `low` times the mechanism's own quantity.
+    """
     given = numbers(seed)
     x, start = of_problem(problem(given)), np.random.default_rng([seed, 2]).standard_normal(6)
     cycle = fj.limit_cycle(x, start, max_returns=1500, throw=False)
     if not bool(cycle.result == fj.CycleResult.converged):
         return None
-    window = 0.6 * given[quantity], 1.6 * given[quantity]
+    window = low * given[quantity], 1.6 * given[quantity]
     return fj.continue_cycle(x, quantity, window, cycle)
 
 
@@ -192,8 +195,9 @@ def test_motions_from_points_of_branches():
     100 rounding has too large a say.
     """
     tested = []
-    for seed, quantity in ((2, "V"), (3, "V"), (4, "V"), (10, "P")):
-        found = followed(seed, quantity)
+    # Below 0.72 of its P the last one repels by thousands, too strongly to be tested here.
+    for seed, quantity, low in ((2, "V", 0.6), (3, "V", 0.6), (4, "V", 0.6), (10, "P", 0.72)):
+        found = followed(seed, quantity, low)
         assert found is not None
         sizes = np.abs(found.multipliers).max(axis=1)
         for i in np.flatnonzero((sizes > 10) & (sizes < 100)):

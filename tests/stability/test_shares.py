@@ -8,8 +8,8 @@ import pytest
 import scipy.linalg
 
 import fractaljax as fj
-from structures import matrices, two_joints
-from tools import ROOT, load_script, reference_scene
+from structures import beam_on_pad, matrices, two_joints
+from tools import reference_scene
 
 shares_of: Any = fj.energy_shares
 
@@ -81,13 +81,9 @@ def test_parts_of_a_rotor():
 
 @functools.cache
 def brake():
-    made = load_script(ROOT / "notebooks" / "brakes.py").beam_on_pad()
-    joints = {
-        f"pair_{i}": fj.Joint(fj.FixedContact(2e8 * share, 1e6), fj.Coulomb(0.4), *pair)
-        for i, (pair, share) in enumerate(zip(made.pairs, made.shares, strict=True))
-    }
-    M, K = made.matrices["M"], made.matrices["K"]
-    return fj.Structure(M, 5 * M + 1e-7 * K, K, joints)
+    return beam_on_pad(
+        lambda share: fj.FixedContact(2e8 * share, 1e6), 0.4, lambda M, K: 5 * M + 1e-7 * K
+    )
 
 
 @functools.cache

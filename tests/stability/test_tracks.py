@@ -10,8 +10,8 @@ from scipy.optimize import linear_sum_assignment
 from scipy.stats import ortho_group
 
 import fractaljax as fj
-from structures import matrices, two_joints
-from tools import ROOT, load_script, reference_scene
+from structures import beam_on_pad, matrices, two_joints
+from tools import reference_scene
 
 track: Any = fj.track_modes
 ODD, EVEN = np.linspace(-0.5, 0.5, 5), np.linspace(-0.5, 0.5, 6)  # through 0 and past it
@@ -196,14 +196,9 @@ def test_brute_force(name):
 
 
 def brake() -> fj.Structure:
-    """The beam on its pad, of 150 degrees of freedom, with a joint in each of nine places."""
-    made = load_script(ROOT / "notebooks" / "brakes.py").beam_on_pad()
-    joints = [
-        fj.Joint(fj.FixedContact(2e8 * share, 0.0), fj.Coulomb(0.3), *pair)
-        for pair, share in zip(made.pairs, made.shares, strict=True)
-    ]
-    M, K = made.matrices["M"], made.matrices["K"]
-    return fj.Structure(M, 5 * M + 1e-7 * K, K, joints)
+    return beam_on_pad(
+        lambda share: fj.FixedContact(2e8 * share, 0.0), 0.3, lambda M, K: 5 * M + 1e-7 * K
+    )
 
 
 def test_coarse_steps_of_a_brake_are_those_of_fine_ones():
