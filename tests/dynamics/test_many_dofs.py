@@ -28,7 +28,7 @@ def test_largest_rate():
     assert rates.max() > 1.2
     assert system.fastest == pytest.approx(rates.max(), rel=1e-2)
     assert system_of(8).fastest is None and system_of(8).products is None
-    excited = excited_system(rods(16), fj.Excitation([1.0], 1e3, dofs=[0]))
+    excited = excited_system(rods(16), fj.Excitation({0: 1.0}, 1e3))
     assert excited.products.matrix.shape == (3 * 6 + 17, 34)
     assert excited.fastest == pytest.approx(2e3 * np.pi / float(excited.omega))
 
