@@ -325,9 +325,23 @@ def _assess(
         h=h,
         rtol=rtol,
     )
-    orbit, error, found = _in_groups(
-        system, record, ready, gap, given, known.orbit, known.error, options=options, length=length
-    )
+
+    def solved():
+        return _in_groups(
+            system,
+            record,
+            ready,
+            gap,
+            given,
+            known.orbit,
+            known.error,
+            options=options,
+            length=length,
+        )
+
+    # XLA moves what does not change out of a loop, to where it is done even if the loop is not.
+    none = known.orbit, known.error, jnp.zeros_like(ready)
+    orbit, error, found = jax.lax.cond(jnp.any(ready), solved, lambda: none)
     now = distance_from(orbit)
     # This near, the multipliers decide whether it attracts.
     ok = ok | (found & (now < options.accepted * scale))
