@@ -139,5 +139,8 @@ def picture(result: Row) -> bytes:
         rows = [row for row in result["rows"] if row["name"] == name]
         if rows:
             lines.append((*columns(rows, "n", "time_s"), style, name))
-    draw(ax, lines, "degrees of freedom", "time [s]", f"rtol {RTOL:g}")
+    draw(ax, lines, "degrees of freedom", "time [s]", f"a limit cycle at rtol {RTOL:g}")
+    counts = sorted({row["n"] for row in result["rows"]})
+    ax.set_xticks(counts, [str(n) for n in counts])
+    ax.minorticks_off()
     return png(figure)
