@@ -166,8 +166,11 @@ def _polynomial_maps(system: HybridSystem, segments: Segments) -> tuple[Array, A
         y, end, h, s, used = segment
 
         def found():
-            _, slope = jax.linearize(lambda y: system.field(y, s), (y + end) / 2)
-            mean = jax.vmap(slope, in_axes=1, out_axes=1)(_identity(y)) * h[None, None]
+            # A system of many lanes has an axis of segments.
+            middle, s_here = ((y + end) / 2)[:, None], s[:, None]
+            _, slope = jax.linearize(lambda y: system.field(y, s_here), middle)
+            mean = jax.vmap(slope, in_axes=1, out_axes=1)(_identity(middle))[:, :, 0]
+            mean = mean * h[None, None]
             powers = [jnp.moveaxis(x, (0, 1), (-2, -1)) for x in (_identity(y), mean)]
             for _ in range(_POWERS - 1):
                 powers.append(jnp.matmul(powers[-1], powers[1]))
@@ -175,7 +178,7 @@ def _polynomial_maps(system: HybridSystem, segments: Segments) -> tuple[Array, A
             for block in reversed(blocks):
                 own = sum(c * power for c, power in zip(block.tolist(), powers, strict=False))
                 A = jnp.matmul(A, powers[-1]) + own
-            return jnp.moveaxis(A, (-2, -1), (0, 1)), system.field(end, s)
+            return jnp.moveaxis(A, (-2, -1), (0, 1)), system.field(end[:, None], s_here)[:, 0]
 
         return jax.lax.cond(jnp.any(used), found, lambda: (_identity(y), jnp.zeros_like(y)))
 

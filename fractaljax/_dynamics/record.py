@@ -55,6 +55,7 @@ class Steps(eqx.Module):
             weight = jnp.max(jnp.abs(error), axis=0) ** 0.125
             weight = jnp.where(used, weight, 0)
             mean = jnp.sum(weight, axis=0) / jnp.sum(used, axis=0)
+            mean = jnp.where(mean > 0, mean, 1)
             weight = h[None] * jnp.maximum(weight / mean[None], 0.1)
             weight = jnp.where(used, jnp.maximum(weight, time * system.fastest / MOST), 0)
         sums = [time, weight]

@@ -45,7 +45,7 @@ class SearchOptions:
     step: float = 0.3  # of the coarse run; no eigenfrequency exceeds 1
     round_steps: int = 128  # between two looks at the returns
     finer_after: tuple[int, int] = (16, 48)  # rounds after which the step is halved
-    round_returns: int = 12  # in a round, usually, where it does not hold only part of one
+    round_returns: int = 12  # of many degrees of freedom, that count as a round of patience
     longest: int = 16  # most returns in one period
     near: float = 0.15  # gap between returns below which an orbit is tried, relative
     ends_near: float = 0.06  # distance that single returns have left, relative

@@ -184,7 +184,7 @@ def test_shallow_dip(depth):
 def _stepped(system, y, h):
     def body(carry, _):
         y, s, last, t = carry
-        y, s_new, dt, guard = step(system, y, s, last, h)
+        y, s_new, dt, guard, _ = step(system, y, s, last, h)
         return (y, s_new, guard, t + dt), (y, s_new, t + dt, dt, guard)
 
     start = y, system.contact_state(y), jnp.array(NONE), jnp.zeros(())
@@ -252,5 +252,5 @@ def test_steps_of_a_batch():
     together = one(system, y, s, last, 0.25)
     for k in range(0, 60, 7):
         alone = one(system, y[:, k], s[:, k], last[k], 0.25)
-        for batched, single in zip(together, alone, strict=True):
+        for batched, single in zip(together[:4], alone[:4], strict=True):
             np.testing.assert_allclose(batched[..., k], single, rtol=0, atol=1e-13)

@@ -100,3 +100,19 @@ def test_cycle_of_forty_degrees_of_freedom_in_a_compiled_program():
     _, slope = jax.jvp(lambda P: found(P)[0], (1.0,), (1.0,))
     ends = [T / own.omega for own, _, T in map(closed, (1 - 1e-4, 1 + 1e-4))]
     assert slope == pytest.approx((ends[1] - ends[0]) / 2e-4, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_many_cycles_of_many_degrees_of_freedom():
+    """Under `jax.vmap` periods and slopes are those of each alone."""
+
+    def period(P):
+        return fj.limit_cycle(rods(12).replace(**{"tip.P": P}), throw=False).period
+
+    function, P = jax.value_and_grad(period), jnp.array([0.9, 1.1])
+    alone = jax.jit(function)
+    np.testing.assert_allclose(
+        jnp.stack(jax.jit(jax.vmap(function))(P)),
+        jnp.array([alone(each) for each in P]).T,
+        rtol=1e-9,
+    )
