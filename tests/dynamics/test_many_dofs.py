@@ -1,6 +1,7 @@
 """Of many degrees of freedom steps and segments follow the motion, far slower than the fastest."""
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +29,7 @@ def test_largest_rate():
     assert rates.max() > 1.2
     assert system.fastest == pytest.approx(rates.max(), rel=1e-2)
     assert system_of(8).fastest is None and system_of(8).products is None
-    excited = excited_system(rods(16), fj.Excitation({0: 1.0}, 1e3))
+    excited: Any = excited_system(rods(16), fj.Excitation({0: 1.0}, 1e3))
     assert excited.products.matrix.shape == (3 * 6 + 17, 34)
     assert excited.fastest == pytest.approx(2e3 * np.pi / float(excited.omega))
 
@@ -72,7 +73,8 @@ def test_cycle_of_forty_degrees_of_freedom_in_a_compiled_program():
         return cycle.period, cycle.state, cycle.stick_fraction, cycle.result
 
     def truth(P):
-        own, joints = structure.replace(**{"tip.P": P}), []
+        own: Any = structure.replace(**{"tip.P": P})
+        joints = []
         for j in own.joints:
             t, n = (np.asarray(own.direction(d)) for d in (j.tangential, j.normal))
             law = functools.partial(hybrid_truth.LAWS["exponential"], mu_s=0.6, mu_d=0.45, v_0=0.5)
