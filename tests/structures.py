@@ -5,6 +5,7 @@ displacement and velocity, differentiates them by differences in 50 digits, and 
 as roots of the determinant.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -14,6 +15,7 @@ import mpmath as mp
 import numpy as np
 
 import fractaljax as fj
+import hybrid_truth
 from tools import ROOT, load_script
 
 DIGITS = 50
@@ -208,3 +210,19 @@ def of_problem(problem) -> fj.Structure:
         joints.append(fj.Joint(contact, law, t, normal, V, preload))
     M, C, K = (jnp.stack([jnp.stack(row) for row in problem[name]]) for name in "MCK")
     return fj.Structure(M, C, K, joints, F=jnp.asarray(problem["F"]))
+
+
+def truth_of(structure: Any) -> hybrid_truth.Mechanism:
+    """The same structure in the terms of the independent solver."""
+    joints = []
+    for j in structure.joints:
+        t, n = (np.asarray(structure.direction(d)) for d in (j.tangential, j.normal))
+        K_n, K_t = map(float, j.stiffness())
+        if isinstance(j.friction, fj.Coulomb):
+            law = functools.partial(hybrid_truth.LAWS["coulomb"], mu=float(j.friction.mu_s))
+        else:
+            numbers = {name: float(getattr(j.friction, name)) for name in ("mu_s", "mu_d", "v_0")}
+            law = functools.partial(hybrid_truth.LAWS["exponential"], **numbers)
+        joints.append(hybrid_truth.Joint(t, float(j.V), law, n, float(j.normal_load), K_n, K_t))
+    M, C, K = (np.asarray(x) for x in (structure.M, structure.C, structure.K))
+    return hybrid_truth.Mechanism(M, C, K, np.zeros(structure.n), tuple(joints))

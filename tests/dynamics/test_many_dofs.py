@@ -1,6 +1,5 @@
 """Of many degrees of freedom steps and segments follow the motion, far slower than the fastest."""
 
-import functools
 from typing import Any
 
 import jax
@@ -15,6 +14,7 @@ from fractaljax._dynamics.excitation import excited_system
 from fractaljax._dynamics.orbit import flow, tableau
 from fractaljax._dynamics.runge_kutta import stability_polynomial
 from fractaljax._dynamics.scaled import hybrid_system
+from structures import truth_of
 
 
 def system_of(n):
@@ -72,23 +72,12 @@ def test_cycle_of_forty_degrees_of_freedom_in_a_compiled_program():
         cycle = fj.limit_cycle(structure.replace(**{"tip.P": P}), throw=False)
         return cycle.period, cycle.state, cycle.stick_fraction, cycle.result
 
-    def truth(P):
-        own: Any = structure.replace(**{"tip.P": P})
-        joints = []
-        for j in own.joints:
-            t, n = (np.asarray(own.direction(d)) for d in (j.tangential, j.normal))
-            law = functools.partial(hybrid_truth.LAWS["exponential"], mu_s=0.6, mu_d=0.45, v_0=0.5)
-            K_n, K_t = map(float, j.stiffness())
-            joints.append(hybrid_truth.Joint(t, 0.5, law, n, float(j.normal_load), K_n, K_t))
-        M, C, K = (np.asarray(x) for x in (own.M, own.C, own.K))
-        return hybrid_truth.Mechanism(M, C, K, np.zeros(40), tuple(joints))
-
     period, state, stick, result = found(1.0)
     assert result == fj.CycleResult.converged
     assert float(period) * float(hybrid_system(structure).omega) > 300
 
     def closed(P):
-        own = truth(P)
+        own = truth_of(structure.replace(**{"tip.P": P}))
         z, T = np.asarray(state) / own.units, float(period) * own.omega
         return own, *hybrid_truth.close(own.scaled, z, T, 1e-12)
 

@@ -8,7 +8,7 @@ import pytest
 
 import fractaljax as fj
 import hybrid_truth
-from structures import beam_on_pad
+from structures import beam_on_pad, truth_of
 
 N = 8  # masses of each of two rods at right angles
 TIPS = [N - 1, 2 * N - 1]
@@ -76,18 +76,6 @@ def brake():
     return fj.reduce(structure, {}, (0, 2 * np.pi * 15000), tol=1e-6, progress=False)
 
 
-def truth(reduced):
-    """The same small structure in the terms of the independent solver."""
-    joints = []
-    for j in reduced.joints:
-        t, n = (np.asarray(reduced.direction(d)) for d in (j.tangential, j.normal))
-        K_n, K_t = map(float, j.stiffness())
-        law = functools.partial(lambda w, mu: mu + 0 * w, mu=float(j.friction.mu_s))
-        joints.append(hybrid_truth.Joint(t, 1.0, law, n, float(j.normal_load), K_n, K_t))
-    M, C, K = (np.asarray(x) for x in (reduced.M, reduced.C, reduced.K))
-    return hybrid_truth.Mechanism(M, C, K, np.zeros(reduced.n), tuple(joints))
-
-
 @pytest.mark.slow
 def test_squeal_of_nine_joints():
     """From the default start, through 600 periods of growth; two of the joints lift off."""
@@ -95,7 +83,7 @@ def test_squeal_of_nine_joints():
     cycle = fj.limit_cycle(reduced, rtol=1e-12)
 
     def closed(mu):
-        mechanism = truth(reduced.replace(**{"pair_3.mu": mu}))
+        mechanism = truth_of(reduced.replace(**{"pair_3.mu": mu}))
         z, T = np.asarray(cycle.state) / mechanism.units, float(cycle.period) * mechanism.omega
         z, T = hybrid_truth.close(mechanism.scaled, z, T, 1e-12)
         return mechanism, z, T
