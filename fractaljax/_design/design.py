@@ -29,10 +29,11 @@ from .._surface.topography import Topographies, topography
 from . import constraints as limits
 from .design_file import design_files, read_design
 from .envelope import Envelope, condition_text
+from .evaluator import Evaluation, evaluator_of
 from .limit import LeastGrowth, least_growth
 from .problem import DEFAULT_BOUNDS, DesignProblem, describe, state_problem
 from .quiet import VERIFIED, Kicks, quiet
-from .search import Evaluation, Found, Search, evaluator_of
+from .search import Found, Search
 from .solvers import Solver, slsqp
 from .starts import choose_starts, designs_around, screened_designs
 from .summary import comparison_table

@@ -16,8 +16,9 @@ from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import replaced
 from .constraints import Constraint
 from .design import Design, design, screened, solver_of
+from .evaluator import Evaluator
 from .problem import DesignProblem, describe, state_problem
-from .search import Evaluator, Search
+from .search import Search
 
 _STARTS = 6  # of each member of the front
 _POINTS_MAX = 1000

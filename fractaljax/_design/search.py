@@ -15,51 +15,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .._base.parts import brief, scalar
-from .envelope import ALONE, Envelope
-from .problem import UNKNOWN, DesignProblem, evaluate, limits_of_joints, linearise
+from .evaluator import Evaluation, Evaluator
+from .problem import UNKNOWN, limits_of_joints, linearise
 from .solvers import Solver
 from .starts import designs_around, within_joints
 from .trust_region import FINE, NEAR, ROUGH, Accuracy, Local, in_trust_region
 
-_LIKELY = 8  # conditions of a first guess at the worst
 _ROUNDS = 12  # of the exchange
 _FEW = 2  # variables, in which a lattice of starts leaves nothing to restore
 _RESTORING = 30  # steps from a start to where all requirements are met
-_NEW = 1e-7  # by which a condition must be worse than the working ones
-_NEAR = 0.05  # a requirement met by more than this on the grid is met between its points
-_TEMPERATURE = 0.02  # of the smooth maximum over an envelope
 _KEPT = 8  # of many ways in a trust region, which go on to the end
 # Around the best end of such ways: rounds of new starts, how many, within what share of the bounds.
 _AGAIN, _AROUND, _SHARE = 3, 8, 0.06
 _GAINED = 1e-3  # of the objective in such a round, for another
-
-
-@dataclasses.dataclass(frozen=True)
-class Evaluation:
-    """Objective and residuals of n designs, and the places where each is at its worst."""
-
-    rows: np.ndarray  # (n, 1 + k)
-    places: np.ndarray  # (n, 1 + k, 1 + ranges)
-
-    @property
-    def values(self) -> np.ndarray:
-        """The objective (n,)."""
-        return self.rows[:, 0]
-
-    @property
-    def residuals(self) -> np.ndarray:
-        """(n, k), at most 0 where met."""
-        return self.rows[:, 1:]
-
-    @property
-    def worst(self) -> np.ndarray:
-        """The largest residual (n,); infinite without a number, or without a value."""
-        return np.where(np.isfinite(self.values), self.residuals.max(axis=1), np.inf)
-
-    def of(self, i: int) -> "Evaluation":
-        """That of one design alone, still with a leading axis."""
-        return Evaluation(self.rows[i : i + 1], self.places[i : i + 1])
 
 
 class Found(NamedTuple):
@@ -70,166 +38,6 @@ class Found(NamedTuple):
     starts: int
     failed: int
     least_growth: Any = None  # `limit.LeastGrowth`, where the growth rate is too large
-
-
-@dataclasses.dataclass(frozen=True)
-class Evaluator:
-    """Every requirement at every condition of an envelope, the objective at its worst."""
-
-    problem: DesignProblem
-    envelope: Envelope = ALONE
-
-    @property
-    def likely(self) -> np.ndarray:
-        """Conditions (m, c) that are a first guess at the worst."""
-        return self.envelope.values(self.envelope.likely(_LIKELY))
-
-    @property
-    def working(self) -> np.ndarray:
-        """The conditions (m, c) that a design is first solved for."""
-        return self.likely
-
-    @property
-    def minimax(self) -> bool:
-        """Whether the objective is the largest of those at many conditions."""
-        return self.problem.objective is not None and self.envelope is not ALONE
-
-    def screen(self, us: np.ndarray) -> np.ndarray:
-        """Objective and residuals (n, 1 + k) of us (n, v), roughly: to choose starts by."""
-        # Cycles are followed from the starts only.
-        rough = dataclasses.replace(self, problem=dataclasses.replace(self.problem, cycles=None))
-        return rough._at_all(us, self.likely).max(axis=1)[:, self.problem.asked]
-
-    def evaluate(self, us: np.ndarray) -> Evaluation:
-        """Designs us (n, v), over all conditions."""
-        grid = self.envelope.grid()
-        each = self._at_all(us, self.envelope.values(grid))
-        each = each[:, :, self.problem.asked]
-        places, rows = grid[each.argmax(axis=1)], each.max(axis=1)
-        near = rows > -_NEAR
-        near[:, 0] = self.problem.objective is not None
-        which, column = np.nonzero(near)
-
-        def residual(places, i):
-            return self._at(us[which[i]], self.envelope.values(places))[
-                np.arange(len(i)), column[i]
-            ]
-
-        places[near], rows[near] = self.envelope.climb(residual, places[near], rows[near])
-        return Evaluation(rows, places)
-
-    def average(self, rows: np.ndarray, jacobians: np.ndarray):
-        """What a design must keep to, from rows (m, 1 + k) at conditions and their Jacobians."""
-        return rows, jacobians
-
-    def exchange(self, us: np.ndarray, working: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Conditions (m, c) at which each of us (n, v) is worse than at all its working ones."""
-        found, new = self.evaluate(us), []
-        counts = [len(conditions) for conditions in working]
-        known = self._at(np.repeat(us, counts, axis=0), np.concatenate(working))
-        known = known[:, self.problem.asked]
-        pieces = np.split(known, np.cumsum(counts)[:-1])
-        for rows, places, piece in zip(found.rows, found.places, pieces, strict=True):
-            worse = rows > piece.max(axis=0) + _NEW
-            worse[1:] &= rows[1:] > 0
-            new.append(self.envelope.values(np.unique(places[worse], axis=0)))
-        return new
-
-    def _at(self, us, conditions):
-        """Rows (n, 1 + k) of designs (n, v), each at a condition; infinite without a number."""
-        rows = evaluate(self.problem, us, conditions)
-        return np.where(np.isnan(rows), np.inf, rows)
-
-    def _at_all(self, us, conditions):
-        """Rows (n, m, 1 + k) of every design at every condition."""
-        n, m = len(us), len(conditions)
-        rows = self._at(np.repeat(us, m, axis=0), np.tile(conditions, (n, 1)))
-        return rows.reshape(n, m, -1)
-
-
-@dataclasses.dataclass(frozen=True)
-class OnAverage(Evaluator):
-    """An average of each requirement over fixed, equally likely conditions.
-
-    `risk` is a temperature T, of T ln sum exp(r/T), which is at least the largest residual, or
-    weights (m,) of the ordered residuals.
-    """
-
-    places: np.ndarray = dataclasses.field(kw_only=True)
-    risk: float | np.ndarray = dataclasses.field(kw_only=True)
-
-    @property
-    def working(self):
-        return self.envelope.values(self.places)
-
-    @property
-    def minimax(self):
-        return False
-
-    def evaluate(self, us):
-        each = self._at_all(us, self.working)
-        rows = np.stack([self._average(rows)[0] for rows in each])
-        return Evaluation(rows, self.places[each.argmax(axis=1)])
-
-    def average(self, rows, jacobians):
-        row, weights = self._average(rows)
-        return row[None], np.einsum("mk,mkv->kv", weights, jacobians)[None]
-
-    def exchange(self, us, working):
-        return [conditions[:0] for conditions in working]
-
-    def _average(self, rows):
-        """The columns of rows (m, 1 + k) on average, and the derivative (m, 1 + k) by them."""
-        row, weights = averaged(rows, self.risk)
-        if self.problem.objective is None:
-            row[0], weights[:, 0] = rows[0, 0], np.arange(len(rows)) == 0
-        return row, weights
-
-
-def evaluator_of(problem: DesignProblem, envelope: Envelope | None, risk: Any) -> Evaluator:
-    """What evaluates designs over the conditions of an envelope, at a risk as in `design`."""
-    match risk:
-        case "worst":
-            return Evaluator(problem, envelope or ALONE)
-        case "smooth":
-            kind, number = "smooth", _TEMPERATURE
-        case ("smooth" as kind, given):
-            number = float(scalar("temperature of risk", given, above=0))
-        case ("cvar" as kind, given):
-            number = float(scalar("alpha of risk", given, at_least=0, below=1))
-        case _:
-            raise ValueError(
-                'risk must be "worst", "smooth", ("smooth", T) or ("cvar", alpha), got '
-                + brief(risk)
-            )
-    if envelope is None:
-        raise ValueError(f"risk {risk!r} needs an envelope")
-    if kind == "smooth":
-        return OnAverage(problem, envelope, places=envelope.coarse_grid(), risk=number)
-    places = envelope.cells()
-    weights = expected_shortfall(len(places), number)
-    return OnAverage(problem, envelope, places=places, risk=weights)
-
-
-def averaged(rows: np.ndarray, risk: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Columns of rows (m, k) on average (k,) as `OnAverage` has it, and their weights (m, k)."""
-    if np.ndim(risk):
-        weights = np.empty_like(rows)
-        np.put_along_axis(weights, rows.argsort(axis=0), np.asarray(risk)[:, None], axis=0)
-        return (weights * rows).sum(axis=0), weights
-    largest = rows.max(axis=0)
-    shares = np.exp((rows - largest) / risk)
-    total = shares.sum(axis=0)
-    return largest + risk * np.log(total), shares / total
-
-
-def expected_shortfall(count: int, alpha: float) -> np.ndarray:
-    """Weights (count,) of ordered, equally likely values: the mean of the worst 1 - alpha."""
-    edges = np.clip(np.arange(count + 1) / count, alpha, 1)
-    return np.diff(edges) / (1 - alpha)
-
-
-# --- landing on the constraints ------------------------------------------------------------
 
 
 @dataclasses.dataclass

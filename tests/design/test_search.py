@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
-from fractaljax._design.search import _Functions, averaged, expected_shortfall, in_lockstep
+from fractaljax._design.evaluator import averaged, expected_shortfall
+from fractaljax._design.search import _Functions, in_lockstep
 from fractaljax._design.solvers import slsqp
 from fractaljax._design.starts import choose_starts, screened_designs
 from tools import reference_scene
