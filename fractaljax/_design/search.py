@@ -62,10 +62,8 @@ class _Functions:
         """Rows and their Jacobians at z, which is u (v,) or, with the extra variable, (u, t)."""
         u = np.clip(z[:-1] if self.extra else z, 0, 1)
         if u.tobytes() not in self._known:
-            rows, jacobians = self.rows_at(u)
-            rows = np.nan_to_num(rows, nan=UNKNOWN, posinf=UNKNOWN, neginf=-UNKNOWN)
+            rows, jacobians = _finite(*self.rows_at(u))
             scale = np.where(np.arange(rows.shape[1]) == 0, self.scale, 1)
-            jacobians = np.nan_to_num(jacobians, posinf=0, neginf=0)
             self._known[u.tobytes()] = rows / scale, jacobians / scale[:, None]
             self.seen.append(u.copy())
         return self._known[u.tobytes()]
@@ -88,6 +86,12 @@ class _Functions:
             by_t = np.append(np.zeros(len(slopes)), -np.ones(len(aimed)))
             slopes = np.column_stack([np.concatenate([slopes, aim_slopes]), by_t])
         return c, slopes
+
+
+def _finite(rows: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows with numbers in place of those that are none, and slopes with zeros."""
+    rows = np.nan_to_num(rows, nan=UNKNOWN, posinf=UNKNOWN, neginf=-UNKNOWN)
+    return rows, np.nan_to_num(slopes, posinf=0, neginf=0)
 
 
 def _compressed(c: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -411,8 +415,7 @@ class Search:
             if not keep:
                 return np.zeros(0), np.zeros((0, v))
             residuals, slopes = (x[0] for x in limits_of_joints(problem, u[None]))
-            residuals = np.nan_to_num(residuals, nan=UNKNOWN, posinf=UNKNOWN, neginf=-UNKNOWN)
-            return _compressed(residuals, np.nan_to_num(slopes, posinf=0, neginf=0))
+            return _compressed(*_finite(residuals, slopes))
 
         if keep and limits(start)[0].max() > 0:
             start = within_joints(problem, start[None])[0]

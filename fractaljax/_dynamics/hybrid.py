@@ -62,7 +62,7 @@ class HybridSystem(eqx.Module):
     # Of many degrees of freedom the largest rate of the mechanism without friction, within a per
     # cent: steps then follow the motion, as far as that allows. None: steps are those of rate 1.
     fastest: Float[Array, ""] | None = None
-    products: "Products | None" = None  # of many degrees of freedom
+    products: Products | None = None  # of many degrees of freedom
 
     def with_products(self) -> "HybridSystem":
         """With them, if it has many degrees of freedom; T, B, K and C are matrices then."""
@@ -295,10 +295,10 @@ class HybridSystem(eqx.Module):
         """What is seen of the motion at the faces, where forces are found from that."""
         return None if any(self.curves) else self.products
 
-    def _seen(self, products: Products, y, s, rows: slice) -> tuple[Array, ...]:
+    def _seen(self, products: Products, y, s, which: slice) -> tuple[Array, ...]:
         """Loads, w, forces and those of sticking faces (f, ...), and the rest of those products."""
         f, leaf = len(self.P), functools.partial(self._leaf, lanes=y.ndim - 1)
-        seen = self._times(products.matrix[rows], y)
+        seen = self._times(products.matrix[which], y)
         loads, along, driven, rest = jnp.split(seen, [f, 2 * f, 3 * f])
         loads, w = loads + leaf(self.P), leaf(self.V) - along
         forces = jnp.where(jnp.abs(s) == 1, self._by_laws(w, loads, s), 0)

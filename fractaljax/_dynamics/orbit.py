@@ -99,9 +99,7 @@ def maps(system: HybridSystem, segments: Segments) -> tuple[Array, Maps]:
         ends, A, b = _maps(system, segments)
     else:
         # The stages of many degrees of freedom fill the cache: one segment at a time.
-        ends, A, b = _one_by_one(functools.partial(_maps, system), segments)
-        ends, b = (jnp.moveaxis(x[:, :, 0], 0, 1) for x in (ends, b))
-        A = A[:, 0]
+        ends, A, b = _one_by_one(lambda part, _: _maps(system, part), segments)
     return ends, Maps(A, b, _guard_slopes(system, segments))
 
 
@@ -114,21 +112,25 @@ def coarse_maps(system: HybridSystem, segments: Segments, count) -> Maps:
         given = functools.partial(_maps, system, coarse=True)
         _, A, b = _of_the_first(given, segments, count)
     else:
-        A, b = _polynomial_maps(system, segments)
+        _, A, b = _one_by_one(functools.partial(_polynomial_maps, system), segments)
     return Maps(A, b, _guard_slopes(system, segments))
 
 
-def _one_by_one(function: Callable, segments: Segments) -> Any:
-    """What `function` gives of every segment alone, of an unused one that of no motion."""
+def _one_by_one(function: Callable, segments: Segments) -> tuple[Array, Array, Array]:
+    """Ends, A and b by `function` of every segment alone and the next start; unused ones stay."""
     lanes = segments.duration.ndim - 1
 
-    def one(segment):
-        part = jax.tree.map(lambda x: jnp.expand_dims(x, x.ndim - lanes), segment)
+    def one(given):
+        part, end = jax.tree.map(lambda x: jnp.expand_dims(x, x.ndim - lanes), given)
         nothing = part.y, jnp.moveaxis(_identity(part.y), 2, 0), jnp.zeros_like(part.y)
-        return jax.lax.cond(jnp.any(part.used), lambda: function(part), lambda: nothing)
+        return jax.lax.cond(jnp.any(part.used), lambda: function(part, end), lambda: nothing)
 
-    front = jax.tree.map(lambda x: jnp.moveaxis(x, _axis(x, lanes), 0), segments)
-    return jax.lax.map(one, front)
+    front = jax.tree.map(
+        lambda x: jnp.moveaxis(x, _axis(x, lanes), 0), (segments, next_start(segments.y))
+    )
+    ends, A, b = jax.lax.map(one, front)
+    ends, b = (jnp.moveaxis(x[:, :, 0], 0, 1) for x in (ends, b))
+    return ends, A[:, 0], b
 
 
 def _maps(system: HybridSystem, segments: Segments, *, coarse: bool = False):
@@ -153,39 +155,25 @@ def _maps(system: HybridSystem, segments: Segments, *, coarse: bool = False):
     return ends, jnp.moveaxis(A, 2, 0), system.field(ends, s)
 
 
-def _polynomial_maps(system: HybridSystem, segments: Segments) -> tuple[Array, Array]:
-    """A and b of neighbours: the step's stability polynomial of the mean Jacobian, and the rate.
+def _polynomial_maps(system: HybridSystem, segments: Segments, ends):
+    """As `_maps`, of segments with known ends: A is the stability polynomial of the mean Jacobian.
 
     Exact if the field is affine. (In powers of its fourth power, by Paterson and Stockmeyer.)
     """
-    lanes = segments.duration.ndim - 1
-    coefficients = stability_polynomial(tableau())
-    blocks = [coefficients[k : k + _POWERS] for k in range(0, len(coefficients), _POWERS)]
-
-    def one(segment):
-        y, end, h, s, used = segment
-
-        def found():
-            # A system of many lanes has an axis of segments.
-            middle, s_here = ((y + end) / 2)[:, None], s[:, None]
-            _, slope = jax.linearize(lambda y: system.field(y, s_here), middle)
-            mean = jax.vmap(slope, in_axes=1, out_axes=1)(_identity(middle))[:, :, 0]
-            mean = mean * h[None, None]
-            powers = [jnp.moveaxis(x, (0, 1), (-2, -1)) for x in (_identity(y), mean)]
-            for _ in range(_POWERS - 1):
-                powers.append(jnp.matmul(powers[-1], powers[1]))
-            A = jnp.zeros_like(powers[1])
-            for block in reversed(blocks):
-                own = sum(c * power for c, power in zip(block.tolist(), powers, strict=False))
-                A = jnp.matmul(A, powers[-1]) + own
-            return jnp.moveaxis(A, (-2, -1), (0, 1)), system.field(end[:, None], s_here)[:, 0]
-
-        return jax.lax.cond(jnp.any(used), found, lambda: (_identity(y), jnp.zeros_like(y)))
-
-    y, s = (jnp.moveaxis(x, _axis(x, lanes), 0) for x in (segments.y, segments.s))
-    given = y, jnp.roll(y, -1, axis=0), segments.duration, s, segments.used
-    A, b = jax.lax.map(one, given)
-    return A, jnp.moveaxis(b, 0, 1)
+    y, h, s = segments.y, segments.duration, segments.s
+    _, slope = jax.linearize(lambda y: system.field(y, s), (y + ends) / 2)
+    eye = _identity(y)
+    mean = jax.vmap(slope, in_axes=1, out_axes=1)(eye) * h[None, None]
+    powers = [jnp.moveaxis(x, (0, 1), (-2, -1)) for x in (eye, mean)]
+    for _ in range(_POWERS - 1):
+        powers.append(jnp.matmul(powers[-1], powers[1]))
+    coefficients = stability_polynomial(tableau()).tolist()
+    A = jnp.zeros_like(powers[1])
+    for first in reversed(range(0, len(coefficients), _POWERS)):
+        block = coefficients[first : first + _POWERS]
+        own = sum(c * power for c, power in zip(block, powers, strict=False))
+        A = jnp.matmul(A, powers[-1]) + own
+    return ends, jnp.moveaxis(A, (-2, -1), (1, 2)), system.field(ends, s)
 
 
 def _identity(y) -> Array:

@@ -22,10 +22,7 @@ def runge_kutta(tableau, field: Callable, y, h, *, error: bool = False) -> Any:
     """
     shape = jnp.broadcast_shapes(y.shape, jnp.shape(h))
     y, h = jnp.broadcast_to(y, shape), jnp.broadcast_to(h, shape)
-    stages = len(tableau.b_sol)
-    rows = np.zeros((stages, stages))
-    for i, row in enumerate(tableau.a_lower):
-        rows[i + 1, : len(row)] = row
+    stages, rows = len(tableau.b_sol), _matrix(tableau)
 
     def weighted(weights, slopes):
         return jnp.tensordot(weights, slopes, 1, precision="highest")
@@ -43,11 +40,16 @@ def runge_kutta(tableau, field: Callable, y, h, *, error: bool = False) -> Any:
 
 def stability_polynomial(tableau) -> np.ndarray:
     """Coefficients, from that of z^0 on, of a step's factor for dy/dt = a y, where z = a h."""
-    stages, power, found = len(tableau.b_sol), np.ones(len(tableau.b_sol)), [1.0]
-    rows = np.zeros((stages, stages))
-    for i, row in enumerate(tableau.a_lower):
-        rows[i + 1, : len(row)] = row
-    for _ in range(stages):
+    rows, power, found = _matrix(tableau), np.ones(len(tableau.b_sol)), [1.0]
+    for _ in rows:
         found.append(float(tableau.b_sol @ power))
         power = rows @ power
     return np.array(found)
+
+
+def _matrix(tableau) -> np.ndarray:
+    """The coefficients (stages, stages) of a stage's state by the slopes before it."""
+    rows = np.zeros((len(tableau.b_sol),) * 2)
+    for i, row in enumerate(tableau.a_lower):
+        rows[i + 1, : len(row)] = row
+    return rows

@@ -219,6 +219,11 @@ class _Progress(eqx.Module):
     calm: Int[Array, " B"]  # rounds with a return in which it did not grow
 
 
+def _passed(system: HybridSystem, rounds, returns, options: SearchOptions):
+    """The rounds that count: of many degrees of freedom a return takes many."""
+    return rounds if system.fastest is None else returns / options.round_returns
+
+
 def _assess(
     system,
     record: Record,
@@ -312,10 +317,9 @@ def _assess(
     left = gap**2 / jnp.maximum(before - gap, 1e-300)
     ends_near = (left < options.ends_near * scale) | (gap < options.accepted / 8 * scale)
     if system.fastest is not None:
-        # Of many degrees of freedom a return takes many rounds, and an attempt long.
-        rounds = returns / options.round_returns
-        ready = ready & exists[3]
-    ready = ready & (ends_near | (period_returns > 1) | (rounds >= options.patient))
+        ready = ready & exists[3]  # of many degrees of freedom an attempt takes long
+    patient = _passed(system, rounds, returns, options) >= options.patient
+    ready = ready & (ends_near | (period_returns > 1) | patient)
 
     given = _Candidates(
         y=seen[:, 0],
@@ -453,10 +457,7 @@ def _find(
     def body(carry):
         record, known, rounds = carry
         # A run that takes long to settle may be near the boundary of two basins.
-        passed = rounds
-        if system.fastest is not None:
-            # Of many degrees of freedom a return takes many steps.
-            passed = jnp.max(known.returns) / options.round_returns
+        passed = _passed(system, rounds, jnp.max(known.returns), options)
         finer = sum(passed >= after for after in options.finer_after)
         h_run = (options.step / 2.0**finer).astype(start.dtype)
         record = record.advance(system, h_run, options.round_steps)

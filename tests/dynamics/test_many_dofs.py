@@ -1,5 +1,6 @@
 """Of many degrees of freedom steps and segments follow the motion, far slower than the fastest."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -38,8 +39,7 @@ def test_largest_rate():
 def test_field_and_guards_by_what_is_seen_at_the_faces(s):
     """As of the same system without those products, in every contact state."""
     system = system_of(12)
-    plain = hybrid_system(rods(12))
-    plain = plain.__class__(**{**vars(plain), "products": None})
+    plain = dataclasses.replace(system, products=None)
     rng = np.random.default_rng(1)
     y, s = jnp.asarray(rng.standard_normal((24, 3))), jnp.tile(jnp.array(s, float)[:, None], 3)
     for found, wanted in ((system.field, plain.field), (system.guards, plain.guards)):
