@@ -18,7 +18,7 @@ MOST_STEPS = 2_000_000
 @functools.cache
 def loop():
     """The compiled loop."""
-    import numba
+    import numba  # pyright: ignore[reportMissingImports]
 
     tableau = diffrax.Dopri5.tableau
     a = np.zeros((7, 7))
