@@ -131,7 +131,7 @@ class HybridSystem(eqx.Module):
         """A leaf with an axis of length one for each lane that the system does not have."""
         return leaf.reshape(leaf.shape + (1,) * (lanes - self.omega.ndim))
 
-    def _times(self, matrix, x) -> Array:
+    def times(self, matrix, x) -> Array:
         """matrix (i, j) times x (j, ...); a matrix (j,) is a diagonal."""
         own = self.omega.ndim
         if matrix.ndim - own == 1:
@@ -146,15 +146,15 @@ class HybridSystem(eqx.Module):
 
     def along(self, x) -> Array:
         """t.x for each face (f, ...)."""
-        return x if self.T is None else self._times(self.T, x)
+        return x if self.T is None else self.times(self.T, x)
 
     def _acceleration(self, forces) -> Array:
         """What forces (f, ...) on the faces accelerate (n, ...)."""
-        return forces if self.B is None else self._times(self.B, forces)
+        return forces if self.B is None else self.times(self.B, forces)
 
     def linear_loads(self, x) -> Array:
         """The loads of the faces (f, ...) with springs of constant stiffness."""
-        return self._times(self.L, x) + self._leaf(self.P, x.ndim - 1)
+        return self.times(self.L, x) + self._leaf(self.P, x.ndim - 1)
 
     def loads(self, x) -> Array:
         """What the coefficient of friction multiplies (f, ...); sticking attracts where > 0."""
@@ -243,7 +243,7 @@ class HybridSystem(eqx.Module):
             friction = jnp.stack(forces)
         if s is not None and any(self.opens):
             friction = jnp.where(s == OPEN, self._taken_back(self.linear_loads(x)), friction)
-        free = self._leaf(self.F, x.ndim - 1) - self._times(self.K, x) - self._times(self.C, u)
+        free = self._leaf(self.F, x.ndim - 1) - self.times(self.K, x) - self.times(self.C, u)
         return free + self._acceleration(friction)
 
     def _taken_back(self, loads) -> Array:
@@ -298,13 +298,13 @@ class HybridSystem(eqx.Module):
     def _seen(self, products: Products, y, s, which: slice) -> tuple[Array, ...]:
         """Loads, w, forces and those of sticking faces (f, ...), and the rest of those products."""
         f, leaf = len(self.P), functools.partial(self._leaf, lanes=y.ndim - 1)
-        seen = self._times(products.matrix[which], y)
+        seen = self.times(products.matrix[which], y)
         loads, along, driven, rest = jnp.split(seen, [f, 2 * f, 3 * f])
         loads, w = loads + leaf(self.P), leaf(self.V) - along
         forces = jnp.where(jnp.abs(s) == 1, self._by_laws(w, loads, s), 0)
         if any(self.opens):
             forces = jnp.where(s == OPEN, self._taken_back(loads), forces)
-        accelerations = leaf(products.F) - driven + self._times(products.W, forces)
+        accelerations = leaf(products.F) - driven + self.times(products.W, forces)
         return loads, w, forces, self.held(accelerations, s == 0), rest
 
     def field(self, y, s) -> Array:
@@ -396,12 +396,12 @@ class HybridSystem(eqx.Module):
         relative change of the way to the opening, where they are not smooth.
         """
         x, u = y[: self.n], y[self.n :]
-        linear, by_time, most = self.linear_loads(x), self._times(self.L, u), jnp.zeros_like(x[0])
+        linear, by_time, most = self.linear_loads(x), self.times(self.L, u), jnp.zeros_like(x[0])
         for j, P, e, curve in self._on_curves(linear):
             tangential, normal = self.faces[j]
             _, slope = jax.jvp(curve, (e,), (jnp.ones_like(e),))
             away = jnp.zeros((len(linear), *e.shape), e.dtype).at[normal].set(1)
-            added = self._times(self.L, self._acceleration(away))[tangential] * (slope - 1)
+            added = self.times(self.L, self._acceleration(away))[tangential] * (slope - 1)
             stiffer = jnp.sqrt(jnp.where(added > 0, added, 0)) / 2
             way = jnp.abs(e + curve.opening) + _SMOOTH * curve.opening
             nearing = jnp.where(s[tangential] == OPEN, 0, jnp.abs(by_time[tangential] / P) / way)
@@ -500,7 +500,7 @@ class HybridSystem(eqx.Module):
                         self._leaf(curve.opening, x.ndim - 1), load.shape
                     )
             loads, openings = jnp.stack(closures), jnp.stack(ones)
-        change = jnp.sum(jnp.where(of_first, self._times(self.L, away) / openings, 0), axis=0)
+        change = jnp.sum(jnp.where(of_first, self.times(self.L, away) / openings, 0), axis=0)
         load = jnp.sum(jnp.where(of_first, loads, 0), axis=0)
         return x - (load / jnp.where(change == 0, 1, change))[None] * away
 

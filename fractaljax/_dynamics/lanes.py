@@ -9,6 +9,16 @@ from jaxtyping import Array
 
 SMALL = 6  # unknowns up to which elimination is no loop, which runs faster
 _SUMMED = 8  # rows up to which products of matrices are sums
+_QUICK = 512  # bytes of an array up to which XLA on a CPU runs a loop's operations one by one
+
+
+def together(size: int, count: int) -> int:
+    """How many items of so many bytes an inner loop takes of `count`: 2^k, which divides that.
+
+    A loop with larger arrays takes twice as long, for XLA would run its operations side by side.
+    """
+    most = max(1, _QUICK // size)
+    return min(1 << (most.bit_length() - 1), count & -count)
 
 
 def rows(x, numbers: Sequence[int] | np.ndarray) -> Array:
@@ -78,8 +88,14 @@ def _positive_inverse_jvp(primals, tangents):
     return inverse, -product(inverse, product(tangents[0], inverse))
 
 
-def product(A, B) -> Array:
-    """A @ B of each lane; a small one as a sum, which compiles into one loop with the rest."""
+def product(A, B, *, written_out: bool = False) -> Array:
+    """A @ B of each lane; a small one as a sum, which compiles into one loop with the rest.
+
+    `written_out` it is quicker where it stands alone: XLA leaves large reductions to a library.
+    """
+    if len(A) <= _SUMMED and written_out:
+        terms = (A[:, k, None] * B[k][None] for k in range(len(B)))
+        return sum(terms, start=jnp.zeros((), A.dtype))
     if len(A) <= _SUMMED:
         return jnp.sum(A[:, :, None] * B[None], axis=1)
     if A[0, 0].size == B[0, 0].size == 1:

@@ -14,7 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from .hybrid import NONE, UNUSED, HybridSystem
 from .lanes import product, row_numbers, solve
@@ -22,10 +22,13 @@ from .runge_kutta import runge_kutta, stability_polynomial
 
 _ITERATIONS = 20
 _HOPELESS = 8  # iterations after which steps must be small, relative to the orbit
-_COARSE = 0.5  # longest step of a coarse map
 _POWERS = 4  # of a matrix in a polynomial of it
 _BLOCK = 32  # of sums
-_TOGETHER, _LEAST = 256, 16  # segments of all lanes that Newton's method takes at a time
+_FEW, _TOGETHER, _LEAST = (
+    512,
+    128,
+    8,
+)  # segments of all lanes, and of each, that are taken at a time
 
 
 class Segments(eqx.Module):
@@ -61,13 +64,6 @@ def tableau():
     return diffrax.Dopri8.tableau
 
 
-def coarse_tableau():
-    """The coefficients of the steps of coarse maps."""
-    import diffrax
-
-    return diffrax.Tsit5.tableau
-
-
 def flow(system: HybridSystem, y, duration, s, error=False) -> Any:
     """The state (2n, ...) after `duration` (...) in contact state s (f, ...), by one step.
 
@@ -95,45 +91,62 @@ def chosen_guard(system: HybridSystem, y, s, guard) -> Array:
 
 def maps(system: HybridSystem, segments: Segments) -> tuple[Array, Maps]:
     """The ends of the segments and their derivatives."""
-    if system.fastest is None:
-        ends, A, b = _maps(system, segments)
-    else:
-        # The stages of many degrees of freedom fill the cache: one segment at a time.
-        ends, A, b = _one_by_one(lambda part, _: _maps(system, part), segments)
+    # The stages of many degrees of freedom fill the cache: one segment at a time.
+    size = len(segments.duration) if system.fastest is None else 1
+    ends, A, b = _in_blocks(functools.partial(_maps, system), _still, size, segments)
     return ends, Maps(A, b, _guard_slopes(system, segments))
 
 
-def coarse_maps(system: HybridSystem, segments: Segments, count) -> Maps:
-    """Derivatives of the first `count`, less exact, which Newton's method converges with as well.
+def coarse_maps(system: HybridSystem, segments: Segments) -> Maps:
+    """Derivatives less exact, which Newton's method converges with as well.
 
-    They take a third of the time, those of many degrees of freedom a tenth.
+    They take a tenth of the time.
     """
+    given, size = functools.partial(_polynomial_maps, system), 1
     if system.fastest is None:
-        given = functools.partial(_maps, system, coarse=True)
-        _, A, b = _of_the_first(given, segments, count)
-    else:
-        _, A, b = _one_by_one(functools.partial(_polynomial_maps, system), segments)
+        size = _together(segments)
+    _, A, b = _in_blocks(given, _still, size, segments, next_start(segments.y))
     return Maps(A, b, _guard_slopes(system, segments))
 
 
-def _one_by_one(function: Callable, segments: Segments) -> tuple[Array, Array, Array]:
-    """Ends, A and b by `function` of every segment alone and the next start; unused ones stay."""
-    lanes = segments.duration.ndim - 1
-
-    def one(given):
-        part, end = jax.tree.map(lambda x: jnp.expand_dims(x, x.ndim - lanes), given)
-        nothing = part.y, jnp.moveaxis(_identity(part.y), 2, 0), jnp.zeros_like(part.y)
-        return jax.lax.cond(jnp.any(part.used), lambda: function(part, end), lambda: nothing)
-
-    front = jax.tree.map(
-        lambda x: jnp.moveaxis(x, _axis(x, lanes), 0), (segments, next_start(segments.y))
-    )
-    ends, A, b = jax.lax.map(one, front)
-    ends, b = (jnp.moveaxis(x[:, :, 0], 0, 1) for x in (ends, b))
-    return ends, A[:, 0], b
+def _together(segments: Segments) -> int:
+    """How many segments of all lanes Newton's method takes at a time: all if they are few."""
+    length, lanes = len(segments.duration), segments.duration[0].size
+    return length if length * lanes <= _FEW else max(_TOGETHER // lanes, _LEAST)
 
 
-def _maps(system: HybridSystem, segments: Segments, *, coarse: bool = False):
+def _still(segments: Segments, *_) -> tuple[Array, Array, Array]:
+    """Ends, A and b of segments that are not used."""
+    y = segments.y
+    return y, jnp.moveaxis(_identity(y), 2, 0), jnp.zeros_like(y)
+
+
+def _in_blocks(function: Callable, unused: Callable, size: int, segments: Segments, *more) -> Any:
+    """function(segments, ...) in blocks of that size; of those without a used segment `unused`."""
+    length, lanes = len(segments.duration), segments.duration.ndim - 1
+    if size >= length:
+        return function(segments, *more)
+
+    def split(x):
+        x = jnp.moveaxis(x, _axis(x, lanes), 0)
+        x = jnp.pad(x, [(0, -length % size), *[(0, 0)] * (x.ndim - 1)], constant_values=UNUSED)
+        return x.reshape(-1, size, *x.shape[1:])
+
+    def block(given):
+        given = jax.tree.map(lambda x: jnp.moveaxis(x, 0, _axis(x, lanes)), given)
+        return jax.lax.cond(
+            jnp.any(given[0].used), lambda: function(*given), lambda: unused(*given)
+        )
+
+    def joined(x):
+        axis = _axis(x[0], lanes)
+        x = jnp.moveaxis(x, axis + 1, 1)
+        return jnp.moveaxis(x.reshape(-1, *x.shape[2:])[:length], 0, axis)
+
+    return jax.tree.map(joined, jax.lax.map(block, jax.tree.map(split, (segments, *more))))
+
+
+def _maps(system: HybridSystem, segments: Segments) -> tuple[Array, Array, Array]:
     """The ends of segments that need not be neighbours, and their derivatives A and b."""
     y, s = segments.y, segments.s
 
@@ -144,13 +157,7 @@ def _maps(system: HybridSystem, segments: Segments, *, coarse: bool = False):
         return jnp.concatenate([along[:, None], tangents], axis=1)
 
     columns = jnp.concatenate([y[:, None], _identity(y)], axis=1)
-    duration = segments.duration[None, None]
-    if coarse:
-        parts = jnp.maximum(jnp.ceil(jnp.nanmax(duration) / _COARSE), 1)
-        step = functools.partial(runge_kutta, coarse_tableau(), field, h=duration / parts)
-        columns = jax.lax.fori_loop(0, parts.astype(int), lambda _, x: step(x), columns)
-    else:
-        columns = runge_kutta(tableau(), field, columns, duration)
+    columns = runge_kutta(tableau(), field, columns, segments.duration[None, None])
     ends, A = columns[:, 0], columns[:, 1:]
     return ends, jnp.moveaxis(A, 2, 0), system.field(ends, s)
 
@@ -162,18 +169,18 @@ def _polynomial_maps(system: HybridSystem, segments: Segments, ends):
     """
     y, h, s = segments.y, segments.duration, segments.s
     _, slope = jax.linearize(lambda y: system.field(y, s), (y + ends) / 2)
-    eye = _identity(y)
-    mean = jax.vmap(slope, in_axes=1, out_axes=1)(eye) * h[None, None]
-    powers = [jnp.moveaxis(x, (0, 1), (-2, -1)) for x in (eye, mean)]
+    mean = jax.vmap(slope, in_axes=1, out_axes=1)(_identity(y)) * h[None, None]
+    eye, mean = (jnp.moveaxis(x, 2, 0) for x in (_identity(y), mean))
+    powers, times = [eye, mean], jax.vmap(functools.partial(product, written_out=True))
     for _ in range(_POWERS - 1):
-        powers.append(jnp.matmul(powers[-1], powers[1]))
+        powers.append(times(powers[-1], mean))
     coefficients = stability_polynomial(tableau()).tolist()
-    A = jnp.zeros_like(powers[1])
+    A = None
     for first in reversed(range(0, len(coefficients), _POWERS)):
         block = coefficients[first : first + _POWERS]
         own = sum(c * power for c, power in zip(block, powers, strict=False))
-        A = jnp.matmul(A, powers[-1]) + own
-    return ends, jnp.moveaxis(A, (-2, -1), (1, 2)), system.field(ends, s)
+        A = own if A is None else times(A, powers[-1]) + own
+    return ends, A, system.field(ends, s)
 
 
 def _identity(y) -> Array:
@@ -194,31 +201,6 @@ def _axis(x, lanes: int) -> int:
     """The axis of segments in x (..., N, ...) of so many axes of lanes; of matrices the first."""
     before = x.ndim - 1 - lanes
     return before if before < 2 else 0
-
-
-def _of_the_first(function: Callable, segments: Segments, count) -> Any:
-    """What `function` gives of segments, of the first `count`: some at a time, zero beyond."""
-    length, lanes = len(segments.duration), segments.duration[0].size
-    size = min(length, max(_TOGETHER // lanes, _LEAST))
-    if size == length:
-        return function(segments)
-
-    along = functools.partial(_axis, lanes=segments.duration.ndim - 1)
-
-    def some(k, found):
-        first = jnp.minimum(k * size, length - size)
-        part = jax.tree.map(
-            lambda x: jax.lax.dynamic_slice_in_dim(x, first, size, along(x)), segments
-        )
-        return jax.tree.map(
-            lambda x, new: jax.lax.dynamic_update_slice_in_dim(x, new, first, along(x)),
-            found,
-            function(part),
-        )
-
-    shapes = jax.eval_shape(function, segments)
-    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    return jax.lax.fori_loop(0, -(-count // size), some, blank)
 
 
 def cumulative(x) -> Array:
@@ -353,14 +335,17 @@ class PeriodicOrbit(eqx.Module):
         return jax.tree.map(chosen, self, other)
 
 
-def solve_periodic_orbits(system: HybridSystem, segments: Segments, wanted, reach) -> PeriodicOrbit:
+def solve_periodic_orbits(
+    system: HybridSystem, segments: Segments, wanted, reach, rtol: ArrayLike = 0
+) -> PeriodicOrbit:
     """The periodic orbits near the segments of g lanes, of those that are `wanted` (g,).
 
     They are solved together: a lane that has converged waits for the others. One gives up where
-    its first state would move further than `reach` (g,).
+    its first state would move further than `reach` (g,). A relative error of less than `rtol` (g,)
+    may be left.
     """
     y, s, guard, used = segments.y, segments.s, segments.guard, segments.used
-    # Those of other lanes may be anything, and all lanes' coarse maps take as many parts.
+    # Those of other lanes may be anything.
     duration = jnp.where(wanted[None], segments.duration, 0)
     if system.excited:
         y = y.at[:, :1].set(system.with_excitation(system.own(y[:, :1]), 0.0))
@@ -373,7 +358,7 @@ def solve_periodic_orbits(system: HybridSystem, segments: Segments, wanted, reac
         # The motion of many degrees of freedom may be far slower than 1.
         extent = jnp.max(jnp.max(y, axis=1) - jnp.min(y, axis=1), axis=0)
         longest_step = jnp.maximum(longest_step, extent / 8)
-    tolerance = 1e3 * eps * size
+    tolerance, together = jnp.maximum(1e3 * eps, 1e-2 * rtol) * size, _together(segments)
     A = jnp.zeros((y.shape[1], len(y), *y[:, 0].shape), y.dtype)
     nothing = Maps(A, jnp.zeros_like(y), jnp.zeros_like(y))
     far = jnp.where(wanted, big, jnp.inf).astype(y.dtype)
@@ -387,13 +372,13 @@ def solve_periodic_orbits(system: HybridSystem, segments: Segments, wanted, reac
         # Each step is this much shorter than the last one, and the next one may be.
         left = change * jnp.clip(change / before, 1e-3, 1)
         going = (left > tolerance) & (change < jnp.inf)
-        # The last iteration is for the error: what half the steps would change.
+        # The last iteration is with half the steps: what it changes is the error.
         ends_here = ~jnp.any(going) | (count == _ITERATIONS)
         # Near the orbit the maps serve again, while they do well.
         stale = going & ((change > 1e-3 * size) | (change > before / 8))
         local = jax.lax.cond(
             jnp.any(stale) & ~ends_here,
-            lambda: coarse_maps(system, found.segments, many),
+            lambda: coarse_maps(system, found.segments),
             lambda: local,
         )
         parts = jnp.where(ends_here, 2, 1)
@@ -404,9 +389,9 @@ def solve_periodic_orbits(system: HybridSystem, segments: Segments, wanted, reac
 
             return jax.lax.fori_loop(0, parts, half, (some.y, some.y))
 
-        ends, middle = _of_the_first(flows, found.segments, many)
+        ends, middle = _in_blocks(flows, lambda none: (none.y, none.y), together, found.segments)
         target = next_start(y)
-        off = jnp.where(ends_here, 0, chosen_guard(system, target, s, guard))
+        off = chosen_guard(system, target, s, guard)
         dy, dt, jacobian = corrections(
             local, found.segments, last, ends - target, off, system.constant, many
         )
@@ -419,13 +404,13 @@ def solve_periodic_orbits(system: HybridSystem, segments: Segments, wanted, reac
         moved = jnp.max(jnp.abs(y[:, 0] + dy[:, 0] - start), axis=0)
         hopeless = (count >= _HOPELESS) & (new > 1e-2 * size)
         new = jnp.where((moved <= reach) & (new < big) & ~hopeless, new, jnp.inf)
-        moves = going & ~ends_here & (new < jnp.inf)
+        converged = left <= 10 * tolerance
+        moves = jnp.where(ends_here, converged, going) & (new < jnp.inf)
         # Far from the orbit a full step may leave the region of convergence.
         share = jnp.minimum(1, longest_step / new)[None]
         y = jnp.where(moves[None, None], y + share[None] * dy, y)
         y = jnp.where(used[None], y, y[:, :1])
         h = jnp.where(moves[None], h + share * dt, h)
-        converged = left <= 10 * tolerance
         middle = jnp.where(used[None], middle, y)
         found = PeriodicOrbit(Segments(y, h, s, guard), converged, jacobian, error, middle)
         change, before = jnp.where(going, jnp.stack([new, change]), jnp.stack([change, before]))

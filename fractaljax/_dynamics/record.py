@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .events import MOST, step
 from .hybrid import NONE, SECTION, UNUSED, HybridSystem
+from .lanes import together
 from .orbit import Segments, cumulative, flow
 
 _PHASES = 256  # most of one contact state in an orbit
@@ -111,18 +112,29 @@ class Record(Steps):
     def advance(self, system: HybridSystem, h, count: int) -> "Record":
         """After `count` more steps, no longer than h; the length is a multiple of `count`."""
 
-        def body(k, carry):
-            y, s, guard, sums, reach, steps = carry
+        rows, _, lanes = self.steps.shape
+        block = together(rows * lanes * self.steps.dtype.itemsize, count)
+
+        def one(k, carry):
+            y, s, guard, sums, reach, some = carry
             y_new, s_new, dt, guard, reach = step(system, y, s, guard, h, reach)
             weight = step_weight(system, y, s, 1 if reach is None else h / reach) * dt
             ended = guard != NONE, guard == SECTION
             sums = sums + jnp.stack([dt, weight, *(x.astype(dt.dtype) for x in ended)])
-            one = jnp.concatenate([y, s, guard.astype(y.dtype)[None], sums])
-            steps = jax.lax.dynamic_update_index_in_dim(steps, one, self.oldest + k, 1)
-            return y_new, s_new, guard, sums, reach, steps
+            row = jnp.concatenate([y, s, guard.astype(y.dtype)[None], sums])
+            some = jax.lax.dynamic_update_index_in_dim(some, row, k, 1)
+            return y_new, s_new, guard, sums, reach, some
 
-        carry = self.y, self.s, self.guard, self.sums, self.reach, self.steps
-        y, s, guard, sums, reach, steps = jax.lax.fori_loop(0, count, body, carry)
+        def body(k, carry):
+            motion, steps = carry
+            motion = jax.lax.fori_loop(0, block, one, motion)
+            at = self.oldest + k * block
+            return motion, jax.lax.dynamic_update_slice_in_dim(steps, motion[-1], at, 1)
+
+        some = jnp.zeros((rows, block, lanes), self.steps.dtype)
+        motion = self.y, self.s, self.guard, self.sums, self.reach, some
+        carry = motion, self.steps
+        (y, s, guard, sums, reach, _), steps = jax.lax.fori_loop(0, count // block, body, carry)
         known = jnp.minimum(self.count + count, self.length)
         oldest = (self.oldest + count) % self.length
         return Record(steps, oldest, y, s, guard, sums, reach, known)

@@ -184,7 +184,8 @@ def _solved(system, record, lane, wanted, given: _Candidates, *, length, options
 
         own = wanted & ((tries == 0) | unsettled(found))
         segments = jax.lax.cond(tries == 0, of_the_run, of_the_orbit)
-        new = solve_periodic_orbits(system, segments, own, options.reach * scale)
+        reach = options.reach * scale
+        new = solve_periodic_orbits(system, segments, own, reach, given.rtol)
         # The method is of order 8; where the motion is not as smooth, halves do.
         known = new.error > 0  # a number
         finer = 0.9 * (given.rtol / jnp.where(known, new.error, 1)) ** 0.125
