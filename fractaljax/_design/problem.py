@@ -297,13 +297,17 @@ def evaluate(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray) -> 
     return _in_batches(_evaluate, problem, us, conditions).astype(float)
 
 
-def limits_of_joints(problem: DesignProblem, us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def limits_of_joints(
+    problem: DesignProblem, us: np.ndarray, conditions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """What joints alone require (n, r) of designs us (n, v), and Jacobians: no eigenvalues.
 
-    Stiffness counts by its logarithm, which many steps of a design change evenly.
+    Each design is at a condition (n, c). Stiffness counts by its logarithm, which many steps of a
+    design change evenly.
     """
-    us = np.asarray(us, problem.low.dtype)
-    return in_batches(functools.partial(_limits_of_joints, problem), _BATCH, us)
+    dtype = problem.low.dtype
+    pairs = np.asarray(us, dtype), np.asarray(conditions, dtype)
+    return in_batches(functools.partial(_limits_of_joints, problem), _BATCH, *pairs)
 
 
 def describe(problem: DesignProblem, us: np.ndarray) -> dict[str, np.ndarray]:
@@ -346,19 +350,29 @@ def _evaluate(problem: DesignProblem, us, conditions):
 
 
 @quick_jit
-def _limits_of_joints(problem: DesignProblem, us):
-    def residuals(u):
-        joints = joints_of(problem.moved(u, problem.own_condition))
-        states = states_of({name: joints[name] for name in problem.contacts})
-        model, stiff = problem.of_joints(states)
-        both = jnp.stack([*model, *(-jnp.log1p(-lacking) for lacking in stiff)])
+def _limits_of_joints(problem: DesignProblem, us, conditions):
+    def required(u, condition, shift=None):
+        joints = joints_of(problem.moved(u, condition, shift))
+        model, stiff = problem.of_joints(
+            states_of({name: joints[name] for name in problem.contacts})
+        )
+        return jnp.stack([*model, *stiff])
+
+    def residuals(u, condition):
+        if problem.scatter is None:
+            found = required(u, condition)
+        else:
+            found = jax.vmap(lambda shift: required(u, condition, shift))(problem.scatter.shifts)
+            found = quantile(found, problem.scatter.weights, problem.scatter.level)
+        model, stiff = jnp.split(found, [problem.model_residuals])
+        both = jnp.concatenate([model, -jnp.log1p(-stiff)])
         return both, both
 
-    def one(u):
-        slopes, values = jax.jacfwd(residuals, has_aux=True)(u)
+    def one(u, condition):
+        slopes, values = jax.jacfwd(residuals, has_aux=True)(u, condition)
         return values, slopes
 
-    return jax.vmap(one)(us)
+    return jax.vmap(one)(us, conditions)
 
 
 # --- checks --------------------------------------------------------------------------------

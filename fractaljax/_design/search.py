@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .evaluator import Evaluation, Evaluator
-from .problem import UNKNOWN, limits_of_joints, linearise
+from .evaluator import Evaluation, Evaluator, OnAverage
+from .problem import UNKNOWN, linearise
 from .solvers import Solver
-from .starts import designs_around, within_joints
+from .starts import designs_around, limits_at, within_joints
 from .trust_region import FINE, NEAR, ROUGH, Accuracy, Local, in_trust_region
 
 _ROUNDS = 12  # of the exchange
@@ -369,7 +369,7 @@ class Search:
             if self.solver:
                 end = self._solved(functions, path[-1], how)
             else:
-                end, merit = self._stepped(functions, path[-1], how)
+                end, merit = self._stepped(functions, path[-1], how, working)
             path += [*functions.seen, end]
             new = ask((self.evaluator.exchange, path[-1], working))
             if not len(new):
@@ -390,14 +390,17 @@ class Search:
         z = solver(functions.objective, functions.constraints, start, bounds)
         return np.clip(np.asarray(z, float)[:v], 0, 1)
 
-    def _stepped(self, functions: _Functions, start: np.ndarray, accuracy: Accuracy):
-        """Where steps in a trust region end, and what is left there to lower."""
+    def _stepped(self, functions: _Functions, start: np.ndarray, accuracy: Accuracy, working):
+        """Where steps in a trust region end, and what is left there to lower.
+
+        The limits of joints are those at the working conditions (m, c).
+        """
         problem, extra, v = self.evaluator.problem, functions.extra, len(start)
         functions = dataclasses.replace(functions, extra=False)
         exact = problem.joint_columns
-        # Scatter and conditions have joints of their own; and where a limit is the aim it is not
-        # yet met.
-        keep = not problem.robust and bool(functions.limited[exact].all())
+        # An average over conditions is of rows; and where a limit is the aim it is not yet met.
+        average = isinstance(self.evaluator, OnAverage)
+        keep = not average and bool(functions.limited[exact].all())
         aimed, limited = functions.aim & extra, functions.limited & ~(exact & keep)
 
         def at(u):
@@ -414,11 +417,12 @@ class Search:
         def limits(u):
             if not keep:
                 return np.zeros(0), np.zeros((0, v))
-            residuals, slopes = (x[0] for x in limits_of_joints(problem, u[None]))
-            return _compressed(*_finite(residuals, slopes))
+            residuals, slopes = (x[0] for x in limits_at(problem, u[None], working))
+            residuals, slopes = _finite(residuals, slopes)
+            return _compressed(residuals + self.slack.max(), slopes)
 
         if keep and limits(start)[0].max() > 0:
-            start = within_joints(problem, start[None])[0]
+            start = within_joints(problem, start[None], working)[0]
         # Of a distance little is lost for a growth rate.
         distance = not extra and problem.objective is None
         curvature, penalty = (2.0 / self.scale, 2.0) if distance else (0.0, 10.0)
