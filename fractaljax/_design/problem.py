@@ -125,19 +125,7 @@ class DesignProblem(eqx.Module):
     def _row(self, u, condition, shift=None):
         """Objective and residuals (1 + k,), and the numbers that describe a design, by name."""
         x = self.moved(u, condition, shift)
-        asked = {
-            name: part
-            for name, part in joints_of(x).items()
-            if part.contact.fractal or name in self.contacts
-        }
-        states = states_of(asked)
-        # The load curve of a joint is that of its own law.
-        known = {
-            name: state
-            for name, state in states.items()
-            if not joints_of(x)[name].follows_load_curve
-        }
-        stiff_x = with_stiffness(x, known)
+        states, stiff_x = self.stiffened(x)
         smooth, rates = [], []
         for each in (stiff_x, *(under(x, law) for law in self.laws)):
             if self.modes:
@@ -178,6 +166,21 @@ class DesignProblem(eqx.Module):
                     numbers[of_joint(name) + key] = getattr(state, key)
         row = [jnp.asarray(value, growth.dtype), *model, *pressing, *stiff, *own]
         return jnp.stack(row + smooth * self.smooth), numbers
+
+    def stiffened(self, x) -> tuple[dict[str, Any], Any]:
+        """States of the contacts of `x` that have one or move, and `x` with their stiffness."""
+        parts = joints_of(x)
+        asked = {
+            name: part
+            for name, part in parts.items()
+            if part.contact.fractal or name in self.contacts
+        }
+        states = states_of(asked)
+        # The load curve of a joint is that of its own law.
+        known = {
+            name: state for name, state in states.items() if not parts[name].follows_load_curve
+        }
+        return states, with_stiffness(x, known)
 
     def of_joints(self, states: Mapping[str, Any]) -> tuple[list[Array], list[Array]]:
         """Residuals of contacts in known states: inside the model, and stiff enough."""

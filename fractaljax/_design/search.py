@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .evaluator import Evaluation, Evaluator, OnAverage
-from .problem import UNKNOWN, linearise
+from .problem import UNKNOWN, DesignProblem, linearise
 from .solvers import Solver
 from .starts import designs_around, limits_at, within_joints
 from .trust_region import FINE, NEAR, ROUGH, Accuracy, Local, in_trust_region
@@ -24,9 +24,9 @@ from .trust_region import FINE, NEAR, ROUGH, Accuracy, Local, in_trust_region
 _ROUNDS = 12  # of the exchange
 _FEW = 2  # variables, in which a lattice of starts leaves nothing to restore
 _RESTORING = 30  # steps from a start to where all requirements are met
-_KEPT = 8  # of many ways in a trust region, which go on to the end
-# Around the best end of such ways: rounds of new starts, how many, within what share of the bounds.
-_AGAIN, _AROUND, _SHARE = 3, 8, 0.06
+_KEPT, _KEPT_NEAR = 8, 4  # of many ways in a trust region, which go on to the end
+# Around the best end of such ways: rounds of new starts, how many, in what shares of the bounds.
+_AGAIN, _AROUND, _SHARES = 8, 12, (0.06, 0.06, 0.15)
 _GAINED = 1e-3  # of the objective in such a round, for another
 
 
@@ -160,6 +160,7 @@ class Search:
     evaluator: Evaluator
     solver: Solver | None  # None: in a trust region, for designs of many joints
     scale: float = 1.0  # of the objective
+    rough: DesignProblem | None = None  # where steps in a trust region begin (`few_modes.py`)
 
     @property
     def slack(self) -> np.ndarray:
@@ -216,9 +217,9 @@ class Search:
             ways = [path]
             if self.solver is None:
                 # What is better is often near.
-                near = designs_around(problem, path[-1], _AROUND, (_SHARE,), again)
+                near = designs_around(problem, path[-1], _AROUND, _SHARES, again)
                 ways += [np.concatenate([path, u[None]]) for u in near]
-            ways = self._land(ways, first=NEAR, kept=3)
+            ways = self._land(ways, first=NEAR, kept=_KEPT_NEAR)
             ended = self._ends(ways)
             values = np.where(ended.worst > 0, np.inf, ended.values)
             best, before = int(values.argmin()), float(end.values[0])
@@ -338,23 +339,42 @@ class Search:
         """
         from tqdm import tqdm
 
-        def run(paths, how):
+        def run(search, paths, how):
             with tqdm(total=len(paths), desc="design", unit="start", disable=not progress) as bar:
 
                 def task(path, ask):
-                    found = self._continued(path, aim, limited, ask, how)
+                    found = search._continued(path, aim, limited, ask, how)
                     bar.update()
                     return found
 
-                return in_lockstep([functools.partial(task, path) for path in paths], self._answer)
+                tasks = [functools.partial(task, path) for path in paths]
+                found = in_lockstep(tasks, search._answer)
+            if search is self:
+                return found
+            # A way shows what was evaluated in the whole problem.
+            ends = zip(paths, found, strict=True)
+            return [(np.concatenate([path, way[-1:]]), merit) for path, (way, merit) in ends]
 
         if self.solver:
-            return [path for path, _ in run(paths, restored)]
-        found = run(paths, first)
-        best = np.argsort([merit for _, merit in found], kind="stable")[:kept].tolist()
-        for i, ended in zip(best, run([found[i][0] for i in best], FINE), strict=True):
-            found[i] = ended
+            return [path for path, _ in run(self, paths, restored)]
+        rough = self._roughly
+        found = run(rough, paths, first)
+        # From the end of the rough problem it is not far: fewer need go on.
+        on = [(self, kept)] if rough is self else [(rough, kept), (self, kept // 2)]
+        for search, count in on:
+            best = np.argsort([merit for _, merit in found], kind="stable")[:count].tolist()
+            ended = run(search, [found[i][0] for i in best], FINE)
+            for i, end in zip(best, ended, strict=True):
+                found[i] = end
         return [path for path, _ in found]
+
+    @property
+    def _roughly(self) -> "Search":
+        """The search in the rough problem, if there is one."""
+        if self.rough is None:
+            return self
+        evaluator = dataclasses.replace(self.evaluator, problem=self.rough)
+        return dataclasses.replace(self, evaluator=evaluator, rough=None)
 
     def _continued(self, path, aim, limited, ask, how):
         """One way, continued by asking for rows and for new conditions, and its merit."""

@@ -43,8 +43,9 @@ def limits_at(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray):
 def within_joints(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray) -> np.ndarray:
     """Designs us (n, v) moved to where every joint is inside its limits, as far as that goes.
 
-    At all conditions (m, c). Of many joints a design that is drawn has nearly always one outside, where no growth rate says
-    anything. Their limits take no eigenvalues. By Levenberg and Marquardt's method.
+    At all conditions (m, c). Of many joints a design that is drawn has nearly always one outside,
+    where no growth rate says anything. Their limits take no eigenvalues. By Levenberg and
+    Marquardt's method.
     """
 
     def lacking(us):
