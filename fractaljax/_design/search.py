@@ -26,8 +26,8 @@ _FEW = 2  # variables, in which a lattice of starts leaves nothing to restore
 _RESTORING = 30  # steps from a start to where all requirements are met
 _KEPT, _KEPT_NEAR = 8, 4  # of many ways in a trust region, which go on to the end
 # Around the best end of such ways: rounds of new starts, how many, in what shares of the bounds.
-_AGAIN, _AROUND, _SHARES = 8, 12, (0.06, 0.06, 0.15)
-_GAINED = 1e-3  # of the objective in such a round, for another
+_AGAIN, _AROUND, _SHARES = 8, 12, 8 * (0.06,) + 4 * (0.15,)
+_GAINED, _IDLE = 1e-3, 2  # of the objective in such rounds, and how many without that are the last
 
 
 class Found(NamedTuple):
@@ -212,6 +212,7 @@ class Search:
         values = np.where(failed, np.inf, found.values)
         best = int(np.flatnonzero(values <= values.min() + 1e-8 * abs(values.min()))[0])
         path, end, count = paths[best], found.of(best), max(len(starts) - int((~failed).sum()), 0)
+        idle = 0
         for again in range(1 if self.solver else _AGAIN):
             # A solver may have stopped early: once more from where it is.
             ways = [path]
@@ -225,7 +226,8 @@ class Search:
             best, before = int(values.argmin()), float(end.values[0])
             if values[best] < before:
                 path, end = ways[best], ended.of(best)
-            if not values[best] < before - _GAINED * abs(before):
+            idle = 0 if values[best] < before - _GAINED * abs(before) else idle + 1
+            if idle == _IDLE:
                 break
         return path, end, count, None
 
