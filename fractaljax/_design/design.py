@@ -30,6 +30,7 @@ from . import constraints as limits
 from .design_file import design_files, read_design
 from .envelope import Envelope, condition_text
 from .evaluator import Evaluation, evaluator_of
+from .few_modes import in_few_modes
 from .limit import LeastGrowth, least_growth
 from .problem import DEFAULT_BOUNDS, DesignProblem, describe, state_problem
 from .quiet import VERIFIED, Kicks, quiet
@@ -290,7 +291,8 @@ def design(
     variable; lattice^2 designs of a low-discrepancy set in more than two variables), and an even
     spread. Of more than two joints there are 32, drawn around the given design, the most promising
     of lattice^2 if that is given; by default steps in a trust region keep to the limits of every
-    joint, the eight best of their ends go on, and more designs are tried around the best.
+    joint, the eight best of their ends go on, and more designs are tried around the best. Of 60
+    degrees of freedom or more those steps begin in the space of the modes that grow most.
     The same arguments give the same design. A request that cannot be met is a result, not an error:
     see `Design.result`. Then `Design.least_growth` is the least growth rate that was found with all
     else met, where, what holds it there, and how many starts agree; or, if that cannot be met
@@ -330,9 +332,9 @@ def design(
         us, scale = choose_starts(own, designs, evaluator.screen(designs), count)
         if problem.cycles is not None:
             scale = abs(float(before.values[0])) or 1.0
-        search = Search(
-            evaluator, solver or solver_of(problem), 1.0 if objective is None else scale
-        )
+        landing = solver or solver_of(problem)
+        rough = None if landing else in_few_modes(problem, us)
+        search = Search(evaluator, landing, 1.0 if objective is None else scale, rough)
         path, after, failed, lowest = search.best(us, progress)
         limit = None if lowest is None else least_growth(search, *lowest)
         return Found(path, after, len(us), failed, limit)

@@ -125,19 +125,7 @@ class DesignProblem(eqx.Module):
     def _row(self, u, condition, shift=None):
         """Objective and residuals (1 + k,), and the numbers that describe a design, by name."""
         x = self.moved(u, condition, shift)
-        asked = {
-            name: part
-            for name, part in joints_of(x).items()
-            if part.contact.fractal or name in self.contacts
-        }
-        states = states_of(asked)
-        # The load curve of a joint is that of its own law.
-        known = {
-            name: state
-            for name, state in states.items()
-            if not joints_of(x)[name].follows_load_curve
-        }
-        stiff_x = with_stiffness(x, known)
+        states, stiff_x = self.stiffened(x)
         smooth, rates = [], []
         for each in (stiff_x, *(under(x, law) for law in self.laws)):
             if self.modes:
@@ -178,6 +166,21 @@ class DesignProblem(eqx.Module):
                     numbers[of_joint(name) + key] = getattr(state, key)
         row = [jnp.asarray(value, growth.dtype), *model, *pressing, *stiff, *own]
         return jnp.stack(row + smooth * self.smooth), numbers
+
+    def stiffened(self, x) -> tuple[dict[str, Any], Any]:
+        """States of the contacts of `x` that have one or move, and `x` with their stiffness."""
+        parts = joints_of(x)
+        asked = {
+            name: part
+            for name, part in parts.items()
+            if part.contact.fractal or name in self.contacts
+        }
+        states = states_of(asked)
+        # The load curve of a joint is that of its own law.
+        known = {
+            name: state for name, state in states.items() if not parts[name].follows_load_curve
+        }
+        return states, with_stiffness(x, known)
 
     def of_joints(self, states: Mapping[str, Any]) -> tuple[list[Array], list[Array]]:
         """Residuals of contacts in known states: inside the model, and stiff enough."""
@@ -297,13 +300,17 @@ def evaluate(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray) -> 
     return _in_batches(_evaluate, problem, us, conditions).astype(float)
 
 
-def limits_of_joints(problem: DesignProblem, us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def limits_of_joints(
+    problem: DesignProblem, us: np.ndarray, conditions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """What joints alone require (n, r) of designs us (n, v), and Jacobians: no eigenvalues.
 
-    Stiffness counts by its logarithm, which many steps of a design change evenly.
+    Each design is at a condition (n, c). Stiffness counts by its logarithm, which many steps of a
+    design change evenly.
     """
-    us = np.asarray(us, problem.low.dtype)
-    return in_batches(functools.partial(_limits_of_joints, problem), _BATCH, us)
+    dtype = problem.low.dtype
+    pairs = np.asarray(us, dtype), np.asarray(conditions, dtype)
+    return in_batches(functools.partial(_limits_of_joints, problem), _BATCH, *pairs)
 
 
 def describe(problem: DesignProblem, us: np.ndarray) -> dict[str, np.ndarray]:
@@ -346,19 +353,29 @@ def _evaluate(problem: DesignProblem, us, conditions):
 
 
 @quick_jit
-def _limits_of_joints(problem: DesignProblem, us):
-    def residuals(u):
-        joints = joints_of(problem.moved(u, problem.own_condition))
-        states = states_of({name: joints[name] for name in problem.contacts})
-        model, stiff = problem.of_joints(states)
-        both = jnp.stack([*model, *(-jnp.log1p(-lacking) for lacking in stiff)])
+def _limits_of_joints(problem: DesignProblem, us, conditions):
+    def required(u, condition, shift=None):
+        joints = joints_of(problem.moved(u, condition, shift))
+        model, stiff = problem.of_joints(
+            states_of({name: joints[name] for name in problem.contacts})
+        )
+        return jnp.stack([*model, *stiff])
+
+    def residuals(u, condition):
+        if problem.scatter is None:
+            found = required(u, condition)
+        else:
+            found = jax.vmap(lambda shift: required(u, condition, shift))(problem.scatter.shifts)
+            found = quantile(found, problem.scatter.weights, problem.scatter.level)
+        model, stiff = jnp.split(found, [problem.model_residuals])
+        both = jnp.concatenate([model, -jnp.log1p(-stiff)])
         return both, both
 
-    def one(u):
-        slopes, values = jax.jacfwd(residuals, has_aux=True)(u)
+    def one(u, condition):
+        slopes, values = jax.jacfwd(residuals, has_aux=True)(u, condition)
         return values, slopes
 
-    return jax.vmap(one)(us)
+    return jax.vmap(one)(us, conditions)
 
 
 # --- checks --------------------------------------------------------------------------------

@@ -15,19 +15,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .evaluator import Evaluation, Evaluator
-from .problem import UNKNOWN, limits_of_joints, linearise
+from .evaluator import Evaluation, Evaluator, OnAverage
+from .problem import UNKNOWN, DesignProblem, linearise
 from .solvers import Solver
-from .starts import designs_around, within_joints
+from .starts import designs_around, limits_at, within_joints
 from .trust_region import FINE, NEAR, ROUGH, Accuracy, Local, in_trust_region
 
 _ROUNDS = 12  # of the exchange
 _FEW = 2  # variables, in which a lattice of starts leaves nothing to restore
 _RESTORING = 30  # steps from a start to where all requirements are met
-_KEPT = 8  # of many ways in a trust region, which go on to the end
-# Around the best end of such ways: rounds of new starts, how many, within what share of the bounds.
-_AGAIN, _AROUND, _SHARE = 3, 8, 0.06
-_GAINED = 1e-3  # of the objective in such a round, for another
+_KEPT, _KEPT_NEAR = 8, 4  # of many ways in a trust region, which go on to the end
+# Around the best end of such ways: rounds of new starts, how many, in what shares of the bounds.
+_AGAIN, _AROUND, _SHARES = 8, 12, 8 * (0.06,) + 4 * (0.15,)
+_GAINED, _IDLE = 1e-3, 2  # of the objective in such rounds, and how many without that are the last
 
 
 class Found(NamedTuple):
@@ -160,6 +160,7 @@ class Search:
     evaluator: Evaluator
     solver: Solver | None  # None: in a trust region, for designs of many joints
     scale: float = 1.0  # of the objective
+    rough: DesignProblem | None = None  # where steps in a trust region begin (`few_modes.py`)
 
     @property
     def slack(self) -> np.ndarray:
@@ -211,20 +212,22 @@ class Search:
         values = np.where(failed, np.inf, found.values)
         best = int(np.flatnonzero(values <= values.min() + 1e-8 * abs(values.min()))[0])
         path, end, count = paths[best], found.of(best), max(len(starts) - int((~failed).sum()), 0)
+        idle = 0
         for again in range(1 if self.solver else _AGAIN):
             # A solver may have stopped early: once more from where it is.
             ways = [path]
             if self.solver is None:
                 # What is better is often near.
-                near = designs_around(problem, path[-1], _AROUND, (_SHARE,), again)
+                near = designs_around(problem, path[-1], _AROUND, _SHARES, again)
                 ways += [np.concatenate([path, u[None]]) for u in near]
-            ways = self._land(ways, first=NEAR, kept=3)
+            ways = self._land(ways, first=NEAR, kept=_KEPT_NEAR)
             ended = self._ends(ways)
             values = np.where(ended.worst > 0, np.inf, ended.values)
             best, before = int(values.argmin()), float(end.values[0])
             if values[best] < before:
                 path, end = ways[best], ended.of(best)
-            if not values[best] < before - _GAINED * abs(before):
+            idle = 0 if values[best] < before - _GAINED * abs(before) else idle + 1
+            if idle == _IDLE:
                 break
         return path, end, count, None
 
@@ -338,23 +341,42 @@ class Search:
         """
         from tqdm import tqdm
 
-        def run(paths, how):
+        def run(search, paths, how):
             with tqdm(total=len(paths), desc="design", unit="start", disable=not progress) as bar:
 
                 def task(path, ask):
-                    found = self._continued(path, aim, limited, ask, how)
+                    found = search._continued(path, aim, limited, ask, how)
                     bar.update()
                     return found
 
-                return in_lockstep([functools.partial(task, path) for path in paths], self._answer)
+                tasks = [functools.partial(task, path) for path in paths]
+                found = in_lockstep(tasks, search._answer)
+            if search is self:
+                return found
+            # A way shows what was evaluated in the whole problem.
+            ends = zip(paths, found, strict=True)
+            return [(np.concatenate([path, way[-1:]]), merit) for path, (way, merit) in ends]
 
         if self.solver:
-            return [path for path, _ in run(paths, restored)]
-        found = run(paths, first)
-        best = np.argsort([merit for _, merit in found], kind="stable")[:kept].tolist()
-        for i, ended in zip(best, run([found[i][0] for i in best], FINE), strict=True):
-            found[i] = ended
+            return [path for path, _ in run(self, paths, restored)]
+        rough = self._roughly
+        found = run(rough, paths, first)
+        # From the end of the rough problem it is not far: fewer need go on.
+        on = [(self, kept)] if rough is self else [(rough, kept), (self, kept // 2)]
+        for search, count in on:
+            best = np.argsort([merit for _, merit in found], kind="stable")[:count].tolist()
+            ended = run(search, [found[i][0] for i in best], FINE)
+            for i, end in zip(best, ended, strict=True):
+                found[i] = end
         return [path for path, _ in found]
+
+    @property
+    def _roughly(self) -> "Search":
+        """The search in the rough problem, if there is one."""
+        if self.rough is None:
+            return self
+        evaluator = dataclasses.replace(self.evaluator, problem=self.rough)
+        return dataclasses.replace(self, evaluator=evaluator, rough=None)
 
     def _continued(self, path, aim, limited, ask, how):
         """One way, continued by asking for rows and for new conditions, and its merit."""
@@ -369,7 +391,7 @@ class Search:
             if self.solver:
                 end = self._solved(functions, path[-1], how)
             else:
-                end, merit = self._stepped(functions, path[-1], how)
+                end, merit = self._stepped(functions, path[-1], how, working)
             path += [*functions.seen, end]
             new = ask((self.evaluator.exchange, path[-1], working))
             if not len(new):
@@ -390,14 +412,17 @@ class Search:
         z = solver(functions.objective, functions.constraints, start, bounds)
         return np.clip(np.asarray(z, float)[:v], 0, 1)
 
-    def _stepped(self, functions: _Functions, start: np.ndarray, accuracy: Accuracy):
-        """Where steps in a trust region end, and what is left there to lower."""
+    def _stepped(self, functions: _Functions, start: np.ndarray, accuracy: Accuracy, working):
+        """Where steps in a trust region end, and what is left there to lower.
+
+        The limits of joints are those at the working conditions (m, c).
+        """
         problem, extra, v = self.evaluator.problem, functions.extra, len(start)
         functions = dataclasses.replace(functions, extra=False)
         exact = problem.joint_columns
-        # Scatter and conditions have joints of their own; and where a limit is the aim it is not
-        # yet met.
-        keep = not problem.robust and bool(functions.limited[exact].all())
+        # An average over conditions is of rows; and where a limit is the aim it is not yet met.
+        average = isinstance(self.evaluator, OnAverage)
+        keep = not average and bool(functions.limited[exact].all())
         aimed, limited = functions.aim & extra, functions.limited & ~(exact & keep)
 
         def at(u):
@@ -414,11 +439,12 @@ class Search:
         def limits(u):
             if not keep:
                 return np.zeros(0), np.zeros((0, v))
-            residuals, slopes = (x[0] for x in limits_of_joints(problem, u[None]))
-            return _compressed(*_finite(residuals, slopes))
+            residuals, slopes = (x[0] for x in limits_at(problem, u[None], working))
+            residuals, slopes = _finite(residuals, slopes)
+            return _compressed(residuals + self.slack.max(), slopes)
 
         if keep and limits(start)[0].max() > 0:
-            start = within_joints(problem, start[None])[0]
+            start = within_joints(problem, start[None], working)[0]
         # Of a distance little is lost for a growth rate.
         distance = not extra and problem.objective is None
         curvature, penalty = (2.0 / self.scale, 2.0) if distance else (0.0, 10.0)

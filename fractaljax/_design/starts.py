@@ -23,22 +23,33 @@ def designs_around(
 ) -> np.ndarray:
     """Designs (count, v) drawn from the bounds, drawn to a centre (v,), and inside of all joints.
 
-    In turn they are in boxes around the centre of such shares of the bounds.
+    In turn they are in boxes around the centre of such shares of the bounds. The joints are under
+    the conditions that `problem` has itself.
     """
     drawn = np.random.default_rng(seed).random((count, len(centre)))
     share = np.resize(shares, count)[:, None]
-    return within_joints(problem, centre + share * (drawn - centre))
+    own = np.asarray(problem.own_condition)[None]
+    return within_joints(problem, centre + share * (drawn - centre), own)
 
 
-def within_joints(problem: DesignProblem, us: np.ndarray) -> np.ndarray:
+def limits_at(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray):
+    """What joints alone require (n, m r) of us (n, v) at conditions (m, c), and Jacobians."""
+    n, m = len(us), len(conditions)
+    repeated = np.repeat(us, m, axis=0), np.tile(conditions, (n, 1))
+    residuals, slopes = limits_of_joints(problem, *repeated)
+    return residuals.reshape(n, -1), slopes.reshape(n, -1, us.shape[1])
+
+
+def within_joints(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray) -> np.ndarray:
     """Designs us (n, v) moved to where every joint is inside its limits, as far as that goes.
 
-    Of many joints a design that is drawn has nearly always one outside, where no growth rate says
-    anything. Their limits take no eigenvalues. By Levenberg and Marquardt's method.
+    At all conditions (m, c). Of many joints a design that is drawn has nearly always one outside,
+    where no growth rate says anything. Their limits take no eigenvalues. By Levenberg and
+    Marquardt's method.
     """
 
     def lacking(us):
-        residuals, slopes = limits_of_joints(problem, us)
+        residuals, slopes = limits_at(problem, us, conditions)
         r = np.clip(np.nan_to_num(residuals, nan=UNKNOWN) + _INSIDE, 0, UNKNOWN)
         return r, np.nan_to_num(slopes) * (r > 0)[:, :, None]
 

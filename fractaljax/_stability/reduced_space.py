@@ -16,7 +16,7 @@ _PARTNERS = 0.03  # least cosine, of the largest, between right and left directi
 _POWERS = {"M": 2, "C": 1, "K": 0}  # of s
 
 
-def _decomposed(vectors: list[np.ndarray], weight: np.ndarray, cut: float) -> np.ndarray:
+def decomposed(vectors: list[np.ndarray], weight: np.ndarray, cut: float) -> np.ndarray:
     """An orthonormal basis (n, r) in the norm of a lumped mass, of vectors (n, k), complex or not.
 
     The most important first; those with singular values below `cut` of the largest are left out.
@@ -36,11 +36,11 @@ class Space:
         right = [x for each in taken for x in (each.modes.right, each.right) if x.shape[1]]
         left = [x for each in taken for x in (each.modes.left, each.left) if x.shape[1]]
         if snapshots.oblique:
-            V, W = (_decomposed(each, weight, cut) for each in (right, left))
+            V, W = (decomposed(each, weight, cut) for each in (right, left))
             r = min(V.shape[1], W.shape[1])
             self.V, self.W = _paired(plain(structure, "M"), V[:, :r], W[:, :r])
         else:
-            self.V = self.W = _decomposed([*right, *left], weight, cut)
+            self.V = self.W = decomposed([*right, *left], weight, cut)
         self.oblique = snapshots.oblique
         self.M = plain(structure, "M")
         self.mass = self.W.T @ (self.M @ self.V)
