@@ -168,7 +168,9 @@ def _polynomial_maps(system: HybridSystem, segments: Segments, ends):
     Exact if the field is affine. (In powers of its fourth power, by Paterson and Stockmeyer.)
     """
     y, h, s = segments.y, segments.duration, segments.s
-    _, slope = jax.linearize(lambda y: system.field(y, s), (y + ends) / 2)
+    b = system.field(ends, s)
+    state = (y + ends) / 2 + h[None] / 12 * (system.field(y, s) - b)  # its mean in time
+    _, slope = jax.linearize(lambda y: system.field(y, s), state)
     mean = jax.vmap(slope, in_axes=1, out_axes=1)(_identity(y)) * h[None, None]
     eye, mean = (jnp.moveaxis(x, 2, 0) for x in (_identity(y), mean))
     powers, times = [eye, mean], jax.vmap(functools.partial(product, written_out=True))
@@ -180,7 +182,7 @@ def _polynomial_maps(system: HybridSystem, segments: Segments, ends):
         block = coefficients[first : first + _POWERS]
         own = sum(c * power for c, power in zip(block, powers, strict=False))
         A = own if A is None else times(A, powers[-1]) + own
-    return ends, A, system.field(ends, s)
+    return ends, A, b
 
 
 def _identity(y) -> Array:
@@ -342,7 +344,7 @@ def solve_periodic_orbits(
 
     They are solved together: a lane that has converged waits for the others. One gives up where
     its first state would move further than `reach` (g,). A relative error of less than `rtol` (g,)
-    may be left.
+    may be left, and where the error is below `rtol` it is corrected.
     """
     y, s, guard, used = segments.y, segments.s, segments.guard, segments.used
     # Those of other lanes may be anything.
@@ -372,7 +374,7 @@ def solve_periodic_orbits(
         # Each step is this much shorter than the last one, and the next one may be.
         left = change * jnp.clip(change / before, 1e-3, 1)
         going = (left > tolerance) & (change < jnp.inf)
-        # The last iteration is with half the steps: what it changes is the error.
+        # The last iteration is with half the steps: what these change is the error.
         ends_here = ~jnp.any(going) | (count == _ITERATIONS)
         # Near the orbit the maps serve again, while they do well.
         stale = going & ((change > 1e-3 * size) | (change > before / 8))
@@ -405,7 +407,8 @@ def solve_periodic_orbits(
         hopeless = (count >= _HOPELESS) & (new > 1e-2 * size)
         new = jnp.where((moved <= reach) & (new < big) & ~hopeless, new, jnp.inf)
         converged = left <= 10 * tolerance
-        moves = jnp.where(ends_here, converged, going) & (new < jnp.inf)
+        accurate = converged & (error <= rtol)
+        moves = jnp.where(ends_here, accurate, going) & (new < jnp.inf)
         # Far from the orbit a full step may leave the region of convergence.
         share = jnp.minimum(1, longest_step / new)[None]
         y = jnp.where(moves[None, None], y + share[None] * dy, y)
