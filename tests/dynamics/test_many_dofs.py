@@ -19,7 +19,6 @@ from fractaljax._dynamics.runge_kutta import stability_polynomial
 from fractaljax._dynamics.scaled import hybrid_system
 from structures import truth_of
 
-
 system = jax.jit(hybrid_system)
 field, guards = jax.jit(HybridSystem.field), jax.jit(HybridSystem.guards)
 
@@ -55,7 +54,7 @@ def test_field_and_guards_by_what_is_seen_at_the_faces(s):
 
 @jax.jit
 def programs(system, y, s):
-    """Slope of the field, the field at 0, and the end of a step of 1.5, (24, 1) in and (24,) out."""
+    """Slope of the field, the field at 0, and the end of a step of 1.5, for states (2n, 1)."""
     slope = jax.jacfwd(lambda y: system.field(y[:, None], s)[:, 0])(y[:, 0])
     end = flow(system, y, jnp.full(1, 1.5), s)
     return slope, system.field(0 * y, s)[:, 0], end[:, 0]
