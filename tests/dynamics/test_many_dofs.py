@@ -17,7 +17,7 @@ from fractaljax._dynamics.hybrid import HybridSystem
 from fractaljax._dynamics.orbit import flow, tableau
 from fractaljax._dynamics.runge_kutta import stability_polynomial
 from fractaljax._dynamics.scaled import hybrid_system
-from structures import truth_of
+from structures import monodromy_of, truth_of
 
 system = jax.jit(hybrid_system)
 field, guards = jax.jit(HybridSystem.field), jax.jit(HybridSystem.guards)
@@ -84,26 +84,26 @@ def test_cycle_of_forty_degrees_of_freedom_in_a_compiled_program():
     @jax.jit
     def found(P):
         cycle = fj.limit_cycle(structure.replace(**{"tip.P": P}), throw=False)
-        return cycle.period, cycle.state, cycle.stick_fraction, cycle.result
+        flow = monodromy_of(cycle)
+        return cycle.period, cycle.state, cycle.stick_fraction, cycle.result, flow
 
-    period, state, stick, result = found(1.0)
+    period, state, stick, result, flow = found(1.0)
     assert result == fj.CycleResult.converged
     assert float(period) * float(hybrid_system(structure).omega) > 300
 
     def closed(P):
         own = truth_of(structure.replace(**{"tip.P": P}))
         z, T = np.asarray(state) / own.units, float(period) * own.omega
-        return own, *hybrid_truth.close(own.scaled, z, T, 1e-12)
+        return own, *hybrid_truth.closed(own.scaled, z, T, 1e-12, own.map_in_units(flow))
 
-    own, z, T = closed(1.0)
+    own, z, T, trip = closed(1.0)
     assert T / own.omega == pytest.approx(float(period), rel=1e-9)
     np.testing.assert_allclose(state, z * own.units, rtol=0, atol=1e-8 * abs(state).max())
-    trip = list(hybrid_truth.phases(own.scaled, z, 1e-12, T))
     np.testing.assert_allclose(stick, hybrid_truth.shares(own.scaled, trip)[0] / T, atol=1e-8)
     assert stick[0] > 0.1 and stick[2] > 0.05
 
     _, slope = jax.jvp(lambda P: found(P)[0], (1.0,), (1.0,))
-    ends = [T / own.omega for own, _, T in map(closed, (1 - 1e-4, 1 + 1e-4))]
+    ends = [T / own.omega for own, _, T, _ in map(closed, (1 - 1e-4, 1 + 1e-4))]
     assert slope == pytest.approx((ends[1] - ends[0]) / 2e-4, rel=1e-6)
 
 

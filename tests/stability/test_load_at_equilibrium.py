@@ -113,7 +113,7 @@ class Oracle:
             u = mp.fdot(self.x.direction(joint.normal).tolist(), x)
             forces.append(float(self.normal(joint, u)))
             K_n = mp.mpf(float(joint.contact.stiffness(0.4, 0.3)[0]))
-            linear.append(float(joint.contact.P + K_n * u))
+            linear.append(float(joint.contact.P) + float(K_n * u))
         assert not np.allclose(forces, linear, rtol=1e-6)  # the curve is felt
         return mp.eig(A, left=False, right=False), forces
 
