@@ -105,6 +105,7 @@ def extrapolated(known: dict, h: float) -> np.ndarray:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unoptimised")
 def test_derivatives():
     """One test for all seeds: a worker of its own for each would compile the same again."""
     for seed in SEEDS:
