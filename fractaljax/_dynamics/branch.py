@@ -286,15 +286,14 @@ def _smooth(follower, y, vector, frequency, q) -> Solution:
     slips = (1,) * len(follower.family.template.P)
     u = np.concatenate([states[:, 0], [2 * np.pi / frequency], np.zeros(7), [q]])
     chain = Chain(
-        s=np.ones((len(slips), N)),
-        guard=np.array([NONE] * (N - 1) + [SECTION]),
-        phase=np.zeros(N, int),
-        begin=np.arange(N) / N,
-        share=np.full(N, 1 / N),
-        used=(np.arange(8) < 1).astype(float),
+        s=jnp.ones((len(slips), N)),
+        guard=jnp.asarray([NONE] * (N - 1) + [SECTION]),
+        phase=jnp.zeros(N, int),
+        begin=jnp.arange(N) / N,
+        share=jnp.full(N, 1 / N),
+        used=jnp.asarray(np.arange(8) < 1, float),
     )
-    lifted = Lifted(u, states, np.zeros((len(y), len(u), N)))
-    chain, lifted = jax.tree.map(jnp.asarray, (chain, lifted))
+    lifted = Lifted(jnp.asarray(u), jnp.asarray(states), jnp.zeros((len(y), len(u), N)))
     return Solution(follower.x, (Phase(slips, SECTION),), chain, lifted, u)
 
 
