@@ -126,6 +126,10 @@ class Mechanism:
         V = max(abs(j.V) for j in self.joints)
         return np.repeat([V / self.omega, V], len(self.M))
 
+    def map_in_units(self, A) -> np.ndarray:
+        """A linear map (2n, 2n) of states [x, x'] in SI, in those units."""
+        return np.asarray(A) * self.units[None] / self.units[:, None]
+
     @cached_property
     def scaled(self) -> "Mechanism":
         """The same in units of 1/omega, V and V/omega."""
@@ -529,6 +533,11 @@ def monodromy(mechanism, trip, rtol=1e-12) -> np.ndarray:
 
 def close(mechanism, z, T, rtol=1e-12, flow=None):
     """The periodic orbit of a scaled mechanism near z, with t.x' = 0 at joint 1, and its period."""
+    return closed(mechanism, z, T, rtol, flow)[:2]
+
+
+def closed(mechanism, z, T, rtol=1e-12, flow=None) -> tuple[np.ndarray, float, list[Phase]]:
+    """As `close`, and the phases of one period. Newton's method begins with a monodromy `flow`."""
     z, best, size = np.array(z), np.inf, len(z)
     row = np.concatenate([np.zeros(size // 2), mechanism.joints[0].t])
     for count in range(30):
@@ -537,7 +546,7 @@ def close(mechanism, z, T, rtol=1e-12, flow=None):
         residual = np.append(end - z, row @ z)
         error = abs(residual).max()
         if error < 2e-14 * max(1, abs(z).max()) or (best < 1e-10 and error > best / 2):
-            return z, T
+            return z, T, trip
         if flow is None or error > 0.1 * best:
             flow = monodromy(mechanism, trip, max(rtol, 1e-10))
         best = min(best, error)

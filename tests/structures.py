@@ -39,6 +39,12 @@ def matrices(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return M, 2.0 * M + 2e-7 * K, K
 
 
+def monodromy_of(cycle: fj.LimitCycle) -> jax.Array:
+    """The monodromy matrix (2n, 2n) of a limit cycle, of states [x, v] in SI."""
+    units = cycle._system.units
+    return cycle._monodromy * units[:, None] / units[None]
+
+
 def two_joints(n: int, seed: int = 0) -> fj.Structure:
     """A structure with a joint between two bodies and another to the ground; it has friction."""
     left = fj.Joint(fj.FixedContact(3e6, 1.4e6), fj.Stribeck(0.5, 0.3, 0.6), (0, 2), (1, 3), V=0.2)

@@ -13,10 +13,12 @@ import jax
 import jax.numpy as jnp
 import matplotlib.image
 import numpy as np
+import pytest
 from jax.flatten_util import ravel_pytree
 
 import fractaljax as fj
 from fractaljax.__main__ import main
+from fractaljax._base import kept
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -101,11 +103,17 @@ def assert_same_picture(drawn: Path, name: str) -> None:
 
 
 def run_command(capsys, *arguments) -> tuple[Any, str, str]:
-    """Exit status, standard output and standard error of one call of the command."""
-    try:
-        status = main([str(argument) for argument in arguments])
-    except SystemExit as stop:
-        status = stop.code
+    """Exit status, standard output and standard error of one call of the command.
+
+    Its programs are those of the other tests. A process of its own keeps them whole, on disk
+    (tests/base/test_kept.py): here they would be compiled once more for that.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kept, "keep_in", lambda _: None)
+        try:
+            status = main([str(argument) for argument in arguments])
+        except SystemExit as stop:
+            status = stop.code
     return status, *capsys.readouterr()
 
 

@@ -20,6 +20,7 @@ import numpy as np
 from .._dynamics.basin import Basin, basin, ellipsoid, kick_size
 from .._dynamics.branch import BranchEvent, continue_cycle
 from .._dynamics.cycle import LimitCycle
+from .._dynamics.excitation import compiled_system
 from .._dynamics.scaled import degrees_of_freedom, hybrid_system
 from .._mechanism.mechanism import Mechanism
 from .._stability.stability import growth_rate
@@ -54,7 +55,7 @@ class Kicks:
     def of(cls, x: Mechanism, within: Any, seed: int, progress: bool) -> "Kicks":
         """Those of `design(quiet_within=)`, checked."""
         n = degrees_of_freedom(x)
-        hybrid_system(x)  # refuses a joint without V
+        jax.eval_shape(hybrid_system, x)  # refuses a joint without V
         return cls(kick_size("quiet_within", within, n), seed, progress)
 
     @property
@@ -65,7 +66,7 @@ class Kicks:
     def tried(self, x: Mechanism, radius: float, count: int) -> tuple[float, Basin]:
         """The least of `count` kicks within `radius` that does not come to rest, else `radius`."""
         self.seed += 1
-        centre, axes = ellipsoid(hybrid_system(x), self.within)
+        centre, axes = ellipsoid(compiled_system(x, None), self.within)
         axes = axes / self.size  # of norm 1
         found = basin(x, radius=radius * axes, starts=count, seed=self.seed, progress=self.progress)
         moves = np.linalg.norm((found.starts[found.labels != 0] - centre) / axes, axis=1)

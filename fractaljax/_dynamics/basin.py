@@ -19,11 +19,12 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float, Int
 
 from .._base.parts import Record, concrete, flag, number, scalar, whole
+from .._base.quick import quick_jit
 from .._base.table import table
 from .._mechanism.mechanism import Mechanism
 from .cycle import CycleResult, LimitCycle
 from .events import step
-from .excitation import Excitation, excited_system
+from .excitation import Excitation, compiled_system
 from .hybrid import NONE, SECTION, HybridSystem
 from .limit_cycle import limit_cycle
 from .orbit import next_start
@@ -112,6 +113,21 @@ class _Lanes(Record):
     label: Int[Array, " k"]
 
 
+@functools.partial(quick_jit, once=True)
+def _centre(system: HybridSystem) -> tuple[Array, Array]:
+    """The equilibrium without an excitation (2n,), and the units (2n,)."""
+    return system.own(system.equilibrium()), system.units
+
+
+@functools.partial(quick_jit, once=True)
+def _linearised(system: HybridSystem) -> tuple[Array, Array, Array, Array]:
+    """The equilibrium (2n,), the field's Jacobian there, the normal forces and their Jacobian."""
+    y, slip = system.equilibrium(), jnp.ones(len(system.P), system.P.dtype)
+    x = y[: system.n]
+    slope = jax.jacfwd(lambda y: system.field(y, slip))(y)
+    return y, slope, system.closures(x), jax.jacfwd(system.closures)(x)
+
+
 class _Modes(eqx.Module):
     """Small motions about the sliding equilibrium."""
 
@@ -125,19 +141,15 @@ class _Modes(eqx.Module):
 
     @classmethod
     def of(cls, system: HybridSystem) -> "_Modes":
-        n, equilibrium = system.n, system.equilibrium()
-        slip = jnp.ones(len(system.P), equilibrium.dtype)
-        A = jax.jacfwd(lambda y: system.field(y, slip))(equilibrium)
+        n, (equilibrium, A, closures, normals) = system.n, map(np.asarray, _linearised(system))
         values, vectors = map(np.asarray, np.linalg.eig(A))
         T = np.eye(n) if system.T is None else np.asarray(system.T)
         rows = [T @ vectors[n:] / np.asarray(system.V)[:, None]]
-        closures = np.asarray(system.closures(equilibrium[:n]))
-        normals = np.asarray(jax.jacfwd(system.closures)(equilibrium[:n]))
         opens = list(system.opens)
         rows.append(normals[opens] @ vectors[:n] / closures[opens, None])
         inverse, reach = np.linalg.inv(vectors), abs(np.concatenate(rows))
-        arrays = values, vectors, inverse, reach, np.real(values).max() < 0
-        return cls(equilibrium, *map(jnp.asarray, arrays), free=not system.excited)
+        arrays = equilibrium, values, vectors, inverse, reach, np.real(values).max() < 0
+        return cls(*map(jnp.asarray, arrays), free=not system.excited)
 
     def amplitudes(self, y) -> Array:
         """Those (2n, k), complex, of states (2n, k)."""
@@ -365,7 +377,7 @@ def basin(
     n = degrees_of_freedom(mechanism)
     if any(concrete(jnp.asarray(x)) is None for x in jax.tree.leaves((mechanism, excitation))):
         raise ValueError("basin runs many programs: call it outside of jit, vmap and grad")
-    system = excited_system(mechanism, excitation)
+    system = compiled_system(mechanism, excitation)
     dtype = system.F.dtype
     tolerance = check_rtol(rtol, dtype)
     max_returns, progress = whole("max_returns", max_returns, 1), flag("progress", progress)
@@ -491,9 +503,8 @@ def kick_size(name: str, given: Any, n: int) -> float | list[float]:
 
 def ellipsoid(system: HybridSystem, size: float | list[float]) -> tuple[np.ndarray, np.ndarray]:
     """Centre and semi-axes (2n,) [m, m/s] of kicks of a size, as `kick_size` gives it."""
-    units = np.asarray(system.units)
-    centre = np.asarray(system.own(system.equilibrium())) * units
-    return centre, np.array(size) if isinstance(size, list) else size * units
+    centre, units = map(np.asarray, _centre(system))
+    return centre * units, np.array(size) if isinstance(size, list) else size * units
 
 
 def _corner(name: str, value: Any, n: int) -> np.ndarray:

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, ScalarLike
 
 from .._base.parts import Numbers, Record, number, require_kind
+from .._base.quick import quick_jit
 from .._mechanism.joint import Dof
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.structure import Structure
@@ -146,3 +147,7 @@ def excited_system(mechanism: Any, excitation: Excitation | None) -> HybridSyste
         excited=True,
         fastest=None if system.fastest is None else jnp.maximum(system.fastest * r, Omega),
     ).with_products()
+
+
+# Outside of a program: its some hundred operations, one by one, would be compiled one by one.
+compiled_system = quick_jit(excited_system, once=True)

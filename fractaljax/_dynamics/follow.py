@@ -5,6 +5,7 @@ their solutions. An itinerary ends where the duration of a phase or, between swi
 falls to zero. There the branch goes on with the phase left out, or with one put in.
 """
 
+import functools
 import itertools
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -13,8 +14,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from .._base.quick import quick_jit
 from .._continuation import cubic
-from .hybrid import OPEN, SECTION
+from .._mechanism.mechanism import Mechanism
+from .hybrid import OPEN, SECTION, HybridSystem
 from .itinerary import Family, Phase, Shooting, Solution
 from .shooting import after_switch, guards_at, largest_friction, linearised, measured, rate_at
 
@@ -39,6 +42,11 @@ class BranchEnd(eqx.Enumeration):
     lost = "where it could not be followed"
     fast = "where it slides so fast that the friction law has lost its meaning"
     long = "after the largest number of points"
+
+
+@functools.partial(quick_jit, once=True)
+def _system(window, x: Mechanism, q) -> HybridSystem:
+    return window.system(x, q)
 
 
 class Point(NamedTuple):
@@ -282,7 +290,7 @@ class Follower:
 
     def record_hopf(self, q, frequency, shooting: Shooting) -> None:
         y, A = self.family.linearised(q)
-        system = self.window.system(self.x, jnp.asarray(q))
+        system = _system(self.window, self.x, jnp.asarray(q))
         period, n, units = 2 * np.pi / frequency, self.n, np.asarray(system.units)
         values, flat = np.exp(np.linalg.eigvals(A) * period), np.zeros(len(system.P))
         order = np.argsort(np.abs(values - 1))

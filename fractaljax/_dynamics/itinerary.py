@@ -1,16 +1,18 @@
 """The equations of `shooting.py` for NumPy: itineraries, meshes and solutions on the host."""
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._base.quick import quick_jit
 from .._continuation import Continuation
 from .._mechanism.mechanism import Mechanism
 from .cycle import LimitCycle
-from .hybrid import NONE, OPEN, SECTION, UNUSED
-from .scaled import hybrid_system
+from .excitation import compiled_system
+from .hybrid import NONE, OPEN, SECTION, UNUSED, HybridSystem
 from .shooting import (
     Chain,
     Lifted,
@@ -55,12 +57,18 @@ class Solution(NamedTuple):
         return np.concatenate([[0], np.cumsum(self.u[k : k + len(self.phases)])])
 
 
+@functools.partial(quick_jit, once=True)
+def _along(system: HybridSystem, y):
+    """t.x of each face (f, k) in states (2n, k)."""
+    return system.along(y[: system.n])
+
+
 class Family:
     """The cycles of one mechanism with one quantity free, and how finely they are cut."""
 
     def __init__(self, x: Mechanism, window: Window, step: float, rtol: float):
         self.x, self.window, self.step = x, window, step
-        self.template = hybrid_system(x)
+        self.template = compiled_system(x, None)
         self.n = self.template.n
         self.h, self.rtol = _LENGTH * (rtol / 1e-9) ** 0.125, rtol
         self.segments = 0  # so far: no fewer later, since another number is compiled anew
@@ -99,7 +107,7 @@ class Family:
         """The time of the largest t.x, roughly."""
         times = np.linspace(0, period, _SAMPLES, endpoint=False)
         y, _ = self.sampled(orbit, times, _SAMPLES)
-        return float(times[np.argmax(np.asarray(self.template.along(y[: self.n]))[0])])
+        return float(times[np.argmax(np.asarray(_along(self.template, y))[0])])
 
 
 class Shooting:

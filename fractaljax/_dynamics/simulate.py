@@ -26,6 +26,7 @@ from .._base.parts import (
     scalar,
     whole,
 )
+from .._base.quick import quick_jit
 from .._mechanism.mechanism import Mechanism
 from .events import Cubic, guards_and_rates, without_start
 from .excitation import Excitation, excited_system
@@ -76,7 +77,8 @@ class Trajectory(Record):
         **Raises:** `ValueError` for times of another shape or outside, and for a simulation with
         `saveat`.
         """
-        return self._at(self._continuous(), self._inside(number("times", jnp.asarray(times))))
+        self._continuous()
+        return _states(self, self._inside(number("times", jnp.asarray(times))))
 
     def _continuous(self) -> HybridSystem:
         """The system that moves, whose states between the times are known.
@@ -339,6 +341,12 @@ def _repeat(system: HybridSystem, y, t0, end, steps: _Steps) -> Trajectory:
     )
 
 
+@eqx.filter_jit
+def _states(trajectory: Trajectory, times) -> Array:
+    """`Trajectory.at` of checked times."""
+    return trajectory._at(trajectory._continuous(), times)
+
+
 @jax.jit
 def _sampled(trajectory: Trajectory, saveat) -> Trajectory:
     """The motion at the times `saveat` alone."""
@@ -439,13 +447,10 @@ def simulate(
     everything is NaN instead.
     """
     start = start_state(start, degrees_of_freedom(mechanism))
-    system = excited_system(mechanism, excitation)
     t0, t1 = _times(t0, t1)
+    system, y, t0, end = _scaled(mechanism, excitation, start, t0, t1)
     saveat = None if saveat is None else _checked(saveat, t0, t1)
     n = whole("max_steps", max_steps, 1)
-    y, end = start / system.units, (t1 - t0) * system.omega
-    y = system.with_excitation(y, t0 * system.omega)
-    t0, end = (jnp.asarray(t, y.dtype) for t in (t0, end))
     rtol = check_rtol(rtol, y.dtype)
     if regularisation is not None:
         eps = number("regularisation", regularisation, above=0)
@@ -464,6 +469,15 @@ def simulate(
     if (bad := refused((mechanism, excitation, start, t0, end, saveat))) is not None:
         trajectory = nan_where(bad, trajectory)  # contact states as well
     return raise_unless(SimulationResult.reached, trajectory) if throw else trajectory
+
+
+@functools.partial(quick_jit, once=True)
+def _scaled(mechanism, excitation, start, t0, t1):
+    """The system, its state at t0, t0 itself, and the duration in scaled time."""
+    system = excited_system(mechanism, excitation)
+    y, duration = start / system.units, (t1 - t0) * system.omega
+    y = system.with_excitation(y, t0 * system.omega)
+    return system, y, jnp.asarray(t0, y.dtype), jnp.asarray(duration, y.dtype)
 
 
 def _times(t0, t1) -> tuple[Float[Array, ""], Float[Array, ""]]:

@@ -12,12 +12,14 @@ from numpy.polynomial import Polynomial
 
 from filippov import PLAIN, phases
 from fractaljax._dynamics.events import Cubic, first_root, step, without_start
-from fractaljax._dynamics.hybrid import NONE, SECTION
+from fractaljax._dynamics.hybrid import NONE, SECTION, HybridSystem
 from fractaljax._dynamics.scaled import hybrid_system
 from tools import reference_scene
 
 EPS = np.finfo(float).eps
 KINDS = pytest.mark.parametrize("kind", ["any", "guards"])
+equilibrium, field = jax.jit(HybridSystem.equilibrium), jax.jit(HybridSystem.field)
+contact_state = jax.jit(HybridSystem.contact_state)
 found_root = jax.jit(lambda *ends: first_root(Cubic.through(*ends)))
 
 
@@ -199,9 +201,9 @@ def stepped(system, y, h):
 @functools.cache
 def reference():
     """Switches and returns of the reference from its start up to 95/omega: times, signs after."""
-    system = hybrid_system(reference_scene())
+    system = jax.jit(hybrid_system)(reference_scene())
     share = float(system.omega) / PLAIN.omega  # its own unit of time
-    start = np.asarray(system.equilibrium().at[0].add(1.0))
+    start = np.asarray(equilibrium(system)) + np.eye(4)[0]
     y = start * [1 / share, 1 / share, -1, -1] + [0, 0, 1, 1]
     run = list(phases(PLAIN, y, 1e-12, 95 / share, maxima=True))
     times = np.array([p.t1 * share for p in run[:-1]])
@@ -229,7 +231,7 @@ def test_end_of_a_step():
     """After a switch the velocity is the belt's to the last bit, after a return nearly zero."""
     system, start, *_ = reference()
     y, s, _, _, guard = stepped(system, start, 0.25)
-    before = np.vstack([np.asarray(system.contact_state(start)), s[:-1]])
+    before = np.vstack([contact_state(system, start), s[:-1]])
     for i in (0, 1):
         ended = (guard - 1) // 2 == i
         assert ended.sum() > 20
@@ -241,7 +243,7 @@ def test_end_of_a_step():
     # A return is a maximum of x1: the velocity falls through zero.
     at = guard == SECTION
     assert abs(y[at, 2]).max() < 1e-3
-    assert (system.field(jnp.asarray(y[at].T), jnp.asarray(s[at].T))[2] < 0).all()
+    assert (field(system, y[at].T, s[at].T)[2] < 0).all()
 
 
 def test_steps_of_a_batch():

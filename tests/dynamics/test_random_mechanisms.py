@@ -14,7 +14,7 @@ import pytest
 
 import fractaljax as fj
 import hybrid_truth
-from structures import of_problem
+from structures import monodromy_of, of_problem
 from tools import both_modes
 
 TANGENTIAL, NORMAL = [1.0, 0.0, -0.4], [0.3, 1.0, 0.0]
@@ -80,21 +80,31 @@ def derivatives(given, by, start):
     return both_modes(outputs, jnp.zeros(2), has_aux=True)
 
 
-def truth(given, state, period, flow) -> tuple[np.ndarray, list]:
-    """The same outputs, and the modes passed through."""
+def truth(given, near, flow) -> tuple[np.ndarray, list, np.ndarray]:
+    """The same outputs, the modes passed through, and the orbit's state and period in SI.
+
+    From such a row near it, and a monodromy matrix [SI] near its own.
+    """
     mechanism = hybrid_truth.Mechanism.of(problem(given))
     core, unit = mechanism.scaled, mechanism.units
-    z, T = hybrid_truth.close(core, state / unit, period * mechanism.omega, 1e-13, flow)
-    trip = list(hybrid_truth.phases(core, z, 1e-13, T))
+    z, T = near[:-1] / unit, near[-1] * mechanism.omega
+    z, T, trip = hybrid_truth.closed(core, z, T, 1e-13, mechanism.map_in_units(flow))
     rows = np.eye(7)[1:]
     low, high = np.array([hybrid_truth.spread(trip, row) for row in rows]).T * unit
     stick, _, opened = hybrid_truth.shares(core, trip) / T
     forces = np.maximum(hybrid_truth.spread(trip, core.normal(0)), 0) * mechanism.omega * unit[-1]
     row = [[T / mechanism.omega], (high - low)[:3], low[3:], high[3:], stick, opened, forces]
-    return np.concatenate(row), [p.mode for p in trip]
+    return np.concatenate(row), [p.mode for p in trip], np.append(z * unit, T / mechanism.omega)
+
+
+def extrapolated(known: dict, h: float) -> np.ndarray:
+    """At h the polynomial through rows at other places."""
+    shares = [np.prod([(h - y) / (x - y) for y in known if y != x]) for x in known]
+    return np.array(shares) @ np.array(list(known.values()))
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unoptimised")
 def test_derivatives():
     """One test for all seeds: a worker of its own for each would compile the same again."""
     for seed in SEEDS:
@@ -107,9 +117,8 @@ def assert_derivatives(seed):
     start = np.random.default_rng([seed, 2]).standard_normal(6)
     row, forward, reverse, found = derivatives(given, by, start)
     assert found.result == fj.CycleResult.converged
-    state, period = np.asarray(found.state), float(found.period)
-    flow = np.asarray(found._monodromy)
-    value, modes = truth(given, state, period, flow)
+    flow = monodromy_of(found)
+    value, modes, orbit = truth(given, np.append(found.state, found.period), flow)
     # Velocities, lengths and forces by the largest of their kind; shares by 1.
     ends = np.cumsum([1, 3, 6, 2, 2])[:-1]
     sizes = [np.full(len(part), abs(part).max()) for part in np.split(value, ends)]
@@ -117,12 +126,13 @@ def assert_derivatives(seed):
     size = np.concatenate(sizes)
     np.testing.assert_allclose(row / size, value / size, rtol=0, atol=1e-9)
     for k in range(2):
-        slopes = []
+        slopes, orbits = [], {0.0: orbit}
         for h in STEPS:
             ends = []
             for sign in (1, -1):
                 at = {name: given[name] + sign * h * by[name][k] for name in given}
-                shifted, passed = truth(at, state, period, flow)
+                near = extrapolated(orbits, sign * h)
+                shifted, passed, orbits[sign * h] = truth(at, near, flow)
                 assert passed == modes
                 ends.append(shifted)
             slopes.append((ends[0] - ends[1]) / (2 * h))

@@ -8,7 +8,7 @@ import pytest
 
 import fractaljax as fj
 import hybrid_truth
-from structures import beam_on_pad, truth_of
+from structures import beam_on_pad, monodromy_of, truth_of
 
 N = 8  # masses of each of two rods at right angles
 TIPS = [N - 1, 2 * N - 1]
@@ -85,14 +85,13 @@ def test_squeal_of_nine_joints():
     def closed(mu):
         mechanism = truth_of(reduced.replace(**{"pair_3.mu": mu}))
         z, T = np.asarray(cycle.state) / mechanism.units, float(cycle.period) * mechanism.omega
-        z, T = hybrid_truth.close(mechanism.scaled, z, T, 1e-12)
-        return mechanism, z, T
+        near = mechanism.map_in_units(monodromy_of(cycle))
+        return mechanism, *hybrid_truth.closed(mechanism.scaled, z, T, 1e-12, near)
 
-    mechanism, z, T = closed(0.35)
+    mechanism, z, T, trip = closed(0.35)
     assert T / mechanism.omega == pytest.approx(float(cycle.period), rel=1e-11)
     state = z * mechanism.units
     np.testing.assert_allclose(cycle.state, state, rtol=0, atol=1e-10 * abs(state).max())
-    trip = list(hybrid_truth.phases(mechanism.scaled, z, 1e-12, T))
     stick, _, opened = hybrid_truth.shares(mechanism.scaled, trip) / T
     np.testing.assert_allclose(cycle.stick_fraction, stick, rtol=0, atol=1e-10)
     np.testing.assert_allclose(cycle.open_fraction, opened, rtol=0, atol=1e-10)
@@ -104,5 +103,5 @@ def test_squeal_of_nine_joints():
         return fj.limit_cycle(reduced.replace(**{"pair_3.mu": mu}), cycle.state).period
 
     slope, h = float(jax.jacfwd(period)(0.35)), 1e-4
-    ends = [T / own.omega for own, _, T in map(closed, (0.35 - h, 0.35 + h))]
+    ends = [T / own.omega for own, _, T, _ in map(closed, (0.35 - h, 0.35 + h))]
     assert slope == pytest.approx((ends[1] - ends[0]) / (2 * h), rel=1e-6)

@@ -4,7 +4,6 @@ Faces are coupled through inertia: a switch of one changes the forces on those t
 """
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import hybrid_truth
@@ -66,8 +65,9 @@ def case(seed):
 
 def test_transitions():
     """Of 3000 events; in two of three the switch releases a face that stuck."""
-    system = hybrid_system(of_problem(PROBLEM))
+    system = jax.jit(hybrid_system)(of_problem(PROBLEM))
     switch = jax.jit(lambda y, s, guard: system.switch(y, s, guard)[1])
+    units = np.asarray(system.units)
     cases = [made for seed in range(3000) if (made := case(seed))]
     compared = released = 0
     for z, mode, event, guard in cases:
@@ -77,7 +77,7 @@ def test_transitions():
             continue
         s = np.where(np.array(mode) == hybrid_truth.OPEN, OPEN, mode).astype(float)
         wanted = np.where(np.array(after) == hybrid_truth.OPEN, OPEN, after)
-        found = switch(z / system.units, jnp.asarray(s), guard)
+        found = switch(z / units, s, guard)
         np.testing.assert_array_equal(found, wanted, err_msg=f"{event} in {mode}")
         compared += 1
         released += any(

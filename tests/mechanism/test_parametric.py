@@ -6,6 +6,7 @@ import pytest
 
 import fractaljax as fj
 from structures import matrices
+from tools import both_modes
 
 M, D, K = matrices(4)
 rng = np.random.default_rng(5)
@@ -33,9 +34,18 @@ def plain(Omega, kr):
     return fj.Structure(M, damping, stiffness, JOINT)
 
 
-growth = jax.jit(lambda x, Omega, kr: fj.growth_rate(x.replace(Omega=Omega, kr=kr)))
-slopes = [jax.jit(d(growth, argnums=(1, 2))) for d in (jax.jacfwd, jax.jacrev)]
-many = jax.jit(jax.vmap(growth, in_axes=(None, 0, None)))
+def growth(x, at):
+    """The growth rate at (Omega, kr)."""
+    return fj.growth_rate(x.replace(Omega=at[0], kr=at[1]))
+
+
+@jax.jit
+def answers(x, at):
+    """With its slopes in both modes: one program."""
+    return both_modes(lambda at: growth(x, at), at)
+
+
+many = jax.jit(jax.vmap(growth, in_axes=(None, 0)))
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -53,7 +63,8 @@ def test_matrices_are_their_sums(form):
 @pytest.mark.parametrize("form", FORMS)
 def test_growth_rate_and_its_derivatives(form):
     x = parametric(form)
-    assert growth(x, 2.0, 1.5) == pytest.approx(float(fj.growth_rate(plain(2.0, 1.5))), rel=1e-9)
+    value, *slopes = answers(x, np.array([2.0, 1.5]))
+    assert value == pytest.approx(float(fj.growth_rate(plain(2.0, 1.5))), rel=1e-9)
     h = 1e-4
     differences = [
         (fj.growth_rate(plain(2 + h, 1.5)) - fj.growth_rate(plain(2 - h, 1.5))) / (2 * h),
@@ -61,12 +72,12 @@ def test_growth_rate_and_its_derivatives(form):
     ]
     # Outside of a program too, where the checks of `replace` see numbers.
     eager = jax.jvp(lambda Omega: fj.growth_rate(x.replace(Omega=Omega, kr=1.5)), (2.0,), (1.0,))
-    assert eager[1] == pytest.approx(float(slopes[0](x, 2.0, 1.5)[0]), rel=1e-9)
+    assert eager[1] == pytest.approx(float(slopes[0][0]), rel=1e-9)
     for slope in slopes:
-        np.testing.assert_allclose(slope(x, 2.0, 1.5), differences, rtol=1e-5)
-    values = np.array([1.0, 2.0])
-    each = [float(growth(x, Omega, 1.5)) for Omega in values]
-    np.testing.assert_allclose(many(x, values, 1.5), each, rtol=1e-9)
+        np.testing.assert_allclose(slope, differences, rtol=1e-5)
+    places = np.array([[1.0, 1.5], [2.0, 1.5]])
+    each = [float(answers(x, at)[0]) for at in places]
+    np.testing.assert_allclose(many(x, places), each, rtol=1e-9)
 
 
 def test_a_mass_that_depends_on_a_parameter():
@@ -81,7 +92,8 @@ def test_a_mass_that_depends_on_a_parameter():
 def test_sweeps_and_boundaries_know_parameters():
     x = parametric("texts")
     found = fj.sweep(fj.growth_rate, x, Omega=[1.0, 2.0], kr=[0.5, 1.5], progress=False)
-    assert found.values[1, 1] == pytest.approx(float(growth(x, 2.0, 1.5)), rel=1e-9)
+    value = float(answers(x, np.array([2.0, 1.5]))[0])
+    assert found.values[1, 1] == pytest.approx(value, rel=1e-9)
     boundary = fj.hopf_boundary(x, ("kr", 1.0, 30.0), ("Omega", 0.05, 5.0), lines=5)
     branch = boundary.branches[0]
     i = len(branch.x) // 2

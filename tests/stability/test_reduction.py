@@ -54,6 +54,19 @@ def places(over):
         yield dict(zip(over, low + u * (high - low), strict=True))
 
 
+@jax.jit
+def answers(x, values):
+    """Stability at values of some quantities, and the slopes of the growth rate in the band."""
+
+    def rate(values):
+        modes = fj.stability(x.replace(**values))
+        inside = (modes.eigenvalues.imag < BAND[1]) & (modes.eigenvalues.imag > BAND[0])
+        return jax.numpy.where(inside, modes.eigenvalues.real, -np.inf).max(), modes
+
+    slopes, modes = jax.grad(rate, has_aux=True)(values)
+    return modes, slopes
+
+
 def in_band(modes):
     s: Any = np.asarray(modes.eigenvalues)[np.asarray(modes.counted)]
     return s[(s.imag > BAND[0]) & (s.imag < BAND[1]) & (np.abs(s.real) < 0.3 * np.abs(s))]
@@ -64,11 +77,11 @@ def test_eigenvalues_and_their_errors(problem):
     assert reduced.n < 0.9 * full.n and reduced.reduction.error <= 1e-8
     for values in places(over):
         x = reduced.replace(**values)
-        exact, found = (in_band(fj.stability(y.replace(**values))) for y in (full, reduced))
+        modes = answers(reduced, values)[0]
+        exact, found = in_band(answers(full, values)[0]), in_band(modes)
         assert len(exact) == len(found) > 5
         off = np.abs(found - exact[np.abs(exact[None] - found[:, None]).argmin(axis=1)])
         assert (off <= 1e-8 * np.abs(found)).all()
-        modes = fj.stability(x)
         of_one_kind = np.asarray(modes.counted) & (np.imag(np.asarray(modes.eigenvalues)) > 0)
         errors = fj.reduction_errors(x)[of_one_kind]
         seen = off > 1e-10 * np.abs(found)  # above rounding
@@ -79,16 +92,7 @@ def test_eigenvalues_and_their_errors(problem):
 def test_derivatives(problem):
     full, reduced, over = problem
     values = next(places(over))
-
-    def growth(x):
-        def rate(values):
-            modes = fj.stability(x.replace(**values))
-            inside = (modes.eigenvalues.imag < BAND[1]) & (modes.eigenvalues.imag > BAND[0])
-            return jax.numpy.where(inside, modes.eigenvalues.real, -np.inf).max()
-
-        return jax.jit(jax.grad(rate))(values)
-
-    wanted, found = growth(full), growth(reduced)
+    wanted, found = (answers(x, values)[1] for x in (full, reduced))
     for name, slope in wanted.items():
         assert abs(found[name] - slope) * abs(values[name]) < 1e-8 * BAND[1], name
 
