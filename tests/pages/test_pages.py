@@ -15,8 +15,8 @@ from tools import ROOT, quick_benchmark
 
 RESULTS = ROOT / "benchmarks" / "results"
 STORED = page.stored(RESULTS)
-# The ratios to the best peers of one cycle and of many.
-MISSED = {"limit_cycle", "many_cycles"}
+# The ratio to the best peer of one cycle.
+MISSED = {"limit_cycle"}
 
 
 def boundary_element(numbers):
