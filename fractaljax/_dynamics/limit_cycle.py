@@ -20,6 +20,7 @@ from .cycle import CycleResult, LimitCycle, Orbit
 from .events import Cubic, first_root, rounding
 from .excitation import Excitation, excited_system
 from .hybrid import NONE, OPEN, HybridSystem
+from .lanes import first_least, row_numbers
 from .orbit import Maps, Segments, flow, maps, next_start, orbit
 from .scaled import FEW, check_rtol, degrees_of_freedom, scaled_start, start_state
 
@@ -59,13 +60,11 @@ def _along(system: HybridSystem, y, s, t, row):
 
 def _lowest(x, count: int) -> tuple[Array, Array]:
     """The lowest values (r, count) in the rows of x (r, k), and where: quicker than sorting."""
-    number, found = jnp.arange(x.shape[1])[None], []
+    x, found = x.T, []
     for _ in range(count):
-        least = jnp.min(x, axis=1)
-        # The first of equal ones, all of which may be infinite.
-        k = jnp.min(jnp.where(x == least[:, None], number, x.shape[1] - 1), axis=1)
+        k, least = first_least(x)
         found.append((least, k))
-        x = jnp.where(number == k[:, None], jnp.inf, x)
+        x = jnp.where(row_numbers(x) == k[None], jnp.inf, x)
     least, k = (jnp.stack(each, axis=1) for each in zip(*found, strict=True))
     return least, k
 

@@ -24,11 +24,8 @@ _ITERATIONS = 20
 _HOPELESS = 8  # iterations after which steps must be small, relative to the orbit
 _POWERS = 4  # of a matrix in a polynomial of it
 _BLOCK = 32  # of sums
-_FEW, _TOGETHER, _LEAST = (
-    512,
-    128,
-    8,
-)  # segments of all lanes, and of each, that are taken at a time
+_FEW = 512  # segments of all lanes that Newton's method takes at once
+_TOGETHER, _LEAST = 128, 8  # of more, how many of all lanes, and of each at least, at a time
 
 
 class Segments(eqx.Module):
@@ -102,15 +99,14 @@ def coarse_maps(system: HybridSystem, segments: Segments) -> Maps:
 
     They take a tenth of the time.
     """
-    given, size = functools.partial(_polynomial_maps, system), 1
-    if system.fastest is None:
-        size = _together(segments)
+    given = functools.partial(_polynomial_maps, system)
+    size = _together(segments) if system.fastest is None else 1
     _, A, b = _in_blocks(given, _still, size, segments, next_start(segments.y))
     return Maps(A, b, _guard_slopes(system, segments))
 
 
 def _together(segments: Segments) -> int:
-    """How many segments of all lanes Newton's method takes at a time: all if they are few."""
+    """How many segments of each lane Newton's method takes at a time: all if they are few."""
     length, lanes = len(segments.duration), segments.duration[0].size
     return length if length * lanes <= _FEW else max(_TOGETHER // lanes, _LEAST)
 
@@ -360,7 +356,8 @@ def solve_periodic_orbits(
         # The motion of many degrees of freedom may be far slower than 1.
         extent = jnp.max(jnp.max(y, axis=1) - jnp.min(y, axis=1), axis=0)
         longest_step = jnp.maximum(longest_step, extent / 8)
-    tolerance, together = jnp.maximum(1e3 * eps, 1e-2 * rtol) * size, _together(segments)
+    tolerance = jnp.maximum(1e3 * eps, 1e-2 * rtol) * size
+    together = _together(segments)
     A = jnp.zeros((y.shape[1], len(y), *y[:, 0].shape), y.dtype)
     nothing = Maps(A, jnp.zeros_like(y), jnp.zeros_like(y))
     far = jnp.where(wanted, big, jnp.inf).astype(y.dtype)
