@@ -1,5 +1,6 @@
 """The solver that lands a design on its requirements."""
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -15,9 +16,18 @@ def slsqp(objective: Callable, constraints: Callable, start: np.ndarray, bounds:
     `constraints(z)` residuals (k,), at most 0 where met, and their Jacobian (k, n); `start` (n,),
     `bounds` (n, 2). It returns a point (n,).
     """
-    from scipy.optimize import minimize
-
     fun, jac = (lambda z: -constraints(z)[0]), (lambda z: -constraints(z)[1])
     limits = {"type": "ineq", "fun": fun, "jac": jac}
-    more: Any = {"method": "SLSQP", "options": {"ftol": 1e-12, "maxiter": 100}}
-    return minimize(objective, start, jac=True, bounds=bounds, constraints=limits, **more).x
+    return minimized(objective, start, bounds, limits, 100)
+
+
+def minimized(objective: Callable, start: np.ndarray, bounds: Any, constraints: Any, steps: int):
+    """The point (n,) at which SLSQP ends; `objective` gives value and gradient."""
+    from scipy.optimize import minimize
+
+    more: Any = {"method": "SLSQP", "options": {"ftol": 1e-12, "maxiter": steps}}
+    with warnings.catch_warnings():
+        # Before SciPy 1.16 a step may leave a bound by rounding, and says so.
+        warnings.filterwarnings("ignore", "Values in x were outside bounds", RuntimeWarning)
+        end = minimize(objective, start, jac=True, bounds=bounds, constraints=constraints, **more)
+    return end.x

@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fractaljax._design.solvers import minimized
+
 Limits = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 _RADIUS_MAX = 0.25  # of a step, in the bounds
@@ -138,8 +140,6 @@ def _step(here: Local, limits: Limits, u, curvature, radius, penalty):
 
     These (h, v) are of the limits that hold it; None where it is outside of one.
     """
-    from scipy.optimize import minimize
-
     v, a, r = len(u), len(here.aimed), len(here.unmet)
     bounds = np.stack([np.maximum(-u, -radius), np.minimum(1 - u, radius)], 1)
     known: dict[bytes, Any] = {}
@@ -171,13 +171,10 @@ def _step(here: Local, limits: Limits, u, curvature, radius, penalty):
 
     largest = (-np.inf, np.inf) if a else (0.0, 0.0)
     start = np.concatenate([np.zeros(v), [here.largest, here.excess]])
-    more: Any = {
-        "method": "SLSQP",
-        "bounds": [*bounds, largest, (0.0, np.inf)],
-        "constraints": {"type": "ineq", "fun": constraints, "jac": slopes},
-        "options": {"ftol": 1e-12, "maxiter": _STEP_ITERATIONS},
-    }
-    step = np.clip(minimize(merit, start, jac=True, **more).x[:v], *bounds.T)
+    asked = {"type": "ineq", "fun": constraints, "jac": slopes}
+    all_bounds = [*bounds, largest, (0.0, np.inf)]
+    end = minimized(merit, start, all_bounds, asked, _STEP_ITERATIONS)
+    step = np.clip(end[:v], *bounds.T)
     residuals, of_limits = limits_at(step)
     inside = residuals.max(initial=-np.inf) <= 0
     return step, bounds, of_limits[residuals >= -_HELD] if inside else None
