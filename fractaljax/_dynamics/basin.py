@@ -27,9 +27,9 @@ from .events import step
 from .excitation import Excitation, compiled_system
 from .hybrid import NONE, SECTION, HybridSystem
 from .limit_cycle import limit_cycle
-from .orbit import next_start
 from .scaled import check_rtol, degrees_of_freedom
 from .search import SearchOptions
+from .segments import next_start
 
 _MOST_STARTS = 1_000_000
 _LANES, _FEW_LANES = 256, 32  # that run side by side, of many starts and of few

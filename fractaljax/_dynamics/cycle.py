@@ -13,7 +13,7 @@ from .._base.parts import Record, concrete
 from .._base.quick import command_jit
 from .hybrid import OPEN, UNUSED, HybridSystem
 from .lanes import log_spectral_radius
-from .orbit import Segments, flow, mean_square
+from .segments import Segments, flow, mean_square
 
 SQUARINGS = 40  # of a monodromy matrix
 _SAMPLES = 1024  # of a smooth orbit, for a mean

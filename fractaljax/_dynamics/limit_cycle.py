@@ -21,8 +21,10 @@ from .events import Cubic, first_root, rounding
 from .excitation import Excitation, excited_system
 from .hybrid import NONE, OPEN, HybridSystem
 from .lanes import first_least, row_numbers
-from .orbit import Maps, Segments, flow, maps, next_start, orbit
+from .maps import Maps, maps
+from .orbit import orbit
 from .scaled import FEW, check_rtol, degrees_of_freedom, scaled_start, start_state
+from .segments import Segments, flow, next_start
 
 if TYPE_CHECKING:
     from diffrax import AbstractSolver

@@ -6,219 +6,21 @@ equations are smooth in states and durations. Newton's method solves them by cha
 maps of all segments.
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float
 
-from .hybrid import NONE, UNUSED, HybridSystem
-from .lanes import product, row_numbers, solve
-from .runge_kutta import runge_kutta, stability_polynomial
+from .hybrid import NONE, HybridSystem
+from .lanes import product, solve
+from .maps import Maps, axis_of, coarse_maps, in_blocks, maps, segments_together
+from .segments import Segments, chosen_guard, flow, last_of_phase, next_start
 
 _ITERATIONS = 20
 _HOPELESS = 8  # iterations after which steps must be small, relative to the orbit
-_POWERS = 4  # of a matrix in a polynomial of it
-_BLOCK = 32  # of sums
-_FEW = 512  # segments of all lanes that Newton's method takes at once
-_TOGETHER, _LEAST = 128, 8  # of more, how many of all lanes, and of each at least, at a time
-
-
-class Segments(eqx.Module):
-    """A closed chain of N segments, of one orbit or of several lanes.
-
-    The end of the last one is the start of the first.
-    """
-
-    y: Float[Array, "2n N ..."]  # state at the start of each
-    duration: Float[Array, "N ..."]
-    s: Float[Array, "f N ..."]  # contact state
-    guard: Int[Array, "N ..."]  # which guard ends it: a number, NONE within a phase, or UNUSED
-
-    @property
-    def used(self) -> Bool[Array, "N ..."]:
-        """Which segments are not padding of zero duration."""
-        return self.guard != UNUSED
-
-
-class Maps(eqx.Module):
-    """Derivatives of each segment's end, and of the guard that ends it."""
-
-    A: Float[Array, "N 2n 2n ..."]  # of the end by the state at its start
-    b: Float[Array, "2n N ..."]  # of the end by its duration
-    c: Float[Array, "2n N ..."]  # of the guard by the state it ends in; 0 where none ends it
-
-
-def tableau():
-    """The coefficients of the segments' steps."""
-    # Imported late: a question of stability does not wait for diffrax.
-    import diffrax
-
-    return diffrax.Dopri8.tableau
-
-
-def flow(system: HybridSystem, y, duration, s, error=False) -> Any:
-    """The state (2n, ...) after `duration` (...) in contact state s (f, ...), by one step.
-
-    With `error`, also an estimate (2n, ...) of its error.
-    """
-    field = functools.partial(_field, system, s)
-    duration = jnp.asarray(duration)[None]
-    return runge_kutta(tableau(), field, y, duration, error=error)
-
-
-def _field(system: HybridSystem, s, y) -> Array:
-    return system.field(y, s)
-
-
-def next_start(y) -> Array:
-    """The states at which segments must end: the starts of the next ones."""
-    return jnp.roll(y, -1, axis=1)
-
-
-def chosen_guard(system: HybridSystem, y, s, guard) -> Array:
-    """The guard that ends each segment, at y; 0 where none does."""
-    guards = system.guards(y, s)
-    return jnp.sum(jnp.where(row_numbers(guards) == guard[None], guards, 0), axis=0)
-
-
-def maps(system: HybridSystem, segments: Segments) -> tuple[Array, Maps]:
-    """The ends of the segments and their derivatives."""
-    # The stages of many degrees of freedom fill the cache: one segment at a time.
-    size = len(segments.duration) if system.fastest is None else 1
-    ends, A, b = _in_blocks(functools.partial(_maps, system), _still, size, segments)
-    return ends, Maps(A, b, _guard_slopes(system, segments))
-
-
-def coarse_maps(system: HybridSystem, segments: Segments) -> Maps:
-    """Derivatives less exact, which Newton's method converges with as well.
-
-    They take a tenth of the time.
-    """
-    given = functools.partial(_polynomial_maps, system)
-    size = _together(segments) if system.fastest is None else 1
-    _, A, b = _in_blocks(given, _still, size, segments, next_start(segments.y))
-    return Maps(A, b, _guard_slopes(system, segments))
-
-
-def _together(segments: Segments) -> int:
-    """How many segments of each lane Newton's method takes at a time: all if they are few."""
-    length, lanes = len(segments.duration), segments.duration[0].size
-    return length if length * lanes <= _FEW else max(_TOGETHER // lanes, _LEAST)
-
-
-def _still(segments: Segments, *_) -> tuple[Array, Array, Array]:
-    """Ends, A and b of segments that are not used."""
-    y = segments.y
-    return y, jnp.moveaxis(_identity(y), 2, 0), jnp.zeros_like(y)
-
-
-def _in_blocks(function: Callable, unused: Callable, size: int, segments: Segments, *more) -> Any:
-    """function(segments, ...) in blocks of that size; of those without a used segment `unused`."""
-    length, lanes = len(segments.duration), segments.duration.ndim - 1
-    if size >= length:
-        return function(segments, *more)
-
-    def split(x):
-        x = jnp.moveaxis(x, _axis(x, lanes), 0)
-        x = jnp.pad(x, [(0, -length % size), *[(0, 0)] * (x.ndim - 1)], constant_values=UNUSED)
-        return x.reshape(-1, size, *x.shape[1:])
-
-    def block(given):
-        given = jax.tree.map(lambda x: jnp.moveaxis(x, 0, _axis(x, lanes)), given)
-        return jax.lax.cond(
-            jnp.any(given[0].used), lambda: function(*given), lambda: unused(*given)
-        )
-
-    def joined(x):
-        axis = _axis(x[0], lanes)
-        x = jnp.moveaxis(x, axis + 1, 1)
-        return jnp.moveaxis(x.reshape(-1, *x.shape[2:])[:length], 0, axis)
-
-    return jax.tree.map(joined, jax.lax.map(block, jax.tree.map(split, (segments, *more))))
-
-
-def _maps(system: HybridSystem, segments: Segments) -> tuple[Array, Array, Array]:
-    """The ends of segments that need not be neighbours, and their derivatives A and b."""
-    y, s = segments.y, segments.s
-
-    def field(columns):
-        # The state and its tangents side by side: one array, one compiled loop a stage.
-        along, slope = jax.linearize(lambda y: system.field(y, s), columns[:, 0])
-        tangents = jax.vmap(slope, in_axes=1, out_axes=1)(columns[:, 1:])
-        return jnp.concatenate([along[:, None], tangents], axis=1)
-
-    columns = jnp.concatenate([y[:, None], _identity(y)], axis=1)
-    columns = runge_kutta(tableau(), field, columns, segments.duration[None, None])
-    ends, A = columns[:, 0], columns[:, 1:]
-    return ends, jnp.moveaxis(A, 2, 0), system.field(ends, s)
-
-
-def _polynomial_maps(system: HybridSystem, segments: Segments, ends):
-    """As `_maps`, of segments with known ends: A is the stability polynomial of the mean Jacobian.
-
-    Exact if the field is affine. (In powers of its fourth power, by Paterson and Stockmeyer.)
-    """
-    y, h, s = segments.y, segments.duration, segments.s
-    b = system.field(ends, s)
-    state = (y + ends) / 2 + h[None] / 12 * (system.field(y, s) - b)  # its mean in time
-    _, slope = jax.linearize(lambda y: system.field(y, s), state)
-    mean = jax.vmap(slope, in_axes=1, out_axes=1)(_identity(y)) * h[None, None]
-    eye, mean = (jnp.moveaxis(x, 2, 0) for x in (_identity(y), mean))
-    powers, times = [eye, mean], jax.vmap(functools.partial(product, written_out=True))
-    for _ in range(_POWERS - 1):
-        powers.append(times(powers[-1], mean))
-    coefficients = stability_polynomial(tableau()).tolist()
-    A = None
-    for first in reversed(range(0, len(coefficients), _POWERS)):
-        block = coefficients[first : first + _POWERS]
-        own = sum(c * power for c, power in zip(block, powers, strict=False))
-        A = own if A is None else times(A, powers[-1]) + own
-    return ends, A, b
-
-
-def _identity(y) -> Array:
-    """The tangents (2n, 2n, ...) at states y (2n, ...)."""
-    eye = jnp.eye(len(y), dtype=y.dtype).reshape(len(y), len(y), *(1,) * (y.ndim - 1))
-    return jnp.broadcast_to(eye, (len(y), *y.shape))
-
-
-def _guard_slopes(system: HybridSystem, segments: Segments) -> Array:
-    """Derivatives (2n, N, ...) of the guards that end segments by the states they end in."""
-    _, pull = jax.vjp(
-        lambda end: chosen_guard(system, end, segments.s, segments.guard), next_start(segments.y)
-    )
-    return pull(jnp.ones_like(segments.duration))[0]
-
-
-def _axis(x, lanes: int) -> int:
-    """The axis of segments in x (..., N, ...) of so many axes of lanes; of matrices the first."""
-    before = x.ndim - 1 - lanes
-    return before if before < 2 else 0
-
-
-def cumulative(x) -> Array:
-    """The sums of x (..., k) up to each place, which compile faster than those of jnp.cumsum."""
-    k = x.shape[-1]
-    if k <= _BLOCK or k % _BLOCK:
-        at = jnp.arange(k)
-        return jnp.sum(jnp.where(at[None] <= at[:, None], x[..., None, :], 0), axis=-1)
-    inside = cumulative(x.reshape(*x.shape[:-1], k // _BLOCK, _BLOCK))
-    before = cumulative(inside[..., -1]) - inside[..., -1]
-    return (inside + before[..., None]).reshape(x.shape)
-
-
-def last_of_phase(segments: Segments) -> Int[Array, "N ..."]:
-    """For each segment the last one of its phase."""
-    ends = (segments.used & (segments.guard != NONE)).T
-    ended = cumulative(ends)
-    phase = ended - ends
-    last = jnp.sum(ended[..., None, :] <= phase[..., None], axis=-1)
-    return jnp.minimum(last, ends.shape[-1] - 1).T
 
 
 def _chain(body: Callable, carry, arrays: tuple, lanes: int, count=None) -> tuple[Any, Array]:
@@ -226,7 +28,7 @@ def _chain(body: Callable, carry, arrays: tuple, lanes: int, count=None) -> tupl
 
     With `count` over so many: that takes no longer than it must, but has no reverse mode.
     """
-    front = [jnp.moveaxis(x, _axis(x, lanes), 0) for x in arrays]
+    front = [jnp.moveaxis(x, axis_of(x, lanes), 0) for x in arrays]
     if count is None:
         carry, found = jax.lax.scan(body, carry, tuple(front))
         return carry, jnp.moveaxis(found, 0, found.ndim - 1 - lanes)
@@ -297,16 +99,6 @@ def corrections(
     return dy, dt, jacobian
 
 
-def mean_square(system: HybridSystem, segments: Segments) -> Float[Array, " 2n"]:
-    """The mean of each component squared over a period, by Gauss-Legendre quadrature."""
-    nodes, weights = np.polynomial.legendre.leggauss(5)
-    share = jnp.asarray((nodes + 1) / 2, segments.y.dtype)
-    y, h, s = segments.y, segments.duration, segments.s
-    inside = jax.vmap(lambda share: flow(system, y, share * h, s))(share)
-    weights = jnp.asarray(weights / 2, y.dtype)
-    return jnp.einsum("g,gin,n->i", weights, inside**2, h) / jnp.sum(h)
-
-
 class PeriodicOrbit(eqx.Module):
     """The outcome of Newton's method for the periodic orbits of g lanes."""
 
@@ -357,7 +149,7 @@ def solve_periodic_orbits(
         extent = jnp.max(jnp.max(y, axis=1) - jnp.min(y, axis=1), axis=0)
         longest_step = jnp.maximum(longest_step, extent / 8)
     tolerance = jnp.maximum(1e3 * eps, 1e-2 * rtol) * size
-    together = _together(segments)
+    together = segments_together(segments)
     A = jnp.zeros((y.shape[1], len(y), *y[:, 0].shape), y.dtype)
     nothing = Maps(A, jnp.zeros_like(y), jnp.zeros_like(y))
     far = jnp.where(wanted, big, jnp.inf).astype(y.dtype)
@@ -388,7 +180,7 @@ def solve_periodic_orbits(
 
             return jax.lax.fori_loop(0, parts, half, (some.y, some.y))
 
-        ends, middle = _in_blocks(flows, lambda none: (none.y, none.y), together, found.segments)
+        ends, middle = in_blocks(flows, lambda none: (none.y, none.y), together, found.segments)
         target = next_start(y)
         off = chosen_guard(system, target, s, guard)
         dy, dt, jacobian = corrections(

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .events import MOST, step
 from .hybrid import NONE, SECTION, UNUSED, HybridSystem
 from .lanes import together
-from .orbit import Segments, cumulative, flow
+from .segments import Segments, cumulative, flow
 
 _PHASES = 256  # most of one contact state in an orbit
 # The last rows of a record: the guard that ended a step, and sums over the steps up to its end,

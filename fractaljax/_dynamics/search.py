@@ -21,15 +21,9 @@ from .cycle import SQUARINGS
 from .events import Cubic
 from .hybrid import SECTION, UNUSED, HybridSystem
 from .lanes import log_spectral_radius
-from .orbit import (
-    PeriodicOrbit,
-    Segments,
-    accurate_return_jacobian,
-    cumulative,
-    next_start,
-    solve_periodic_orbits,
-)
+from .orbit import PeriodicOrbit, accurate_return_jacobian, solve_periodic_orbits
 from .record import ENDED, RETURNED, TIME, Record, Steps, cut
+from .segments import Segments, cumulative, next_start
 
 HARDLY = 1e-3  # growth in a period up to which an orbit that repels is kept
 _FEW_SQUARINGS, _UNSURE = 13, 1e-2  # of coarse Jacobians, and growth that they do not tell from 0

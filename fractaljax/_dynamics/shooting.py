@@ -21,9 +21,9 @@ from .._mechanism.quantities import substituted
 from .events import Cubic
 from .hybrid import NONE, UNUSED, HybridSystem
 from .limit_cycle import extreme_values
-from .orbit import Segments, chosen_guard, flow, next_start, tableau
 from .runge_kutta import runge_kutta
 from .scaled import hybrid_system
+from .segments import Segments, chosen_guard, flow, next_start, tableau
 
 
 class Window(eqx.Module):

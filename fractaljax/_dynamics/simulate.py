@@ -31,8 +31,8 @@ from .._mechanism.mechanism import Mechanism
 from .events import Cubic, guards_and_rates, without_start
 from .excitation import Excitation, excited_system
 from .hybrid import NONE, OPEN, HybridSystem
-from .orbit import chosen_guard, flow
 from .scaled import check_rtol, degrees_of_freedom, start_state
+from .segments import chosen_guard, flow
 
 if TYPE_CHECKING:
     from diffrax import AbstractSolver

@@ -8,8 +8,8 @@ import pytest
 import fractaljax as fj
 from fractaljax._dynamics.hybrid import NONE, SECTION
 from fractaljax._dynamics.limit_cycle import extreme_values
-from fractaljax._dynamics.orbit import Segments
 from fractaljax._dynamics.scaled import hybrid_system
+from fractaljax._dynamics.segments import Segments
 
 COUNT = 35
 

@@ -14,9 +14,9 @@ import hybrid_truth
 from benchmarks.many_dofs import rods
 from fractaljax._dynamics.excitation import excited_system
 from fractaljax._dynamics.hybrid import HybridSystem
-from fractaljax._dynamics.orbit import flow, tableau
 from fractaljax._dynamics.runge_kutta import stability_polynomial
 from fractaljax._dynamics.scaled import hybrid_system
+from fractaljax._dynamics.segments import flow, tableau
 from structures import monodromy_of, truth_of
 
 system = jax.jit(hybrid_system)

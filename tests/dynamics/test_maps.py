@@ -8,8 +8,9 @@ import pytest
 import fractaljax as fj
 from fractaljax._dynamics.hybrid import NONE, UNUSED
 from fractaljax._dynamics.lanes import together
-from fractaljax._dynamics.orbit import Segments, _in_blocks, _maps, _still, coarse_maps, maps
+from fractaljax._dynamics.maps import _maps, coarse_maps, in_blocks, maps, unmoved
 from fractaljax._dynamics.scaled import hybrid_system
+from fractaljax._dynamics.segments import Segments
 
 LENGTH, USED, LANES = 11, 7, 3
 
@@ -43,10 +44,10 @@ def test_coarse_maps_of_an_affine_field_are_exact(n):
 def test_segments_in_blocks(size):
     system, segments = problem(2)
 
-    def in_blocks(size):
-        return _in_blocks(lambda some: _maps(system, some), _still, size, segments)
+    def solved(size):
+        return in_blocks(lambda some: _maps(system, some), unmoved, size, segments)
 
-    found, wanted = jax.jit(lambda: (in_blocks(size), in_blocks(LENGTH)))()
+    found, wanted = jax.jit(lambda: (solved(size), solved(LENGTH)))()
     ends, A, b = found
     np.testing.assert_allclose(ends[:, :USED], wanted[0][:, :USED], rtol=0, atol=1e-15)
     np.testing.assert_allclose(A[:USED], wanted[1][:USED], rtol=0, atol=1e-15)

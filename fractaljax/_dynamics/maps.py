@@ -1,0 +1,142 @@
+"""Derivatives of segments: of their ends by the states at their starts and by durations."""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .hybrid import UNUSED, HybridSystem
+from .lanes import product
+from .runge_kutta import runge_kutta, stability_polynomial
+from .segments import Segments, chosen_guard, next_start, tableau
+
+_POWERS = 4  # of a matrix in a polynomial of it
+_FEW = 512  # segments of all lanes that are taken at once
+_TOGETHER, _LEAST = 128, 8  # of more, how many of all lanes, and of each at least, at a time
+
+
+class Maps(eqx.Module):
+    """Derivatives of each segment's end, and of the guard that ends it."""
+
+    A: Float[Array, "N 2n 2n ..."]  # of the end by the state at its start
+    b: Float[Array, "2n N ..."]  # of the end by its duration
+    c: Float[Array, "2n N ..."]  # of the guard by the state it ends in; 0 where none ends it
+
+
+def maps(system: HybridSystem, segments: Segments) -> tuple[Array, Maps]:
+    """The ends of the segments and their derivatives."""
+    # The stages of many degrees of freedom fill the cache: one segment at a time.
+    size = len(segments.duration) if system.fastest is None else 1
+    ends, A, b = in_blocks(functools.partial(_maps, system), unmoved, size, segments)
+    return ends, Maps(A, b, _guard_slopes(system, segments))
+
+
+def coarse_maps(system: HybridSystem, segments: Segments) -> Maps:
+    """Derivatives less exact, which Newton's method converges with as well.
+
+    They take a tenth of the time.
+    """
+    given = functools.partial(_polynomial_maps, system)
+    size = segments_together(segments) if system.fastest is None else 1
+    _, A, b = in_blocks(given, unmoved, size, segments, next_start(segments.y))
+    return Maps(A, b, _guard_slopes(system, segments))
+
+
+def segments_together(segments: Segments) -> int:
+    """How many segments of each lane Newton's method takes at a time: all if they are few."""
+    length, lanes = len(segments.duration), segments.duration[0].size
+    return length if length * lanes <= _FEW else max(_TOGETHER // lanes, _LEAST)
+
+
+def unmoved(segments: Segments, *_) -> tuple[Array, Array, Array]:
+    """Ends, A and b of segments that are not used."""
+    y = segments.y
+    return y, jnp.moveaxis(_identity(y), 2, 0), jnp.zeros_like(y)
+
+
+def in_blocks(function: Callable, unused: Callable, size: int, segments: Segments, *more) -> Any:
+    """function(segments, ...) in blocks of that size; of those without a used segment `unused`."""
+    length, lanes = len(segments.duration), segments.duration.ndim - 1
+    if size >= length:
+        return function(segments, *more)
+
+    def split(x):
+        x = jnp.moveaxis(x, axis_of(x, lanes), 0)
+        x = jnp.pad(x, [(0, -length % size), *[(0, 0)] * (x.ndim - 1)], constant_values=UNUSED)
+        return x.reshape(-1, size, *x.shape[1:])
+
+    def block(given):
+        given = jax.tree.map(lambda x: jnp.moveaxis(x, 0, axis_of(x, lanes)), given)
+        return jax.lax.cond(
+            jnp.any(given[0].used), lambda: function(*given), lambda: unused(*given)
+        )
+
+    def joined(x):
+        axis = axis_of(x[0], lanes)
+        x = jnp.moveaxis(x, axis + 1, 1)
+        return jnp.moveaxis(x.reshape(-1, *x.shape[2:])[:length], 0, axis)
+
+    return jax.tree.map(joined, jax.lax.map(block, jax.tree.map(split, (segments, *more))))
+
+
+def _maps(system: HybridSystem, segments: Segments) -> tuple[Array, Array, Array]:
+    """The ends of segments that need not be neighbours, and their derivatives A and b."""
+    y, s = segments.y, segments.s
+
+    def field(columns):
+        # The state and its tangents side by side: one array, one compiled loop a stage.
+        along, slope = jax.linearize(lambda y: system.field(y, s), columns[:, 0])
+        tangents = jax.vmap(slope, in_axes=1, out_axes=1)(columns[:, 1:])
+        return jnp.concatenate([along[:, None], tangents], axis=1)
+
+    columns = jnp.concatenate([y[:, None], _identity(y)], axis=1)
+    columns = runge_kutta(tableau(), field, columns, segments.duration[None, None])
+    ends, A = columns[:, 0], columns[:, 1:]
+    return ends, jnp.moveaxis(A, 2, 0), system.field(ends, s)
+
+
+def _polynomial_maps(system: HybridSystem, segments: Segments, ends):
+    """As `_maps`, of segments with known ends: A is the stability polynomial of the mean Jacobian.
+
+    Exact if the field is affine. (In powers of its fourth power, by Paterson and Stockmeyer.)
+    """
+    y, h, s = segments.y, segments.duration, segments.s
+    b = system.field(ends, s)
+    state = (y + ends) / 2 + h[None] / 12 * (system.field(y, s) - b)  # its mean in time
+    _, slope = jax.linearize(lambda y: system.field(y, s), state)
+    mean = jax.vmap(slope, in_axes=1, out_axes=1)(_identity(y)) * h[None, None]
+    eye, mean = (jnp.moveaxis(x, 2, 0) for x in (_identity(y), mean))
+    powers, times = [eye, mean], jax.vmap(functools.partial(product, written_out=True))
+    for _ in range(_POWERS - 1):
+        powers.append(times(powers[-1], mean))
+    coefficients = stability_polynomial(tableau()).tolist()
+    A = None
+    for first in reversed(range(0, len(coefficients), _POWERS)):
+        block = coefficients[first : first + _POWERS]
+        own = sum(c * power for c, power in zip(block, powers, strict=False))
+        A = own if A is None else times(A, powers[-1]) + own
+    return ends, A, b
+
+
+def _identity(y) -> Array:
+    """The tangents (2n, 2n, ...) at states y (2n, ...)."""
+    eye = jnp.eye(len(y), dtype=y.dtype).reshape(len(y), len(y), *(1,) * (y.ndim - 1))
+    return jnp.broadcast_to(eye, (len(y), *y.shape))
+
+
+def _guard_slopes(system: HybridSystem, segments: Segments) -> Array:
+    """Derivatives (2n, N, ...) of the guards that end segments by the states they end in."""
+    _, pull = jax.vjp(
+        lambda end: chosen_guard(system, end, segments.s, segments.guard), next_start(segments.y)
+    )
+    return pull(jnp.ones_like(segments.duration))[0]
+
+
+def axis_of(x, lanes: int) -> int:
+    """The axis of segments in x (..., N, ...) of so many axes of lanes; of matrices the first."""
+    before = x.ndim - 1 - lanes
+    return before if before < 2 else 0

@@ -1,0 +1,96 @@
+"""Short segments of an orbit, each in one contact state, and the flow along them."""
+
+import functools
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from .hybrid import NONE, UNUSED, HybridSystem
+from .lanes import row_numbers
+from .runge_kutta import runge_kutta
+
+_BLOCK = 32  # of sums
+
+
+class Segments(eqx.Module):
+    """A closed chain of N segments, of one orbit or of several lanes.
+
+    The end of the last one is the start of the first.
+    """
+
+    y: Float[Array, "2n N ..."]  # state at the start of each
+    duration: Float[Array, "N ..."]
+    s: Float[Array, "f N ..."]  # contact state
+    guard: Int[Array, "N ..."]  # which guard ends it: a number, NONE within a phase, or UNUSED
+
+    @property
+    def used(self) -> Bool[Array, "N ..."]:
+        """Which segments are not padding of zero duration."""
+        return self.guard != UNUSED
+
+
+def tableau():
+    """The coefficients of the segments' steps."""
+    # Imported late: a question of stability does not wait for diffrax.
+    import diffrax
+
+    return diffrax.Dopri8.tableau
+
+
+def flow(system: HybridSystem, y, duration, s, error=False) -> Any:
+    """The state (2n, ...) after `duration` (...) in contact state s (f, ...), by one step.
+
+    With `error`, also an estimate (2n, ...) of its error.
+    """
+    field = functools.partial(_field, system, s)
+    duration = jnp.asarray(duration)[None]
+    return runge_kutta(tableau(), field, y, duration, error=error)
+
+
+def _field(system: HybridSystem, s, y) -> Array:
+    return system.field(y, s)
+
+
+def next_start(y) -> Array:
+    """The states at which segments must end: the starts of the next ones."""
+    return jnp.roll(y, -1, axis=1)
+
+
+def chosen_guard(system: HybridSystem, y, s, guard) -> Array:
+    """The guard that ends each segment, at y; 0 where none does."""
+    guards = system.guards(y, s)
+    return jnp.sum(jnp.where(row_numbers(guards) == guard[None], guards, 0), axis=0)
+
+
+def cumulative(x) -> Array:
+    """The sums of x (..., k) up to each place, which compile faster than those of jnp.cumsum."""
+    k = x.shape[-1]
+    if k <= _BLOCK or k % _BLOCK:
+        at = jnp.arange(k)
+        return jnp.sum(jnp.where(at[None] <= at[:, None], x[..., None, :], 0), axis=-1)
+    inside = cumulative(x.reshape(*x.shape[:-1], k // _BLOCK, _BLOCK))
+    before = cumulative(inside[..., -1]) - inside[..., -1]
+    return (inside + before[..., None]).reshape(x.shape)
+
+
+def last_of_phase(segments: Segments) -> Int[Array, "N ..."]:
+    """For each segment the last one of its phase."""
+    ends = (segments.used & (segments.guard != NONE)).T
+    ended = cumulative(ends)
+    phase = ended - ends
+    last = jnp.sum(ended[..., None, :] <= phase[..., None], axis=-1)
+    return jnp.minimum(last, ends.shape[-1] - 1).T
+
+
+def mean_square(system: HybridSystem, segments: Segments) -> Float[Array, " 2n"]:
+    """The mean of each component squared over a period, by Gauss-Legendre quadrature."""
+    nodes, weights = np.polynomial.legendre.leggauss(5)
+    share = jnp.asarray((nodes + 1) / 2, segments.y.dtype)
+    y, h, s = segments.y, segments.duration, segments.s
+    inside = jax.vmap(lambda share: flow(system, y, share * h, s))(share)
+    weights = jnp.asarray(weights / 2, y.dtype)
+    return jnp.einsum("g,gin,n->i", weights, inside**2, h) / jnp.sum(h)
