@@ -306,7 +306,7 @@ def _aligned(a: _Modes, b: _Modes) -> _Modes:
             continue
         # LAPACK's left vectors of equal eigenvalues do not belong to its right ones.
         dual = np.linalg.pinv(left[group] @ right[group].T) @ left[group]
-        turn = a.right[group] @ dual.T  # rows: modes of a in the space of the group
-        if np.linalg.cond(turn) < _INDEPENDENT:
-            right[group], left[group] = turn @ right[group], np.linalg.inv(turn).T @ dual
+        rotation = a.right[group] @ dual.T  # rows: modes of a in the space of the group
+        if np.linalg.cond(rotation) < _INDEPENDENT:
+            right[group], left[group] = rotation @ right[group], np.linalg.inv(rotation).T @ dual
     return b._replace(right=right, left=left)

@@ -55,9 +55,9 @@ def _stick_slip(force, V, c=0.0, m=1.0, k=1.0):
     found = _slip(force, V, m, c, k)
     end, (last,) = found.t_events[2][0], found.y_events[2]
     stuck = ((force(0.0) - c * V) / k - last[0]) / V
-    turns = found.y_events[0][:, 0]
+    extremes = found.y_events[0][:, 0]
     orbit = np.append(found.sol(np.linspace(0, end, 49)), found.sol(0.0)[:, None], axis=1)
-    return end + stuck, stuck / (end + stuck), turns.min(), turns.max(), orbit
+    return end + stuck, stuck / (end + stuck), extremes.min(), extremes.max(), orbit
 
 
 def _grazing(force, low, high, c):

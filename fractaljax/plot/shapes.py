@@ -133,7 +133,7 @@ def _deformed(
     ax, drawn, move = draw_mesh(mesh, ax, factor * largest, amplitudes / largest, 1.0)
     bar = ax.figure.colorbar(drawn, ax=ax, location="bottom", shrink=0.6, aspect=40)
     bar.set_label("amplitude, of the largest [-]")
-    return ax, lambda turn: move(factor * (motion * turn).real)
+    return ax, lambda phasor: move(factor * (motion * phasor).real)
 
 
 def _bars(shape: Any, names: Any, ax: Axes) -> tuple[Axes, Callable[[complex], Any]]:
@@ -152,8 +152,8 @@ def _bars(shape: Any, names: Any, ax: Axes) -> tuple[Axes, Callable[[complex], A
     bar = ax.figure.colorbar(colours, ax=ax, pad=0.02, ticks=range(-180, 181, 90))
     bar.set_label("phase of the shape [°]")
 
-    def move(turn: complex) -> None:
-        for each, height in zip(bars, (unit * turn).real, strict=True):
+    def move(phasor: complex) -> None:
+        for each, height in zip(bars, (unit * phasor).real, strict=True):
             each.set_height(height)
 
     return ax, move
