@@ -112,6 +112,15 @@ def beam(elements: int, free: bool = False, height: float = 0.01):
     return (M, K) if free else (M[2:, 2:], K[2:, 2:])
 
 
+def hoffmann(C=None) -> fj.Structure:
+    """The minimal model of mode coupling (Hoffmann et al. 2002): eigenvalues 2 +- (1 - 4 mu/3)^.5.
+
+    They coalesce at mu = 3/4.
+    """
+    K = [(None, [[2.0, 1.0], [1.0, 2.0]]), ("-4*mu/3", [[0.0, 1.0], [0.0, 0.0]])]
+    return fj.ParametricStructure(np.eye(2), C, K, parameters={"mu": 0.1})
+
+
 def numbers_of(structure: fj.Structure) -> dict[str, Any]:
     """The numbers of a structure whose friction is Stribeck's, for `linearised`."""
     joints = []

@@ -10,7 +10,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.stats import ortho_group
 
 import fractaljax as fj
-from structures import beam_on_pad, matrices, two_joints
+from structures import beam_on_pad, hoffmann, matrices, two_joints
 from tools import reference_scene
 
 track: Any = fj.track_modes
@@ -24,15 +24,6 @@ def oscillators(coupling, turn=None) -> fj.Structure:
     fixed, split = np.array([[1, coupling], [coupling, 1]]), np.diag([1.0, -1.0])
     K = [(None, T.T @ fixed @ T), ("a", T.T @ split @ T)]
     return fj.ParametricStructure(np.eye(2), None, K, parameters={"a": 0.3})
-
-
-def hoffmann(C=None) -> fj.Structure:
-    """The minimal model of mode coupling (Hoffmann et al. 2002): eigenvalues 2 +- (1 - 4 mu/3)^.5.
-
-    They coalesce at mu = 3/4.
-    """
-    K = [(None, [[2.0, 1.0], [1.0, 2.0]]), ("-4*mu/3", [[0.0, 1.0], [0.0, 0.0]])]
-    return fj.ParametricStructure(np.eye(2), C, K, parameters={"mu": 0.1})
 
 
 def assert_modal(structure, tracks):
