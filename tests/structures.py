@@ -39,6 +39,12 @@ def matrices(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return M, 2.0 * M + 2e-7 * K, K
 
 
+def state_matrix(M, C, K) -> np.ndarray:
+    """Of the states [x, v] (2n, 2n)."""
+    n = len(M)
+    return np.block([[np.zeros((n, n)), np.eye(n)], [-np.linalg.solve(M, np.hstack([K, C]))]])
+
+
 def monodromy_of(cycle: fj.LimitCycle) -> jax.Array:
     """The monodromy matrix (2n, 2n) of a limit cycle, of states [x, v] in SI."""
     units = cycle._system.units

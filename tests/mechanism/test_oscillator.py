@@ -48,9 +48,8 @@ def exact(x):
 def friction_coefficient(x, v):
     """Eq. 38, as the source prints it."""
     drop = x["mu_s"] - x["mu_m"]
-    return (
-        x["mu_s"] * mp.sign(v) - 3 * drop / (2 * x["v_m"]) * v + drop / (2 * x["v_m"] ** 3) * v**3
-    )
+    falling = 3 * drop / (2 * x["v_m"]) * v
+    return x["mu_s"] * mp.sign(v) - falling + drop / (2 * x["v_m"] ** 3) * v**3
 
 
 def acceleration(x, state):
