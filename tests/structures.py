@@ -16,6 +16,7 @@ import numpy as np
 
 import fractaljax as fj
 import hybrid_truth
+from mechanisms import PROBLEMS
 from tools import ROOT, load_script
 
 DIGITS = 50
@@ -231,6 +232,14 @@ def of_problem(problem) -> fj.Structure:
         joints.append(fj.Joint(contact, law, t, normal, V, preload))
     M, C, K = (jnp.stack([jnp.stack(row) for row in problem[name]]) for name in "MCK")
     return fj.Structure(M, C, K, joints, F=jnp.asarray(problem["F"]))
+
+
+@functools.cache
+def belt_cycle() -> tuple[fj.Structure, fj.LimitCycle]:
+    """A structure of one degree of freedom, whose joint slides along it, and its limit cycle."""
+    problem = PROBLEMS["papangelo_2017"]
+    structure = of_problem(problem)
+    return structure, fj.limit_cycle(structure, problem["start"])
 
 
 def truth_of(structure: Any) -> hybrid_truth.Mechanism:

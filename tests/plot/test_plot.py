@@ -19,6 +19,7 @@ from IPython.core.formatters import DisplayFormatter
 import fractaljax as fj
 from fractaljax.plot.axes import coordinate
 from fractaljax.plot.maps import vibration_modes
+from structures import belt_cycle
 from synthetic import DX, gaussian_map, gaussian_profile
 from tools import (
     assert_whole,
@@ -411,15 +412,6 @@ def test_spectrum_shows_the_harmonics():
     # A period of two returns has twice as many lines.
     twice = eqx.tree_at(lambda cycle: cycle.returns, cycle, jnp.array(2))
     assert drawn(plot.spectrum(twice), "harmonics")[0].shape == (2, 39)
-
-
-@functools.cache
-def belt_cycle():
-    """A structure of one degree of freedom, whose joint slides along it."""
-    law = fj.ExponentialStribeck(1.0, 0.5, 0.5)
-    joint = fj.Joint(fj.FixedContact(0.0, 0.0, 1.0), law, 0, None, 1.0)
-    belt = fj.Structure([[1.0]], [[0.1]], [[1.0]], [joint], F=[0.0])
-    return belt, fj.limit_cycle(belt, [1.5, 0.0], throw=False)
 
 
 def test_cycle_of_a_structure():
