@@ -156,9 +156,8 @@ def test_flattened_bases_that_yield_at_once_are_the_source_s_law(D, G, P):
     # The smallest base as small as to carry nothing.
     log_a_s = math.log(state.a_e) - 80 / (3 - float(D))
     log_a_e, log_a_l = math.log(state.a_e) - log_a_s, math.log(state.a_l) - log_a_s
-    p_e = float(
-        fractal.critical_pressure_ratio(MATERIAL, fractal.friction_correction(jnp.asarray(MU_M)))
-    )
+    k_mu = fractal.friction_correction(jnp.asarray(MU_M))
+    p_e = float(fractal.critical_pressure_ratio(MATERIAL, k_mu))
     borders = [jnp.asarray(log_a_e * k / 8) for k in range(1, 9)]
 
     def spot(log_a):
@@ -255,9 +254,8 @@ def test_domain_extension_solves_its_equation(D):
             return (grown - rest) / ((3 - exact) / (exact - 1)) - 1
 
         expected = float(mp.log(mp.findroot(excess, 2)))
-    assert float(asperity.log_domain_extension(jnp.asarray(float(D)))) == pytest.approx(
-        expected, rel=1e-13
-    )
+    found = asperity.log_domain_extension(jnp.asarray(float(D)))
+    assert float(found) == pytest.approx(expected, rel=1e-13)
 
 
 def test_domain_extension_ends_at_the_golden_ratio_and_e():
