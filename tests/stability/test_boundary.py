@@ -305,4 +305,6 @@ def test_picture():
     assert "frequency at the boundary [kHz]" in [a.get_ylabel() for a in ax.figure.axes]
     given = Figure().add_subplot()
     assert fj.plot.boundary(boundary("ratio and friction"), given) is given
-    given.figure.draw_without_rendering()
+    for figure in (each.get_figure(root=True) for each in (ax, given)):
+        assert figure is not None
+        figure.draw_without_rendering()
