@@ -78,19 +78,18 @@ def test_table(compared):
     assert "boundary elements" in lines[5] and "%" in lines[5]
     titles, rows = compared.rows()
     assert len(titles) == len(rows[0]) == 7
-    plastic = fj.compare_laws(SURFACE, MATERIAL, [100.0], area=1e-4, seeds=0, progress=False)
+    loads = [100.0, 600.0, 6000.0]
+    plastic = fj.compare_laws(SURFACE, MATERIAL, loads, **SIZES, seeds=0, progress=False)
     assert plastic.rows()[1][0][2:6] == ["0", "-", "-", "-"]
 
 
 def test_full_contact_is_infinitely_stiff():
-    smooth = fj.Surface(2.9, 1e-12)
-    found = fj.compare_laws(
-        smooth, MATERIAL, [1e5, 1e6], area=1e-4, n=16, L_s=5e-3, seeds=2, progress=False
-    )
+    smooth, loads = fj.Surface(2.9, 1e-12), [4e6, 4e7, 4e8]
+    found = fj.compare_laws(smooth, MATERIAL, loads, **SIZES, n=64, seeds=3, progress=False)
     judge: Any = found.curves["boundary elements"]
     assert np.isinf(judge.K_n).all() and np.isnan(judge.alpha).all()
     assert np.isnan(judge.scatter).all()
-    np.testing.assert_allclose(judge.real_area, 1e-4, rtol=1e-12)
+    np.testing.assert_allclose(judge.real_area, 4e-4, rtol=1e-12)
     assert found.rows()[1][3][2:6] == ["inf", "-", "-", "-"]
 
 
