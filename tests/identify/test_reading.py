@@ -293,8 +293,10 @@ def test_without_the_package(tmp_path, monkeypatch):
 
 
 def test_units():
-    found = [metres(unit) for unit in ["um", "µm", "μm", "Micron", " nm ", "Å"]]
-    assert found == [1e-6, 1e-6, 1e-6, 1e-6, 1e-9, 1e-10]
+    found = [
+        metres(unit) for unit in ["m", "cm", "mm", "um", "µm", "μm", "Micron", " nm ", "pm", "Å"]
+    ]
+    assert found == [1.0, 1e-2, 1e-3, 1e-6, 1e-6, 1e-6, 1e-6, 1e-9, 1e-12, 1e-10]
     for unknown in ["V", "Mm", "", "MM"]:
         with pytest.raises(ValueError, match=r"the unit must be one of m, cm, mm, um, .* got '"):
             metres(unknown)
