@@ -247,6 +247,7 @@ BAD = [
     ('matrices = "all.npz"\ndamping_ratio = 0.01', "gives damping twice: C and damping_ratio"),
     (TWO + "rayleigh = [1, 0]\ndamping_ratio = 0.01", "gives damping twice"),
     (TWO + "rayleigh = 3", "rayleigh must be [alpha, beta], got 3"),
+    (TWO + "rayleigh = [1]", "rayleigh must be [alpha, beta], got [1]"),
     (TWO + 'rayleigh = ["a", 0]', "alpha must be a number, got 'a'"),
     (TWO + "rayleigh = [-1, 0]", "alpha must be at least 0, got -1.0"),
     (TWO + "damping_ratio = [1, 2]", "damping_ratio must be a scalar or have shape"),
