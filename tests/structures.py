@@ -16,6 +16,7 @@ import numpy as np
 
 import fractaljax as fj
 import hybrid_truth
+from mechanisms import PROBLEMS
 from tools import ROOT, load_script
 
 DIGITS = 50
@@ -37,6 +38,12 @@ def matrices(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     M = 0.1 * (A @ A.T / n + np.eye(n))
     K = 4e6 * (B @ B.T / n + np.diag(np.linspace(1, 3, n)))
     return M, 2.0 * M + 2e-7 * K, K
+
+
+def state_matrix(M, C, K) -> np.ndarray:
+    """Of the states [x, v] (2n, 2n)."""
+    n = len(M)
+    return np.block([[np.zeros((n, n)), np.eye(n)], [-np.linalg.solve(M, np.hstack([K, C]))]])
 
 
 def monodromy_of(cycle: fj.LimitCycle) -> jax.Array:
@@ -110,6 +117,15 @@ def beam(elements: int, free: bool = False, height: float = 0.01):
         M[element, element] += m
         K[element, element] += k
     return (M, K) if free else (M[2:, 2:], K[2:, 2:])
+
+
+def hoffmann(C=None) -> fj.Structure:
+    """The minimal model of mode coupling (Hoffmann et al. 2002): eigenvalues 2 +- (1 - 4 mu/3)^.5.
+
+    They coalesce at mu = 3/4.
+    """
+    K = [(None, [[2.0, 1.0], [1.0, 2.0]]), ("-4*mu/3", [[0.0, 1.0], [0.0, 0.0]])]
+    return fj.ParametricStructure(np.eye(2), C, K, parameters={"mu": 0.1})
 
 
 def numbers_of(structure: fj.Structure) -> dict[str, Any]:
@@ -216,6 +232,14 @@ def of_problem(problem) -> fj.Structure:
         joints.append(fj.Joint(contact, law, t, normal, V, preload))
     M, C, K = (jnp.stack([jnp.stack(row) for row in problem[name]]) for name in "MCK")
     return fj.Structure(M, C, K, joints, F=jnp.asarray(problem["F"]))
+
+
+@functools.cache
+def belt_cycle() -> tuple[fj.Structure, fj.LimitCycle]:
+    """A structure of one degree of freedom, whose joint slides along it, and its limit cycle."""
+    problem = PROBLEMS["papangelo_2017"]
+    structure = of_problem(problem)
+    return structure, fj.limit_cycle(structure, problem["start"])
 
 
 def truth_of(structure: Any) -> hybrid_truth.Mechanism:

@@ -15,7 +15,9 @@ from fractaljax._design import problem
 from fractaljax._dynamics import basin, itinerary
 from fractaljax._stability import boundary, tracks
 from fractaljax._sweep import batches
+from mechanisms import PROBLEMS
 from programs import BRAKE, PROGRAMS, STRUCTURE
+from structures import of_problem
 from tools import primitives
 
 # Calls of libraries of NVIDIA's, which stay on the device.
@@ -89,39 +91,22 @@ def recorded(monkeypatch, module, *names):
     return calls
 
 
-def belt():
-    joint = fj.Joint(
-        fj.FixedContact(1.0, 0.0, P=1.0),
-        fj.ExponentialStribeck(mu_s=1.0, mu_d=0.5, v_0=0.5),
-        tangential=[1.0],
-        V=1.0,
-    )
-    return fj.Structure(M=[[1.0]], C=[[0.1]], K=[[1.0]], joints=[joint])
-
-
+KICKS: dict[str, Any] = {"radius": 1.0, "starts": 2, "progress": False}
 WINDOW = {"x": ("D", 2.35, 2.45), "y": ("mu", 0.3, 0.4), "lines": 4}
 DRIVERS = {
-    "sweep": (
-        batches,
-        ["_batch"],
-        lambda: fj.sweep(fj.growth_rate, BRAKE, progress=False, D=[2.4]),
-    ),
+    "sweep": (batches, ["_batch"], lambda: fj.sweep(fj.growth_rate, BRAKE, None, False, D=[2.4])),
     "design": (
         problem,
         ["_linearise_light"],
         lambda: fj.design(BRAKE, {"D": (2.39, 2.41)}, starts=1, progress=False),
     ),
-    "basin": (
-        basin,
-        ["_first", "_run"],
-        lambda: fj.basin(BRAKE, radius=1.0, starts=2, progress=False),
-    ),
+    "basin": (basin, ["_first", "_run"], lambda: fj.basin(BRAKE, **KICKS)),
     "track_modes": (tracks, ["_states"], lambda: fj.track_modes(STRUCTURE, "D", [2.4, 2.41])),
     "hopf_boundary": (boundary, ["_at", "_tests"], lambda: fj.hopf_boundary(BRAKE, **WINDOW)),
     "continue_cycle": (
         itinerary,
         ["condensed", "lowest"],
-        lambda: fj.continue_cycle(belt(), "V", (1.0, 1.1)),
+        lambda: fj.continue_cycle(of_problem(PROBLEMS["papangelo_2017"]), "V", (1.0, 1.1)),
     ),
 }
 

@@ -11,21 +11,17 @@ import fractaljax as fj
 
 SCENE = fj.brake_scene()
 SURFACE, MATERIAL = SCENE.contact.surface, SCENE.contact.material
+GAP, TABLE = dict(P=1e3, area=1e-4, L=1e-2, L_s=1e-5), ((1.0, 2.0), (1e7, 2e7))
 MECHANISM = dict(m=1.0, omega_1=6e3, omega_2=5e3, xi_1=0.01, xi_2=0.01, F=5.0, V=0.1)
+SLIP = dict(slip_ratio=0.2)
 LIMITS = dict(at_least=1e-9, at_most=1e-3)
 CALLS = {
     "surface": (fj.Surface, dict(D=2.4, G=1e-10, gamma=1.5)),
     "material": (fj.Material, dict(E=1e11, nu=0.3, sigma_y=3e8, H=9e8)),
     "pair": (fj.Material.pair, dict(E1=1e11, nu1=0.3, E2=1e11, nu2=0.3, sigma_y=3e8, H=9e8)),
     "contact": (partial(fj.FractalContact, SURFACE, MATERIAL), dict(P=1e3, stiffness_ratio=0.5)),
-    "persson": (
-        partial(fj.PerssonContact, SURFACE, MATERIAL),
-        dict(P=1e3, area=1e-4, L=1e-2, L_s=1e-5),
-    ),
-    "measured": (
-        partial(fj.MeasuredContact, (1.0, 2.0), (1e7, 2e7)),
-        dict(P=1e3, stiffness_ratio=0.8),
-    ),
+    "persson": (partial(fj.PerssonContact, SURFACE, MATERIAL), GAP),
+    "measured": (partial(fj.MeasuredContact, *TABLE), dict(P=1e3, stiffness_ratio=0.8)),
     "fixed": (fj.FixedContact, dict(K_n=1e8, K_t=1e8)),
     "coulomb": (fj.Coulomb, dict(mu=0.3)),
     "stribeck": (fj.Stribeck, dict(mu_s=0.4, mu_m=0.2, v_m=0.5)),
@@ -42,6 +38,7 @@ CALLS = {
         dict(heights=np.eye(3), dx=1e-6, P=1.0, rtol=1e-6),
     ),
     "dimensionless": (fj.dimensionless_normal_stiffness, dict(D=2.4, A_r=1e-3, a_e=1e-5)),
+    "slip": (partial(fj.dimensionless_tangential_stiffness, 2.4, 0.3, 1e-3, 1e-5), SLIP),
     "equilibrium": (partial(fj.equilibrium, SCENE.oscillator), dict(K_n=1e8, K_t=1e8, mu=0.3)),
     "replace": (SCENE.replace, dict(D=2.4, P=1e3, surface=SURFACE)),
     "roughness": (fj.constraints.Roughness, LIMITS | dict(L=1e-3, L_s=1e-6)),

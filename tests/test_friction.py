@@ -16,7 +16,6 @@ from tools import both_modes
 STRIBECK, COULOMB = fj.Stribeck(0.4, 0.25, 0.5), fj.Coulomb(0.4)
 SPEEDS = np.array([1e-300, 1e-9, 0.01, 0.15, 0.3, 0.4999, 0.5, 0.75, 1.0, 3.0])
 BOTH_WAYS = np.concatenate([-SPEEDS[::-1], [0.0], SPEEDS])
-MODES = pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 
 
 class Exponential(fj.Friction):
@@ -63,37 +62,29 @@ def equation_38(v, mu_s=mpf(0.4), mu_m=mpf(0.25), v_m=mpf(0.5)):  # noqa: B008
     return mu_s - 3 * (mu_s - mu_m) / (2 * v_m) * v + (mu_s - mu_m) / (2 * v_m**3) * v**3
 
 
-def test_values():
-    """Eq. 38 in 40 digits; its minimum; a constant."""
-    with mp.workdps(40):
-        truth = [float(equation_38(mpf(v))) for v in SPEEDS]
-    np.testing.assert_allclose(STRIBECK.mu(SPEEDS), truth, rtol=1e-15)
-    assert STRIBECK.mu(0.0) == 0.4 and STRIBECK.slope(0.5) == 0.0
-    np.testing.assert_array_equal(COULOMB.mu(SPEEDS), 0.4)
-    assert COULOMB.mu_s == COULOMB.mu_m == 0.4 and not COULOMB.velocity_dependent
-
-
-@MODES
-def test_slope(mode):
-    """`slope` and both modes against differences in 60 digits; even in the velocity."""
+def test_slope():
+    """Against differences in 60 digits of Eq. 38; even in the velocity; its minimum; a constant."""
     with mp.workdps(60):
         h = mpf("1e-20")  # truncation h^2, rounding 1e-60/h
         pairs = [(equation_38(mpf(v) + h), equation_38(mpf(v) - h)) for v in SPEEDS]
         truth = np.array([float((up - down) / (2 * h)) for up, down in pairs])
-    by_mode = jax.vmap(mode(STRIBECK.mu))(SPEEDS)
-    for found in (by_mode, STRIBECK.slope(SPEEDS), STRIBECK.slope(-SPEEDS)):
+        values = [float(equation_38(mpf(v))) for v in SPEEDS]
+    np.testing.assert_allclose(STRIBECK.mu(SPEEDS), values, rtol=1e-15)
+    by_mode = [jax.vmap(mode(STRIBECK.mu))(SPEEDS) for mode in (jax.jacfwd, jax.jacrev)]
+    for found in (*by_mode, STRIBECK.slope(SPEEDS), STRIBECK.slope(-SPEEDS)):
         # Near the minimum two terms of the size of the slope at 0 cancel.
         np.testing.assert_allclose(found, truth, rtol=1e-15, atol=5e-16)
+    assert STRIBECK.slope(0.5) == 0.0 and not COULOMB.velocity_dependent
+    np.testing.assert_array_equal(COULOMB.mu(SPEEDS), 0.4)
     np.testing.assert_array_equal(COULOMB.slope(SPEEDS), 0)
 
 
-@MODES
-def test_derivatives_by_parameter(mode):
-    """dmu/dmu_s = 1 - c, dmu/dmu_m = c and dmu/dv_m, with c = u (3 - u^2)/2, u = v/v_m."""
-    u = 0.15 / 0.5
-    c, by_v_m = u * (3 - u**2) / 2, 0.15 * 1.5 * (1 - u**2) * u / 0.5
-    found = mode(lambda *x: fj.Stribeck(*x).mu(0.15), argnums=(0, 1, 2))(0.4, 0.25, 0.5)
-    np.testing.assert_allclose(found, [1 - c, c, by_v_m], rtol=2e-15)
+def viscous(s, d, v, c, w):
+    return d + (s - d) * mp.exp(-w / v) + c * w
+
+
+def falling(s, d, v, w):
+    return viscous(s, d, v, 0, w)
 
 
 LAW_TABLE = {  # numbers, mu in working precision, its least value in closed form
@@ -104,24 +95,14 @@ LAW_TABLE = {  # numbers, mu in working precision, its least value in closed for
         lambda s, d, v, w: s - 3 * d / (2 * v) * w + d / (2 * v**3) * w**3,
         0.25,
     ),
-    "exponential": (
-        fj.ExponentialStribeck,
-        (0.5, 0.2, 0.07),
-        lambda s, d, v, w: d + (s - d) * mp.exp(-w / v),
-        0.2,
-    ),
+    "exponential": (fj.ExponentialStribeck, (0.5, 0.2, 0.07), falling, 0.2),
     "exponential, viscous": (
         fj.ExponentialStribeck,
         (0.5, 0.2, 0.07, 0.3),
-        lambda s, d, v, c, w: d + (s - d) * mp.exp(-w / v) + c * w,
+        viscous,
         0.2 + 0.3 * 0.07 * (1 + np.log(0.3 / (0.3 * 0.07))),
     ),
-    "exponential, rising": (
-        fj.ExponentialStribeck,
-        (0.5, 0.4, 0.1, 2.0),
-        lambda s, d, v, c, w: d + (s - d) * mp.exp(-w / v) + c * w,
-        0.5,
-    ),
+    "exponential, rising": (fj.ExponentialStribeck, (0.5, 0.4, 0.1, 2.0), viscous, 0.5),
     "hyperbolic": (fj.HyperbolicStribeck, (0.45, 3.0), lambda s, d, w: s / (1 + d * w), 0.0),
     "coulomb": (fj.Coulomb, (0.4,), lambda s, w: s + 0 * w, 0.4),
 }
@@ -320,13 +301,10 @@ def test_branches(law):
         np.testing.assert_allclose(near, law.slope(0.0), rtol=1e-14, atol=1e-15)
     smoothed = law.branch(SPEEDS, 0.25) - law.branch(SPEEDS, 1.0)
     np.testing.assert_allclose(smoothed, -0.75 * 0.4, rtol=1e-14)
-
-
-def test_stribeck_branch_is_one_cubic():
-    truth = np.polynomial.Polynomial([0.4, -1.5 * 0.15 / 0.5, 0, 0.5 * 0.15 / 0.5**3])
-    np.testing.assert_allclose(
-        STRIBECK.branch(BOTH_WAYS, 1.0), truth(BOTH_WAYS), rtol=1e-15, atol=5e-16
-    )
+    if law is STRIBECK:
+        cubic = np.polynomial.Polynomial([0.4, -1.5 * 0.15 / 0.5, 0, 0.5 * 0.15 / 0.5**3])
+        found = law.branch(BOTH_WAYS, 1.0)
+        np.testing.assert_allclose(found, cubic(BOTH_WAYS), rtol=1e-15, atol=5e-16)
 
 
 def test_float32():
@@ -343,16 +321,11 @@ def test_float32():
         (lambda: fj.Stribeck(0.4, -0.1, 0.5), r"^mu_m must be at least 0, got -0\.1$"),
         (lambda: fj.Stribeck(0.4, 0.5, 0.5), r"^mu_s must be at least mu_m = 0\.5, got 0\.4$"),
         (lambda: fj.Stribeck(0.4, 0.25, 0.0), r"^v_m must be above 0"),
-        (lambda: fj.Stribeck(0.4, 0.25, np.nan), r"^v_m must be above 0, got nan"),
         (lambda: fj.Coulomb(0), "^mu must be above 0, got 0"),
-        (lambda: fj.Coulomb(WRONG), "^mu must be a number, got None"),
         (lambda: ABSTRACT(), "abstract"),
         (lambda: fj.ExponentialStribeck(0.4, 0.5, 0.1), r"^mu_s must be at least mu_d = 0\.5, got"),
         (lambda: fj.ExponentialStribeck(0.4, 0.2, 0.0), "^v_0 must be above 0, got 0"),
-        (
-            lambda: fj.ExponentialStribeck(0.4, 0.2, 0.1, -1.0),
-            "^viscous must be at least 0, got -1",
-        ),
+        (lambda: fj.ExponentialStribeck(0.4, 0.2, 0.1, -1.0), "^viscous must be at least 0, got"),
         (lambda: fj.HyperbolicStribeck(0.0, 0.1), "^mu_s must be above 0, got 0"),
         (lambda: fj.HyperbolicStribeck(0.4, -0.1), "^delta must be at least 0, got -0.1"),
         (lambda: Cubic(np.nan, 0.1, 0.5), "^high must be finite, got nan"),

@@ -8,15 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad, solve_ivp
 
-from hybrid_truth import (
-    OPEN,
-    Impossible,
-    Mechanism,
-    cycle,
-    monodromy,
-    phases,
-    simulate,
-)
+from hybrid_truth import OPEN, Impossible, Mechanism, cycle, monodromy, phases, simulate
 from mechanisms import PROBLEMS
 
 REFERENCE = Path(__file__).parent / "reference"
@@ -30,20 +22,7 @@ def coulomb(mu):
     return ("coulomb", {"mu": mu})
 
 
-BELT = {
-    "M": [[1.0]],
-    "C": [[0.1]],
-    "K": [[1.0]],
-    "F": [0.0],
-    "joints": [
-        {
-            "tangential": [1.0],
-            "V": 1.0,
-            "P": 1.0,
-            "friction": ("exponential", {"mu_s": 1.0, "mu_d": 0.5, "v_0": 0.5}),
-        }
-    ],
-}
+BELT = PROBLEMS["papangelo_2017"]
 # Two joints, which stick together for a while, on three degrees of freedom.
 PAIR = {
     "M": np.diag([1.0, 0.5, 0.8]),
@@ -52,17 +31,12 @@ PAIR = {
     "F": [0.0, 0.0, 0.0],
     "joints": [
         {
-            "tangential": [1.0, 0.0, 0.0],
-            "normal": [0.0, 0.0, 1.0],
-            "V": 0.4,
-            "P": 1.0,
-            "K_n": 1.0,
+            **{"tangential": [1.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]},
+            **{"V": 0.4, "P": 1.0, "K_n": 1.0},
             "friction": ("exponential", {"mu_s": 0.9, "mu_d": 0.4, "v_0": 0.3}),
         },
         {
-            "tangential": [0.3, 1.0, 0.0],
-            "V": 0.5,
-            "P": 0.8,
+            **{"tangential": [0.3, 1.0, 0.0], "V": 0.5, "P": 0.8},
             "friction": ("hyperbolic", {"mu_s": 0.8, "delta": 1.5}),
         },
     ],

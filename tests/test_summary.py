@@ -18,10 +18,7 @@ FIXED = BRAKE.replace(contact=fj.FixedContact(4e8, 2e8))
 ROWS = [
     (BRAKE, {"regime": "elastic-plastic"}),
     # A plastic joint has no stiffness ratio, a slipping one no tangential stiffness.
-    (
-        BRAKE.replace(D=2.2, G=1e-9),
-        {"regime": "fully plastic", "K_n [N/m]": "0", "K_t/K_n": "-"},
-    ),
+    (BRAKE.replace(D=2.2, G=1e-9), {"regime": "fully plastic", "K_n [N/m]": "0", "K_t/K_n": "-"}),
     (BRAKE.replace(D=2.7, G=1e-11), {"regime": "gross slip", "K_t [N/m]": "0"}),
 ]
 
@@ -51,9 +48,10 @@ def test_roughness_where_wavelengths_are_given():
 def test_stability_table_has_the_friction_that_starts_to_squeal():
     """As the library says; none where no friction does."""
     scene = fj.brake_scene().replace(contact=fj.FixedContact(4e8, 6e7), friction=fj.Coulomb(0.4))
-    lines = stability_table(scene).splitlines()
-    assert ["critical friction", "0.754017"] in [re.split("  +", line) for line in lines]
-    assert f"{fj.margin(scene):+.6g}" in stability_table(scene)
+    text = stability_table(scene)
+    assert ["critical friction", "0.754017"] in [re.split("  +", x) for x in text.splitlines()]
+    assert f"{fj.margin(scene):+.6g}" in text and "regime" not in text
+    assert "(stable against small disturbances)" in text
     lines = stability_table(scene.replace(K_t=0.0)).splitlines()
     assert ["critical friction", "none"] in [re.split("  +", line) for line in lines]
 
@@ -67,13 +65,9 @@ def test_every_active_constraint_has_a_line():
 
 
 def test_columns_are_aligned():
-    """Titles stand above their columns."""
+    """Titles stand above their columns; many columns are rows, so that lines stay short."""
     text = table(["a", "b"], [{"row": "1", "longer row": "22"}, {"row": "3", "longer row": "4"}])
     assert text == "            a   b\nrow         1   3\nlonger row  22  4"
-
-
-def test_many_columns_are_rows():
-    """So that lines stay short."""
     lines = table([*"abcdef"], [{"row": str(i), "longer row": "22"} for i in range(6)]).splitlines()
     assert lines[:2] == ["   row  longer row", "a  0    22"] and len(lines) == 7
 
@@ -126,38 +120,27 @@ def test_cycle_table_agrees_with_the_cycle():
 def test_cycle_table_without_a_cycle():
     """Why there is none, and no row of NaN."""
     scene = motionless_scene()
-    text = cycle_table(scene, fj.limit_cycle(scene, throw=False))
-    assert cells(text) == [
+    growth = f"{fj.growth_rate(scene):+.6g}"
+    assert cells(cycle_table(scene, fj.limit_cycle(scene, throw=False))) == [
         ["result", "the motion dies out: the sliding equilibrium attracts it"],
-        [
-            "growth rate [1/s]",
-            f"{fj.growth_rate(scene):+.6g}",
-            "(stable against small disturbances)",
-        ],
+        ["growth rate [1/s]", growth, "(stable against small disturbances)"],
     ]
 
 
-def test_cycle_table_of_an_inaccurate_cycle():
-    """All the numbers, and the warning."""
-    poor = eqx.tree_at(lambda c: c.result, reference_cycle(), fj.CycleResult.inaccurate)
-    text = cycle_table(reference_scene(), poor)
+def test_cycle_tables_of_other_cycles(monkeypatch):
+    """An inaccurate one has all numbers and a warning; one without switches has no list of them.
+
+    One of the regularised law has none, and a difference from the exact law.
+    """
+    scene, cycle = reference_scene(), reference_cycle()
+    text = cycle_table(scene, eqx.tree_at(lambda c: c.result, cycle, fj.CycleResult.inaccurate))
     assert text.startswith("result                a limit cycle was found, but not to rtol")
-    assert "Floquet multiplier 4" in text and "switch 5" in text
-
-
-def test_cycle_table_without_switches(monkeypatch):
-    """A cycle that never reaches the belt's velocity has no list of switches."""
-    monkeypatch.setattr(fj.LimitCycle, "switches", lambda _: [])
-    text = cycle_table(reference_scene(), reference_cycle())
-    assert "switch" not in text and text.splitlines()[-1].startswith("sticks")
-
-
-def test_cycle_table_of_the_regularised_law():
-    """It has no switches, and a difference from the exact law."""
-    moved = eqx.tree_at(lambda c: c.regularisation_error, reference_cycle(), 0.0123)
-    text = cycle_table(reference_scene(), moved)
+    assert "Floquet multiplier 4" in text and "switch 5" in text and "off the exact" not in text
+    text = cycle_table(scene, eqx.tree_at(lambda c: c.regularisation_error, cycle, 0.0123))
     assert "off the exact law by  1.2e-02" in text and "switch" not in text
-    assert "off the exact" not in cycle_table(reference_scene(), reference_cycle())
+    monkeypatch.setattr(fj.LimitCycle, "switches", lambda _: [])
+    text = cycle_table(scene, cycle)
+    assert "switch" not in text and text.splitlines()[-1].startswith("sticks")
 
 
 UNCOMPUTABLE = [

@@ -40,6 +40,7 @@ PARTS = [
     fj.Coulomb(0.4),
     fj.Stribeck(0.4, 0.25, 0.5),
     fj.brake_scene(),
+    fj.brake_scene().oscillator,
 ]
 STATE = fj.contact_state(SURFACE, MATERIAL, 1907.3, mu_s=0.4, mu_m=0.25)
 

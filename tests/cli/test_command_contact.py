@@ -43,17 +43,10 @@ def test_scene_with_a_nominal_area(capsys):
         ((), "--area must be given: the law of the scene knows no nominal area"),
         (("--area", 1e-4, "--loads", "2:1"), "--loads must be LOW:HIGH with 0 < LOW < HIGH"),
         (("--area", 1e-4, "--points", 1), "--points must be at least 2, got 1"),
-        (("--area", -1), "area must be above 0, got -1.0"),
+        (("fixed.toml", "--area", 1e-4), "fixed.toml: the law of its contact takes no surface"),
     ],
 )
 def test_refuses(capsys, arguments, said):
+    fj.brake_scene().replace(contact=fj.FixedContact(1e8, 1e8)).save("fixed.toml")
     status, _, err = run(capsys, "contact", *arguments, "--quiet")
     assert status == 2 and said in err and not Path("fractaljax-contact").exists()
-
-
-def test_refuses_a_scene_without_surface(capsys):
-    fj.brake_scene().replace(contact=fj.FixedContact(1e8, 1e8)).save("fixed.toml")
-    status, _, err = run(capsys, "contact", "fixed.toml", "--area", 1e-4)
-    assert (
-        status == 2 and err == "fractaljax: fixed.toml: the law of its contact takes no surface\n"
-    )

@@ -18,13 +18,8 @@ _WRITTEN += ["topographies.png", "topography.npy"]
 _ROWS = ["D ", "G [m]", "Sq [m]", "Sdq", "K_n [N/m]", "K_t [N/m]", "K_t/K_n", "regime", "a_l/a_e"]
 _ROWS += ["Q_e/(mu_s P)", "growth rate [1/s]", "frequency [Hz]", "damping ratio"]
 _ROWS += ["active constraints", "Sq and Sdq: wavelengths from 0.001 to 1e-06 m", "found: "]
-_ROWS += [
-    "",
-    " ",
-    "as it is (FractalContact)",
-    "friction on P + K_n x2",
-    "K_t/K_n from 0.355 to 0.824",
-]
+_ROWS += ["", " ", "as it is (FractalContact)", "friction on P + K_n x2"]
+_ROWS += ["K_t/K_n from 0.355 to 0.824"]
 _ROWS += ["Quiet, but it rests on: friction on K_n x2; K_t/K_n = 0.355."]
 _ROWS += ["Not asked: other contact laws (area), scatter (tolerance), kicks (quiet_within).", ""]
 _ROWS += ["written to fractaljax-design: ", "topography.npy: 1024 x 1024 heights in m, dx = "]
@@ -88,20 +83,17 @@ def test_a_tolerance_comes_from_the_file_of_an_identification():
     assert _tolerance(["D=0.01", "lnG=0.1"]) == {"D": 0.01, "ln G": 0.1}
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
+def test_a_damaged_tolerance_is_refused(capsys):
+    for text, said in (
         ("", "the table [tolerance] is missing"),
         ('[tolerance]\nnames = ["D"]', "[tolerance] lacks 'covariance'"),
         ("[tolerance]\nsigma = 1", "[tolerance] has the unknown key 'sigma'"),
         ('[tolerance]\nnames = ["D"]\ncovariance = [[1, 2]]', "tolerance must name the rows"),
-    ],
-)
-def test_a_damaged_tolerance_is_refused(capsys, text, said):
-    Path("mine.toml").write_text(text)
-    status, out, err = run(capsys, "design", "--tolerance", "mine.toml", "--quiet")
-    assert (status, out) == (2, "") and err.startswith("fractaljax: mine.toml: ")
-    assert said in err and err.count("\n") == 1
+    ):
+        Path("mine.toml").write_text(text)
+        status, out, err = run(capsys, "design", "--tolerance", "mine.toml", "--quiet")
+        assert (status, out) == (2, "") and err.startswith("fractaljax: mine.toml: ")
+        assert said in err and err.count("\n") == 1
 
 
 def test_infeasible_design_is_no_success(capsys):
@@ -152,29 +144,19 @@ def test_robust_design_and_its_repetition(capsys):
         (["--out", "file/below", "--quiet"], "not a folder: file/below"),
         (["--out", "file", "--quiet"], "File exists"),
         (["--D", 2.5, 2.3], "bounds on D must be (lower, upper), got (2.5, 2.3)"),
-        (["--D", 2.5, 2.9], "D must lie inside its bounds [2.5, 2.9], got 2.4"),
         (["--starts", 0], "starts must be a whole number of at least 1, got 0"),
         (["--target", "low"], "invalid float value: 'low'"),
         (["--envelope", "P"], "--envelope must be NAME=LOW:HIGH, got 'P'"),
         (["--envelope", "P=1:x"], "--envelope P must be numbers, got 'x'"),
         (["--envelope", "P=1"], "--envelope P must be LOW:HIGH or at least two samples"),
-        (["--envelope", "P=1:1"], "envelope of P must be (lower, upper), got (1, 1)"),
-        (["--envelope", "P=nan:2"], "envelope of P must be finite, got nan"),
         (["--envelope", "P=1:2", "--envelope", "P=3:4"], "--envelope has P more than once"),
-        (["--envelope", "Q=1:2"], "envelope names 'Q'; there are D, G"),
         (["--tolerance", "D=1", "lnG=1", "D=2"], "--tolerance has D more than once"),
         (["--tolerance", "D"], "--tolerance must be NAME=SIGMA, got 'D'"),
-        (["--tolerance", "D=-1"], "tolerance of D must be at least 0, got -1.0"),
         (["--seed", 1, "--seed", 2], "argument --seed: given more than once"),
         (["--seed", "1e20"], "argument --seed: invalid int value: '1e20'"),
         (["--seed", 10**20], f"seed must be a whole number of at most {2**63 - 1}, got {10**20}"),
-        (["--lattice", 200000], "lattice must be a whole number of at most 1000, got"),
-        (["--lattice", 2, "--starts", 5], "starts must be at most the 4 of the lattice"),
-        (["--quantile", "nan"], "quantile must be at least 0.5 and at most 0.999, got "),
         (["--quiet-within", "x"], "--quiet-within must be numbers, got 'x'"),
-        (["--quiet-within", "1,2"], "quiet_within must have 4 semi-axes, got 2"),
         (["--risk", "cvar:x"], "--risk must be numbers, got 'x'"),
-        (["--sq", "2:1"], "Sq at_least must be below at_most, got 2.0, 1.0"),
         (["--sq-lengths", 1, 2], "--sq-lengths needs --sq"),
         (["--damping-ratio", "0:1"], "--damping-ratio has a lower limit only: LOW:"),
         (["--cycle-amplitude", "1:"], "--cycle-amplitude has an upper limit only: :HIGH"),
@@ -214,10 +196,7 @@ def test_random_arguments(capsys, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("text", "asked"), [("2", 2.0), ("1e-5,2e-5,0.1,0.2", [1e-5, 2e-5, 0.1, 0.2])]
-)
-def test_size_of_kicks(capsys, monkeypatch, text, asked):
+def test_size_of_kicks(capsys, monkeypatch):
     """A radius or semi-axes; the file of the scene may follow, and --quiet is another option."""
 
     def design(_, quiet_within, **__):
@@ -225,8 +204,9 @@ def test_size_of_kicks(capsys, monkeypatch, text, asked):
 
     monkeypatch.setattr("fractaljax._design.design.design", design)
     fj.brake_scene().save("mine.toml")
-    _, _, err = run(capsys, "design", "--quiet", "--quiet-within", text, "mine.toml")
-    assert err == f"fractaljax: {asked}\n"
+    for text, asked in (("2", 2.0), ("1e-5,2e-5,0.1,0.2", [1e-5, 2e-5, 0.1, 0.2])):
+        _, _, err = run(capsys, "design", "--quiet", "--quiet-within", text, "mine.toml")
+        assert err == f"fractaljax: {asked}\n"
 
 
 @pytest.mark.parametrize(

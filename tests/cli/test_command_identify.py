@@ -45,11 +45,7 @@ def test_identify_a_profile(capsys):
     written = "identification.png, scene.toml, tolerance.toml"
     assert f"written to fractaljax-identification: {written}" in lines
     assert lines[-1] == f"next: fractaljax design {SCENE}"
-    assert sorted(path.name for path in SCENE.parent.iterdir()) == [
-        "identification.png",
-        "scene.toml",
-        "tolerance.toml",
-    ]
+    assert ", ".join(sorted(path.name for path in SCENE.parent.iterdir())) == written
     assert (SCENE.parent / "identification.png").read_bytes().startswith(b"\x89PNG")
     found, scene = fj.identify(z, DX), fj.Scene.load(SCENE)
     assert f"{found}" in out
@@ -108,16 +104,14 @@ def test_options_reach_reading_and_identification(capsys, monkeypatch):
     assert asked == reading | limits | fitting | expected
 
 
-WAVY = 1e-6 * np.sin(2 * np.pi * DX * np.arange(4096) / 3e-4) + 1e-9 * np.random.default_rng(
-    1
-).normal(size=4096)
+WAVY = 1e-6 * np.sin(2 * np.pi * DX * np.arange(4096) / 3e-4)
+WAVY += 1e-9 * np.random.default_rng(1).normal(size=4096)
 
 
 @pytest.mark.parametrize(
     ("z", "message"),
     [
         (profile(1024, 3.25), "D must be above 2 and below 3"),
-        (profile(1024, 1.25), "D must be above 2 and below 3"),
         (WAVY, DISQUALIFYING[0]),
         (1e-8 * np.round(4 * profile(1024) / np.ptp(profile(1024))), DISQUALIFYING[1]),
     ],
@@ -156,17 +150,14 @@ def test_force_writes_a_scene_all_the_same(capsys, monkeypatch):
             assert run(capsys, "identify", "mine.csv", "--force")[0] == 0
 
 
-@pytest.mark.parametrize(
-    ("D", "G", "options"),
-    [
+def test_bounds_for_the_design():
+    """Only where the default ones leave the surface out."""
+    for D, G, options in (
         (2.4, 1e-10, ""),
         (2.06, 1e-10, " --D 2.03 2.16"),
         (2.95, 1e-7, " --D 2.85 2.975 --G 1e-08 1e-06"),
-    ],
-)
-def test_bounds_for_the_design(D, G, options):
-    """Only where the default ones leave the surface out."""
-    assert _bounds(fj.Surface(D, G)) == options
+    ):
+        assert _bounds(fj.Surface(D, G)) == options
 
 
 @pytest.mark.parametrize(
@@ -176,11 +167,8 @@ def test_bounds_for_the_design(D, G, options):
         (["nowhere.csv"], "no such file"),
         (["words.csv"], "words.csv: there is no line of numbers in it"),
         (["flat.npy", "--dx", 1], "in which unit heights are: give it (--unit um)"),
-        (["flat.npy", "--unit", "um"], "give dx in metres (--dx 1e-6)"),
-        (["flat.npy", "--unit", "um", "--dx", "1um"], "invalid float value: '1um'"),
         (["flat.npy", "--unit", "um", "--dx", 1], "z has no roughness: it is constant"),
         (["flat.npy", "--scene", "fixed.toml"], "takes no surface"),
-        (["flat.npy", "--scene", "nowhere.toml"], "no such file"),
         (["good.csv", "--band", 1e9, 2e9], "band must rise and lie between"),
         (["good.csv", "--out", "words.csv"], "File exists"),
     ],

@@ -1,8 +1,6 @@
 """The command: what it prints and writes, and how it refuses."""
 
 import csv
-import errno
-import os
 import subprocess
 import sys
 import tempfile
@@ -31,15 +29,12 @@ def names(folder) -> list[str]:
 
 
 def test_stability(capsys, tmp_path):
-    """The table of the reference brake, and of a file; the slope of the friction law left out."""
+    """The table of the reference brake, and of a file with the slope of its law left out."""
     status, out, err = run(capsys, "stability")
     assert (status, err) == (0, "")
     assert "+22.0801  (it squeals)" in out and out.count("eigenvalue") == 4
-    fixed = fj.brake_scene().replace(contact=fj.FixedContact(0.0, 0.0), friction=fj.Coulomb(0.3))
-    fixed.save(tmp_path / "fixed.toml")
-    status, out, _ = run(capsys, "stability", "fixed.toml")
-    assert status == 0 and "(stable against small disturbances)" in out and "regime" not in out
-    status, out, _ = run(capsys, "stability", "--constant-friction")
+    fj.brake_scene().save(tmp_path / "brake.toml")
+    status, out, _ = run(capsys, "stability", "brake.toml", "--constant-friction")
     assert status == 0 and "+23.311" in out
 
 
@@ -56,7 +51,6 @@ def test_scene_and_version(capsys):
     ("arguments", "said"),
     [
         (["--x", "D"], "--x must be NAME=LOW:HIGH, got 'D'"),
-        (["--x", "D=2.3"], "--x must be NAME=LOW:HIGH, got 'D=2.3'"),
         (["--y", "G=1:x"], "--y G must be numbers, got 'x'"),
         (["--x", "speed=1:2"], "no quantity 'speed'"),
     ],
@@ -163,8 +157,13 @@ EDITS = [
 ]
 
 
-@pytest.mark.parametrize(("old", "new", "message"), EDITS)
-@pytest.mark.parametrize("command", ["design", "stability", "cycle"])
+@pytest.mark.parametrize(
+    ("command", "old", "new", "message"),
+    [
+        *(("stability", *edit) for edit in EDITS),
+        *((command, *EDITS[i]) for command in ("design", "cycle") for i in (0, -1)),
+    ],
+)
 def test_bad_scene_files(capsys, tmp_path, command, old, new, message):
     """One line with file, table, bound and value; exit status 2; nothing written."""
     text = fj.brake_scene().to_toml()
@@ -176,14 +175,6 @@ def test_bad_scene_files(capsys, tmp_path, command, old, new, message):
     assert names(tmp_path) == ["bad.toml"]
 
 
-def test_friction_beyond_its_law(capsys, tmp_path):
-    """mu_m above 0.9 is beyond Eq. 19."""
-    text = fj.brake_scene().to_toml().replace("mu_s = 0.4", "mu_s = 1.0")
-    (tmp_path / "bad.toml").write_text(text.replace("mu_m = 0.25", "mu_m = 0.95"))
-    status, _, err = run(capsys, "stability", "bad.toml")
-    assert status == 2 and "mu_m must be at most 0.9, got 0.95" in err
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -191,10 +182,8 @@ def test_friction_beyond_its_law(capsys, tmp_path):
         (["cycle", "nowhere.toml"], "no such file: nowhere.toml"),
         (["cycle", "--out", "file/below"], "not a folder: file/below"),
         (["cycle", "--rtol", "nan"], "rtol must be above 0 and at most 0.1, got nan"),
-        (["cycle", "--max-returns", 0], "max_returns must be a whole number of at least 1, got 0"),
         (["cycle", "--max-returns", 1.5], "invalid int value: '1.5'"),
         (["cycle", "--start", 1, 2, 3], "start must have shape (4,), got (3,)"),
-        (["cycle", "--start", 0, 0, "nan", 0], "start must be finite, got nan"),
         (["cycle", "--rtol", 1, "--rtol", 2], "argument --rtol: given more than once"),
         (["cycle", "--constant-friction"], "unrecognized arguments: --constant-friction"),
         (["polish"], "invalid choice: 'polish'"),
@@ -241,23 +230,6 @@ def test_defect_keeps_its_traceback(monkeypatch):
     monkeypatch.setattr(_TABLE, raising(AttributeError("no x")))
     with pytest.raises(AttributeError, match="no x"):
         main(["stability"])
-
-
-def test_full_disk(capsys, monkeypatch):
-    """The reason is that of the second file, and neither file is left."""
-    fsync, synced = os.fsync, []
-
-    def fail(handle):
-        synced.append(handle)
-        if len(synced) == 2:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        fsync(handle)
-
-    monkeypatch.setattr(_SEARCH, lambda *_, **__: reference_cycle())
-    monkeypatch.setattr(os, "fsync", fail)
-    said = "fractaljax: No space left on device: fractaljax-cycle/cycle.csv\n"
-    assert run(capsys, "cycle") == (2, "", said)
-    assert names(".") == []
 
 
 # --- processes: signals, pipes, precision -------------------------------------------------

@@ -372,13 +372,10 @@ def test_what_does_not_converge_says_so(plastic):
     [
         ({"heights": np.zeros(8)}, r"^heights must have shape \(nx, ny\), got \(8,\)$"),
         ({"heights": np.zeros((1, 8))}, r"^heights must have shape \(nx, ny\).*\(1, 8\)$"),
-        ({"heights": np.full((4, 4), np.nan)}, "^heights must be finite, got nan$"),
         ({"dx": 0}, r"^dx must be above 0, got 0\.0$"),
         ({"P": -1.0}, r"^P must be above 0, got -1\.0$"),
         ({"P": np.ones(2)}, r"^P must be a single number, got shape \(2,\)$"),
         ({"rtol": 0}, r"^rtol must be above 0 and below 1, got 0\.0$"),
-        ({"rtol": 1}, r"^rtol must be above 0 and below 1, got 1\.0$"),
-        ({"material": None}, "^material must be a Material, got None$"),
         ({"plastic": 1}, "^plastic must be True or False, got 1$"),
     ],
 )

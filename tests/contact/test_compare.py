@@ -13,35 +13,21 @@ from tools import assert_whole
 
 BRAKE = fj.brake_scene().contact
 SURFACE, MATERIAL = BRAKE.surface, BRAKE.material
+SIZES: dict[str, Any] = {"area": 4e-4, "L": 1e-2, "L_s": 1e-3}
 LOADS = np.array([600.0, 1907.3, 6000.0])
 MEASURED = fj.MeasuredContact((100.0, 1e4), (1e8, 1e10), 1.0, 0.7)
 
 
 @pytest.fixture(scope="module")
 def compared():
-    return fj.compare_laws(
-        SURFACE,
-        MATERIAL,
-        LOADS,
-        area=4e-4,
-        L=1e-2,
-        L_s=1e-3,
-        laws={"measured": MEASURED},
-        n=64,
-        seeds=3,
-        key=jax.random.key(5),
-        progress=False,
-    )
+    asked: dict[str, Any] = {"n": 64, "seeds": 3, "key": jax.random.key(5), "progress": False}
+    given = {"measured": MEASURED}
+    return fj.compare_laws(SURFACE, MATERIAL, LOADS, **SIZES, laws=given, **asked)
 
 
 def test_every_law_is_as_by_itself(compared):
-    assert list(compared.curves) == [
-        "fractal",
-        "asperity",
-        "Persson",
-        "measured",
-        "boundary elements",
-    ]
+    names = ["fractal", "asperity", "Persson", "measured", "boundary elements"]
+    assert list(compared.curves) == names
     for i, P in enumerate(LOADS):
         state = fj.contact_state(SURFACE, MATERIAL, P, mu_s=0.4, mu_m=0.25)
         found = compared.curves["fractal"]
@@ -57,9 +43,7 @@ def test_every_law_is_as_by_itself(compared):
 def test_alpha_is_the_logarithmic_slope(compared):
     h = 1e-5
     low, high = (
-        fj.compare_laws(
-            SURFACE, MATERIAL, LOADS * x, area=4e-4, L=1e-2, L_s=1e-3, seeds=0, progress=False
-        ).curves
+        fj.compare_laws(SURFACE, MATERIAL, LOADS * x, **SIZES, seeds=0, progress=False).curves
         for x in (np.exp(-h), np.exp(h))
     )
     for name in ("fractal", "asperity", "Persson"):
@@ -94,19 +78,18 @@ def test_table(compared):
     assert "boundary elements" in lines[5] and "%" in lines[5]
     titles, rows = compared.rows()
     assert len(titles) == len(rows[0]) == 7
-    plastic = fj.compare_laws(SURFACE, MATERIAL, [100.0], area=1e-4, seeds=0, progress=False)
+    loads = [100.0, 600.0, 6000.0]
+    plastic = fj.compare_laws(SURFACE, MATERIAL, loads, **SIZES, seeds=0, progress=False)
     assert plastic.rows()[1][0][2:6] == ["0", "-", "-", "-"]
 
 
 def test_full_contact_is_infinitely_stiff():
-    smooth = fj.Surface(2.9, 1e-12)
-    found = fj.compare_laws(
-        smooth, MATERIAL, [1e5, 1e6], area=1e-4, n=16, L_s=5e-3, seeds=2, progress=False
-    )
+    smooth, loads = fj.Surface(2.9, 1e-12), [4e6, 4e7, 4e8]
+    found = fj.compare_laws(smooth, MATERIAL, loads, **SIZES, n=64, seeds=3, progress=False)
     judge: Any = found.curves["boundary elements"]
     assert np.isinf(judge.K_n).all() and np.isnan(judge.alpha).all()
     assert np.isnan(judge.scatter).all()
-    np.testing.assert_allclose(judge.real_area, 1e-4, rtol=1e-12)
+    np.testing.assert_allclose(judge.real_area, 4e-4, rtol=1e-12)
     assert found.rows()[1][3][2:6] == ["inf", "-", "-", "-"]
 
 

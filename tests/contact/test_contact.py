@@ -555,10 +555,8 @@ def test_regimes_are_outcomes():
 
 # --- refusals ---------------------------------------------------------------------------------
 
-SURFACE, NAN, STAR = BRAKE.surface, float("nan"), {"D": 2.4, "A_r": 1e-3, "a_e": 1e-5}
-
-
-WRONG: Any = 3
+SURFACE, STAR = BRAKE.surface, {"D": 2.4, "A_r": 1e-3, "a_e": 1e-5}
+tangential = fj.dimensionless_tangential_stiffness
 
 
 def state_of(P: Any = 1907.3, mu_s: Any = 0.4, mu_m: Any = 0.25):
@@ -574,30 +572,18 @@ def state_of(P: Any = 1907.3, mu_s: Any = 0.4, mu_m: Any = 0.25):
         (lambda: state_of(mu_m=0.3, mu_s=0.25), r"^mu_s must be at least mu_m = 0\.3, got 0\.25$"),
         (lambda: state_of(P=np.array([1.0, 2.0])), r"^P must be a scalar, .*jax\.vmap"),
         (lambda: state_of(mu_s=np.array([0.5, 0.6])), "^mu_s must be a single number"),
-        (lambda: state_of(mu_m="0.2"), "^mu_m must be a number, got '0.2'$"),
         (lambda: jax.grad(lambda P: state_of(P).K_n)(-1.0), r"^P must be above 0, got -1\.0"),
         (lambda: fj.contact_load(SURFACE, MATERIAL, 0.0, mu_m=0.2), "^A_r must be above 0"),
         (lambda: fj.contact_load(SURFACE, MATERIAL, 1e-6, mu_m=1.0), "^mu_m must be"),
-        (lambda: fj.contact_load(WRONG, MATERIAL, 1.0, mu_m=0.2), "^surface must be a Surface"),
-        (lambda: fj.FractalContact(SURFACE, WRONG, 1.0), "^material must be a Material, got 3$"),
-        (lambda: fj.FractalContact(SURFACE, MATERIAL, NAN), "^P must be above 0, got nan$"),
         (
             lambda: fj.FractalContact(SURFACE, MATERIAL, 1, -0.5),
             "^stiffness_ratio must be at least",
         ),
         (lambda: fj.FixedContact(-1.0, 1e8), "^K_n must be at least 0, got -1.0$"),
-        (lambda: fj.FixedContact(1e8, np.inf), "^K_t must be at least 0, got inf$"),
         (lambda: fj.dimensionless_normal_stiffness(**STAR | {"D": 3.0}), "^D must be above 2"),
         (lambda: fj.dimensionless_normal_stiffness(**STAR | {"A_r": -1.0}), "^A_r must be above"),
         (lambda: fj.dimensionless_normal_stiffness(**STAR | {"a_e": 0.0}), "^a_e must be above 0"),
-        (
-            lambda: fj.dimensionless_tangential_stiffness(2.4, 0.6, 1e-3, 1e-5, 0.2),
-            "^nu must be at least 0 and at most 0.5",
-        ),
-        (
-            lambda: fj.dimensionless_tangential_stiffness(2.4, 0.3, 1e-3, 1e-5, NAN),
-            "^slip_ratio must be finite",
-        ),
+        (lambda: tangential(2.4, 0.6, 1e-3, 1e-5, 0.2), "^nu must be at least 0 and at most 0.5"),
         (lambda: fj.Contact(), "abstract"),  # pyright: ignore[reportAbstractUsage]
     ],
 )

@@ -10,7 +10,6 @@ from mpmath import mp, mpf
 
 import fractaljax as fj
 
-WRONG: Any = "1"
 GOOD: dict[str, Any] = {"E": 1.154e11, "nu": 0.3, "sigma_y": 3.55e8, "H": 9.94e8}
 BODIES = {"E1": 2.1e11, "nu1": 0.27, "E2": 9e10, "nu2": 0.35}
 PAIR = BODIES | {"sigma_y": 3.55e8, "H": 9.94e8}
@@ -41,6 +40,10 @@ def test_the_closed_ends():
         assert (material.nu, material.H) == (nu, material.sigma_y)
 
 
+def hardness(H):
+    return fj.Material(**GOOD | {"H": H}).H
+
+
 ARRAYS = {"sigma_y": np.array([1.0, 3.0]), "H": np.array([2.5, 2.5])}
 
 
@@ -49,16 +52,11 @@ ARRAYS = {"sigma_y": np.array([1.0, 3.0]), "H": np.array([2.5, 2.5])}
     [
         (lambda: fj.Material(**GOOD | {"E": 0}), r"^E must be above 0, got 0\.0$"),
         (lambda: fj.Material(**GOOD | {"nu": np.nextafter(0.5, 1)}), "^nu .* at most 0.5, got"),
-        (lambda: fj.Material(**GOOD | {"sigma_y": np.nan}), "^sigma_y must be above 0, got nan$"),
         (lambda: fj.Material(**GOOD | {"H": 1}), r"^H .* sigma_y = 355000000\.0, got 1\.0$"),
         (lambda: fj.Material(**GOOD | ARRAYS), r"^H must be at least sigma_y = 3\.0, got 2\.5$"),
-        (lambda: fj.Material(**GOOD | {"H": WRONG}), "^H must be a number, got '1'$"),
         (lambda: fj.Material.pair(**PAIR | {"E2": -1}), r"^E2 must be above 0, got -1\.0$"),
         (lambda: fj.Material.pair(**PAIR | {"nu1": 0.6}), "^nu1 must be"),
-        (
-            lambda: jax.grad(lambda H: fj.Material(**GOOD | {"H": H}).H)(1.0),
-            r"^H must be at least sigma_y = 355000000\.0, got 1\.0",
-        ),
+        (lambda: jax.grad(hardness)(1.0), r"^H must be at least sigma_y = 355000000\.0, got 1\.0"),
     ],
 )
 def test_refusals(call, message):

@@ -128,33 +128,26 @@ REFUSED = [
     ("a.csv", "1\n2\n", U, "the step between heights is not known"),
     ("a.csv", "x,z [um]\n0,1\n1,2\n", {}, r"unit positions are: give it \(--position-unit um"),
     ("a.csv", "x [um],z [V]\n0,1\n1,2\n", {}, "unit of heights must be one of .* got 'V'"),
-    ("a.csv", "x [s],z [um]\n0,1\n1,2\n", {}, "unit of positions must be one of .* got 's'"),
-    ("a.csv", "Length,1500.0 um\nz\n1\n2\n", {"dx": 1}, "in which unit heights are"),
     ("a.csv", "z [um]\n1\n2\n", {"dx": 1, "unit": "nm"}, "unit of heights is 1e-06 m in the f"),
     ("a.csv", "0,1\n1,2\n", {"unit": "m", "dx": 2}, "dx is 1 m in the file, got 2"),
     ("a.csv", "0,1\n1,2\n", {"unit": "m", "dy": 2}, "dy is for maps"),
     ("a.csv", "0,1\n1,2\n", {"unit": "m", "channel": 1}, "no channels, got channel 1"),
-    ("a.npy", npy(Z), {"dx": 1}, "in which unit heights are"),
     ("a.npz", npz(h=npy(Z)), {}, "must hold z and dx in metres, got h"),
     ("a.npz", npz(z=npy(Z), dx=npy(np.ones(2))), {}, r"dx must be a number, got shape \(2,\)"),
     ("a.npz", npz(z=npy(Z), dx=TENTH), U, "the unit of heights is 1 m in the file"),
     ("map.x3p", X3P, {"dx": 1e-6}, r"dx is 2.5e-07 m in the file, got 1e-06"),
-    ("map.x3p", X3P, {"dy": 1e-6}, r"dy is 4e-07 m in the file, got 1e-06"),
-    ("map.x3p", X3P, U, r"the unit of heights is 1 m in the file, got 1e-06"),
     # Positions.
     ("a.csv", "0,1\n,2\n2,3\n", {"unit": "m"}, "positions must not have gaps"),
     ("a.csv", "0,1\n1,2\n4,3\n9,4\n", {"unit": "m"}, "not equidistant"),
     ("a.csv", "0,12\n0,13\n", {"unit": "m"}, "decimal commas need semicolons"),
     # Text that is not plain numbers.
     ("a.csv", "", {}, "no line of numbers"),
-    ("a.csv", "one\ntwo\n", {}, "no line of numbers"),
     ("a.csv", "1,2\n3\n", {}, "line 2 has 1 columns, the first one has 2"),
     ("a.csv", "# a\nx,z\n1,2\n3,4,5\n", {}, "line 4 has 3 columns, the first one has 2"),
     ("a.csv", "1,2\n3,abc\n5,6\n", {}, "line 2: 'abc' is not a number"),
     ("a.csv", "0;1\n1;1.0D6\n", {}, "line 2: '1.0D6' is not a number"),
     ("a.csv", "0 1\n1 1_000\n", {}, "line 2: '1_000' is not a number"),
     ("a.csv", "0 1\n1 \u0661\n", {}, "line 2: '\u0661' is not a number"),
-    ("a.csv", "0;1\n1;5 nm\n", {}, "line 2: '5 nm' is not a number"),
     ("a.csv", '0,1\n1,"2\n', {}, "line 2: '\"2' is not a number"),
     ("a.csv", "1,234.5\n2,034.5\n", {}, "line 2: '034.5' is not a number"),
     ("a.csv", "0,1\n1,1e400\n", {}, "line 2: '1e400' is too large"),
@@ -165,7 +158,6 @@ REFUSED = [
     ("columns.prf", "0 1\n1e-7 2\n2e-7 1\n" * 9, {"unit": "m"}, "it is plain text: save"),
     # Damaged, too large or unknown.
     ("a.npy", npy(Z + 0j), UM, "z must be real numbers, got complex128"),
-    ("a.npy", npy(np.array([1, None], object)), UM, "z must be real numbers, got object"),
     ("a.npy", HUGE, UM, "24000000000000 bytes were to follow its header, 24 do"),
     ("a.npy", npy(np.ones(5)) + b"\0", UM, "40 bytes were to follow its header, 41 do"),
     ("b.npz", b"no zip", {}, "no sound file of numbers from NumPy"),
@@ -178,7 +170,6 @@ REFUSED = [
     ("bomb.x3p", npz(z=npy(np.zeros(2**22))), {}, "it unpacks to 33554"),
     ("noise.x3p", NOISE, {}, "unknown to SurfaceTopography .*, or damaged"),
     ("square", bytes(2 * 64**2), {}, "no known format"),
-    ("nothing.sur", b"", {}, "no known format"),
     ("cut.x3p", X3P[:500], {}, "unknown to SurfaceTopography .*, or damaged"),
     ("cut.bcr", BCR[:-7], {}, "cannot be read: The file ended after 33 of 40 bytes"),
 ]  # fmt: skip
@@ -247,9 +238,8 @@ def test_channels(tmp_path, channel, factor):
     read = read_measurement(path, channel=channel)
     np.testing.assert_allclose(read.z, factor * z, rtol=1e-15)
     assert ("'Height'" if factor == 1 else "'Retrace'") in read.source
-    assert_refused(
-        path, None, r"no channel 'Phase'; channels are 0 'Height', 1 'R", channel="Phase"
-    )
+    said = r"no channel 'Phase'; channels are 0 'Height', 1 'R"
+    assert_refused(path, None, said, channel="Phase")
 
 
 def test_channels_without_heights():
@@ -303,8 +293,10 @@ def test_without_the_package(tmp_path, monkeypatch):
 
 
 def test_units():
-    found = [metres(unit) for unit in ["um", "µm", "μm", "Micron", " nm ", "Å"]]
-    assert found == [1e-6, 1e-6, 1e-6, 1e-6, 1e-9, 1e-10]
+    found = [
+        metres(unit) for unit in ["m", "cm", "mm", "um", "µm", "μm", "Micron", " nm ", "pm", "Å"]
+    ]
+    assert found == [1.0, 1e-2, 1e-3, 1e-6, 1e-6, 1e-6, 1e-6, 1e-9, 1e-12, 1e-10]
     for unknown in ["V", "Mm", "", "MM"]:
         with pytest.raises(ValueError, match=r"the unit must be one of m, cm, mm, um, .* got '"):
             metres(unknown)
@@ -343,7 +335,6 @@ def test_equal_steps(x, dx, k, unit):
         ([0.0, 1.0, 0.5, 2.0], "positions must rise or fall throughout, got 1 and then 0.5 m"),
         (np.arange(9.0) ** 2, "positions are not equidistant, steps are 1 to 15 m: resample"),
         ([0.0, 1.0, 2.0, 2.8, 4.0], "positions are not equidistant"),
-        ([0.0, 1.0, 2.0, 50.0], "positions are not equidistant"),
         (np.sort(np.random.default_rng(0).choice(2000, 400, replace=False)) * 0.1, "equidistant"),
     ],
 )
@@ -394,7 +385,6 @@ def test_measurement():
     ("z", "dx", "dy", "message"),
     [
         (np.ones(9), None, None, r"the step between heights is not known: give dx in metres"),
-        (np.ones(9), 0.0, None, "dx must be above 0 and finite, in m, got 0"),
         (np.ones(9), NAN, None, "dx must be above 0 and finite, in m, got nan"),
         (np.ones((9, 9)), 1.0, 0.0, "dy must be above 0 and finite, in m, got 0"),
         (np.ones(9), 1.0, 2.0, "dy is for maps, got 2 for a profile"),

@@ -162,18 +162,12 @@ def bent(rng, p=2.0, corner=5e3):
 
 MADE = {
     "noise floor": lambda z, rng: z + 0.02 * z.std() * rng.standard_normal(z.size),
-    "not fractal over the band: bins scatter": lambda z, _: (
-        0.3 * z + 2 * z.std() * np.sin(0.7 * np.arange(z.size))
-    ),
-    "not fractal over the band: the slope bends": lambda z, _: np.convolve(
-        z, np.hanning(9), "valid"
-    ),
+    "bins scatter": lambda z, _: 0.3 * z + 2 * z.std() * np.sin(0.7 * np.arange(z.size)),
+    "the slope bends": lambda z, _: np.convolve(z, np.hanning(9), "valid"),
     "plateau below": lambda _, rng: bent(rng),
     "too few decades": lambda z, _: z[:150],
     "is not between 2 and 3": lambda z, rng: 1e-8 * rng.standard_normal(z.size),
-    "waves finer than two points may be aliased": lambda *_: gaussian_profile(
-        np.random.default_rng(2), 2.8, 400
-    ),
+    "may be aliased": lambda *_: gaussian_profile(np.random.default_rng(2), 2.8, 400),
 }
 
 

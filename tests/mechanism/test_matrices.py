@@ -9,9 +9,10 @@ import scipy.sparse
 
 import fractaljax as fj
 from fractaljax._mechanism.matrices import array_of, fitting, mass_matrix, mass_normalised, square
-from structures import beam, matrices
+from structures import beam, matrices, state_matrix
 
 M, C, K = matrices(5)
+UNEVEN = jnp.array([[1.0, 0.5], [0.0, 1.0]])
 RATIOS = np.array([0.03, 0.01, 0.02, 0.0, 0.05])
 
 
@@ -41,15 +42,8 @@ def test_what_is_no_array_of_real_numbers(value):
         (lambda: fitting("K", [[np.nan]], (1, 1)), "K must be finite, got nan"),
         (lambda: square("M", M[:2]), r"M must be a square matrix, got shape \(2, 5\)"),
         (lambda: square("M", 3.0), r"M must be a square matrix, got shape \(\)"),
-        (
-            lambda: mass_matrix(jnp.diag(jnp.array([1.0, -2.0]))),
-            "definite, got -2.0 on its .* at 1",
-        ),
         (lambda: mass_matrix(jnp.diag(jnp.array([1.0, 1, 0]))), "definite, got 0.0 on its .* at 2"),
-        (
-            lambda: mass_matrix(jnp.array([[1.0, 0.5], [0.0, 1.0]])),
-            r"M must be symmetric, got 0.5 at \(0, 1\) and 0.0 at \(1, 0\)",
-        ),
+        (lambda: mass_matrix(UNEVEN), r"symmetric, got 0.5 at \(0, 1\) and 0.0 at \(1, 0\)"),
         (lambda: mass_matrix(jnp.ones((3, 3))), "definite: some motion would have no kinetic"),
         (lambda: mass_matrix(jnp.ones((3, 3)) - 0.1 * jnp.eye(3)), "no kinetic energy"),
         (lambda: fj.rayleigh_damping(M, K, -1.0, 0.0), r"alpha must be at least 0, got -1\.0"),
@@ -70,7 +64,7 @@ def test_refusals(call, message):
 def test_under_jit_it_is_nan():
     """By the same tests as where it is known."""
     checked = jax.jit(mass_matrix)
-    wrong = [-jnp.eye(2), jnp.diag(jnp.array([1.0, 0])), jnp.array([[1.0, 0.5], [0.0, 1.0]])]
+    wrong = [-jnp.eye(2), jnp.diag(jnp.array([1.0, 0])), UNEVEN]
     wrong += [jnp.ones((2, 2)), jnp.array([[1.0, 2.0], [2.0, 1.0]]), jnp.full((2, 2), jnp.nan)]
     for matrix in wrong:
         assert np.isnan(checked(matrix)).all()
@@ -101,9 +95,7 @@ def test_coordinates_of_unit_mass():
 
 def damping_ratios(C):
     """Those of the modes in the order of rising frequency, by SciPy, and the frequencies."""
-    one, zero = np.eye(5), np.zeros((5, 5))
-    A = np.block([[zero, one], [-np.linalg.solve(M, K), -np.linalg.solve(M, C)]])
-    s = np.linalg.eigvals(A)
+    s = np.linalg.eigvals(state_matrix(M, C, K))
     s = s[s.imag > 0]
     s = s[np.argsort(abs(s))]
     return -s.real / abs(s), abs(s)

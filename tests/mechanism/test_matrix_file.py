@@ -195,49 +195,28 @@ def dof_names(nodes):
     return tuple(f"{node}.{dof}" for node, dof in nodes.tolist())
 
 
+def npz(kind):
+    return lambda path, A: scipy.sparse.save_npz(path, kind(A))
+
+
+def mat(kind, **options):
+    return lambda path, A: scipy.io.savemat(path, {"KAA": kind(A)}, **options)
+
+
+csc = scipy.sparse.csc_matrix
 CASES = {  # by name: the file, what writes it, the names, and the relative error of its digits
-    "npz csr": (
-        "KAA.npz",
-        lambda p, A: scipy.sparse.save_npz(p, scipy.sparse.csr_array(A)),
-        None,
-        0,
-    ),
-    "npz coo": (
-        "KAA.npz",
-        lambda p, A: scipy.sparse.save_npz(p, scipy.sparse.coo_matrix(A)),
-        None,
-        0,
-    ),
-    "npz dia": (
-        "KAA.npz",
-        lambda p, A: scipy.sparse.save_npz(p, scipy.sparse.dia_array(A)),
-        None,
-        0,
-    ),
-    "npz bsr": (
-        "KAA.npz",
-        lambda p, A: scipy.sparse.save_npz(p, scipy.sparse.bsr_array(A)),
-        None,
-        0,
-    ),
+    "npz csr": ("KAA.npz", npz(scipy.sparse.csr_array), None, 0),
+    "npz coo": ("KAA.npz", npz(scipy.sparse.coo_matrix), None, 0),
+    "npz dia": ("KAA.npz", npz(scipy.sparse.dia_array), None, 0),
+    "npz bsr": ("KAA.npz", npz(scipy.sparse.bsr_array), None, 0),
     "npz dense": ("x.npz", lambda p, A: np.savez(p, KAA=A), None, 0),
     "mtx": ("KAA.mtx", matrix_market, None, 0),
     "mtx dense": ("KAA.mtx", lambda p, A: scipy.io.mmwrite(p, A, precision=17), None, 0),
     "mtx.gz": ("KAA.mtx.gz", packed(gzip.compress), None, 0),
     "mtx.bz2": ("KAA.MTX.bz2", packed(bz2.compress), None, 0),
-    "mat dense": ("x.mat", lambda p, A: scipy.io.savemat(p, {"KAA": A}), None, 0),
-    "mat sparse": (
-        "x.mat",
-        lambda p, A: scipy.io.savemat(p, {"KAA": scipy.sparse.csc_matrix(A)}),
-        None,
-        0,
-    ),
-    "mat 7": (
-        "x.mat",
-        lambda p, A: scipy.io.savemat(p, {"KAA": scipy.sparse.csc_matrix(A)}, do_compression=True),
-        None,
-        0,
-    ),
+    "mat dense": ("x.mat", mat(np.asarray), None, 0),
+    "mat sparse": ("x.mat", mat(csc), None, 0),
+    "mat 7": ("x.mat", mat(csc, do_compression=True), None, 0),
     "abaqus": ("KAA.mtx", matrix_input, dof_names(NODES), 0),
     "abaqus labels": ("KAA.mtx", labels, dof_names(NODES), 0),
     "abaqus coordinate": ("KAA.mtx", coordinate, None, 0),
@@ -251,7 +230,7 @@ CASES = {  # by name: the file, what writes it, the names, and the relative erro
     "op4 text bigmat": ("x.op4", op4_text("big", 1), None, 0),
     "dmig": ("x.pch", dmig("large"), dof_names(POINTS), 1e-9),
     "dmig free": ("x.bdf", dmig("free"), dof_names(POINTS), 0),
-    "hb": ("KAA.hb", lambda p, A: scipy.io.hb_write(p, scipy.sparse.csc_matrix(A)), None, 1e-15),
+    "hb": ("KAA.hb", lambda p, A: scipy.io.hb_write(p, csc(A)), None, 1e-15),
     "ansys": ("KAA.MATRIX", rsa, None, 0),
 }
 ENDLESS = ("abaqus", "dmig")  # files that do not say how long they are
@@ -360,7 +339,9 @@ def test_dmig_matrices_share_their_degrees_of_freedom(tmp_path):
 
 
 ONE = "%%MatrixMarket matrix coordinate real general\n"
+COMPLEX = ONE.replace("real", "complex") + "1 1 1\n1 1 1 2"
 HEAD = "DMIG,K,0,6,2\n"
+OP4 = f"{1:8d}{1:8d}{6:8d}{2:8d}K\n"
 BOEING = "t\n 3 1 1 1 0\nRSA 2 2 2 0\n(3I8) (2I8) (2E12.4)\n       1       3       3\n"
 BAD = [
     ("x.txt", "", "of unknown format; known are .npz, .mat, .mtx, .op4, .pch, .bdf, .dat, .hb"),
@@ -369,15 +350,8 @@ BAD = [
     ("x.mtx.gz", b"no", "it is damaged"),
     ("x.mtx", ONE + "2 3 1\n1 1 1", r"x must be square or one column, got shape \(2, 3\)"),
     ("x.mtx", ONE + "2000000 2000000 1\n1 1 1", "reduce the model to 1000000 at most"),
-    ("x.mtx", ONE + "2 2 1\n1 1 nan", "line 3 must be 'row column number'"),
-    ("x.mtx", ONE + "2 2 2\n1 1 1\n1 1 1", "line 4 must not give an entry twice"),
     ("x.mtx", "%%MatrixMarket matrix array real general\n9999 9999\n1", "as a dense array at most"),
-    (
-        "x.mtx",
-        ONE.replace("real", "complex") + "1 1 1\n1 1 1 2",
-        "must be real numbers, got complex",
-    ),
-    ("x.mtx", "", "neither a Matrix Market file nor a matrix of Abaqus"),
+    ("x.mtx", COMPLEX, "must be real numbers, got complex"),
     ("x.mtx", "*CLOAD\n1,1,5.", "neither a Matrix Market file nor"),
     ("x.mtx", "1,1,1,1,5.\n** a\n1,1,1,2,x", "line 3 must be 'node dof node dof number'"),
     ("x.mtx", "1,1,1,1,5.\n1,1,2", "line 2 must be 'node dof node dof number'"),
@@ -387,30 +361,19 @@ BAD = [
     ("x.mtx", "1,-1,1,1,1.", "line 1 must have dofs from 0"),
     ("x.mtx", "1 999999999999999 1.", "x must have from 1 to 1000000 rows"),
     ("x.mtx", "999999999999999 1 1 1 1.", "too large a number"),
-    ("x.op4", "", "line 1 must begin a matrix"),
     ("x.op4", "hello", "line 1 must begin a matrix of an OUTPUT4 file"),
     ("x.op4", f"{1:8d}{1:8d}{6:8d}{4:8d}K       1P,3E23.16", "K must be real numbers, got type 4"),
     ("x.op4", f"{1:8d}{1:8d}{6:8d}{2:8d}K       1P,3E23.16\n", "it ends within a matrix"),
-    (
-        "x.op4",
-        f"{1:8d}{1:8d}{6:8d}{2:8d}K\n       1       1       1\nx\n",
-        "line 3 must be numbers",
-    ),
-    (
-        "x.op4",
-        f"{1:8d}{1:8d}{6:8d}{2:8d}K\n  1  2  1\n 1.\n  2  1  1\n 1.",
-        "an entry lies outside 1",
-    ),
+    ("x.op4", OP4 + "       1       1       1\nx\n", "line 3 must be numbers"),
+    ("x.op4", OP4 + "  1  2  1\n 1.\n  2  1  1\n 1.", "an entry lies outside 1"),
     ("x.op4", f"{10**7:8d}{1:8d}{6:8d}{2:8d}K\n", "K must have from 1 to 1000000 rows"),
     ("x.op4", b"\x18\0\0\0" + b"\0" * 30, "it is damaged: no record at byte 0"),
-    ("x.pch", "GRID,1", "it holds no DMIG card"),
     ("x.pch", "DMIG,K,1,1,,1,1,2.", "it holds no DMIG card that begins"),
     ("x.pch", HEAD + "DMIG,M,1,1,,1,1,2.", "no DMIG card begins M"),
     ("x.pch", HEAD + HEAD, "line 2 must have a form .* and a new name"),
     ("x.pch", "DMIG,K,0,6,4", "line 1 must have a form of 1, 2, 6 and 9, type 1 or 2"),
     ("x.pch", HEAD + "DMIG,K,1,1,,1,1,2.,3.", "line 2 begins a DMIG card that cannot be read"),
     ("x.pch", HEAD + "DMIG,K,1,1,,1,x,2.", "line 2 begins a DMIG card"),
-    ("x.pch", HEAD + "DMIG,K,1,1,,1,1,2x", "line 2 begins a DMIG card"),
     ("x.pch", HEAD + "DMIG,K,1,1,,1,1,1.+999", "K must have finite numbers"),
     ("x.pch", HEAD + "DMIG,K,1,1,,1,2,2.\nDMIG,K,1,2,,1,1,2.", "twice, or above and below"),
     ("x.hb", "hello", "it is no Harwell-Boeing file in ASCII"),
@@ -420,11 +383,7 @@ BAD = [
     ("x.hb", BOEING.replace(" 3 1", " 0 1"), "it ends before 2 numbers from line 6 on"),
     ("x.hb", BOEING + "       1       3\n 1. 2.", "row indices must be from 1 to 2"),
     ("x.hb", BOEING + "       1       x\n 1. 2.", "line 6 must be numbers in their fields"),
-    (
-        "x.hb",
-        BOEING.replace("1       3  ", "1       4  ") + " 1 1\n 1. 2.",
-        "pointers are damaged",
-    ),
+    ("x.hb", BOEING.replace("1       3  ", "1       4  ") + " 1 1\n 1. 2.", "pointers are damag"),
     ("x.hb", BOEING.replace("2 2 2", "3 2 2") + " 1 2\n 1. 2.", "and calls them symmetric"),
     ("x.npz", "hello", "it is no sound file of numbers from NumPy"),
     ("x.mat", "hello", "it is no file of MATLAB's version 5 to 7"),

@@ -66,10 +66,7 @@ BAD = [
     ("coordinate real skew-symmetric\n2 2 1\n\n1 2 1", "line 4 must lie below the diagonal"),
     ("coordinate real skew-symmetric\n2 2 1\n1 1 1", "line 3 must lie below the diagonal"),
     ("coordinate real symmetric\n2 2 4\n1 1 1", "line 2 must have .* of entries, at most 3"),
-    (
-        "coordinate real symmetric\n2 3 1\n1 1 1",
-        "line 2 must have the size of a matrix that",
-    ),
+    ("coordinate real symmetric\n2 3 1\n1 1 1", "line 2 must have the size of a matrix that"),
     ("coordinate real general\n2 2 2\n1 1 1\n1 1 2", "line 4 must not give an entry twice"),
     ("coordinate real general\n2 2 2\n1 1 1\n", "ends after 1 of 2 numbers"),
     ("coordinate real general\n2 2 1\n1 1 1\n2 2 2", "line 4 must not be there, after all of 1"),

@@ -1,7 +1,5 @@
 """Equilibrium and linearisation of the mass on a belt, against the nonlinear equations."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import mpmath as mp
@@ -48,9 +46,8 @@ def exact(x):
 def friction_coefficient(x, v):
     """Eq. 38, as the source prints it."""
     drop = x["mu_s"] - x["mu_m"]
-    return (
-        x["mu_s"] * mp.sign(v) - 3 * drop / (2 * x["v_m"]) * v + drop / (2 * x["v_m"] ** 3) * v**3
-    )
+    falling = 3 * drop / (2 * x["v_m"]) * v
+    return x["mu_s"] * mp.sign(v) - falling + drop / (2 * x["v_m"] ** 3) * v**3
 
 
 def acceleration(x, state):
@@ -151,10 +148,7 @@ def test_vmapped_is_looped():
     ("name", "value", "message"),
     [
         *((name, 0.0, "must be above 0, got 0.0") for name in ("m", "omega_1", "omega_2", "V")),
-        ("m", "1", "must be a number, got '1'"),
         ("xi_1", -1e-9, "must be at least 0, got -1e-09"),
-        ("xi_2", np.nan, "must be at least 0, got nan"),
-        ("F", np.inf, "must be finite, got inf"),
         ("V", np.array([0.1, -0.2]), "must be above 0, got -0.2"),
     ],
 )
@@ -175,12 +169,3 @@ def test_a_traced_value_outside_the_domain_is_nan():
     run = jax.jit(lambda m: fj.Oscillator(**(OSCILLATOR | {"m": m})).m)
     assert float(run(2.0)) == 2.0
     assert np.isnan(run(-1.0))
-
-
-def test_pytree_round_trip_and_frozen():
-    oscillator, _ = parts(CASES[0])
-    leaves, structure = jax.tree.flatten(oscillator)
-    assert [float(x) for x in leaves] == list(OSCILLATOR.values())
-    assert isinstance(jax.tree.unflatten(structure, leaves), fj.Oscillator)
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        oscillator.m = 3.0  # pyright: ignore[reportAttributeAccessIssue]

@@ -89,11 +89,16 @@ def test_a_mass_that_depends_on_a_parameter():
         x.replace(a=-1.05)
 
 
-def test_sweeps_and_boundaries_know_parameters():
+def test_sweeps_know_parameters():
     x = parametric("texts")
     found = fj.sweep(fj.growth_rate, x, Omega=[1.0, 2.0], kr=[0.5, 1.5], progress=False)
     value = float(answers(x, np.array([2.0, 1.5]))[0])
     assert found.values[1, 1] == pytest.approx(value, rel=1e-9)
+
+
+@pytest.mark.slow
+def test_boundaries_know_parameters():
+    x = parametric("texts")
     boundary = fj.hopf_boundary(x, ("kr", 1.0, 30.0), ("Omega", 0.05, 5.0), lines=5)
     branch = boundary.branches[0]
     i = len(branch.x) // 2

@@ -116,13 +116,6 @@ def test_a_batch_of_scenes():
             refuse(batch)
 
 
-def test_frozen_and_shown_with_its_numbers():
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        BRAKE.contact = FIXED  # pyright: ignore[reportAttributeAccessIssue]
-    assert "Surface(D=2.4, G=1.342e-10, gamma=1.5)" in repr(BRAKE)
-    assert repr(jax.eval_shape(lambda s: s, BRAKE))
-
-
 def test_stiffness_by_kind_of_contact():
     """Given stiffness is returned as it is, a given ratio multiplies K_n."""
     assert fj.stiffness(SCENES["fixed, coulomb"]) == (4e8, 2e8)

@@ -53,8 +53,6 @@ def files(tmp_path_factory):
         "big": dict(M=M.astype(">f8"), K=np.asfortranarray(K)),
         "odd": dict(M=M, Kay=K),
         "pickled": dict(M=np.array([None, 1], dtype=object), K=K),
-        "complex": dict(M=1j * M, K=K),
-        "text": dict(M=np.array(["a"]), K=K),
         "scalar": dict(M=np.array(1.0), K=K),
     }
     for name, arrays in archives.items():
@@ -63,7 +61,6 @@ def files(tmp_path_factory):
     scipy.io.mmwrite(folder / "K.mtx", K)
     scipy.io.mmwrite(folder / "C.mtx", scipy.sparse.coo_matrix(C), symmetry="general")
     scipy.io.mmwrite(folder / "F.mtx", np.array([[1.0], [2.0], [3.0]]))
-    scipy.io.mmwrite(folder / "complex.mtx", 1j * K)
     scipy.io.mmwrite(folder / "huge.mtx", scipy.sparse.eye_array(100_000).tocoo())
     for suffix, compress in ((".gz", gzip.compress), (".bz2", bz2.compress)):
         packed = compress((folder / "K.mtx").read_bytes())
@@ -88,8 +85,7 @@ def files(tmp_path_factory):
     for mark, flags in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
         whole[whole.index(mark) + flags] |= 1
     (folder / "encrypted.npz").write_bytes(whole)
-    for name in ("no.npz", "no.mtx"):
-        (folder / name).write_text("hello")
+    (folder / "no.mtx").write_text("hello")
     return folder
 
 
@@ -246,7 +242,6 @@ BAD = [
     ('matrices = "all.npz"\nmass = 3', "[structure] has the unknown key 'mass'"),
     ("matrices = 3", "[structure] matrices must be the name of a file, got 3"),
     ('M = "M.mtx"', "[structure] lacks the matrix K"),
-    ('K = "K.mtx"', "[structure] lacks the matrix M"),
     ('matrices = "all.npz"\nK = "K.mtx"', "[structure] gives K twice"),
     ('matrices = "all.npz"\nF = [1, 2, 3]', "[structure] gives F twice"),
     ('matrices = "all.npz"\ndamping_ratio = 0.01', "gives damping twice: C and damping_ratio"),
@@ -258,9 +253,7 @@ BAD = [
     (TWO + "damping_ratio = [1, 2]", "damping_ratio must be a scalar or have shape"),
     (TWO + 'damping_ratio = "low"', "damping_ratio must be a number or a list of one a mode"),
     (TWO + "F = 3", "F must be a list, a table or a file's name, got 3"),
-    (TWO + "F = [1, 2]", "F must have shape (3,) as M demands, got (2,)"),
     (TWO + 'F = ["a", 2, 3]', "F must be an array of real numbers"),
-    (TWO + "F = [true, 2, 3]", "F must be an array of real numbers"),
     (TWO + f"F = [1{'0' * 400}, 2, 3]", "F must be an array of real numbers"),
     (TWO + f"F = {'[' * 9000}{']' * 9000}", "nested too deeply"),
     (TWO + "F = {w = 3}", "unknown degree of freedom 'w'"),
@@ -269,22 +262,16 @@ BAD = [
     (TWO + 'F = {"\u0660" = 1}', "unknown degree of freedom '\u0660'"),
     ('matrices = "odd.npz"', "odd.npz has the unknown key 'Kay'; known are M, C, K, F"),
     ('matrices = "pickled.npz"', "pickled.npz: M must be real numbers, got object"),
-    ('matrices = "complex.npz"', "complex.npz: M must be real numbers, got complex128"),
-    ('matrices = "text.npz"', "text.npz: M must be real numbers, got <U1"),
     ('matrices = "scalar.npz"', "M must be a square matrix, got shape ()"),
     ('matrices = "encrypted.npz"', "encrypted.npz: M is encrypted"),
     ('matrices = "bomb.npz"', "bomb.npz: it unpacks to 4000000000 bytes, at most 1073741824"),
     ('matrices = "twice.npz"', "twice.npz: it holds two arrays of one name"),
     ('matrices = "liar.npz"', "liar.npz: M is damaged: 8000000000000 bytes"),
     ('matrices = "cut.npz"', "cut.npz: it is no sound file of numbers"),
-    ('matrices = "no.npz"', "no.npz: it is no sound file of numbers"),
-    ('matrices = "M.mtx"', "[structure] lacks the matrix K"),
-    ('matrices = "/dev/zero"', "zero: of unknown format; known are .npz, .mat, .mtx"),
     ('matrices = "missing.npz"', "missing.npz"),
     ('M = "no.mtx"\nK = "K.mtx"', "no.mtx: it is neither a Matrix Market file nor"),
     ('M = "/dev/zero"\nK = "K.mtx"', "zero: of unknown format"),
     ('M = "huge.mtx"\nK = "K.mtx"', "K must have shape (100000, 100000) as M demands"),
-    (MTX + '"complex.mtx"', "complex.mtx: it must be real numbers, got complex ones"),
     (MTX + '"F.mtx"', "K must be a square matrix, got shape (3, 1)"),
     *((MTX + f'"{name}"', f"{name}: it is damaged") for name in ("cut.mtx.gz", "cut.mtx.bz2")),
     *((MTX + f'"{name}"', f"{name}: it is damaged") for name in ("no.mtx.gz", "no.mtx.bz2")),
@@ -293,10 +280,7 @@ BAD = [
 BAD_JOINTS = [
     ("", "the table [joints] is missing"),
     (JOINT.replace("V = 0.2", "speed = 0.2"), "[joints.pad] has the unknown key 'speed'"),
-    (
-        JOINT.replace('normal = "z"', ""),
-        "[joints.pad] a joint without normal needs a contact with a normal load P, got FixedC",
-    ),
+    (JOINT.replace('normal = "z"', ""), "[joints.pad] a joint without normal needs a contact with"),
     (JOINT.replace('"z"', '"w"'), "joint pad: unknown degree of freedom 'w'; the structure has x"),
     (JOINT.replace('"z"', "1.5"), "[joints.pad] normal must be a degree of freedom or a pair"),
     (JOINT.replace("pad.contact", "pad.spring"), "[joints.pad] has the unknown key 'spring'"),
@@ -359,10 +343,7 @@ STIFF = fj.Joint(fj.FixedContact(1.5e308, 1e5), fj.Coulomb(0.3), 0, 1)
     [
         (fj.Structure(np.eye(4), None, FREE, DRIVEN, F=[0, 0, 1, 2]), "no static equilibrium"),
         (fj.Structure(np.eye(4), None, FREE, DRIVEN), "F must be given"),
-        (
-            fj.Structure(np.eye(2), None, 1e308 * np.eye(2), STIFF),
-            "K with the joints attached",
-        ),
+        (fj.Structure(np.eye(2), None, 1e308 * np.eye(2), STIFF), "K with the joints attached"),
     ],
 )
 def test_the_command_refuses_in_one_line(tmp_path, capsys, structure, message):

@@ -22,7 +22,8 @@ SCENE = fj.brake_scene()
 DUSTY = fj.Scene(fj.FixedContact(4e8, 2e8, P=50.0), fj.Coulomb(0.4), SCENE.oscillator, preload=True)
 WINDOWS = dict(D=(2.2, 2.6), G=(1e-11, 1e-9), P=(1e2, 1e4), mu=(0.05, 0.6))
 LAW: fj.FractalContact = SCENE.contact
-ROUGH = fj.PerssonContact(LAW.surface, LAW.material, 1907.3, area=1e-4, L=1e-2, L_s=1e-4)
+BARE = LAW.surface, LAW.material
+ROUGH = fj.PerssonContact(*BARE, 1907.3, area=1e-4, L=1e-2, L_s=1e-4)
 BY_PERSSON = SCENE.replace(contact=ROUGH)
 DASH = "\N{EN DASH}"  # where there is no number
 
@@ -94,24 +95,6 @@ def test_operations():
     for (x, y), row in zip(places, found, strict=True):
         wanted = [float(value) for value in function(jnp.array(x), jnp.array(y))]
         np.testing.assert_allclose(np.array(row), np.array(wanted), rtol=1e-15)
-
-
-def test_arrays():
-    """Moved about, summed along axes, with numbers and constants of the program."""
-    table = np.random.default_rng(0).normal(size=(2, 3, 4))
-
-    def function(x, y):
-        z = x * jnp.asarray(table) + jnp.stack([y, x, y * x])[None, :, None]
-        turned = jnp.concatenate([z.T[::-1, 1:], jnp.ones((4, 1, 2))], axis=1).reshape(3, -1)
-        some = jax.lax.slice_in_dim(turned, 0, 5, axis=1).reshape(3, 1, 5)
-        wide = jnp.where(some > y, some, jnp.arange(5.0)[None, None] / 7)
-        return [wide.sum(), wide.sum((0, 1))[3], turned.sum(1)[2], jnp.float32(x) + z[1, 2, 3]]
-
-    places = [(0.3, 0.2), (-0.7, 3.0)]
-    found = in_node(javascript(function, 2, "f"), [f"f([{x},{y}])" for x, y in places])
-    for (x, y), row in zip(places, found, strict=True):
-        wanted = [float(value) for value in function(jnp.array(x), jnp.array(y))]
-        np.testing.assert_allclose(np.array(row), np.array(wanted), rtol=1e-13)
 
 
 def test_error_function():

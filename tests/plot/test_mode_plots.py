@@ -11,12 +11,11 @@ import equinox as eqx
 import jax
 import matplotlib.animation
 import matplotlib.image
-import matplotlib.pyplot
 import numpy as np
 import pytest
 
 import fractaljax as fj
-from structures import two_joints
+from structures import hoffmann, two_joints
 from tools import assert_whole, labels
 
 plot: Any = fj.plot
@@ -31,11 +30,6 @@ FACES = np.array(
     [[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]]
 )
 SOLID: dict[str, Any] = {"points": BLOCK, "dofs": np.arange(24).reshape(8, 3), "cells": FACES}
-
-
-def hoffmann():
-    K = [(None, [[2.0, 1.0], [1.0, 2.0]]), ("-4*mu/3", [[0.0, 1.0], [0.0, 0.0]])]
-    return fj.ParametricStructure(np.eye(2), None, K, parameters={"mu": 0.1})
 
 
 @functools.cache
@@ -61,9 +55,16 @@ def chart(**axes):
     return fj.sweep(measure, two_joints(4), progress=False, **values)
 
 
+def batch():
+    return jax.tree.map(lambda x: np.asarray(x)[None], modes())
+
+
 def one_point():
-    found = jax.tree.map(lambda x: np.asarray(x)[None], modes())
-    return fj.Sweep(found, (np.array([0.5]),), ("mu_s",), two_joints(4))
+    return fj.Sweep(batch(), (np.array([0.5]),), ("mu_s",), two_joints(4))
+
+
+def rates():
+    return fj.sweep(fj.growth_rate, fj.brake_scene(), progress=False, P=np.array([1e3, 2e3]))
 
 
 jax.tree_util.register_pytree_node(
@@ -111,16 +112,14 @@ def test_tracks():
     rate, frequency = figure.axes
     assert (rate.get_ylabel(), frequency.get_ylabel()) == ("growth rate [1/s]", "frequency [Hz]")
     assert frequency.get_xlabel() == "parameter mu [-]" and frequency.get_xlim() == (0.3, 1.2)
-    assert labels(rate) == ["mode 1", "mode 2"] and matplotlib.pyplot.get_fignums() == []
     for ax, values in ((rate, tracks().growth_rates), (frequency, tracks().frequencies)):
         thin = [line.get_ydata() for line in ax.lines if line.get_linewidth() == 1.6]
         np.testing.assert_array_equal(np.transpose(thin), values)
         thick = np.transpose([line.get_ydata() for line in ax.lines if line.get_linewidth() == 4])
         grows = (tracks().values[:, None] > 0.75) & (tracks().growth_rates > 0)
         np.testing.assert_array_equal(thick, np.where(grows, values, np.nan))
-    many = eqx.tree_at(
-        lambda t: (t.eigenvalues,), tracks(), (np.tile(tracks().eigenvalues, (1, 5)) * 1e4,)
-    )
+    s = np.tile(tracks().eigenvalues, (1, 5)) * 1e4
+    many = eqx.tree_at(lambda t: (t.eigenvalues,), tracks(), (s,))
     rate, frequency = plot.mode_tracks(many).axes
     assert labels(rate) == [f"mode {i}" for i in (2, 4, 6, 8, 10)]
     assert frequency.get_ylabel() == "frequency [kHz]" and rate.get_ylim()[0] > -1000
@@ -138,11 +137,7 @@ def test_chart_over_two_quantities():
     shown = ax.collections[0].get_array().reshape(4, 5)
     np.testing.assert_array_equal(shown, expected.T)
     assert len(np.unique(expected)) > 2
-    assert (ax.get_xlabel(), ax.figure.axes[1].get_ylabel()) == (
-        "static friction coefficient mu_s [-]",
-        "unstable modes",
-    )
-    assert ax.get_title(loc="left") == "growth rate [1/s]"
+    assert ax.get_xlabel() == "static friction coefficient mu_s [-]"
 
 
 def test_chart_over_one_quantity():
@@ -167,7 +162,6 @@ def test_deformed_mesh():
     np.testing.assert_allclose(corners(ax), moved[CELLS], atol=1e-12)
     np.testing.assert_allclose(ax.collections[-1].get_array(), 1)
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("x [m]", "y [m]")
-    assert ax.get_title(loc="left") == "phase 40°"
     both = np.arange(84).reshape(42, 2)
     ellipse = np.tile([1.0, 0.6j], 42) * np.linspace(1, 2, 84)  # axes along x and y
     ellipse[:2] = [3.0, 3.0]  # a line, of length 3 sqrt(2) to each side
@@ -207,9 +201,7 @@ def test_travelling_wave_travels():
     crest = x[frames[:4, :10].argmax(axis=1)]
     assert crest[0] == 0 and crest[2] == pytest.approx(0.125, abs=0.026)
     bars = plot.animate_mode(modes(), 2, frames=5)
-    heights = recorded(
-        bars, lambda figure: [bar.get_height() for bar in figure.axes[0].patches[4:]]
-    )
+    heights = recorded(bars, lambda figure: [b.get_height() for b in figure.axes[0].patches[4:]])
     turns: Any = np.exp(2j * np.pi * np.arange(5) / 5)
     np.testing.assert_allclose(heights, np.real(np.outer(turns, modes().shapes[2])), rtol=1e-9)
 
@@ -256,10 +248,7 @@ def test_shape_of_a_reduced_structure():
         (lambda: plot.complex_mode(["a"]), "one number a degree of freedom"),
         (lambda: plot.complex_mode(modes(), 8), "index must be a whole number of at most 7"),
         (lambda: plot.complex_mode(modes(), -1), "index must be a whole number of at least 0"),
-        (
-            lambda: plot.complex_mode(jax.tree.map(lambda x: x[None], modes())),
-            "a picture shows one result, got a batch",
-        ),
+        (lambda: plot.complex_mode(batch()), "a picture shows one result, got a batch"),
         (lambda: plot.complex_mode(SHAPE, points=NODES), "points need dofs and cells"),
         (lambda: plot.complex_mode(SHAPE, **STRIP | {"points": [1.0]}), r"points must be \(nodes"),
         (lambda: plot.complex_mode(SHAPE, **STRIP | {"dofs": DOFS[1:]}), "dofs must have shape"),
@@ -271,12 +260,7 @@ def test_shape_of_a_reduced_structure():
         ),
         (lambda: plot.animate_mode(SHAPE, path="a.mp4"), "path must end in .gif or .html"),
         (lambda: plot.animate_mode(SHAPE, frames=1), "frames must be a whole number of at least 2"),
-        (
-            lambda: plot.stability_chart(
-                fj.sweep(fj.growth_rate, fj.brake_scene(), progress=False, P=[1e3, 2e3])
-            ),
-            "a chart needs a sweep of stability",
-        ),
+        (lambda: plot.stability_chart(rates()), "a chart needs a sweep of stability"),
         (lambda: plot.stability_chart(one_point()), "a chart needs two values or more"),
     ],
 )

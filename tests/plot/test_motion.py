@@ -1,6 +1,5 @@
 """Limit cycles on meshes: the drawn places, marks and lanes against the orbit itself."""
 
-import functools
 from typing import Any
 
 import numpy as np
@@ -9,8 +8,7 @@ from matplotlib.colors import to_rgba
 
 import fractaljax as fj
 from fractaljax import plot
-from mechanisms import PROBLEMS
-from structures import of_problem
+from structures import belt_cycle
 from tools import assert_whole
 
 BLOCK: dict[str, Any] = {  # moves along x, with a held edge
@@ -21,13 +19,6 @@ BLOCK: dict[str, Any] = {  # moves along x, with a held edge
 COLOURS = {1: "tab:blue", -1: "tab:cyan", 0: "tab:orange", 2: "tab:red"}
 
 
-@functools.cache
-def belt():
-    problem = PROBLEMS["papangelo_2017"]
-    structure = of_problem(problem)
-    return structure, fj.limit_cycle(structure, problem["start"])
-
-
 def moved(cycle, share, samples=256):
     """The displacements at a share of the period from their mean."""
     x = np.asarray(cycle.orbit(samples)[1])[:, : len(cycle.amplitude)]
@@ -36,7 +27,7 @@ def moved(cycle, share, samples=256):
 
 @pytest.mark.parametrize("at", [0.0, 0.25, 0.5])
 def test_places_marks_and_lanes(at):
-    structure, cycle = belt()
+    structure, cycle = belt_cycle()
     figure: Any = plot.cycle_motion(cycle, structure, at=at, scale=0.5, **BLOCK)
     top, lanes = figure.axes[0], next(ax for ax in figure.axes if "period" in ax.get_xlabel())
     x = 0.5 * moved(cycle, at)[0]
@@ -63,7 +54,7 @@ def test_places_marks_and_lanes(at):
 
 
 def test_contact_states_are_those_of_the_switches():
-    _, cycle = belt()
+    _, cycle = belt_cycle()
     times, states = np.asarray(cycle.orbit(999)[0]), np.asarray(cycle.contact_states(999))
     names = {"+": 1, "-": -1, "stick": 0}
     switches = cycle.switches()
@@ -73,7 +64,7 @@ def test_contact_states_are_those_of_the_switches():
 
 
 def test_motion_as_files(tmp_path):
-    structure, cycle = belt()
+    structure, cycle = belt_cycle()
     path = tmp_path / "squeal.html"
     moving: Any = plot.animate_cycle(cycle, structure, frames=3, path=path, **BLOCK)
     text = path.read_text()
@@ -96,7 +87,7 @@ def test_motion_as_files(tmp_path):
     ],
 )
 def test_refusals(change: Any, message):
-    structure, cycle = belt()
+    structure, cycle = belt_cycle()
     if change.get("structure"):
         joint = fj.Joint(fj.FixedContact(1.0, 1.0), fj.Coulomb(0.3), 0, 1, V=1.0)
         change = {"structure": fj.Structure(np.eye(2), 0 * np.eye(2), np.eye(2), (joint,))}

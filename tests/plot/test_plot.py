@@ -19,6 +19,7 @@ from IPython.core.formatters import DisplayFormatter
 import fractaljax as fj
 from fractaljax.plot.axes import coordinate
 from fractaljax.plot.maps import vibration_modes
+from structures import belt_cycle
 from synthetic import DX, gaussian_map, gaussian_profile
 from tools import (
     assert_whole,
@@ -112,82 +113,63 @@ def cube():
 MAP = "friction coefficient mu [-]", "stiffness ratio K_t/K_n [-]"
 SURFACE = "fractal dimension D [-]", "fractal roughness G [m]"
 BELT, NORMAL = "along the belt [µm]", "normal to the belt [µm]"
-FREQUENCY, DENSITY = "frequency f [1/m]", "power spectral density"
-# Result, options, and the labels of x and y.
-PICTURES: dict[str, tuple[Any, Any, dict[str, Any], str, str]] = {
-    "design": (plot.design, best, {}, *SURFACE),
-    "growth map": (plot.growth_map, modes, {}, *MAP),
-    "growth map of a surface": (plot.growth_map, rates, {}, *SURFACE),
-    "frequency map": (plot.frequency_map, modes, {"mode": 2}, *MAP),
-    "mode lines": (plot.mode_lines, modes, {}, MAP[1], "real part [1/s] of all modes"),
-    "mode frequencies": (
-        plot.mode_lines,
-        modes,
-        {"quantity": "frequency"},
+GROWTH, KHZ = "growth rate [1/s]", "frequency [kHz]"
+LOADS: dict[str, Any] = {"P": [1e3, 2e3]}
+# What draws on given axes, and the labels of x and y.
+PICTURES: dict[str, tuple[Any, str, str]] = {
+    "design": (lambda ax: plot.design(best(), ax), *SURFACE),
+    "growth map": (lambda ax: plot.growth_map(modes(), ax), *MAP),
+    "growth map of a surface": (lambda ax: plot.growth_map(rates(), ax), *SURFACE),
+    "frequency map": (lambda ax: plot.frequency_map(modes(), ax, mode=2), *MAP),
+    "mode lines": (
+        lambda ax: plot.mode_lines(modes(), ax),
         MAP[1],
-        "frequency [kHz] of all modes",
+        "real part [1/s] of all modes",
+    ),
+    "mode frequencies": (
+        lambda ax: plot.mode_lines(modes(), ax, quantity="frequency"),
+        MAP[1],
+        f"{KHZ} of all modes",
     ),
     "curves": (
-        lambda rates, ax=None, **options: plot.curves(
-            fj.sweep(fj.growth_rate, BRAKE, progress=False, P=[1e3, 2e3]), ax, **options
+        lambda ax: plot.curves(
+            fj.sweep(fj.growth_rate, BRAKE, progress=False, **LOADS), ax, label=GROWTH
         ),
-        rates,
-        {"label": "growth rate [1/s]"},
         "normal load P [N]",
-        "growth rate [1/s]",
+        GROWTH,
     ),
-    "K_n": (plot.stiffness_curves, states, {}, SURFACE[0], "normal stiffness K_n [N/m]"),
     "K_t": (
-        plot.stiffness_curves,
-        states,
-        {"stiffness": "K_t"},
+        lambda ax: plot.stiffness_curves(states(), ax, stiffness="K_t"),
         SURFACE[0],
         "tangential stiffness K_t [N/m]",
     ),
-    "portrait": (plot.phase_portrait, reference_cycle, {}, f"x1, {BELT}", "dx1/dt [m/s]"),
-    "normal portrait": (
-        plot.phase_portrait,
-        reference_cycle,
-        {"direction": 2},
+    "portrait": (
+        lambda ax: plot.phase_portrait(reference_cycle(), ax, direction=2),
         f"x2, {NORMAL}",
         "dx2/dt [m/s]",
     ),
     "spectrum": (
-        plot.spectrum,
-        reference_cycle,
-        {"direction": 2},
-        "frequency [kHz]",
+        lambda ax: plot.spectrum(reference_cycle(), ax, direction=2),
+        KHZ,
         "peak amplitude of x2 [µm]",
     ),
     "amplitudes": (
-        lambda batch, ax=None, **options: plot.amplitudes(batch, [1, 2, 5], ax, **options),
-        batch,
-        {"label": "stiffness [N/m]"},
+        lambda ax: plot.amplitudes(batch(), [1, 2, 5], ax, label="stiffness [N/m]"),
         "stiffness [N/m]",
         "peak-to-peak amplitude [µm]",
     ),
-    "trajectory": (plot.trajectory, motion, {}, "time [ms]", f"x1, {BELT}"),
+    "trajectory": (lambda ax: plot.trajectory(motion(), ax), "time [ms]", f"x1, {BELT}"),
     "distribution": (
-        plot.distribution,
-        lambda: SAMPLES,
-        {"label": "growth rate [1/s]", "limit": 0.0},
-        "growth rate [1/s]",
+        lambda ax: plot.distribution(SAMPLES, ax, label=GROWTH, limit=0.0),
+        GROWTH,
         "share below [-]",
     ),
     "identification": (
-        plot.identification,
-        spectrum_of_profile,
-        {},
-        FREQUENCY,
-        f"{DENSITY} of the profile [m³]",
+        lambda ax: plot.identification(spectrum_of_profile(), ax),
+        "frequency f [1/m]",
+        "power spectral density of the profile [m³]",
     ),
-    "topography": (
-        lambda z, ax=None, **options: plot.topography(z, 2e-6, ax, **options),
-        lambda: Z,
-        {"dy": 3e-6},
-        "x [µm]",
-        "y [µm]",
-    ),
+    "topography": (lambda ax: plot.topography(Z, 2e-6, ax, dy=3e-6), "x [µm]", "y [µm]"),
 }
 FIGURES = {
     "modes": lambda: plot.modes(modes()),
@@ -207,10 +189,10 @@ def drawn(ax, label):
 @pytest.mark.parametrize("name", PICTURES)
 def test_labels_with_units_on_given_axes(name):
     """Nothing is cut off."""
-    draw, result, options, x, y = PICTURES[name]
+    draw, *expected = PICTURES[name]
     ax = plot.new_figure().add_subplot()
-    assert draw(result(), ax, **options) is ax
-    assert (ax.get_xlabel(), ax.get_ylabel()) == (x, y)
+    assert draw(ax) is ax
+    assert [ax.get_xlabel(), ax.get_ylabel()] == expected
     assert_whole(ax.figure)
     assert matplotlib.pyplot.get_fignums() == []
 
@@ -235,32 +217,27 @@ def test_whole_figures(name):
         (lambda: plot.trajectory(motion(), direction=0), "direction must be 1 or 2"),
         (lambda: plot.trajectory(jax.tree.map(lambda x: x[None], motion())), "index the batch"),
         (lambda: plot.amplitudes(batch(), [1, 2], label="x"), r"got \(2,\) and \(3,\)"),
-        (lambda: plot.amplitudes(reference_cycle(), [1], label="x"), r"got \(1,\) and \(\)"),
         (
             lambda: plot.amplitudes(batch(), [1, 2, 3], label="x", slopes=[1, 2]),
             r"slopes must have shape \(3,\), got \(2,\)",
         ),
         (lambda: plot.distribution({}, label="x"), "at least one set of samples"),
-        (lambda: plot.distribution({"bad": []}, label="x"), "samples 'bad' must be finite"),
-        (lambda: plot.distribution({"bad": [[1.0]]}, label="x"), "samples 'bad' must be finite"),
-        (lambda: plot.distribution({"bad": [np.nan]}, label="x"), "samples 'bad' must be finite"),
-        (lambda: plot.topography(np.zeros(5), 1e-6), r"z must be a map \(n, m\) of heights"),
-        (lambda: plot.topography(np.full((3, 3), np.nan), 1e-6), "z must be a map"),
-        (lambda: plot.topography(np.zeros((0, 3)), 1e-6), "z must be a map"),
-        (lambda: plot.topography(Z, 0.0), "dx and dy must be above 0, got 0.0 and 0.0"),
+        *(
+            (lambda x=x: plot.distribution({"bad": x}, label="x"), "samples 'bad' must be finite")
+            for x in ([], [[1.0]], [np.nan])
+        ),
+        *(
+            (lambda z=z: plot.topography(z, 1e-6), r"z must be a map \(n, m\) of heights")
+            for z in (np.zeros(5), np.full((3, 3), np.nan), np.zeros((0, 3)))
+        ),
         (lambda: plot.topography(Z, np.nan), "dx and dy must be above 0"),
         (lambda: plot.frequency_map(modes(), mode=3), "mode must be from 1 to 2, got 3"),
         (lambda: plot.mode_lines(modes(), quantity="imag"), "quantity must be 'real' or"),
         (lambda: plot.stiffness_curves(states(), stiffness="K"), "stiffness must be 'K_n' or"),
         (lambda: plot.curves(cube(), label="x"), "curves need scalars over one or two axes"),
-        (
-            lambda: plot.growth_map(fj.sweep(fj.growth_rate, BRAKE, progress=False, P=[1e3])),
-            "a map needs two axes of two values or more",
-        ),
-        (
-            lambda: plot.stability_map(reference_scene()),
-            "scene has no quantity 'D'",
-        ),
+        (lambda: plot.growth_map(cube()), "a map needs two axes of two values or more"),
+        (lambda: plot.stability_map(reference_scene()), "scene has no quantity 'D'"),
+        (lambda: plot.basin(section(1.0, 21)), "starts that differ in 2 coordinates, got 1"),
     ],
 )
 def test_refusals(call, message):
@@ -273,16 +250,12 @@ def test_refusals(call, message):
 
 def test_design_shows_its_path_and_whether_it_is_one():
     ax = plot.design(best())
-    legend = ["fully plastic", "gross slip", "stable", "stability boundary"]
-    assert labels(ax)[:4] == legend and labels(ax)[-2:] == ["given surface", "designed surface"]
-    np.testing.assert_array_equal(
-        drawn(ax, "path of the best start")[0], [best().history["D"], best().history["G"]]
-    )
+    path = [best().history["D"], best().history["G"]]
+    np.testing.assert_array_equal(drawn(ax, "path of the best start")[0], path)
+    assert {"fully plastic", "gross slip", "stability boundary"} <= {*labels(ax)}
     assert ax.figure.axes[1].get_ylabel() == "growth rate where it squeals [1/s]"
     missed = dataclasses.replace(best(), violated=("K_n >= K_n_min",))
     assert labels(plot.design(missed))[-1] == "best found, not a solution"
-    title = plot.topographies(missed, n=8).axes[1].get_title()
-    assert title.startswith("best found: D = ")
 
 
 @pytest.mark.slow
@@ -301,19 +274,6 @@ def test_boundary_is_where_the_growth_rate_changes_sign():
         growth = jax.vmap(lambda p, moved=moved: fj.growth_rate(moved(p)))
         sides = growth(points - np.array([aside])), growth(points + np.array([aside]))
         assert (sides[0] * sides[1] < 0).mean() > 0.95
-
-
-@pytest.mark.slow
-def test_maps_of_other_quantities_and_bounds():
-    ax = plot.stability_map(BRAKE, {"D": (2.3, 2.5)})
-    assert ax.get_xlim() == (2.3, 2.5) and ax.get_ylim() == pytest.approx((1e-12, 1e-8))
-    calm = plot.stability_map(BRAKE.replace(mu_s=0.01, mu_m=0.01))
-    assert len(calm.figure.axes) == 1 and "stability boundary" not in labels(calm)
-    given = plot.stability_map(BRAKE.replace(stiffness_ratio=0.5))
-    assert "gross slip" not in labels(given) and "fully plastic" in labels(given)
-    fixed = plot.stability_map(reference_scene(), {"K_n": (1e8, 1e9), "mu": (0.1, 0.6)})
-    assert fixed.get_xlabel() == "normal contact stiffness K_n [N/m]"
-    assert labels(fixed) == ["stable", "stability boundary"]
 
 
 @pytest.mark.parametrize("damping", [(0.001, 0.007), (0.0, 0.0), (6.0, 0.007), (5.0, 9.0)], ids=str)
@@ -352,29 +312,24 @@ def test_maps_and_lines_show_the_modes():
     assert surfaces.get_zlabel() == "frequency [kHz]" and labels(surfaces) == ["mode 1", "mode 2"]
 
 
-def test_map_of_a_surface_hatches_the_other_regimes():
-    ax = plot.growth_map(rates())
-    assert labels(ax) == ["stability boundary", "fully plastic", "gross slip"]
-    assert (ax.get_xscale(), ax.get_yscale()) == ("linear", "log")
-    assert ax.get_ylim() == pytest.approx((1e-12, 1e-8))
-
-
 def test_map_without_a_boundary():
-    """All stable and all alike: no boundary, no legend, no warning."""
+    """All stable and all alike: no boundary, no legend, no warning; other regimes are hatched."""
     same = eqx.tree_at(lambda s: s.values, modes(), jax.tree.map(np.ones_like, modes().values))
     calm = eqx.tree_at(lambda s: s.values.growth_rate, same, -np.ones(same.growth_rate.shape))
     for draw in (plot.growth_map, plot.frequency_map):
         ax = draw(calm)
         assert ax.get_legend() is None
         ax.figure.draw_without_rendering()
+    ax = plot.growth_map(rates())
+    assert labels(ax) == ["stability boundary", "fully plastic", "gross slip"]
+    assert ax.get_yscale() == "log" and ax.get_ylim() == pytest.approx((1e-12, 1e-8))
+    given = plot.stability_map(BRAKE.replace(stiffness_ratio=0.5), {"D": (2.3, 2.5)})
+    assert given.get_xlim() == (2.3, 2.5) and "gross slip" not in labels(given)
 
 
 def test_curves_of_stiffness_and_their_marks():
     """Marks at the last elastic point and the last before gross slip."""
     ax, x = plot.stiffness_curves(states()), states().points[0]
-    assert labels(ax)[:2] == ["G = 1e-10 m", "G = 1e-08 m"]
-    assert labels(ax)[2:] == ["fully plastic beyond", "gross slip begins or ends"]
-    assert (ax.get_xscale(), ax.get_yscale()) == ("linear", "log")
     K_n = states().values.K_n.T
     curves = np.stack([line.get_ydata() for line in ax.lines if len(line.get_xdata()) == 60])
     np.testing.assert_array_equal(curves, np.where(K_n > 0, K_n, np.nan))
@@ -383,9 +338,8 @@ def test_curves_of_stiffness_and_their_marks():
         return [np.ravel(line.get_xydata()) for line in ax.lines if line.get_marker() == marker]
 
     first = [np.flatnonzero(row > 0)[0] for row in K_n]
-    np.testing.assert_array_equal(
-        marks("o"), [(x[k], row[k]) for k, row in zip(first, K_n, strict=True)]
-    )
+    elastic = [(x[k], row[k]) for k, row in zip(first, K_n, strict=True)]
+    np.testing.assert_array_equal(marks("o"), elastic)
     slips = np.asarray(states().values.regime == fj.Regime.gross_slip).T
     last = np.flatnonzero(slips[0])[0] - 1
     assert not slips[1].any()
@@ -402,8 +356,12 @@ def test_curves_of_stiffness_and_their_marks():
 
 
 @pytest.mark.parametrize("direction", [1, 2])
+# REPLACES test_sticking_is_drawn_where_it_is
 def test_phase_portrait_has_the_extent_of_the_cycle(direction):
-    """A closed curve, as wide as the amplitude and as high as the velocity range; V dashed."""
+    """A closed curve, as wide as the amplitude and as high as the velocity range; V dashed.
+
+    Sticking is at the velocity of the belt, as far as it moves meanwhile, along the orbit.
+    """
     cycle, i = reference_cycle(), direction - 1
     ax = plot.phase_portrait(cycle, direction=direction)
     ((x, v),) = drawn(ax, "limit cycle")
@@ -414,7 +372,17 @@ def test_phase_portrait_has_the_extent_of_the_cycle(direction):
     assert list(drawn(ax, "belt velocity 0.15 m/s")[0][1]) == [0.15, 0.15]
     assert len(drawn(ax, "sticks, 9.7% of the period")) == 2 - direction
     creeps = eqx.tree_at(lambda cycle: cycle.regularisation_error, cycle, 0.0123)
-    assert labels(plot.phase_portrait(creeps)) == ["limit cycle", "belt velocity 0.15 m/s"]
+    assert not drawn(plot.phase_portrait(creeps), "sticks")
+
+    ax = plot.phase_portrait(both_stick(), direction=direction)
+    ((x, v),) = drawn(ax, "sticks")
+    np.testing.assert_array_equal(v, 0.15)
+    time = both_stick().stick_fraction[i] * both_stick().period
+    assert x[1] - x[0] == pytest.approx(1e6 * 0.15 * float(time), rel=1e-3)
+    ((orbit_x, orbit_v),) = drawn(ax, "limit cycle")
+    inside = (orbit_x > x[0]) & (orbit_x < x[1]) & (orbit_v > 0)
+    assert inside.sum() > 5
+    np.testing.assert_allclose(orbit_v[inside], 0.15, rtol=1e-9)
 
 
 @pytest.mark.parametrize("direction", [1, 2])
@@ -446,26 +414,16 @@ def test_spectrum_shows_the_harmonics():
     assert drawn(plot.spectrum(twice), "harmonics")[0].shape == (2, 39)
 
 
-@functools.cache
-def belt_cycle():
-    """A structure of one degree of freedom, whose joint slides along it."""
-    law = fj.ExponentialStribeck(1.0, 0.5, 0.5)
-    joint = fj.Joint(fj.FixedContact(0.0, 0.0, 1.0), law, 0, None, 1.0)
-    belt = fj.Structure([[1.0]], [[0.1]], [[1.0]], [joint], F=[0.0])
-    return belt, fj.limit_cycle(belt, [1.5, 0.0], throw=False)
-
-
 def test_cycle_of_a_structure():
     """A joint's t.x and a degree of freedom, scaled; a row for each joint."""
     belt, cycle = belt_cycle()
     (row,) = (figure := plot.cycle(cycle)).subfigs or [figure.axes]
-    assert [ax.get_xlabel() for ax in row] == ["t.x of joint 1 [µm]", "frequency [kHz]"]
+    assert [ax.get_xlabel() for ax in row] == ["t.x of joint 1 [µm]", KHZ]
     assert row[0].get_ylabel() == "t.dx/dt of joint 1 [m/s]"
     assert_whole(figure)
     ((x, v),) = drawn(row[0], "limit cycle")
     assert np.ptp(x) == pytest.approx(1e6 * float(cycle.amplitude[0]), rel=1e-3)
-    share = f"sticks, {cycle.stick_fraction[0]:.1%} of the period"
-    assert labels(row[0]) == ["limit cycle", "belt velocity 1 m/s", share]
+    assert drawn(row[0], f"sticks, {cycle.stick_fraction[0]:.1%} of the period")
     along = plot.phase_portrait(cycle)
     assert along.get_xlabel() == f"x1, {BELT}"
     np.testing.assert_array_equal(drawn(along, "limit cycle")[0], [x, v])
@@ -480,14 +438,11 @@ def test_cycle_of_a_structure():
     assert [(*c.row, c.face) for c in shown] == [(-2.0, 0), (1.0, None)]
     moved = fj.simulate(belt, cycle.state, 10.0)
     for ax in (plot.trajectory(moved, joint=1), plot.trajectory(moved)):
-        assert "sticks" in labels(ax)
-    for call, message in (
-        (lambda: plot.phase_portrait(cycle, joint=2), "joint must be 1, got 2"),
-        (lambda: plot.spectrum(cycle, direction=2), "direction must be 1, got 2"),
-        (lambda: plot.trajectory(moved, direction=0), "direction must be 1, got 0"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            call()
+        assert drawn(ax, "sticks")
+    with pytest.raises(ValueError, match="joint must be 1, got 2"):
+        plot.phase_portrait(cycle, joint=2)
+    with pytest.raises(ValueError, match="direction must be 1, got 2"):
+        plot.spectrum(cycle, direction=2)
 
 
 def test_cycles_have_common_axes():
@@ -523,8 +478,12 @@ def test_amplitudes_with_gaps_and_tangents():
 
 
 @pytest.mark.parametrize("direction", [1, 2])
+# REPLACES test_sticking_is_marked_in_the_motion
 def test_motion_is_drawn_as_it_is(direction):
-    """From the start to the end, every step among them."""
+    """From the start to the end, every step among them.
+
+    Sticking is marked as long as the contact states say, at the velocity of the belt.
+    """
     ax, i = plot.trajectory(motion(), direction=direction), direction - 1
     ((t, x),) = drawn(ax, "motion")
     assert t[0] == 0 and t[-1] == pytest.approx(1e3 * TIME) and (np.diff(t) >= 0).all()
@@ -532,6 +491,16 @@ def test_motion_is_drawn_as_it_is(direction):
     assert (x[0], x[-1]) == pytest.approx(ends)
     at_steps = np.interp(1e3 * motion().times, t, x)
     np.testing.assert_allclose(at_steps, 1e6 * motion().states[:, i], atol=1e-6)
+    if direction == 2:
+        slides = fj.simulate(motionless_scene(), [1e-8, 0, 0, 0], TIME)
+        return np.testing.assert_equal(labels(plot.trajectory(slides)), ["motion"])
+    ((t, x),) = drawn(ax, "sticks")
+    inside = np.isfinite(x[1:]) & np.isfinite(x[:-1])
+    sticks = np.diff(motion().times)[np.asarray(motion().contact_states)[:-1, 0] == 0].sum()
+    # The last sample before its end is not drawn: one of some 180.
+    assert sticks > 0 and np.diff(t)[inside].sum() == pytest.approx(1e3 * sticks, rel=0.03)
+    moved = np.diff(x)[inside].sum() / np.diff(t)[inside].sum()
+    assert moved == pytest.approx(1e3 * 0.15, rel=1e-6)  # um/ms
 
 
 def test_sticking_is_marked_in_the_motion():
@@ -553,7 +522,6 @@ def test_sticking_is_marked_in_the_motion():
 def test_share_below_every_value():
     """A step of 1/n at each of the sorted samples, and the limit."""
     ax = plot.distribution(SAMPLES, label="growth rate [1/s]", limit=0.0)
-    assert labels(ax) == ["wide", "narrow", "limit 0"]
     for name, values in SAMPLES.items():
         ((x, y),) = drawn(ax, name)
         np.testing.assert_allclose(y[1:], [(np.asarray(values) <= at).mean() for at in x[1:]])
@@ -564,9 +532,7 @@ def test_share_below_every_value():
 def test_identification_shows_spectrum_fit_and_limit():
     found = spectrum_of_profile()
     ax = plot.identification(found)
-    words = labels(ax)
-    assert words[:2] == ["measured", "means over bins"] and words[3].startswith("structure")
-    assert words[4] == "limit of the instrument 6.25e+04 1/m"
+    assert "limit of the instrument 6.25e+04 1/m" in labels(ax)
     np.testing.assert_array_equal(ax.lines[0].get_ydata(), found.spectrum.power)
     ((f, power),) = drawn(ax, f"D = {found.D:.3f} ± ")
     np.testing.assert_allclose(f[[0, -1]], found.band)
@@ -586,7 +552,7 @@ def test_topography_shows_heights_about_their_mean():
 
 
 def test_topographies_have_one_colour_scale():
-    left, right, bar = plot.topographies(best(), n=32).axes
+    left, right, _ = plot.topographies(best(), n=32).axes
     surfaces = best().topographies(32)
     for ax, z in ((left, surfaces.before), (right, surfaces.after)):
         np.testing.assert_allclose(ax.images[0].get_array(), (z - z.mean()).T * 1e6)
@@ -594,9 +560,7 @@ def test_topographies_have_one_colour_scale():
     heights = [ax.images[0].get_array() for ax in (left, right)]
     limits = min(z.min() for z in heights), max(z.max() for z in heights)
     assert left.images[0].get_clim() == right.images[0].get_clim() == limits
-    assert bar.get_ylabel() == "height about the mean [µm]"
     assert left.get_title() == "given surface: D = 2.4, G = 1.342e-10 m"
-    assert right.get_title().startswith("designed surface: D = ")
 
 
 # --- figures ------------------------------------------------------------------------------
@@ -623,13 +587,13 @@ def test_a_notebook_is_given_the_picture():
 # --- basins ---------------------------------------------------------------------------------
 
 
-def section(scale):
+def section(scale, count=None):
     """A made-up basin on a grid of starts: three outcomes of five, by x2 and dx1/dt."""
     x, v = np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-0.5, 0.5, 21))
     starts = np.stack([0 * x, scale * x, v, 0 * x], axis=-1).reshape(-1, 4)
     marks = np.where(x.ravel() < 0, 0, np.where(v.ravel() < 0, 1, 3))
     outcomes = "equilibrium", "cycle 1", "diverges", "undecided"
-    return fj.Basin(starts, marks, outcomes, (), {})
+    return fj.Basin(starts[:count], marks[:count], outcomes, (), {})
 
 
 @pytest.mark.parametrize(("scale", "unit", "times"), [(2e-5, "µm", 1e6), (2.0, "m", 1)])
@@ -641,19 +605,9 @@ def test_basin(scale, unit, times):
     assert (ax.get_xlabel(), ax.get_ylabel()) == (f"x2 [{unit}]", "dx1/dt [m/s]")
     assert [text.split(",")[0] for text in labels(ax)] == ["equilibrium", "cycle 1", "undecided"]
     assert labels(ax)[0].endswith(f"{made.shares['equilibrium']:.1%}")
-    (image,) = ax.images
-    left, right, bottom, top = image.get_extent()
-    np.testing.assert_allclose(
-        [left, right, bottom, top], [-scale * times, scale * times, -0.5, 0.5]
-    )
-    shown = np.asarray(image.get_array())
+    shown = np.asarray(ax.images[0].get_array())
+    extent = [-scale * times, scale * times, -0.5, 0.5]
+    np.testing.assert_allclose(ax.images[0].get_extent(), extent)
     for share_x, share_v, mark in [(0.2, 0.2, 0), (0.2, 0.9, 0), (0.8, 0.2, 1), (0.8, 0.9, 3)]:
         rows, columns = shown.shape
         assert shown[int(share_v * rows), int(share_x * columns)] == mark
-
-
-def test_basin_needs_a_section():
-    made = section(1.0)
-    line = fj.Basin(made.starts[:21], made.labels[:21], made.outcomes, (), {})
-    with pytest.raises(ValueError, match="starts that differ in 2 coordinates, got 1"):
-        plot.basin(line)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
 
 import fractaljax as fj
 from fractaljax._base.ranges import is_logarithmic, within
@@ -18,6 +19,7 @@ FIXED = BRAKE.replace(contact=fj.FixedContact(402628934.268313, 191682502.096783
 CONSTANT = fj.Scene(fj.FixedContact(4e8, 6e7), fj.Coulomb(0.4), BRAKE.oscillator)
 STRIBECK = CONSTANT.replace(friction=fj.Stribeck(0.4, 0.25, 0.5))
 TONGUE = CONSTANT.replace(mu=0.001, xi_1=1e-6, xi_2=1e-6)  # squeal where the modes all but coincide
+STEP = BRAKE.replace(F=5e3, V=0.02, v_m=0.1)
 RATIO, MU = ("K_t/K_n", 0.01, 1.0), ("mu", 0.05, 1.0)
 PROBLEMS = {
     "ratio and friction": (CONSTANT, RATIO, MU),
@@ -26,11 +28,7 @@ PROBLEMS = {
     "tongue": (TONGUE, ("omega_1", 2e4, 5e4), ("omega_2", 1e4, 5e4)),
     "all damping lost": (FIXED, ("K_n", 1e6, 1e11), ("F", -1e4, 1e4)),
     "gross slip": (BRAKE, ("P", 1e4, 1e6), ("v_m", 0.05, 0.5)),
-    "step of Eq. 19": (
-        BRAKE.replace(F=5e3, V=0.02, v_m=0.1),
-        ("mu", 0.3, 0.6),
-        ("K_t/K_n", 0.4, 1.0),
-    ),
+    "step of Eq. 19": (STEP, ("mu", 0.3, 0.6), ("K_t/K_n", 0.4, 1.0)),
 }
 TRACED = pytest.mark.parametrize("name", ["ratio and friction", "surfaces", "loop"])
 slow = pytest.mark.slow
@@ -248,16 +246,12 @@ def test_derived_quantities():
 K_N = ("K_n", 1e8, 1e9)
 REFUSED = [
     (CONSTANT, ("nonsense", 0, 1), MU, "scene has no quantity 'nonsense'; it has K_n, "),
-    (CONSTANT, ("contact", 0, 1), MU, "scene has no quantity 'contact'"),
     (CONSTANT, MU, ("K_n", 1e9, 1e8), "y must go from a lower to a higher value"),
-    (CONSTANT, MU, ("K_n", 1e8, 1e8), "y must go from a lower to a higher value"),
     (CONSTANT, MU, ("K_n", 1e8, np.inf), "y limit must be finite, got inf"),
     (CONSTANT, MU, ("K_n", 1e8), r"y must be \(name, low, high\)"),
     (CONSTANT, ("mu", 0.0, 1), K_N, "mu must be above 0"),
-    (CONSTANT, ("K_t/K_n", -0.1, 1), K_N, "K_t/K_n must be at least 0"),
     (CONSTANT, ("omega_1/omega_2", 0, 1), K_N, "omega_1/omega_2 must be above 0"),
     (CONSTANT, MU, MU, "quantities must be independent, got mu and mu"),
-    (CONSTANT, ("K_t", 1e8, 1e9), RATIO, "quantities must be independent"),
     (CONSTANT.replace(mu=np.array([0.1, 0.2])), MU, K_N, r"use jax\.vmap for many scenes"),
     (BRAKE, ("mu_s", 0.1, 0.9), ("D", 2.1, 2.9), "mu_s must be at least mu_m"),
     # At the corners mu_m is inside; mu(V) is least, and so the law is scaled most, at V = v_m.
@@ -292,14 +286,15 @@ def test_printed_it_is_a_summary():
     assert second.endswith("begins at the edge of the window, ends at the edge of the window")
 
 
-def test_picture(tmp_path):
+def test_picture():
     """Axes with units and scales of the window, every branch, and a bar of frequencies."""
     found = boundary("surfaces")
     ax = fj.plot.boundary(found)
-    assert ax.get_xlabel() == "fractal dimension D [-]"
-    assert ax.get_ylabel() == "fractal roughness G [m]"
-    assert (ax.get_xscale(), ax.get_yscale()) == ("linear", "log")
-    assert ax.get_xlim() == found.x[1:]
+    assert (ax.get_xlabel(), ax.get_ylabel()) == (
+        "fractal dimension D [-]",
+        "fractal roughness G [m]",
+    )
+    assert (ax.get_yscale(), ax.get_xlim()) == ("log", found.x[1:])
     assert len(ax.lines) == len(found.branches)
     (lines,) = ax.collections
     assert isinstance(lines, LineCollection)
@@ -308,15 +303,8 @@ def test_picture(tmp_path):
     shown = np.asarray(lines.get_array())
     assert kilohertz.min() <= shown.min() <= shown.max() <= kilohertz.max()
     assert "frequency at the boundary [kHz]" in [a.get_ylabel() for a in ax.figure.axes]
-    figure = ax.get_figure(root=True)
-    assert figure is not None
-    figure.savefig(tmp_path / "boundary.png")
-
-
-def test_picture_of_derived_quantities_in_given_axes():
-    from matplotlib.figure import Figure
-
-    ax = Figure().add_subplot()
-    assert fj.plot.boundary(boundary("ratio and friction"), ax) is ax
-    assert ax.get_xlabel() == "stiffness ratio K_t/K_n [-]"
-    assert ax.get_ylabel() == "friction coefficient mu [-]"
+    given = Figure().add_subplot()
+    assert fj.plot.boundary(boundary("ratio and friction"), given) is given
+    for figure in (each.get_figure(root=True) for each in (ax, given)):
+        assert figure is not None
+        figure.draw_without_rendering()

@@ -21,8 +21,7 @@ ORDER = 16  # of quadrature, which leaves more digits than a double has
 
 
 def by_numpy(x) -> Any:
-    """The eigenvalue with the largest real part, and its the derivatives (18,) of
-    its real part by D and ln G of each joint."""
+    """The eigenvalue with the largest real part, and the derivatives (18,) of its real part."""
     M, C, K = (np.array(A, float) for A in (x.M, x.C, x.K))
     n, moved = len(M), []
     for joint in x.joints:
@@ -73,6 +72,16 @@ def test_growth_rate_and_its_18_derivatives(seed):
 
     surfaces = [joint.contact.surface for joint in x.joints]
     q = jnp.array([[surface.D, jnp.log(surface.G)] for surface in surfaces])
-    found, slopes = jax.jit(jax.value_and_grad(rate))(q)
+    direction = np.random.default_rng(seed).standard_normal(q.shape)
+
+    @jax.jit
+    def both(q):
+        found, along = jax.linearize(rate, q)
+        (slopes,) = jax.linear_transpose(along, q)(1.0)
+        return found, slopes.ravel(), along(direction)
+
+    found, slopes, forward = both(q)
+    room = 1e-11 * np.abs(wanted).max()
     assert float(found) == pytest.approx(s.real, rel=1e-9)
-    np.testing.assert_allclose(slopes.ravel(), wanted, rtol=1e-9, atol=1e-11 * np.abs(wanted).max())
+    np.testing.assert_allclose(slopes, wanted, rtol=1e-9, atol=room)
+    assert float(forward) == pytest.approx(wanted @ direction.ravel(), rel=1e-9, abs=50 * room)

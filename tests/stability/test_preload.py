@@ -14,11 +14,16 @@ import pytest
 
 import fractaljax as fj
 from fractaljax._stability.summary import stability_table, structure_table
-from preloaded import BRAKE, DIGITS, LEVER, PROBLEMS, PULL, problem
+from preloaded import BRAKE, DIGITS, LEVER, PROBLEMS, PULL, measured, problem
+from tools import both_gradients
 
-MODES = (jax.jacfwd, jax.jacrev)
 slow = pytest.mark.slow
-EACH = pytest.mark.parametrize("name", PROBLEMS)
+
+
+def most_slow(*quick):
+    """All problems, of which only these are in the default run."""
+    each = (name if name in quick else pytest.param(name, marks=slow) for name in PROBLEMS)
+    return pytest.mark.parametrize("name", [*each])
 
 
 @pytest.fixture(autouse=True)
@@ -37,28 +42,31 @@ def answers(x, slope=True):
 CONSTANT = [(name, False) for name in ("scene", "lever arms", "three kinds")]
 
 
-@pytest.mark.parametrize(("name", "slope"), [*((name, True) for name in PROBLEMS), *CONSTANT])
+EACH = [pytest.param(x, True, marks=slow if x == "load curves" else ()) for x in PROBLEMS]
+
+
+@pytest.mark.parametrize(("name", "slope"), [*EACH, *CONSTANT])
 def test_eigenvalues_and_normal_forces(name, slope):
     """All eigenvalues, what follows from them, and the force on each joint at the equilibrium."""
     x, oracle = problem(name)
     wanted = sorted(oracle.eigenvalues(slope), key=lambda s: -s.real)
-    size = float(max(map(abs, wanted)))
+    room = (1e-10 if "load curve" in name else 1e-12) * float(max(map(abs, wanted)))
     found, growth_rate, margin = answers(x, slope)
     apart = np.abs(np.array(found.eigenvalues)[:, None] - np.array(wanted, complex)[None])
-    assert apart.min(axis=0).max() < 1e-12 * size and apart.min(axis=1).max() < 1e-12 * size
+    assert apart.min(axis=0).max() < room and apart.min(axis=1).max() < room
     growth = float(wanted[0].real)
-    assert float(growth_rate) == pytest.approx(growth, abs=1e-12 * size)
+    assert float(growth_rate) == pytest.approx(growth, abs=room)
     assert (float(margin) > 0) == (growth < 0)
     if isinstance(x, fj.Structure):
         least = float(min(-s.real / abs(s) for s in wanted))
         assert float(found.margin) == pytest.approx(least, abs=1e-12)
     forces: Any = found.normal_force
-    np.testing.assert_allclose(forces, oracle.normal_forces(), rtol=1e-11)
+    rtol = 1e-10 if "load curve" in name else 1e-11
+    np.testing.assert_allclose(forces, oracle.normal_forces(), rtol=rtol)
 
 
-@slow
 @pytest.mark.usefixtures("unoptimised")
-@EACH
+@most_slow("scene, load curve")
 def test_gradients(name):
     """By every quantity of every joint, in both modes, against differences in 40 digits."""
     x, oracle = problem(name)
@@ -71,8 +79,8 @@ def test_gradients(name):
     wanted = {place: oracle.slope_of(quantity) for quantity, place in places.items()}
     scale = max(abs(wanted[place] * float(at[place])) for place in at)
     assert scale > 0
-    for mode in MODES:
-        found = jax.jit(mode(lambda values: fj.growth_rate(x.replace(**values))))(at)
+    rate = jax.jit(lambda at: both_gradients(lambda v: fj.growth_rate(x.replace(**v)), at))
+    for found in rate(at):
         for place, slope in wanted.items():
             rounding = 1e-10 * scale / float(at[place])
             assert float(found[place]) == pytest.approx(slope, rel=1e-8, abs=rounding), place
@@ -96,7 +104,11 @@ def test_a_scene_is_its_structure(name):
     found, wanted = fj.stability(same), answers(scene)[0]
     size = float(np.abs(wanted.eigenvalues).max())
     np.testing.assert_allclose(found.eigenvalues, wanted.eigenvalues, rtol=0, atol=1e-12 * size)
-    np.testing.assert_allclose(found.normal_force, wanted.normal_force, rtol=1e-12)
+    curved = "load curve" in name
+    rtol = 1e-11 if curved else 1e-12
+    np.testing.assert_allclose(found.normal_force, wanted.normal_force, rtol=rtol)
+    if curved:
+        return
     o, (K_n, K_t) = scene.oscillator, fj.stiffness(scene)
     x_1, x_2 = fj.equilibrium(o, K_n, K_t, scene.friction.mu(o.V), scene.contact.P)
     force = float(scene.contact.P + K_n * x_2)
@@ -185,6 +197,21 @@ def test_boundary():
         assert np.ptp(branch.y) > 0.01  # it depends on the load
 
 
+@slow
+def test_onset_on_a_load_curve():
+    """Where friction, scaled, makes the growth rate 0; and the boundary passes through it."""
+    x = fj.Scene(measured(4e8, 1907.3), fj.Coulomb(0.3), BRAKE.oscillator, True).replace(F=1500.0)
+    critical = float(fj.critical_friction(x))
+    assert abs(float(fj.growth_rate(x.replace(mu=critical)))) < 1e-6
+    linear = fj.Scene(x.contact, x.friction, x.oscillator, "linear")
+    assert abs(float(fj.growth_rate(linear.replace(mu=critical)))) > 1e-3
+    boundary = fj.hopf_boundary(x.replace(mu=critical), ("P", 1800.0, 3000.0), ("mu", 0.01, 0.89))
+    points = np.concatenate([np.stack([b.x, b.y]) for b in boundary.branches], axis=1)
+    near = np.abs(points[0] - 1907.3).argmin()
+    rate = float(fj.growth_rate(x.replace(P=points[0, near], mu=points[1, near])))
+    assert abs(rate) < 1e-3
+
+
 # --- open joints --------------------------------------------------------------------------
 
 
@@ -211,6 +238,14 @@ def test_an_open_joint_has_no_number(which):
         table(x)
     closed = x.replace(P=1e5)
     assert np.isfinite(answers(closed)[1]) and "normal force [N]" in table(closed)
+
+
+def test_open_at_equilibrium_on_a_load_curve():
+    """Pulled off the belt there is no steady sliding."""
+    x = problem("scene, load curve")[0].replace(F=1e5)
+    for each in (x, fj.Structure.from_scene(x)):
+        found, growth_rate, _ = answers(each)
+        assert np.isnan(growth_rate) and found.normal_force[0] == 0
 
 
 def test_it_opens_where_the_normal_force_is_0():

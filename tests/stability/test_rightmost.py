@@ -14,6 +14,7 @@ from fractaljax._mechanism.reduced import CoarseSpace
 from fractaljax._stability import reduction
 from fractaljax._stability.quadratic import solve
 from fractaljax._stability.rightmost import _refined, rightmost
+from structures import state_matrix
 
 N, BAND = 24, (0.0, 8.5)
 
@@ -28,12 +29,10 @@ def problem(seed: int = 0):
 
 def modes_of(M, C, K):
     """Eigenvalues in the upper half plane and their vectors, in columns, by SciPy."""
-    inverse = np.linalg.inv(M)
-    A = np.block([[np.zeros((N, N)), np.eye(N)], [-inverse @ K, -inverse @ C]])
-    found: Any = scipy.linalg.eig(A, left=True)
+    found: Any = scipy.linalg.eig(state_matrix(M, C, K), left=True)
     s, left, right = found
     up = s.imag > 0
-    return s[up], right[:N, up], inverse.T @ left[N:, up].conj()
+    return s[up], right[:N, up], np.linalg.solve(M.T, left[N:, up].conj())
 
 
 def largest(matrices) -> complex:

@@ -8,7 +8,7 @@ import pytest
 import scipy.linalg
 
 import fractaljax as fj
-from structures import beam_on_pad, matrices, two_joints
+from structures import beam_on_pad, matrices, state_matrix, two_joints
 from tools import reference_scene
 
 shares_of: Any = fj.energy_shares
@@ -60,8 +60,7 @@ def test_parts_of_a_rotor():
     found, parts = shares_of(structure), rotor_parts(structure)
     assert found.parts == tuple(parts)
     M, C, K = (sum(each) for each in zip(*parts.values(), strict=True))
-    A = np.block([[np.zeros((4, 4)), np.eye(4)], [-np.linalg.solve(M, np.hstack([K, C]))]])
-    solved: Any = scipy.linalg.eig(A)
+    solved: Any = scipy.linalg.eig(state_matrix(M, C, K))
     s, vectors = solved
     for k, own in enumerate(found.eigenvalues):
         i = np.abs(s - own).argmin()
@@ -172,27 +171,15 @@ def test_names_and_the_table():
 
 
 @pytest.mark.parametrize(
-    ("call", "error", "message"),
+    ("given", "options", "message"),
     [
-        (lambda: shares_of(3.0), TypeError, "x must be a Scene or a Structure"),
-        (lambda: shares_of(rotor(), "all"), TypeError, "modes must be a Stability"),
-        (
-            lambda: shares_of(rotor(), fj.stability(two_joints(5))),
-            ValueError,
-            r"modes must be of 4 degrees of freedom, got \(10, 5\)",
-        ),
-        (
-            lambda: shares_of(rotor(), names={"K 4": "pad"}),
-            ValueError,
-            "names must be of M 1, M 2, C 1, C 2, K 1, K 2, K 3, pad, got 'K 4'",
-        ),
-        (
-            lambda: shares_of(rotor(), friction_slope=1),
-            TypeError,
-            "friction_slope must be True or False",
-        ),
+        ((3.0,), {}, "x must be a Scene or a Structure"),
+        ((rotor(), "all"), {}, "modes must be a Stability"),
+        ((rotor(), fj.stability(two_joints(5))), {}, r"modes must be of 4 degrees .* \(10, 5\)"),
+        ((rotor(),), {"names": {"K 4": "pad"}}, "names must be of M 1, .* K 3, pad, got 'K 4'"),
+        ((rotor(),), {"friction_slope": 1}, "friction_slope must be True or False"),
     ],
 )
-def test_refusals(call, error, message):
-    with pytest.raises(error, match=message):
-        call()
+def test_refusals(given, options, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        shares_of(*given, **options)

@@ -75,6 +75,27 @@ def test_batches():
         assert value == pytest.approx(float(getattr(found, name)[1]), rel=1e-13)
 
 
+@jax.jit
+def of_numbers(D, G, gamma, L, L_s):
+    return roughness(fj.Surface(D, G, gamma), L, L_s)
+
+
+def test_roughness_scales():
+    """With G as G^(D-2) alone; a larger copy of a surface is as steep and higher."""
+    u = np.random.default_rng(3).uniform(size=(5, 500))
+    D, G, gamma = 2 + 1e-6 + (1 - 2e-6) * u[0], 10 ** (-18 + 14 * u[1]), 1 + 10 ** (4 * u[2] - 3)
+    L = 10 ** (9 * u[3] - 8)
+    L_s = L / 10 ** (8 * u[4])
+    base = of_numbers(D, G, gamma, L, L_s)
+    rougher = of_numbers(D, 16.0 * G, gamma, L, L_s)
+    larger = of_numbers(D, 8.0 * G, gamma, 8.0 * L, 8.0 * L_s)
+    for name, length in (("Sq", 8.0), ("Sa", 8.0), ("Sdq", 1.0)):
+        value = np.asarray(getattr(base, name))
+        assert (value > 0).all() and np.isfinite(value).all()
+        np.testing.assert_allclose(getattr(rougher, name) / value, 16.0 ** (D - 2), rtol=1e-12)
+        np.testing.assert_allclose(getattr(larger, name), length * value, rtol=1e-12)
+
+
 def test_powers_of_gamma_count_as_such():
     """L/L_s a power of gamma or just beside it, in double and in single precision."""
     for ratio, count in [(1.5**7, 8), (1.5**7 * 0.999, 7), (1.5**7 * 1.001, 8), (1.01, 1)]:

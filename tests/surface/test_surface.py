@@ -1,15 +1,11 @@
 """Surfaces: the domain and refusals."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import fractaljax as fj
-
-WRONG: Any = "2.4"
 
 
 def test_the_whole_open_interval():
@@ -25,9 +21,8 @@ def test_the_whole_open_interval():
     [
         *((lambda D=D: fj.Surface(D, 1e-10), "^D must be above 2 and below 3") for D in (2, 3)),
         (lambda: fj.Surface(jnp.array([2.5, 3.5]), 1e-10), r"^D .* below 3, got 3\.5$"),
-        (lambda: fj.Surface(2.4, np.nan), "^G must be above 0, got nan$"),
+        (lambda: fj.Surface(2.4, 0.0), "^G must be above 0, got 0.0$"),
         (lambda: fj.Surface(2.4, 1e-10, 1), r"^gamma must be above 1, got 1\.0$"),
-        (lambda: fj.Surface(WRONG, 1e-10), "^D must be a number, got '2.4'$"),
         (lambda: jax.grad(lambda D: fj.Surface(D, 1e-10).D)(3.25), r"^D .* below 3, got 3\.25"),
     ],
 )

@@ -189,24 +189,18 @@ def test_signs_of_zero_are_other_axes(tmp_path):
         fj.sweep(fj.growth_rate, scene, None, False, tmp_path, K_t=[-0.0])
 
 
-def test_numbers_that_numpy_has_not(tmp_path):
+def test_what_cannot_be_kept_is_refused(tmp_path, monkeypatch):
+    """Numbers that NumPy has not, an address, and anything without zarr; nothing is written."""
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match="out cannot keep value, which is of dtype bfloat16"):
         opened(tmp_path / "run.zarr", {"value": jax.ShapeDtypeStruct((), jnp.bfloat16)})
-    assert not list(tmp_path.iterdir())
-
-
-def test_an_address_is_no_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match="out must be a folder of this machine, got s3://bucket/a"):
         fj.sweep(fj.growth_rate, SCENE, None, False, "s3://bucket/a", D=[2.4])
-    assert not list(tmp_path.iterdir())
-
-
-def test_without_zarr_it_says_so(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "zarr", None)
     with pytest.raises(ImportError, match=r'^out needs zarr: .* install "fractaljax\[sweep\]"$'):
         fj.sweep(fj.growth_rate, SCENE, None, False, tmp_path, D=[2.4])
     fj.sweep(fj.growth_rate, SCENE, None, False, D=[2.4])
+    assert not list(tmp_path.iterdir())
 
 
 def test_attributes_are_those_of_the_sweep(tmp_path):

@@ -55,21 +55,21 @@ def friction_at(mu, V):
     return GIVEN.replace(mu_s=0.4 * factor, mu_m=0.25 * factor, V=V)
 
 
+def ratio_at(ratio, K_n):
+    return GIVEN.replace(K_n=K_n, K_t=ratio * K_n)
+
+
+def omega_at(ratio, omega):
+    return GIVEN.replace(omega_1=ratio * omega, omega_2=omega)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "axes", "moved"),
     [
         # Ratios are those of the stiffness and frequency at the same point, whatever the order.
-        (
-            GIVEN,
-            {"K_t/K_n": [0.2, 0.9], "K_n": [1e8, 9e8]},
-            lambda ratio, K_n: GIVEN.replace(K_n=K_n, K_t=ratio * K_n),
-        ),
-        (
-            GIVEN,
-            {"omega_1/omega_2": [0.2, 0.9], "omega_2": [3e3, 2e4]},
-            lambda ratio, omega: GIVEN.replace(omega_1=ratio * omega, omega_2=omega),
-        ),
+        (GIVEN, {"K_t/K_n": [0.2, 0.9], "K_n": [1e8, 9e8]}, ratio_at),
+        (GIVEN, {"omega_1/omega_2": [0.2, 0.9], "omega_2": [3e3, 2e4]}, omega_at),
         (GIVEN, {"mu": [0.2, 0.5], "V": [0.1, 0.3]}, friction_at),
         (SCENE, {"G": G, "D": D}, lambda G, D: SCENE.replace(G=G, D=D)),
         (SCENE, {"K_t/K_n": [0.2, 0.4]}, lambda ratio: SCENE.replace(stiffness_ratio=ratio)),
@@ -164,35 +164,24 @@ def test_progress_goes_to_standard_error(capsys):
     assert capsys.readouterr().err == ""
 
 
+# Refused before any memory is taken.
+LARGE = {name: np.full(10**5, x) for name, x in {"D": 2.4, "G": 1e-10, "P": 1e3}.items()}
+
+
 @pytest.mark.parametrize(
     ("axes", "message"),
     [
         ({}, "sweep needs an axis"),
         ({"d": [2.4]}, "scene has no quantity 'd'; it has D, G, "),
-        ({"friction": [2.4]}, "no quantity 'friction'"),
         ({"mu": [0.3], "mu_s": [0.4]}, "must be independent, got mu and mu_s"),
         ({"D": 2.4}, r"values of D must be a list, got shape \(\)"),
-        ({"D": []}, r"values of D must be a list, got shape \(0,\)"),
         ({"D": [2.4, 3.1]}, "D must be above 2 and below 3, got 3.1"),
-        ({"D": [2.4, np.nan]}, "D must be finite, got nan"),
-        ({"omega_1/omega_2": [0.0]}, "omega_1/omega_2 must be above 0"),
-        ({"K_t/K_n": [0.1, -0.1]}, "K_t/K_n must be at least 0"),
         ({"mu_s": [0.4, 0.3], "mu_m": [0.2, 0.35]}, "mu_s must be at least mu_m = 0.35, got 0.3"),
         # At the corners the friction law is above its minimum, which is inside.
         ({"V": [0.05, 0.5, 0.95], "mu": [0.3, 1.2]}, "mu_m must be at most 0.9, got 1.2"),
-        (
-            {"D": [2.4], "v_m": [0.05, 0.15, 0.95], "P": [1e3, 2e3], "mu": [0.3, 1.2]},
-            "mu_m must be at most 0.9, got 1.2",
-        ),
         ({"batch_size": 0, "D": D}, "batch_size must be an integer of at least 1"),
-        ({"batch_size": 2.5, "D": D}, "batch_size must be an integer of at least 1"),
-        ({"batch_size": True, "D": D}, "batch_size must be an integer of at least 1"),
         ({"devices": [], "D": D}, "at least one device"),
-        # Before any memory is taken.
-        (
-            {name: np.full(10**5, x) for name, x in {"D": 2.4, "G": 1e-10, "P": 1e3}.items()},
-            "a sweep of 1000000000000000 points would take 8.00e.15 b",
-        ),
+        (LARGE, "a sweep of 1000000000000000 points would take 8.00e.15 b"),
     ],
 )
 def test_refusals(axes, message):
