@@ -2,7 +2,7 @@
 
 Many designs are screened by one compiled program. From the best of distinct basins a solver lands
 on the constraints, and the best of all that meet every requirement, evaluated afresh, is the
-answer (`search.py`). What is required is in `problem.py`.
+answer (`search.py`). What is asked is stated in `statement.py` and required in `problem.py`.
 """
 
 import os
@@ -32,11 +32,13 @@ from .envelope import Envelope, condition_text
 from .evaluator import Evaluation, evaluator_of
 from .few_modes import in_few_modes
 from .limit import LeastGrowth, least_growth
-from .problem import DEFAULT_BOUNDS, DesignProblem, describe, state_problem
+from .problem import DesignProblem
 from .quiet import VERIFIED, Kicks, quiet
+from .rows import describe
 from .search import Found, Search
 from .solvers import Solver, slsqp
 from .starts import choose_starts, designs_around, screened_designs
+from .statement import DEFAULT_BOUNDS, state_problem
 from .summary import comparison_table
 from .tolerance import Tolerance, squeal_probability
 

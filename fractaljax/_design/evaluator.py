@@ -8,7 +8,8 @@ import numpy as np
 
 from .._base.parts import brief, scalar
 from .envelope import ALONE, Envelope
-from .problem import DesignProblem, evaluate
+from .problem import DesignProblem
+from .rows import evaluate
 
 _LIKELY = 8  # conditions of a first guess at the worst
 _NEW = 1e-7  # by which a condition must be worse than the working ones

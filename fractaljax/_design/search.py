@@ -16,9 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .evaluator import Evaluation, Evaluator, OnAverage
-from .problem import UNKNOWN, DesignProblem, linearise
+from .joint_limits import limits_at, within_joints
+from .problem import UNKNOWN, DesignProblem
+from .rows import linearise
 from .solvers import Solver
-from .starts import designs_around, limits_at, within_joints
+from .starts import designs_around
 from .trust_region import FINE, NEAR, ROUGH, Accuracy, Local, in_trust_region
 
 _ROUNDS = 12  # of the exchange

@@ -3,9 +3,9 @@
 import numpy as np
 
 from .._base.ranges import low_discrepancy
-from .problem import UNKNOWN, DesignProblem, limits_of_joints
+from .joint_limits import within_joints
+from .problem import DesignProblem
 
-_INSIDE, _INSIDE_STEPS = 0.01, 40  # by how much designs that are screened are inside the limits
 _PENALTY = 10.0  # of unmet requirements, by which starts are ranked
 
 
@@ -30,44 +30,6 @@ def designs_around(
     share = np.resize(shares, count)[:, None]
     own = np.asarray(problem.own_condition)[None]
     return within_joints(problem, centre + share * (drawn - centre), own)
-
-
-def limits_at(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray):
-    """What joints alone require (n, m r) of us (n, v) at conditions (m, c), and Jacobians."""
-    n, m = len(us), len(conditions)
-    repeated = np.repeat(us, m, axis=0), np.tile(conditions, (n, 1))
-    residuals, slopes = limits_of_joints(problem, *repeated)
-    return residuals.reshape(n, -1), slopes.reshape(n, -1, us.shape[1])
-
-
-def within_joints(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray) -> np.ndarray:
-    """Designs us (n, v) moved to where every joint is inside its limits, as far as that goes.
-
-    At all conditions (m, c). Of many joints a design that is drawn has nearly always one outside,
-    where no growth rate says anything. Their limits take no eigenvalues. By Levenberg and
-    Marquardt's method.
-    """
-
-    def lacking(us):
-        residuals, slopes = limits_at(problem, us, conditions)
-        r = np.clip(np.nan_to_num(residuals, nan=UNKNOWN) + _INSIDE, 0, UNKNOWN)
-        return r, np.nan_to_num(slopes) * (r > 0)[:, :, None]
-
-    (r, slopes), damping = lacking(us), np.ones(len(us))
-    for _ in range(_INSIDE_STEPS):
-        if not r.any():
-            break
-        normal = np.einsum("nkv,nkw->nvw", slopes, slopes)
-        normal += damping[:, None, None] * np.eye(us.shape[1])
-        step = np.linalg.solve(normal, np.einsum("nkv,nk->nv", slopes, r)[:, :, None])[:, :, 0]
-        tried = np.clip(us - step, 0, 1)
-        other, other_slopes = lacking(tried)
-        better = (other**2).sum(axis=1) < (r**2).sum(axis=1)
-        us = np.where(better[:, None], tried, us)
-        r = np.where(better[:, None], other, r)
-        slopes = np.where(better[:, None, None], other_slopes, slopes)
-        damping = np.clip(np.where(better, damping / 5, damping * 3), 1e-6, 1e6)
-    return us
 
 
 def choose_starts(own: np.ndarray, designs: np.ndarray, rows: np.ndarray, count: int):

@@ -11,10 +11,12 @@ import scipy.linalg
 import fractaljax as fj
 from fractaljax._design.design import screened, solver_of
 from fractaljax._design.few_modes import in_few_modes
+from fractaljax._design.joint_limits import limits_of_joints
 from fractaljax._design.joints import state_of, states_of
-from fractaljax._design.problem import evaluate, limits_of_joints, linearise, state_problem
+from fractaljax._design.rows import evaluate, linearise
 from fractaljax._design.solvers import slsqp
 from fractaljax._design.starts import screened_designs
+from fractaljax._design.statement import state_problem
 from random_brakes import random_brake
 from structures import two_joints
 
