@@ -43,6 +43,11 @@ def describe(problem: DesignProblem, us: np.ndarray) -> dict[str, np.ndarray]:
     return linearise(nominal, us, own)[2]
 
 
+def paired(us: np.ndarray, conditions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Each of us (n, v) at every one of conditions (m, c): (n m, v) and (n m, c)."""
+    return np.repeat(us, len(conditions), axis=0), np.tile(conditions, (len(us), 1))
+
+
 def rows_in_batches(program, problem, us, conditions):
     """A compiled program of a problem, designs (b, v) and conditions (b, c), for (n, v) of them."""
     problem = dataclasses.replace(problem, cycles=None)

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .evaluator import Evaluation, Evaluator, OnAverage
-from .joint_limits import limits_at, within_joints
+from .joint_limits import limits_at, limits_of_joints, within_joints
 from .problem import UNKNOWN, DesignProblem
 from .rows import linearise
 from .solvers import Solver
@@ -438,12 +438,14 @@ class Search:
                 *_compressed(unmet, slopes[:, limited].reshape(-1, v)),
             )
 
+        of_joints, slack = limits_of_joints(problem), self.slack.max()
+
         def limits(u):
             if not keep:
                 return np.zeros(0), np.zeros((0, v))
-            residuals, slopes = (x[0] for x in limits_at(problem, u[None], working))
+            residuals, slopes = (x[0] for x in limits_at(of_joints, u[None], working))
             residuals, slopes = _finite(residuals, slopes)
-            return _compressed(residuals + self.slack.max(), slopes)
+            return _compressed(residuals + slack, slopes)
 
         if keep and limits(start)[0].max() > 0:
             start = within_joints(problem, start[None], working)[0]
