@@ -47,7 +47,8 @@ _STARTS, _FOLLOWED = 12, 1  # the latter where cycles are followed
 _LATTICE = {False: (1024, 48), True: (256, 24)}  # whether a design takes long
 _LATTICE_MAX = 1_000_000, 1000
 _STARTS_OF_STRUCTURES, _STARTS_OF_MANY_JOINTS = 8, 32
-_SHARES = (0.2, 0.6, 1.0)  # of the bounds, about the given design, in which the latter are
+# Of the bounds, about the given design, in which the latter are: where best is nearest, near.
+_SHARES = {True: (0.1, 0.2, 0.6), False: (0.2, 0.6, 1.0)}
 _STARTS_MAX = 10_000
 _FEW_JOINTS = 2  # of more, nearly no design of an even spread is inside all limits
 _SEED_MAX = 2**63 - 1  # of a JAX key
@@ -371,7 +372,8 @@ def screened(problem: DesignProblem, starts: int | None, lattice: int | None):
         return starts, screened_designs(lattice, variables)
     # Near the given design more is met, and an objective is often that of few changes.
     drawn = count if given else max(1, starts - 1)
-    return starts, designs_around(problem, np.asarray(problem.start, float), drawn, _SHARES, 0)
+    shares = _SHARES[problem.objective is None]
+    return starts, designs_around(problem, np.asarray(problem.start, float), drawn, shares, 0)
 
 
 def solver_of(problem: DesignProblem) -> Solver | None:

@@ -7,6 +7,8 @@ from .joint_limits import within_joints
 from .problem import DesignProblem
 
 _PENALTY = 10.0  # of unmet requirements, by which starts are ranked
+_SHARES_NEAR = 0.06, 0.06, 0.15  # of the bounds, about the best design so far
+_BACK, _SPREAD = (0.8, 0.6, 0.4), 0.3  # of the way to it, and of its distance, about the way
 
 
 def screened_designs(lattice: int, variables: int) -> np.ndarray:
@@ -30,6 +32,23 @@ def designs_around(
     share = np.resize(shares, count)[:, None]
     own = np.asarray(problem.own_condition)[None]
     return within_joints(problem, centre + share * (drawn - centre), own)
+
+
+def designs_near(problem: DesignProblem, best: np.ndarray, count: int, seed: int) -> np.ndarray:
+    """Designs (count, v) drawn in boxes around the best so far (v,), and inside of all joints.
+
+    Where the objective is the distance from the given design, what is better is nearer to that:
+    half of them are drawn on the way back.
+    """
+    half = count // 2 if problem.objective is None else 0
+    near = designs_around(problem, best, count - half, _SHARES_NEAR, seed)
+    own = np.asarray(problem.start, float)
+    drawn = np.random.default_rng([seed, 1]).uniform(-1, 1, (half, len(own)))
+    size = _SPREAD * float(np.sqrt(3 * np.mean((best - own) ** 2)))  # as far as `best`, and a share
+    way = np.resize(_BACK, half)[:, None] * (best - own)
+    condition = np.asarray(problem.own_condition)[None]
+    back = within_joints(problem, np.clip(own + way + size * drawn, 0, 1), condition)
+    return np.concatenate([near, back])
 
 
 def choose_starts(own: np.ndarray, designs: np.ndarray, rows: np.ndarray, count: int):

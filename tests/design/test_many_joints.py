@@ -77,6 +77,11 @@ def test_designs_that_are_screened_are_inside_the_limits_of_all_joints():
     assert ((moved >= 0) & (moved <= 1)).all()
     within = limits_of_joints(problem)(moved, nothing[: len(moved)])[0]
     assert (within.max(axis=1) <= 0).mean() > 0.7
+    # A few designs, one by one, are as those of a batch.
+    for few, many in zip(
+        limits_of_joints(problem)(drawn[:3], nothing[:3]), (residuals, slopes), strict=True
+    ):
+        np.testing.assert_allclose(few, many[:3], rtol=1e-10, atol=1e-12)
     # One in three is near the given design.
     away = np.abs(moved - np.asarray(problem.start)).mean(axis=1)
     assert np.median(away[::3]) < 0.1 < np.median(away[2::3])
