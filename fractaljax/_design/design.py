@@ -294,8 +294,9 @@ def design(
     variable; lattice^2 designs of a low-discrepancy set in more than two variables), and an even
     spread. Of more than two joints there are 32, drawn around the given design, the most promising
     of lattice^2 if that is given; by default steps in a trust region keep to the limits of every
-    joint, the eight best of their ends go on, and more designs are tried around the best. Of 60
-    degrees of freedom or more those steps begin in the space of the modes that grow most.
+    joint, the eight best of their ends go on, and rounds of more starts near the best follow until
+    they cease to gain. Of 60 degrees of freedom or more all that is in the space of the modes that
+    grow most, and the best end in all degrees of freedom.
     The same arguments give the same design. A request that cannot be met is a result, not an error:
     see `Design.result`. Then `Design.least_growth` is the least growth rate that was found with all
     else met, where, what holds it there, and how many starts agree; or, if that cannot be met
