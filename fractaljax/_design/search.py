@@ -31,7 +31,7 @@ _KEPT, _KEPT_NEAR, _AT_ONCE = 8, 4, 2
 _AGAIN, _AROUND = 12, 12  # rounds of new starts near the best end of such ways, and how many
 # Of the objective in such rounds; as good as the best; how many without a gain are the last. One
 # with several ends that agree with the best counts twice.
-_GAINED, _AGREE, _IDLE, _SEVERAL = 1e-3, 1e-2, 3, 2
+_GAINED, _AGREE, _IDLE, _SEVERAL = 1e-3, 1e-3, 3, 2
 
 
 class Found(NamedTuple):

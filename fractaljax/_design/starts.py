@@ -7,7 +7,7 @@ from .joint_limits import within_joints
 from .problem import DesignProblem
 
 _PENALTY = 10.0  # of unmet requirements, by which starts are ranked
-_SHARES_NEAR = 0.06, 0.06, 0.15  # of the bounds, about the best design so far
+_SHARES_NEAR = 8 * (0.06,) + 4 * (0.15,)  # of the bounds, about the best design so far
 _BACK, _SPREAD = (0.8, 0.6, 0.4), 0.3  # of the way to it, and of its distance, about the way
 
 
@@ -34,21 +34,20 @@ def designs_around(
     return within_joints(problem, centre + share * (drawn - centre), own)
 
 
-def designs_near(problem: DesignProblem, best: np.ndarray, count: int, seed: int) -> np.ndarray:
-    """Designs (count, v) drawn in boxes around the best so far (v,), and inside of all joints.
+def designs_near(problem: DesignProblem, best: np.ndarray, count: int, again: int) -> np.ndarray:
+    """Designs (count, v) for round `again`: around the best so far (v,), inside of all joints.
 
     Where the objective is the distance from the given design, what is better is nearer to that:
-    half of them are drawn on the way back.
+    every other round is on the way back.
     """
-    half = count // 2 if problem.objective is None else 0
-    near = designs_around(problem, best, count - half, _SHARES_NEAR, seed)
+    if problem.objective is not None or again % 2 == 0:
+        return designs_around(problem, best, count, _SHARES_NEAR, again)
     own = np.asarray(problem.start, float)
-    drawn = np.random.default_rng([seed, 1]).uniform(-1, 1, (half, len(own)))
+    drawn = np.random.default_rng([again, 1]).uniform(-1, 1, (count, len(own)))
     size = _SPREAD * float(np.sqrt(3 * np.mean((best - own) ** 2)))  # as far as `best`, and a share
-    way = np.resize(_BACK, half)[:, None] * (best - own)
+    way = np.resize(_BACK, count)[:, None] * (best - own)
     condition = np.asarray(problem.own_condition)[None]
-    back = within_joints(problem, np.clip(own + way + size * drawn, 0, 1), condition)
-    return np.concatenate([near, back])
+    return within_joints(problem, np.clip(own + way + size * drawn, 0, 1), condition)
 
 
 def choose_starts(own: np.ndarray, designs: np.ndarray, rows: np.ndarray, count: int):

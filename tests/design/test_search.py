@@ -122,18 +122,18 @@ def test_starts_are_those_given_and_one_in_every_basin():
     assert len(us) == 6 and scale == pytest.approx(np.ptp(np.quantile(values, [0.1, 0.9])))
 
 
-def test_new_starts_are_near_the_best_and_half_of_them_on_the_way_back(monkeypatch):
+def test_new_starts_are_near_the_best_and_every_other_round_on_the_way_back(monkeypatch):
     """Back to the given design only where the distance from it is the objective."""
     monkeypatch.setattr(starting, "within_joints", lambda problem, us, conditions: us)
     own, best = np.full(18, 0.5), np.full(18, 0.5) + 0.1 * np.cos(np.arange(18.0))
     stated: Any = SimpleNamespace(objective=None, start=own, own_condition=np.zeros(0))
     distance = np.linalg.norm(best - own)
-    near, back = np.split(designs_near(stated, best, 12, 3), 2)
-    assert (np.abs(near - best).max(axis=1) <= [0.06, 0.06, 0.15] * 2).all()
+    near, back = (designs_near(stated, best, 12, again) for again in (2, 3))
+    assert (np.abs(near - best).max(axis=1) <= 8 * [0.06] + 4 * [0.15]).all()
     along = (back - own) @ (best - own) / distance**2
-    np.testing.assert_allclose(along, [0.8, 0.6, 0.4] * 2, atol=0.2)
+    np.testing.assert_allclose(along, [0.8, 0.6, 0.4] * 4, atol=0.2)
     assert (np.linalg.norm(back - own, axis=1) < distance).all()
-    assert len(np.unique(np.concatenate([near, back]), axis=0)) == 12
+    assert len(np.unique(np.concatenate([near, back]), axis=0)) == 24
     stated.objective = len
     assert (np.abs(designs_near(stated, best, 12, 3) - best).max(axis=1) <= 0.15).all()
 
@@ -144,7 +144,7 @@ def test_new_starts_are_near_the_best_and_half_of_them_on_the_way_back(monkeypat
         # All that gains goes on; three rounds that do not are the last.
         ([[5], [4], [4.1], [3], [3.1], [3.2], [3.3], [1]], 7, 3),
         # Several ends as good as the best count twice.
-        ([[5], [4], [4.01, 4.02], [4.1], [1]], 4, 4),
+        ([[5], [4], [4.002, 4.003], [4.1], [1]], 4, 4),
         # Too small a gain is none, but is kept.
         ([[5], [4.999], [4.998], [4.997], [1]], 4, 4.997),
         # Nothing is met: the given end stays.
