@@ -11,7 +11,7 @@ import pytest
 from jax import export
 
 import fractaljax as fj
-from fractaljax._design import problem
+from fractaljax._design import rows
 from fractaljax._dynamics import basin, itinerary
 from fractaljax._stability import boundary, tracks
 from fractaljax._sweep import batches
@@ -96,7 +96,7 @@ WINDOW = {"x": ("D", 2.35, 2.45), "y": ("mu", 0.3, 0.4), "lines": 4}
 DRIVERS = {
     "sweep": (batches, ["_batch"], lambda: fj.sweep(fj.growth_rate, BRAKE, None, False, D=[2.4])),
     "design": (
-        problem,
+        rows,
         ["_linearise_light"],
         lambda: fj.design(BRAKE, {"D": (2.39, 2.41)}, starts=1, progress=False),
     ),

@@ -180,7 +180,7 @@ def _verdict(x, best, area) -> list[str]:
 
 def _options(arguments) -> dict:
     """The arguments of `design` that a command asks for."""
-    from .._design.problem import DEFAULT_BOUNDS
+    from .._design.statement import DEFAULT_BOUNDS
 
     options = {name: getattr(arguments, name) for name in _OPTIONS}
     options = {name: value for name, value in options.items() if value is not None}

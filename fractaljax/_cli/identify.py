@@ -167,7 +167,7 @@ def _joint(base, found, area, envelope) -> list[str]:
 
 def _bounds(found) -> str:
     """Options of `design` where its default bounds leave the surface out."""
-    from .._design.problem import DEFAULT_BOUNDS
+    from .._design.statement import DEFAULT_BOUNDS
 
     ranges = {
         "D": (found.D, max(found.D - 0.1, 1 + found.D / 2), min(found.D + 0.1, 1.5 + found.D / 2)),

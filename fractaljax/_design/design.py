@@ -2,7 +2,7 @@
 
 Many designs are screened by one compiled program. From the best of distinct basins a solver lands
 on the constraints, and the best of all that meet every requirement, evaluated afresh, is the
-answer (`search.py`). What is required is in `problem.py`.
+answer (`search.py`). What is asked is stated in `statement.py` and required in `problem.py`.
 """
 
 import os
@@ -32,11 +32,13 @@ from .envelope import Envelope, condition_text
 from .evaluator import Evaluation, evaluator_of
 from .few_modes import in_few_modes
 from .limit import LeastGrowth, least_growth
-from .problem import DEFAULT_BOUNDS, DesignProblem, describe, state_problem
+from .problem import DesignProblem
 from .quiet import VERIFIED, Kicks, quiet
+from .rows import describe
 from .search import Found, Search
 from .solvers import Solver, slsqp
 from .starts import choose_starts, designs_around, screened_designs
+from .statement import DEFAULT_BOUNDS, state_problem
 from .summary import comparison_table
 from .tolerance import Tolerance, squeal_probability
 
@@ -45,7 +47,8 @@ _STARTS, _FOLLOWED = 12, 1  # the latter where cycles are followed
 _LATTICE = {False: (1024, 48), True: (256, 24)}  # whether a design takes long
 _LATTICE_MAX = 1_000_000, 1000
 _STARTS_OF_STRUCTURES, _STARTS_OF_MANY_JOINTS = 8, 32
-_SHARES = (0.2, 0.6, 1.0)  # of the bounds, about the given design, in which the latter are
+# Of the bounds, about the given design, in which the latter are: where best is nearest, near.
+_SHARES = {True: (0.1, 0.2, 0.6), False: (0.2, 0.6, 1.0)}
 _STARTS_MAX = 10_000
 _FEW_JOINTS = 2  # of more, nearly no design of an even spread is inside all limits
 _SEED_MAX = 2**63 - 1  # of a JAX key
@@ -291,8 +294,9 @@ def design(
     variable; lattice^2 designs of a low-discrepancy set in more than two variables), and an even
     spread. Of more than two joints there are 32, drawn around the given design, the most promising
     of lattice^2 if that is given; by default steps in a trust region keep to the limits of every
-    joint, the eight best of their ends go on, and more designs are tried around the best. Of 60
-    degrees of freedom or more those steps begin in the space of the modes that grow most.
+    joint, the eight best of their ends go on, and rounds of more starts near the best follow until
+    they cease to gain. Of 60 degrees of freedom or more all that is in the space of the modes that
+    grow most, and the best end in all degrees of freedom.
     The same arguments give the same design. A request that cannot be met is a result, not an error:
     see `Design.result`. Then `Design.least_growth` is the least growth rate that was found with all
     else met, where, what holds it there, and how many starts agree; or, if that cannot be met
@@ -369,7 +373,8 @@ def screened(problem: DesignProblem, starts: int | None, lattice: int | None):
         return starts, screened_designs(lattice, variables)
     # Near the given design more is met, and an objective is often that of few changes.
     drawn = count if given else max(1, starts - 1)
-    return starts, designs_around(problem, np.asarray(problem.start, float), drawn, _SHARES, 0)
+    shares = _SHARES[problem.objective is None]
+    return starts, designs_around(problem, np.asarray(problem.start, float), drawn, shares, 0)
 
 
 def solver_of(problem: DesignProblem) -> Solver | None:

@@ -31,7 +31,7 @@ from .._mechanism.structure import Structure
 from . import constraints as known_constraints
 from .constraints import Constraint
 from .envelope import Envelope
-from .problem import state_problem
+from .statement import state_problem
 from .tolerance import Tolerance
 
 _PACKAGE = __name__.split(".")[0]

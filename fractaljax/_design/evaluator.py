@@ -8,7 +8,8 @@ import numpy as np
 
 from .._base.parts import brief, scalar
 from .envelope import ALONE, Envelope
-from .problem import DesignProblem, evaluate
+from .problem import DesignProblem
+from .rows import evaluate, paired
 
 _LIKELY = 8  # conditions of a first guess at the worst
 _NEW = 1e-7  # by which a condition must be worse than the working ones
@@ -113,9 +114,8 @@ class Evaluator:
 
     def _at_all(self, us, conditions):
         """Rows (n, m, 1 + k) of every design at every condition."""
-        n, m = len(us), len(conditions)
-        rows = self._at(np.repeat(us, m, axis=0), np.tile(conditions, (n, 1)))
-        return rows.reshape(n, m, -1)
+        rows = self._at(*paired(us, conditions))
+        return rows.reshape(len(us), len(conditions), -1)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,7 +15,7 @@ import numpy as np
 from .._base.parts import Record
 from .envelope import condition_text
 from .evaluator import Evaluation, Evaluator, OnAverage
-from .problem import linearise
+from .rows import linearise
 from .search import Search
 
 _ACTIVE = 1e-4  # a residual, or a scaled variable, is at its limit within this

@@ -17,8 +17,10 @@ from .._mechanism.quantities import replaced
 from .constraints import Constraint
 from .design import Design, design, screened, solver_of
 from .evaluator import Evaluator
-from .problem import DesignProblem, describe, state_problem
+from .problem import DesignProblem
+from .rows import describe
 from .search import Search
+from .statement import state_problem
 
 _STARTS = 6  # of each member of the front
 _POINTS_MAX = 1000

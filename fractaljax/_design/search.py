@@ -16,18 +16,22 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .evaluator import Evaluation, Evaluator, OnAverage
-from .problem import UNKNOWN, DesignProblem, linearise
+from .joint_limits import limits_at, limits_of_joints, within_joints
+from .problem import UNKNOWN, DesignProblem
+from .rows import linearise
 from .solvers import Solver
-from .starts import designs_around, limits_at, within_joints
-from .trust_region import FINE, NEAR, ROUGH, Accuracy, Local, in_trust_region
+from .starts import designs_near
+from .trust_region import FINE, NEAR, ROUGH, SETTLED, Accuracy, Local, in_trust_region
 
 _ROUNDS = 12  # of the exchange
 _FEW = 2  # variables, in which a lattice of starts leaves nothing to restore
 _RESTORING = 30  # steps from a start to where all requirements are met
-_KEPT, _KEPT_NEAR = 8, 4  # of many ways in a trust region, which go on to the end
-# Around the best end of such ways: rounds of new starts, how many, in what shares of the bounds.
-_AGAIN, _AROUND, _SHARES = 8, 12, 8 * (0.06,) + 4 * (0.15,)
-_GAINED, _IDLE = 1e-3, 2  # of the objective in such rounds, and how many without that are the last
+# Of many ways in a trust region: how many go on, and of these to the end at once.
+_KEPT, _KEPT_NEAR, _AT_ONCE = 8, 4, 2
+_AGAIN, _AROUND = 12, 12  # rounds of new starts near the best end of such ways, and how many
+# Of the objective in such rounds; as good as the best; how many without a gain are the last. One
+# with several ends that agree with the best counts twice.
+_GAINED, _AGREE, _IDLE, _SEVERAL = 1e-3, 1e-3, 3, 2
 
 
 class Found(NamedTuple):
@@ -212,24 +216,38 @@ class Search:
         values = np.where(failed, np.inf, found.values)
         best = int(np.flatnonzero(values <= values.min() + 1e-8 * abs(values.min()))[0])
         path, end, count = paths[best], found.of(best), max(len(starts) - int((~failed).sum()), 0)
-        idle = 0
-        for again in range(1 if self.solver else _AGAIN):
-            # A solver may have stopped early: once more from where it is.
-            ways = [path]
-            if self.solver is None:
-                # What is better is often near.
-                near = designs_around(problem, path[-1], _AROUND, _SHARES, again)
-                ways += [np.concatenate([path, u[None]]) for u in near]
-            ways = self._land(ways, first=NEAR, kept=_KEPT_NEAR)
-            ended = self._ends(ways)
-            values = np.where(ended.worst > 0, np.inf, ended.values)
-            best, before = int(values.argmin()), float(end.values[0])
-            if values[best] < before:
-                path, end = ways[best], ended.of(best)
-            idle = 0 if values[best] < before - _GAINED * abs(before) else idle + 1
-            if idle == _IDLE:
-                break
+        # A solver may have stopped early: once more from where it is. What is better is often near.
+        ways = [path] if self.solver else [np.array([*path, u]) for u in self._near(path[-1])]
+        ways = self._land(ways, stages=[(self, FINE, len(ways))])
+        ended = self._ends(ways)
+        values = np.where(ended.worst > 0, np.inf, ended.values)
+        best = int(values.argmin())
+        if values[best] < end.values[0]:
+            path, end = ways[best], ended.of(best)
         return path, end, count, None
+
+    def _near(self, u: np.ndarray) -> list[np.ndarray]:
+        """The best end (v,) of ways that begin near the best so far, and the one before it.
+
+        The first is u. All in the rough problem, for as long as rounds gain.
+        """
+        rough, value, ends, idle = self._roughly, np.inf, [u], 0
+        for again in range(_AGAIN):
+            starts = designs_near(rough.evaluator.problem, ends[0], _AROUND, again)
+            ways = [start[None] for start in (starts if again else [u, *starts])]
+            stages = [(rough, NEAR, len(ways)), (rough, SETTLED, _KEPT_NEAR)]
+            ended = np.array([way[-1] for way in rough._land(ways, stages=stages)])
+            found = rough.evaluator.evaluate(ended)
+            values = np.where(found.worst > 0, np.inf, found.values)
+            best, known = int(values.argmin()), bool(np.isfinite(value))
+            gained = values[best] < (value - _GAINED * abs(value) if known else value)
+            alike = known and np.isclose(values, value, rtol=_AGREE, atol=0).sum() >= _SEVERAL
+            idle = 0 if gained else idle + 1 + alike
+            if values[best] < value:
+                value, ends = float(values[best]), [ended[best], *ends][:_AT_ONCE]
+            if idle >= _IDLE:
+                break
+        return ends
 
     def _landed(self, starts, progress):
         """The ways from all starts, and what their ends are."""
@@ -312,7 +330,7 @@ class Search:
     def _ends(self, paths) -> Evaluation:
         return self.evaluator.evaluate(np.array([path[-1] for path in paths]))
 
-    def _land(self, paths, violated=None, progress=False, restored=False, first=ROUGH, kept=_KEPT):
+    def _land(self, paths, violated=None, progress=False, restored=False, stages=None):
         """Ways (s, v) continued to the least objective that meets every requirement.
 
         With some requirements (k,) marked as violated, to the least of their largest residual that
@@ -332,12 +350,13 @@ class Search:
             aim, limited = ~asked, limited & asked & ~own
         elif problem.smooth:
             limited &= ~self.growing
-        return self._ways(paths, aim, limited, progress, restored, first, kept)
+        return self._ways(paths, aim, limited, progress, restored, stages)
 
-    def _ways(self, paths, aim, limited, progress=False, restored=False, first=ROUGH, kept=_KEPT):
+    def _ways(self, paths, aim, limited, progress=False, restored=False, stages=None):
         """Ways continued to the least of the columns in `aim` with those in `limited` met.
 
-        Of many in a trust region the most promising alone go on to the end.
+        Of many in a trust region the most promising alone go on to the end: of `stages`, each is a
+        search, how accurate, and how many go through it.
         """
         from tqdm import tqdm
 
@@ -359,13 +378,14 @@ class Search:
 
         if self.solver:
             return [path for path, _ in run(self, paths, restored)]
-        rough = self._roughly
-        found = run(rough, paths, first)
-        # From the end of the rough problem it is not far: fewer need go on.
-        on = [(self, kept)] if rough is self else [(rough, kept), (self, kept // 2)]
-        for search, count in on:
+        if stages is None:
+            rough = self._roughly
+            # From the end of the rough problem it is not far: fewer need go on.
+            stages = [(rough, ROUGH, len(paths)), (rough, SETTLED, _KEPT), (self, FINE, _AT_ONCE)]
+        found = [(path, 0.0) for path in paths]
+        for search, accuracy, count in stages:
             best = np.argsort([merit for _, merit in found], kind="stable")[:count].tolist()
-            ended = run(search, [found[i][0] for i in best], FINE)
+            ended = run(search, [found[i][0] for i in best], accuracy)
             for i, end in zip(best, ended, strict=True):
                 found[i] = end
         return [path for path, _ in found]
@@ -436,12 +456,14 @@ class Search:
                 *_compressed(unmet, slopes[:, limited].reshape(-1, v)),
             )
 
+        of_joints, slack = limits_of_joints(problem), self.slack.max()
+
         def limits(u):
             if not keep:
                 return np.zeros(0), np.zeros((0, v))
-            residuals, slopes = (x[0] for x in limits_at(problem, u[None], working))
+            residuals, slopes = (x[0] for x in limits_at(of_joints, u[None], working))
             residuals, slopes = _finite(residuals, slopes)
-            return _compressed(residuals + self.slack.max(), slopes)
+            return _compressed(residuals + slack, slopes)
 
         if keep and limits(start)[0].max() > 0:
             start = within_joints(problem, start[None], working)[0]

@@ -3,10 +3,12 @@
 import numpy as np
 
 from .._base.ranges import low_discrepancy
-from .problem import UNKNOWN, DesignProblem, limits_of_joints
+from .joint_limits import within_joints
+from .problem import DesignProblem
 
-_INSIDE, _INSIDE_STEPS = 0.01, 40  # by how much designs that are screened are inside the limits
 _PENALTY = 10.0  # of unmet requirements, by which starts are ranked
+_SHARES_NEAR = 8 * (0.06,) + 4 * (0.15,)  # of the bounds, about the best design so far
+_BACK, _SPREAD = (0.8, 0.6, 0.4), 0.3  # of the way to it, and of its distance, about the way
 
 
 def screened_designs(lattice: int, variables: int) -> np.ndarray:
@@ -32,42 +34,20 @@ def designs_around(
     return within_joints(problem, centre + share * (drawn - centre), own)
 
 
-def limits_at(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray):
-    """What joints alone require (n, m r) of us (n, v) at conditions (m, c), and Jacobians."""
-    n, m = len(us), len(conditions)
-    repeated = np.repeat(us, m, axis=0), np.tile(conditions, (n, 1))
-    residuals, slopes = limits_of_joints(problem, *repeated)
-    return residuals.reshape(n, -1), slopes.reshape(n, -1, us.shape[1])
+def designs_near(problem: DesignProblem, best: np.ndarray, count: int, again: int) -> np.ndarray:
+    """Designs (count, v) for round `again`: around the best so far (v,), inside of all joints.
 
-
-def within_joints(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray) -> np.ndarray:
-    """Designs us (n, v) moved to where every joint is inside its limits, as far as that goes.
-
-    At all conditions (m, c). Of many joints a design that is drawn has nearly always one outside,
-    where no growth rate says anything. Their limits take no eigenvalues. By Levenberg and
-    Marquardt's method.
+    Where the objective is the distance from the given design, what is better is nearer to that:
+    every other round is on the way back.
     """
-
-    def lacking(us):
-        residuals, slopes = limits_at(problem, us, conditions)
-        r = np.clip(np.nan_to_num(residuals, nan=UNKNOWN) + _INSIDE, 0, UNKNOWN)
-        return r, np.nan_to_num(slopes) * (r > 0)[:, :, None]
-
-    (r, slopes), damping = lacking(us), np.ones(len(us))
-    for _ in range(_INSIDE_STEPS):
-        if not r.any():
-            break
-        normal = np.einsum("nkv,nkw->nvw", slopes, slopes)
-        normal += damping[:, None, None] * np.eye(us.shape[1])
-        step = np.linalg.solve(normal, np.einsum("nkv,nk->nv", slopes, r)[:, :, None])[:, :, 0]
-        tried = np.clip(us - step, 0, 1)
-        other, other_slopes = lacking(tried)
-        better = (other**2).sum(axis=1) < (r**2).sum(axis=1)
-        us = np.where(better[:, None], tried, us)
-        r = np.where(better[:, None], other, r)
-        slopes = np.where(better[:, None, None], other_slopes, slopes)
-        damping = np.clip(np.where(better, damping / 5, damping * 3), 1e-6, 1e6)
-    return us
+    if problem.objective is not None or again % 2 == 0:
+        return designs_around(problem, best, count, _SHARES_NEAR, again)
+    own = np.asarray(problem.start, float)
+    drawn = np.random.default_rng([again, 1]).uniform(-1, 1, (count, len(own)))
+    size = _SPREAD * float(np.sqrt(3 * np.mean((best - own) ** 2)))  # as far as `best`, and a share
+    way = np.resize(_BACK, count)[:, None] * (best - own)
+    condition = np.asarray(problem.own_condition)[None]
+    return within_joints(problem, np.clip(own + way + size * drawn, 0, 1), condition)
 
 
 def choose_starts(own: np.ndarray, designs: np.ndarray, rows: np.ndarray, count: int):

@@ -31,10 +31,11 @@ class Accuracy(NamedTuple):
     radius: float  # below which steps are not tried
     gain: float  # as a share of what is lowered, below which steps are not worth it
     steps: int
+    meets: bool = False  # whether what is left unmet is penalised harder
 
 
 ROUGH, NEAR = Accuracy(0.1, 3e-3, 1e-2, 40), Accuracy(0.03, 1e-3, 1e-3, 40)
-FINE = Accuracy(0.02, 1e-7, 1e-7, 100)
+SETTLED, FINE = Accuracy(0.02, 1e-5, 1e-4, 60, True), Accuracy(0.02, 1e-7, 1e-7, 100, True)
 
 
 class Local(NamedTuple):
@@ -90,10 +91,10 @@ def in_trust_region(
     """
     u, radius = start, accuracy.first
     learnt = curvature * np.eye(len(start))
-    for _ in range(_TIMES if accuracy is FINE else 1):
+    for _ in range(_TIMES if accuracy.meets else 1):
         learning = limits, curvature, accuracy, radius, penalty
         u, learnt, excess = _descended(at, u, learnt, *learning)
-        if met < excess <= _NEARLY and accuracy is FINE:
+        if met < excess <= _NEARLY and accuracy.meets:
             # To where all is met, if that is near.
             nearest = functools.partial(_nearest, at, u)
             u, _, excess = _descended(nearest, u, 2 * np.eye(len(u)), *learning)

@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 
 import fractaljax as fj
 from fractaljax._base.parts import substitute
-from fractaljax._design.problem import DEFAULT_BOUNDS
+from fractaljax._design.statement import DEFAULT_BOUNDS
 from fractaljax._design.tolerance import nodes, quantile
 from structures import fractal_joints
 

@@ -12,7 +12,8 @@ import pytest
 import fractaljax as fj
 from fractaljax._design import followed
 from fractaljax._design.constraints import CycleAmplitude, VelocityLevel
-from fractaljax._design.problem import linearise, state_problem
+from fractaljax._design.rows import linearise
+from fractaljax._design.statement import state_problem
 from mechanisms import PROBLEMS
 from structures import of_problem
 

@@ -149,7 +149,8 @@ def test_requirements_that_contradict_one_another_are_named():
 def test_every_law_has_its_modes():
     """A structure of two joints under its own law and another: rates as of each by itself."""
     from fractaljax._design.joints import under
-    from fractaljax._design.problem import evaluate, state_problem
+    from fractaljax._design.rows import evaluate
+    from fractaljax._design.statement import state_problem
 
     x: Any = fractal_joints()
     contact = x.joints[0].contact

@@ -9,13 +9,8 @@ import pytest
 
 import fractaljax as fj
 from fractaljax._design.constraints import NormalStiffness
-from fractaljax._design.problem import (
-    DEFAULT_BOUNDS,
-    _linearise,
-    describe,
-    linearised,
-    state_problem,
-)
+from fractaljax._design.rows import _linearise, describe, linearised
+from fractaljax._design.statement import DEFAULT_BOUNDS, state_problem
 from fractaljax._design.tolerance import Tolerance
 from structures import fractal_joints
 from tools import primitives

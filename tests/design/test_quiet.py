@@ -12,8 +12,8 @@ import filippov
 import fractaljax as fj
 from fractaljax._design.cuts import Cuts
 from fractaljax._design.design_file import read_design
-from fractaljax._design.problem import state_problem
 from fractaljax._design.quiet import Kicks, _planes
+from fractaljax._design.statement import state_problem
 from mechanisms import PROBLEMS, changed
 from structures import of_problem, two_joints
 from tools import ROOT

@@ -1,16 +1,19 @@
 """The solver on known problems, starts, averages, and the exchange of conditions."""
 
 import threading
+from types import SimpleNamespace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import fractaljax as fj
+from fractaljax._design import search as searches, starts as starting
 from fractaljax._design.evaluator import averaged, expected_shortfall
-from fractaljax._design.search import _Functions, in_lockstep
+from fractaljax._design.search import Search, _Functions, in_lockstep
 from fractaljax._design.solvers import slsqp
-from fractaljax._design.starts import choose_starts, screened_designs
+from fractaljax._design.starts import choose_starts, designs_near, screened_designs
 from tools import reference_scene
 
 
@@ -117,6 +120,58 @@ def test_starts_are_those_given_and_one_in_every_basin():
     for basin in (deep, shallow):
         assert np.abs(us[1:3] - basin).max(axis=1).min() < 1 / 24
     assert len(us) == 6 and scale == pytest.approx(np.ptp(np.quantile(values, [0.1, 0.9])))
+
+
+def test_new_starts_are_near_the_best_and_every_other_round_on_the_way_back(monkeypatch):
+    """Back to the given design only where the distance from it is the objective."""
+    monkeypatch.setattr(starting, "within_joints", lambda problem, us, conditions: us)
+    own, best = np.full(18, 0.5), np.full(18, 0.5) + 0.1 * np.cos(np.arange(18.0))
+    stated: Any = SimpleNamespace(objective=None, start=own, own_condition=np.zeros(0))
+    distance = np.linalg.norm(best - own)
+    near, back = (designs_near(stated, best, 12, again) for again in (2, 3))
+    assert (np.abs(near - best).max(axis=1) <= 8 * [0.06] + 4 * [0.15]).all()
+    along = (back - own) @ (best - own) / distance**2
+    np.testing.assert_allclose(along, [0.8, 0.6, 0.4] * 4, atol=0.2)
+    assert (np.linalg.norm(back - own, axis=1) < distance).all()
+    assert len(np.unique(np.concatenate([near, back]), axis=0)) == 24
+    stated.objective = len
+    assert (np.abs(designs_near(stated, best, 12, 3) - best).max(axis=1) <= 0.15).all()
+
+
+@pytest.mark.parametrize(
+    ("rounds", "count", "end"),
+    [
+        # All that gains goes on; three rounds that do not are the last.
+        ([[5], [4], [4.1], [3], [3.1], [3.2], [3.3], [1]], 7, 3),
+        # Several ends as good as the best count twice.
+        ([[5], [4], [4.002, 4.003], [4.1], [1]], 4, 4),
+        # Too small a gain is none, but is kept.
+        ([[5], [4.999], [4.998], [4.997], [1]], 4, 4.997),
+        # Nothing is met: the given end stays.
+        ([[np.inf], [np.inf], [np.inf], [1]], 3, 7),
+    ],
+)
+def test_rounds_near_the_best_end_when_they_cease_to_gain(monkeypatch, rounds, count, end):
+    """Ends are designs of one variable, which is the objective."""
+    asked = []
+
+    class Scripted(Search):
+        def _land(self, paths, *_, **__):
+            asked.append(paths)
+            ends = rounds[len(asked) - 1]
+            return [np.append(path, [[z]], axis=0) for path, z in zip(paths, ends, strict=False)]
+
+    def evaluate(us):
+        met = np.isfinite(us[:, 0])
+        return SimpleNamespace(worst=np.where(met, -1.0, 1.0), values=np.where(met, us[:, 0], 9.0))
+
+    monkeypatch.setattr(searches, "designs_near", lambda problem, best, *_: np.tile(best, (12, 1)))
+    evaluator: Any = SimpleNamespace(problem=None, evaluate=evaluate)
+    found = Scripted(evaluator, None)._near(np.array([7.0]))
+    assert len(asked) == count and found[0] == [end] and len(found) <= 2
+    assert asked[0][0] == [[7.0]] and len(asked[0]) == 13 and len(asked[1]) == 12
+    ended = [min(ends) for ends in rounds[: count - 1]]
+    assert asked[-1][0] == [[min([7.0, *ended]) if np.isfinite(ended).all() else 7.0]]
 
 
 @pytest.mark.parametrize(("count", "alpha"), [(10, 0.9), (10, 0.85), (7, 0.0), (4, 0.99)])

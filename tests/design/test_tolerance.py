@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
-from fractaljax._design.problem import DEFAULT_BOUNDS
+from fractaljax._design.statement import DEFAULT_BOUNDS
 from fractaljax._design.tolerance import Tolerance, low_discrepancy, nodes, proportion, quantile
 from tools import both_modes
 

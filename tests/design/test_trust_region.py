@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fractaljax._design.trust_region import FINE, ROUGH, Local, in_trust_region
+from fractaljax._design.trust_region import FINE, ROUGH, SETTLED, Local, in_trust_region
 
 
 def by_complex_step(f):
@@ -113,9 +113,18 @@ def test_a_rough_way_takes_fewer_steps_and_ends_near():
         return (1 - x) ** 2 + 10 * (y - x**2) ** 2
 
     steps = {}
-    for accuracy in (ROUGH, FINE):
+    for accuracy in (ROUGH, SETTLED, FINE):
         at, seen = asked(f, lambda u: -1 + 0 * u[0])
         u = in_trust_region(at, free, np.array([0.1, 0.8]), 0.0, accuracy, 10.0)
-        np.testing.assert_allclose(u, [0.75, 0.75], atol=0.1 if accuracy is ROUGH else 1e-3)
+        near = {ROUGH: 0.1, SETTLED: 0.02, FINE: 1e-3}[accuracy]
+        np.testing.assert_allclose(u, [0.75, 0.75], atol=near)
         steps[accuracy] = len(seen)
-    assert steps[ROUGH] < steps[FINE]
+    assert steps[ROUGH] < steps[SETTLED] <= steps[FINE]
+
+
+@pytest.mark.parametrize("accuracy", [ROUGH, SETTLED])
+def test_a_settled_way_meets_what_a_rough_one_leaves_unmet(accuracy):
+    """The first penalty is too small."""
+    at, _ = asked(lambda u: 100 * u[0] + (u[1] - 0.5) ** 2, lambda u: 0.5 - u[0])
+    u = in_trust_region(at, free, np.array([0.6, 0.2]), 0.0, accuracy, 10.0)
+    assert (abs(u[0] - 0.5) < 1e-6) == (accuracy is SETTLED)

@@ -1,0 +1,48 @@
+"""How many modes of a structure may grow: each has a growth rate to keep low."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._base.quick import quick_jit
+from .._base.ranges import low_discrepancy
+from .._stability.linearise import assembled
+from .._stability.quadratic import leading
+from .joints import under
+from .problem import DesignProblem
+from .rows import rows_in_batches
+
+_LOOKED_AT = 15  # designs, besides the given one, in which growing modes are counted
+_MODES_MOST = 16  # that requirements are made of
+
+
+def modes_to_keep(problem: DesignProblem) -> int:
+    """How many modes may grow: two more than grow in any of a few designs."""
+    designs = np.concatenate(
+        [np.asarray(problem.start)[None], low_discrepancy(_LOOKED_AT, len(problem.names))]
+    )
+    modes = max(2, min(_MODES_MOST, problem.x.n))
+    own = np.broadcast_to(
+        np.asarray(problem.own_condition), (len(designs), len(problem.conditions))
+    )
+    looking = dataclasses.replace(problem, modes=modes)
+    growing = rows_in_batches(_rates, looking, designs, own) > float(problem.target)
+    return min(int(growing.sum(axis=2).max()) + 2, modes)
+
+
+@quick_jit
+def _rates(problem: DesignProblem, us, conditions):
+    """The largest growth rates (n, laws, modes), NaN where there is no steady sliding."""
+
+    def one(u, condition):
+        x = problem.moved(u, condition)
+        rates = []
+        for each in (problem.stiffened(x)[1], *(under(x, law) for law in problem.laws)):
+            attached = assembled(each, problem.friction_slope, refuse=False)
+            found = leading(*attached[:3], problem.modes, x.band)
+            rates.append(jnp.where(attached.lost, jnp.nan, found.s.real))
+        return jnp.stack(rates)
+
+    return jax.vmap(one)(us, conditions)

@@ -1,0 +1,107 @@
+"""What joints alone require of designs: it takes no eigenvalues."""
+
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._base.batches import in_batches
+from .._base.quick import outermost_jit
+from .._mechanism.quantities import joints_of
+from .joints import states_of
+from .problem import UNKNOWN, DesignProblem
+from .rows import BATCH, paired
+from .tolerance import quantile
+
+_INSIDE, _INSIDE_STEPS = 0.01, 40  # by how much designs that are screened are inside the limits
+
+
+Limits = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+def limits_of_joints(problem: DesignProblem) -> Limits:
+    """A function: what joints alone require (n, r) of designs (n, v), and Jacobians.
+
+    Each design is at a condition (n, c). Stiffness counts by its logarithm, which many steps of a
+    design change evenly. To take the problem apart once, not at each call, and to fill up no batch
+    saves three quarters of a call.
+    """
+    leaves, structure = jax.tree.flatten(problem)
+    program = functools.partial(_limits_of_joints, leaves, structure=structure)
+    dtype = problem.low.dtype
+
+    def limits(us, conditions):
+        single = len(us) <= BATCH and not problem.conditions
+        pairs = np.asarray(us, dtype), np.asarray(conditions, dtype)
+        return in_batches(program, 1 if single else BATCH, *pairs)
+
+    return limits
+
+
+def limits_at(limits: Limits, us: np.ndarray, conditions: np.ndarray):
+    """What joints alone require (n, m r) of us (n, v) at conditions (m, c), and Jacobians."""
+    residuals, slopes = limits(*paired(us, conditions))
+    n, v = us.shape
+    return residuals.reshape(n, -1), slopes.reshape(n, -1, v)
+
+
+def within_joints(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray) -> np.ndarray:
+    """Designs us (n, v) moved to where every joint is inside its limits, as far as that goes.
+
+    At all conditions (m, c). Of many joints a design that is drawn has nearly always one outside,
+    where no growth rate says anything. Their limits take no eigenvalues. By Levenberg and
+    Marquardt's method.
+    """
+
+    limits = limits_of_joints(problem)
+
+    def lacking(us):
+        residuals, slopes = limits_at(limits, us, conditions)
+        r = np.clip(np.nan_to_num(residuals, nan=UNKNOWN) + _INSIDE, 0, UNKNOWN)
+        return r, np.nan_to_num(slopes) * (r > 0)[:, :, None]
+
+    (r, slopes), damping = lacking(us), np.ones(len(us))
+    for _ in range(_INSIDE_STEPS):
+        if not r.any():
+            break
+        normal = np.einsum("nkv,nkw->nvw", slopes, slopes)
+        normal += damping[:, None, None] * np.eye(us.shape[1])
+        step = np.linalg.solve(normal, np.einsum("nkv,nk->nv", slopes, r)[:, :, None])[:, :, 0]
+        tried = np.clip(us - step, 0, 1)
+        other, other_slopes = lacking(tried)
+        better = (other**2).sum(axis=1) < (r**2).sum(axis=1)
+        us = np.where(better[:, None], tried, us)
+        r = np.where(better[:, None], other, r)
+        slopes = np.where(better[:, None, None], other_slopes, slopes)
+        damping = np.clip(np.where(better, damping / 5, damping * 3), 1e-6, 1e6)
+    return us
+
+
+@functools.partial(outermost_jit, static_argnames="structure")
+def _limits_of_joints(leaves, us, conditions, structure):
+    problem: DesignProblem = jax.tree.unflatten(structure, leaves)
+
+    def required(u, condition, shift=None):
+        joints = joints_of(problem.moved(u, condition, shift))
+        model, stiff = problem.of_joints(
+            states_of({name: joints[name] for name in problem.contacts})
+        )
+        return jnp.stack([*model, *stiff])
+
+    def residuals(u, condition):
+        if problem.scatter is None:
+            found = required(u, condition)
+        else:
+            found = jax.vmap(lambda shift: required(u, condition, shift))(problem.scatter.shifts)
+            found = quantile(found, problem.scatter.weights, problem.scatter.level)
+        model, stiff = jnp.split(found, [problem.model_residuals])
+        both = jnp.concatenate([model, -jnp.log1p(-stiff)])
+        return both, both
+
+    def one(u, condition):
+        slopes, values = jax.jacfwd(residuals, has_aux=True)(u, condition)
+        return values, slopes
+
+    return jax.vmap(one)(us, conditions)

@@ -1,0 +1,81 @@
+"""Designs by the many: their rows, Jacobians and descriptions, by compiled programs."""
+
+import dataclasses
+import functools
+
+import jax
+import numpy as np
+
+from .._base.batches import in_batches
+from .._base.quick import quick_jit
+from .problem import DesignProblem
+
+BATCH = 32  # designs, each at one condition, evaluated at once
+# Structures take so long that filling up a batch costs more than a call.
+_BATCH_OF_STRUCTURES, _SMALL = 8, 16  # of at most so many degrees of freedom; of larger ones 1
+
+
+def linearise(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray):
+    """Rows (n, 1 + k), their Jacobians (n, 1 + k, v), and what describes designs us (n, v).
+
+    Each design is at a condition (n, c).
+    """
+    program = _linearise_light if problem.light else _linearise
+    rows, jacobians, numbers = rows_in_batches(program, problem, us, conditions)
+    rows, jacobians = rows.astype(float), jacobians.astype(float)
+    if problem.cycles is not None:
+        problem.cycles.fill(problem, us, rows, jacobians)
+        numbers = numbers | {"objective": rows[:, 0]}
+    return rows, jacobians, numbers
+
+
+def evaluate(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray) -> np.ndarray:
+    """Objective and residuals (n, 1 + k) of designs us (n, v), each at a condition (n, c)."""
+    if not problem.robust:
+        return linearise(problem, us, conditions)[0]  # compiled already
+    return rows_in_batches(evaluated, problem, us, conditions).astype(float)
+
+
+def describe(problem: DesignProblem, us: np.ndarray) -> dict[str, np.ndarray]:
+    """Quantities and results (n,) of designs us (n, v), as they are, without scatter."""
+    nominal = dataclasses.replace(problem, scatter=None)
+    own = np.broadcast_to(np.asarray(problem.own_condition), (len(us), len(problem.conditions)))
+    return linearise(nominal, us, own)[2]
+
+
+def paired(us: np.ndarray, conditions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Each of us (n, v) at every one of conditions (m, c): (n m, v) and (n m, c)."""
+    return np.repeat(us, len(conditions), axis=0), np.tile(conditions, (len(us), 1))
+
+
+def rows_in_batches(program, problem, us, conditions):
+    """A compiled program of a problem, designs (b, v) and conditions (b, c), for (n, v) of them."""
+    problem = dataclasses.replace(problem, cycles=None)
+    dtype = problem.low.dtype
+    pairs = np.asarray(us, dtype), np.asarray(conditions, dtype)
+    batch = BATCH
+    if problem.modes:
+        batch = _BATCH_OF_STRUCTURES if problem.x.n <= _SMALL else 1
+    return in_batches(functools.partial(program, problem), batch, *pairs)
+
+
+def linearised(problem: DesignProblem, us, conditions):
+    """What `linearise` compiles."""
+
+    def one(u, condition):
+        def row(u):
+            row, numbers = problem.at(u, condition)
+            return row, (row, numbers)
+
+        jacobian, (value, numbers) = jax.jacfwd(row, has_aux=True)(u)
+        return value, jacobian, numbers
+
+    return jax.vmap(one)(us, conditions)
+
+
+_linearise, _linearise_light = quick_jit(linearised), quick_jit(linearised, once=True)
+
+
+@quick_jit
+def evaluated(problem: DesignProblem, us, conditions):
+    return jax.vmap(lambda u, condition: problem.at(u, condition)[0])(us, conditions)
