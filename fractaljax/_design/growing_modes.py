@@ -12,7 +12,7 @@ from .._stability.linearise import assembled
 from .._stability.quadratic import leading
 from .joints import under
 from .problem import DesignProblem
-from .rows import rows_in_batches
+from .rows import paired, rows_in_batches
 
 _LOOKED_AT = 15  # designs, besides the given one, in which growing modes are counted
 _MODES_MOST = 16  # that requirements are made of
@@ -24,11 +24,9 @@ def modes_to_keep(problem: DesignProblem) -> int:
         [np.asarray(problem.start)[None], low_discrepancy(_LOOKED_AT, len(problem.names))]
     )
     modes = max(2, min(_MODES_MOST, problem.x.n))
-    own = np.broadcast_to(
-        np.asarray(problem.own_condition), (len(designs), len(problem.conditions))
-    )
     looking = dataclasses.replace(problem, modes=modes)
-    growing = rows_in_batches(_rates, looking, designs, own) > float(problem.target)
+    own = paired(designs, np.asarray(problem.own_condition)[None])
+    growing = rows_in_batches(_rates, looking, *own) > float(problem.target)
     return min(int(growing.sum(axis=2).max()) + 2, modes)
 
 

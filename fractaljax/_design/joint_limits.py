@@ -17,7 +17,6 @@ from .tolerance import quantile
 
 _INSIDE, _INSIDE_STEPS = 0.01, 40  # by how much designs that are screened are inside the limits
 
-
 Limits = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
@@ -54,7 +53,6 @@ def within_joints(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray
     where no growth rate says anything. Their limits take no eigenvalues. By Levenberg and
     Marquardt's method.
     """
-
     limits = limits_of_joints(problem)
 
     def lacking(us):

@@ -39,8 +39,7 @@ def evaluate(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray) -> 
 def describe(problem: DesignProblem, us: np.ndarray) -> dict[str, np.ndarray]:
     """Quantities and results (n,) of designs us (n, v), as they are, without scatter."""
     nominal = dataclasses.replace(problem, scatter=None)
-    own = np.broadcast_to(np.asarray(problem.own_condition), (len(us), len(problem.conditions)))
-    return linearise(nominal, us, own)[2]
+    return linearise(nominal, *paired(us, np.asarray(problem.own_condition)[None]))[2]
 
 
 def paired(us: np.ndarray, conditions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fractaljax._design.solvers import minimized
+from .solvers import minimized
 
 Limits = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
