@@ -28,7 +28,7 @@ GROUPS = {  # of the API: title, and the modules whose public names it has
     "surface": ("Surfaces", ("_surface",)),
     "contact": ("Contact", ("_contact",)),
     "friction": ("Friction", ("_friction",)),
-    "mechanism": ("Scenes and structures", ("_mechanism", "_base")),
+    "mechanism": ("Scenes and structures", ("_mechanism",)),
     "stability": ("Stability", ("_stability",)),
     "dynamics": ("Motion and limit cycles", ("_dynamics",)),
     "design": ("Design", ("_design",)),
@@ -36,6 +36,7 @@ GROUPS = {  # of the API: title, and the modules whose public names it has
     "sweep": ("Sweeps", ("_sweep",)),
     "validate": ("Validation", ("_validate",)),
     "plot": ("Pictures", ("plot",)),
+    "compilation": ("Compilation", ("_base",)),
 }
 
 
@@ -180,7 +181,7 @@ def public_names() -> dict[str, list[str]]:
             if name.startswith("_") or not home.startswith("fractaljax.") or not local:
                 continue
             if name == "quantity":
-                home = "fractaljax._base"
+                home = "fractaljax._mechanism"
             (group,) = [g for g, (_, of) in GROUPS.items() if home.split(".")[1] in of]
             found[group].append(prefix + name)
     return {group: sorted(names, key=str.lower) for group, names in found.items()}

@@ -18,7 +18,10 @@ def test_options_are_for_the_outermost_program_only(known, monkeypatch):
     asked = functools.cache(inspect.unwrap(quick._available))  # conftest says no to all others
     monkeypatch.setattr(quick, "_available", asked)
     square = quick.quick_jit(lambda x: x**2)
-    assert quick._available() == (known and jax.default_backend() == "cpu")
+    expected = known and jax.default_backend() == "cpu"
+    assert quick._available() == expected
+    assert quick.quick_compilation() == (quick._OPTIONS if expected else {})
+    assert jax.jit(square, compiler_options=quick.quick_compilation())(3.0) == 9
     x = jnp.arange(3.0)
     assert float(square(3.0)) == 9
     assert (jax.vmap(square)(x) == x**2).all()
