@@ -84,10 +84,8 @@ class Space:
         if self.oblique:
             P, size, Qt = np.linalg.svd(self.mass[:r, :r])
             T, S = T @ Qt.T / np.sqrt(size), S @ P / np.sqrt(size)
-        terms = len(self.residuals) // self.size
-        rest = np.eye(len(self.residuals) - terms * self.size)
-        left, right = (_block_diagonal([X] * terms + [rest]) for X in (S, T))
-        return self.V @ T, self.W @ S, left.T @ self.residuals @ right
+        residuals = _in_space(_in_space(self.residuals, S).T, T).T
+        return self.V @ T, self.W @ S, residuals
 
 
 def _paired(M: Any, V: np.ndarray, W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -100,10 +98,12 @@ def _paired(M: Any, V: np.ndarray, W: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return np.hstack([W @ P[:, alone], V]), np.hstack([V @ Qt.T[:, alone], W])
 
 
-def _block_diagonal(blocks: list[np.ndarray]) -> Any:
-    from scipy.linalg import block_diag
-
-    return block_diag(*blocks)
+def _in_space(rows: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """Rows (k, ...) of all terms, then of the joints, of which T^T (r, size) reduces each term's."""
+    terms = len(rows) // len(T)
+    of_terms, rest = np.split(rows, [terms * len(T)])
+    reduced = T.T @ of_terms.reshape(terms, len(T), -1)
+    return np.concatenate([reduced.reshape(-1, rows.shape[1]), rest])
 
 
 def _terms(x: Structure) -> Iterator[tuple[int, Callable | None, Any]]:

@@ -3,8 +3,13 @@
 (s^2 M + s C + K) x = 0 is inverted about a shift by one sparse LU factorisation of the size of M,
 and ARPACK finds the nearest eigenvalues (R. B. Lehoucq, D. C. Sorensen and C. Yang, 1998). Left
 vectors are those of the transposed problem, by the same factors. SciPy, outside of JAX.
+
+Threads share the solutions: SuperLU lets go of the interpreter.
 """
 
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -35,8 +40,20 @@ class Factors:
 
     def solve(self, b: np.ndarray, transposed: bool = False) -> np.ndarray:
         """x (n,) or (n, k) for right-hand sides of that shape, complex."""
-        b = np.ascontiguousarray(b, complex) if b.ndim == 1 else np.asfortranarray(b, complex)
-        return self._lu.solve(b, "T" if transposed else "N")
+        how = "T" if transposed else "N"
+        if b.ndim == 1:
+            return self._lu.solve(np.ascontiguousarray(b, complex), how)
+
+        def some(columns):
+            return self._lu.solve(np.asfortranarray(columns, complex), how)
+
+        return np.concatenate(side_by_side(some, np.array_split(b, os.cpu_count() or 1, 1)), axis=1)
+
+
+def side_by_side(function: Callable, arguments: Iterable) -> list[Any]:
+    """What a function gives for each of the arguments, in threads."""
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return list(pool.map(function, arguments))
 
 
 def band_modes(matrices: tuple[Any, Any, Any], band: tuple[float, float]) -> BandModes:
@@ -59,14 +76,16 @@ def _within(matrices, low, high, width) -> list[BandModes]:
     factors = Factors(matrices, half * 1e-3 + 1j * (low + high) / 2)
     n = matrices[0].shape[0]
     count = min(_NEAREST, 2 * n - 2)
-    s, right = _nearest(matrices, factors, count, transposed=False)
+    # Left ones at once, even if the right ones say that the band must be halved.
+    (s, right), (z, left) = side_by_side(
+        lambda transposed: _nearest(matrices, factors, count, transposed), (False, True)
+    )
     if np.abs(s - factors.shift).max() < _BEYOND * half and count == _NEAREST:
         if half < _NARROWEST * width:
             raise ValueError(f"too many eigenvalues near {high:g} rad/s: choose a narrower band")
         middle = (low + high) / 2
         parts = (low, middle), (middle, high)
         return [each for part in parts for each in _within(matrices, *part, width)]
-    z, left = _nearest(matrices, factors, count, transposed=True)
     # The low end of a band at 0 has no mode of its own: real eigenvalues do not oscillate.
     inside = (s.imag > low) & (s.imag <= high)
     s, right = s[inside], right[:, inside]

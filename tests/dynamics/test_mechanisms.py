@@ -65,6 +65,7 @@ def test_cycle(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", DIFFERENTIATED)
+@pytest.mark.usefixtures("unoptimised")
 def test_derivatives(name):
     """Of period, amplitudes and shares by the numbers in `by`, forward and reverse."""
     problem, row = PROBLEMS[name], ROWS[name]
