@@ -37,6 +37,9 @@ class Cubic(eqx.Module):
             (27 * a - 9 * g_0 - 27 * b + 9 * g_1) / 2,
         )
 
+    def __neg__(self) -> "Cubic":
+        return Cubic(-self.k_0, -self.k_1, -self.k_2, -self.k_3)
+
     def __call__(self, x):
         return self.k_0 + x * (self.k_1 + x * (self.k_2 + x * self.k_3))
 
@@ -55,17 +58,26 @@ class Cubic(eqx.Module):
         inside = (square >= 0) & (x > 0) & (x < 1)
         return jnp.where(inside, x, 0), inside
 
-    def root_before(self, end, start: ArrayLike = 0) -> Array:
-        """Where it falls through zero in (0, end], if it does: Newton steps from the secant's root.
+    def root_before(self, end) -> Array:
+        """Where it falls through zero in (0, end], if it does and no minimum is inside that.
 
-        They begin at `start` if that is later.
+        Newton steps beyond a maximum, from where on it only falls, from the root of a parabola
+        with its top there; without one from the secant's. Those that leave the interval in which
+        the root is halve it.
         """
-        at_end = self(end)
-        x = end * self.k_0 / jnp.where(self.k_0 == at_end, 1, self.k_0 - at_end)
-        x = jnp.maximum(x, start)
+        at_end, (peak, inside) = self(end), (-self).minimum()
+        inside = inside & (peak < end)
+        low = jnp.where(inside, peak, 0)
+        value, high = self(low), end
+        share = value / jnp.where(value == at_end, 1, value - at_end)
+        share = jnp.where(inside, jnp.sqrt(jnp.maximum(share, 0)), share)
+        x = low + (end - low) * share
         for _ in range(3):
-            slope = self.slope(x)
-            x = jnp.clip(x - self(x) / jnp.where(slope == 0, 1, slope), 0, end)
+            value, slope = self(x), self.slope(x)
+            low, high = jnp.where(value < 0, low, x), jnp.where(value < 0, x, high)
+            newton = x - value / jnp.where(slope == 0, 1, slope)
+            good = (slope < 0) & (newton >= low) & (newton <= high)
+            x = jnp.where(good, newton, (low + high) / 2)
         return x
 
 
@@ -95,10 +107,7 @@ def first_root(whole: Cubic) -> Array:
     lowest, dips = cubic.minimum()
     dips &= cubic(lowest) < 0
     end = jnp.where(dips, lowest, 1)
-    # A cubic that rises from just above zero has a root just before 0, which does not count.
-    rising = ~entered & (whole.k_1 > 0)
-    back = without_start(whole, rising).root_before(end)
-    x = cubic.root_before(end, jnp.where(rising, back, 0))
+    x = cubic.root_before(end)
     # A step of zero length would be repeated forever.
     x = jnp.where(entered, jnp.maximum(x, 1e-6), x)
     return jnp.where(whole.k_0 < 0, 0, jnp.where(cubic(end) < 0, x, 2))
@@ -144,10 +153,8 @@ def step(system: HybridSystem, y, s, last, h, reach=None):
 
     nodes = jnp.stack([y, between(1 / 3), between(2 / 3), y_1])
     guards = jax.vmap(lambda y: system.guards(y, s))(nodes)
-    start, rate = guards[0], guards[1] - guards[0]
-    # A guard starts on its own side: at zero it is entered, unless it falls on.
-    near = rounding(y)[None]
-    start = jnp.where((jnp.abs(start) <= near) & (rate >= -near), 0, start)
+    # A guard starts on its own side: to rounding at zero, it is entered.
+    start = jnp.where(jnp.abs(guards[0]) <= rounding(y)[None], 0, guards[0])
     roots = first_root(Cubic.at_thirds((start, *guards[1:])))
     # Only a fall through the section counts. (XLA does not turn updates of rows into vectors.)
     falls = (start > 0) & (last != SECTION)[None]

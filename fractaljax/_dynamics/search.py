@@ -22,7 +22,7 @@ from .events import Cubic
 from .hybrid import SECTION, UNUSED, HybridSystem
 from .lanes import log_spectral_radius
 from .orbit import PeriodicOrbit, accurate_return_jacobian, solve_periodic_orbits
-from .record import ENDED, RETURNED, TIME, Record, Steps, cut
+from .record import ENDED, RETURNED, TIME, WEIGHT, Record, Steps, cut
 from .segments import Segments, cumulative, next_start
 
 HARDLY = 1e-3  # growth in a period up to which an orbit that repels is kept
@@ -347,7 +347,12 @@ def _assess(
     distance = jnp.where(found & ~ok, now, distance)
     late = returns > max_returns / 2
     widest = jnp.where(late, jnp.maximum(known.widest, closest / scale), known.widest)
-    over = jnp.where((widest < 0.02) | (smooth & (growth < 0)), EXHAUSTED, NOT_PERIODIC)
+    # Of what nearly repeats, segments of length h, and one more a phase, may be too many.
+    last = jnp.stack([at[0], jnp.take_along_axis(at, repeated[None], axis=0)[0]])
+    weight, phases = (record.past(row, last, lane[None]) for row in (WEIGHT, ENDED))
+    cramped = (weight[0] - weight[1]) / h + phases[0] - phases[1] > length
+    nearly = jnp.where(cramped & (widest < 0.02), TOO_LONG, EXHAUSTED)
+    over = jnp.where((widest < 0.02) | (smooth & (growth < 0)), nearly, NOT_PERIODIC)
     ended = (returns >= max_returns) | (idle > options.patience)
     over = jnp.where(ended, over, RUNNING)
     # A period that the record does not hold is never seen to repeat.

@@ -99,7 +99,7 @@ def _paired(M: Any, V: np.ndarray, W: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _in_space(rows: np.ndarray, T: np.ndarray) -> np.ndarray:
-    """Rows (k, ...) of all terms, then of the joints, of which T^T (r, size) reduces each term's."""
+    """Rows (k, ...) of all terms, each reduced by T^T (r, size), then those of the joints."""
     terms = len(rows) // len(T)
     of_terms, rest = np.split(rows, [terms * len(T)])
     reduced = T.T @ of_terms.reshape(terms, len(T), -1)

@@ -153,6 +153,12 @@ def test_root_near_the_start():
         pairs = zip(roots, far, strict=True)
         k = np.array([with_roots([-height, r, f], height * r) for r, f in pairs]).T
         np.testing.assert_allclose(found_root(*ends_of(k)), roots, rtol=1e-4)
+    # It rises, or is level, before it falls far: the secant's root is too early.
+    high = np.array([0.0, 1e-3, 1.0, 50.0])
+    for slope in (0.0, 1.0, 10.0):
+        k = np.array([high, 0 * high + slope, 0 * high + 1e3, 0 * high - 1e4])
+        truth = [first_fall(column) for column in k.T]
+        np.testing.assert_allclose(found_root(*ends_of(k)), truth, atol=0.03)
     late = cubics("any")
     late[0] = -abs(late[0]) * np.logspace(-16, 0, late.shape[1])
     np.testing.assert_array_equal(found_root(*late), 0)

@@ -64,6 +64,19 @@ def problem(given) -> dict:
     return {"joints": [joint], **{name: given[name] for name in "MCKF"}}
 
 
+def row_of(found: fj.LimitCycle) -> jax.Array:
+    shares = found.stick_fraction, found.open_fraction
+    extremes = found.amplitude, found.velocity_min, found.velocity_max
+    return jnp.concatenate([found.period[None], *extremes, *shares, found.normal_force[0]])
+
+
+def sizes_of(row) -> np.ndarray:
+    """Velocities, lengths and forces by the largest of their kind; shares by 1."""
+    sizes = [np.full(len(part), abs(part).max()) for part in np.split(row, [1, 4, 10, 12])]
+    sizes[3][:] = 1
+    return np.concatenate(sizes)
+
+
 @jax.jit
 def derivatives(given, by, start):
     """Outputs, their derivatives (k, 2) in both modes, and the cycle."""
@@ -72,10 +85,7 @@ def derivatives(given, by, start):
         at = {name: given[name] + jnp.tensordot(theta, by[name], 1) for name in given}
         structure = of_problem(problem(at))
         found = fj.limit_cycle(structure, start, segments=128, max_returns=1500, throw=False)
-        shares = found.stick_fraction, found.open_fraction
-        extremes = found.amplitude, found.velocity_min, found.velocity_max
-        row = jnp.concatenate([found.period[None], *extremes, *shares, found.normal_force[0]])
-        return row, found
+        return row_of(found), found
 
     return both_modes(outputs, jnp.zeros(2), has_aux=True)
 
@@ -119,11 +129,7 @@ def assert_derivatives(seed):
     assert found.result == fj.CycleResult.converged
     flow = monodromy_of(found)
     value, modes, orbit = truth(given, np.append(found.state, found.period), flow)
-    # Velocities, lengths and forces by the largest of their kind; shares by 1.
-    ends = np.cumsum([1, 3, 6, 2, 2])[:-1]
-    sizes = [np.full(len(part), abs(part).max()) for part in np.split(value, ends)]
-    sizes[3][:] = 1
-    size = np.concatenate(sizes)
+    size = sizes_of(value)
     np.testing.assert_allclose(row / size, value / size, rtol=0, atol=1e-9)
     for k in range(2):
         slopes, orbits = [], {0.0: orbit}
@@ -140,6 +146,19 @@ def assert_derivatives(seed):
         scale = 1e-6 * (abs(expected) + size)
         assert (abs(forward[:, k] - expected) < scale).all()
     np.testing.assert_allclose(reverse, forward, rtol=0, atol=1e-9 * abs(forward).max())
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("unoptimised")
+@pytest.mark.parametrize("seed", [45, 161])
+def test_cycles_that_a_coarse_run_hardly_reaches(seed):
+    """Its steps see guards that rise before they fall far; and a default of few segments."""
+    given, start = numbers(seed), np.random.default_rng([seed, 2]).standard_normal(6)
+    cycle = fj.limit_cycle(of_problem(problem(given)), start, rtol=2e-9, max_returns=1500)
+    near = np.append(cycle.state, cycle.period)
+    value, *_ = truth(given, near, monodromy_of(cycle))
+    size = sizes_of(value)
+    np.testing.assert_allclose(row_of(cycle) / size, value / size, rtol=0, atol=4e-9)
 
 
 # --- branches ---
