@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array
 
 from .hybrid import NONE, SECTION, HybridSystem
 from .lanes import first_least, row_numbers
