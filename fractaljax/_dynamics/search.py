@@ -43,6 +43,7 @@ class SearchOptions:
     longest: int = 16  # most returns in one period
     near: float = 0.15  # gap between returns below which an orbit is tried, relative
     ends_near: float = 0.06  # distance that single returns have left, relative
+    repeats: float = 1e-6  # gap between returns of a motion that has settled, relative
     own_scale: float = 4.0  # most that gaps are relative to, in distances from the equilibrium
     patient: int = 4  # rounds in which that is asked of them
     accepted: float = 0.03  # distance from the orbit at which its multipliers decide, relative
@@ -347,12 +348,12 @@ def _assess(
     distance = jnp.where(found & ~ok, now, distance)
     late = returns > max_returns / 2
     widest = jnp.where(late, jnp.maximum(known.widest, closest / scale), known.widest)
-    # Of what nearly repeats, segments of length h, and one more a phase, may be too many.
+    over = jnp.where((widest < 0.02) | (smooth & (growth < 0)), EXHAUSTED, NOT_PERIODIC)
+    # A motion that repeats was no orbit if segments of length h, and one a phase, are too many.
     last = jnp.stack([at[0], jnp.take_along_axis(at, repeated[None], axis=0)[0]])
     weight, phases = (record.past(row, last, lane[None]) for row in (WEIGHT, ENDED))
     cramped = (weight[0] - weight[1]) / h + phases[0] - phases[1] > length
-    nearly = jnp.where(cramped & (widest < 0.02), TOO_LONG, EXHAUSTED)
-    over = jnp.where((widest < 0.02) | (smooth & (growth < 0)), nearly, NOT_PERIODIC)
+    over = jnp.where(cramped & (closest < options.repeats * scale), TOO_LONG, over)
     ended = (returns >= max_returns) | (idle > options.patience)
     over = jnp.where(ended, over, RUNNING)
     # A period that the record does not hold is never seen to repeat.
