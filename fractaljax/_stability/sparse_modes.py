@@ -47,7 +47,8 @@ class Factors:
         def some(columns):
             return self._lu.solve(np.asfortranarray(columns, complex), how)
 
-        return np.concatenate(side_by_side(some, np.array_split(b, os.cpu_count() or 1, 1)), axis=1)
+        parts = min(os.cpu_count() or 1, b.shape[1]) or 1  # none without a column
+        return np.concatenate(side_by_side(some, np.array_split(b, parts, axis=1)), axis=1)
 
 
 def side_by_side(function: Callable, arguments: Iterable) -> list[Any]:

@@ -8,8 +8,10 @@ import jax
 import numpy as np
 import pytest
 import scipy.linalg
+from scipy.sparse import csr_array
 
 import fractaljax as fj
+from fractaljax._stability.sparse_modes import Factors
 from structures import beam, state_matrix
 
 BAND = (0.0, 9000.0)
@@ -185,6 +187,17 @@ def test_refused(message):
         fj.reduce(full_structure("no joints"), **(dict(over={}, band=BAND) | REFUSED[message]))
     with pytest.raises(TypeError, match="structure must be a Structure"):
         fj.reduce(fj.brake_scene(), {}, BAND)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("columns", [0, 1, 5, 70])
+def test_many_right_hand_sides_on_many_processors(monkeypatch, columns):
+    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    rng, shift = np.random.default_rng(0), 0.3 + 0.2j
+    M, C, K = (np.diag(rng.uniform(1, 2, 30)) + 0.1 * rng.standard_normal((30, 30)) for _ in "MCK")
+    factors, Q = Factors(tuple(map(csr_array, (M, C, K))), shift), shift**2 * M + shift * C + K
+    b = rng.standard_normal((30, columns))
+    np.testing.assert_allclose(Q @ factors.solve(b), b, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(Q.T @ factors.solve(b, transposed=True), b, rtol=0, atol=1e-13)
 
 
 BRAKE = os.environ.get("FRACTALJAX_BRAKE", "")
