@@ -61,9 +61,8 @@ class Cubic(eqx.Module):
     def root_before(self, end) -> Array:
         """Where it falls through zero in (0, end], if it does and no minimum is inside that.
 
-        Newton steps beyond a maximum, from where on it only falls, from the root of a parabola
-        with its top there; without one from the secant's. Those that leave the interval in which
-        the root is halve it.
+        Newton's method, kept in a bracket by bisection. Beyond a maximum it only falls: there the
+        first guess is the root of the parabola from that to `end`, elsewhere the secant's.
         """
         at_end, (peak, inside) = self(end), (-self).minimum()
         inside = inside & (peak < end)

@@ -43,7 +43,6 @@ class SearchOptions:
     longest: int = 16  # most returns in one period
     near: float = 0.15  # gap between returns below which an orbit is tried, relative
     ends_near: float = 0.06  # distance that single returns have left, relative
-    repeats: float = 1e-6  # gap between returns of a motion that has settled, relative
     own_scale: float = 4.0  # most that gaps are relative to, in distances from the equilibrium
     patient: int = 4  # rounds in which that is asked of them
     accepted: float = 0.03  # distance from the orbit at which its multipliers decide, relative
@@ -55,6 +54,7 @@ class SearchOptions:
     small: float = 1e-2  # size below which any decay without switches does
     extrapolated: float = 0.02  # growth in a return, without switches, that is extrapolated
     divergence: float = 1e6  # size at which a motion diverges: with a small V, many V are ordinary
+    repeats: float = 1e-6  # gap between returns of a motion that has settled, relative
     settling: int = 8  # rounds without growth after which the record must hold two returns
     patience: int = 512  # rounds without a maximum
     record: int = 2048  # steps that are kept, at least; a period takes fewer

@@ -4,7 +4,7 @@
 and ARPACK finds the nearest eigenvalues (R. B. Lehoucq, D. C. Sorensen and C. Yang, 1998). Left
 vectors are those of the transposed problem, by the same factors. SciPy, outside of JAX.
 
-Threads share the solutions: SuperLU lets go of the interpreter.
+Solutions run in threads: SuperLU releases the interpreter's lock.
 """
 
 import os
@@ -47,7 +47,7 @@ class Factors:
         def some(columns):
             return self._lu.solve(np.asfortranarray(columns, complex), how)
 
-        parts = min(os.cpu_count() or 1, b.shape[1]) or 1  # none without a column
+        parts = min(os.cpu_count() or 1, b.shape[1]) or 1  # one without a column
         return np.concatenate(side_by_side(some, np.array_split(b, parts, axis=1)), axis=1)
 
 
@@ -77,7 +77,7 @@ def _within(matrices, low, high, width) -> list[BandModes]:
     factors = Factors(matrices, half * 1e-3 + 1j * (low + high) / 2)
     n = matrices[0].shape[0]
     count = min(_NEAREST, 2 * n - 2)
-    # Left ones at once, even if the right ones say that the band must be halved.
+    # Side by side, though the left ones are wasted where the band must be halved.
     (s, right), (z, left) = side_by_side(
         lambda transposed: _nearest(matrices, factors, count, transposed), (False, True)
     )
