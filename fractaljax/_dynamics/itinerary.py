@@ -243,6 +243,10 @@ class Shooting:
         of_phases = slice(2 * self.family.n, self.quantity)
         return z[of_phases] * self.scale[of_phases]
 
+    def times(self, z) -> np.ndarray:
+        """When each phase begins, and the last ends."""
+        return np.concatenate([[0], np.cumsum(self.lengths(z))])
+
     def mechanism(self, z) -> Any:
         return self.x
 

@@ -1,0 +1,284 @@
+"""Where the itinerary of a branch of cycles changes, and how the branch goes on.
+
+An itinerary ends where the duration of a phase or, between switches, a guard falls to zero. There
+the branch goes on with the phase left out, or with one put in.
+"""
+
+import itertools
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .hybrid import SECTION
+from .itinerary import Phase, Shooting
+from .shooting import after_switch, guards_at
+
+if TYPE_CHECKING:
+    from .follow import Follower
+
+_NEW = (1e-3, 1e-4, 1e-2)  # durations of a phase that appears, as a share of the period
+_NARROW = 3e-8  # share of a step within which the end of an itinerary is found
+_SHORT = 1e-6  # duration of a phase that vanishes, as a share of the period
+
+
+class ItineraryChange:
+    """The ways on for a branch from the end of an itinerary; the branch gets the events."""
+
+    def __init__(self, branch: "Follower"):
+        self.branch, self.family = branch, branch.family
+
+    def onward(self, shooting: Shooting, z, reached):
+        """Where to go on from the end of an itinerary, between z and `reached`; None if nowhere."""
+        inside, outside = self._bracket(shooting, z, reached)
+        p = int(np.argmin(shooting.durations(inside)))
+        # A phase this short is about to vanish, though rounding may touch one of its guards first.
+        vanishes = shooting.durations(inside)[p] < _SHORT
+        if shooting.durations(outside).min() <= 0:
+            vanishes, p = True, int(np.argmin(shooting.durations(outside)))
+        candidates = itertools.chain(
+            self._vanishing(shooting, inside, p) if vanishes else (),
+            self._touching(shooting, inside, outside),
+        )
+        for candidate in candidates:
+            if candidate is not None:
+                return candidate
+        self._ends(shooting, inside, outside, p if vanishes else None)
+        return None
+
+    def _bracket(self, shooting: Shooting, z, reached) -> tuple[np.ndarray, np.ndarray]:
+        """Points inside and outside the itinerary, close to each other where it ends."""
+        import scipy.optimize  # not before it is used: it takes its time
+
+        inside, outside = {0.0: z}, {1.0: reached}
+
+        def along(share):
+            at = (inside | outside).get(share)
+            if at is None:
+                at = self.branch.between(shooting, z, reached, share)
+            value = -1.0 if at is None else shooting.admissibility(at)
+            if share > 0 and at is not None:
+                (inside if value > 0 else outside)[share] = at
+            return value if share > 0 else max(value, 1e-15)
+
+        share: Any = scipy.optimize.brentq(along, 0.0, 1.0, xtol=_NARROW)
+        along(min(share + _NARROW, 1.0))
+        # Rounding may hide on which side a point is: further and further inside.
+        away = _NARROW
+        while away < share and along(share - away) <= 0:
+            away *= 4
+        last = min(outside)
+        return inside[max(share for share in inside if share < last)], outside[last]
+
+    def _ends(self, shooting, inside, outside, p: int | None) -> None:
+        """Notes the grazing beyond which no cycle goes on, where phase p vanishes if it is one."""
+        found = None
+        if p is None:
+            at = self.branch.root(shooting, inside, outside, lambda z: shooting.lowest(z)[0])
+            if at is not None:
+                found = at, ("touch", shooting.lowest(at)[1])
+        else:
+            at = self._without_duration(shooting, inside, p)
+            if at is not None:
+                found = at, ("vanish", p)
+        if found is not None:
+            self.branch.record(shooting, found[0])
+            self.branch.note("grazing", shooting, found[0], shooting.itinerary(), "", found[1])
+
+    def _without_duration(self, shooting, z, p: int) -> np.ndarray | None:
+        """The point of the curve near z at which phase p has none."""
+        at = z.copy()
+        at[shooting.index(p)] = 0
+        found = shooting.curves.corrected(at, shooting.index(p))
+        return None if found is None else found[0]
+
+    def _vanishing(self, shooting: Shooting, z, p: int) -> Iterator[Any]:
+        """Ways on where phase p, nearly of no duration at z, is left out or changes places."""
+        phases, m = shooting.phases, shooting.m
+        old, new = phases[p - 1], phases[(p + 1) % m]
+        solution, times = shooting.solution(z), shooting.times(z)
+        if old.s == new.s:
+            # The chain begins where the next phase ends.
+            order = [(p + 2 + i) % m for i in range(m - 3)] if m > 2 else []
+            begin = times[(p + 1) % m + 1] if m > 2 else times[p]
+            if m > 2:
+                kept = [phases[i] for i in order] + [Phase(new.s, new.guard)]
+                edges = np.concatenate(
+                    [[begin], [_after(times[i + 1], begin, times) for i in order]]
+                )
+                edges = np.append(edges, begin + times[-1])
+            else:
+                kept, begin = [Phase(new.s, SECTION)], self.family.maximum(solution, times[-1])
+                edges = np.array([begin, begin + times[-1]])
+            yield self._merged(shooting, z, shooting.again(solution, kept, edges))
+        elif old.guard == phases[p].guard:
+            # A slip to and fro before a stick: without it the stick begins at its limit.
+            kept, edges = _without(phases, times, p, old.guard)
+            yield self._merged(shooting, z, shooting.again(solution, kept, edges))
+        # Otherwise the phase can be brought to no duration at all.
+        at = self._without_duration(shooting, z, p)
+        if at is None:
+            return
+        solution, times = shooting.solution(at), shooting.times(at)
+        condition = ("vanish", p)
+        faces = len(new.s)
+        if _face(old.guard, faces) != _face(phases[p].guard, faces):
+            changed = [i for i in range(faces) if phases[p].s[i] != new.s[i]]
+            s = tuple(new.s[i] if i in changed else old.s[i] for i in range(faces))
+            swapped = list(phases)
+            swapped[p - 1] = Phase(old.s, phases[p].guard)
+            swapped[p] = Phase(s, old.guard)
+            yield self._inserted(shooting, at, swapped, times, p, "order of switches", condition)
+        for guard in (old.guard, phases[p].guard):
+            kept, edges = _without(phases, times, p, guard)
+            yield self._direct(shooting, at, kept, edges, p, condition)
+
+    def _touching(self, shooting: Shooting, inside, outside) -> Iterator[Any]:
+        """Ways on where a guard touches zero between two switches, or at one."""
+        at = None
+        if shooting.durations(outside).min() > 0:
+            at = self.branch.root(shooting, inside, outside, lambda z: shooting.lowest(z)[0])
+        if at is None:
+            return
+        _, place = shooting.lowest(at)
+        solution, times = shooting.solution(at), shooting.times(at)
+        chain = solution.chain
+        k = int(place.segment)
+        p = int(chain.phase[k])
+        h = times[p + 1] - times[p]
+        since = float(chain.begin[k] + place.theta * chain.share[k]) * h
+        phase, moment = shooting.phases[p], times[p] + since
+        y = np.asarray(self.family.sampled(solution, np.array([moment]), 1)[0])[:, 0]
+        q, guard = solution.u[-1], int(place.guard)
+        s = np.array(phase.s, float)
+        face = (guard - 1) // 2
+        tried = []
+        if since <= 0 or since >= h:
+            tried = self._at_switch(phase, face, guard) if since <= 0 else []
+        else:
+            engine = np.asarray(
+                after_switch(solution.x, self.family.window, q, y, s, guard)
+            ).astype(int)
+            tried = [tuple(int(i) for i in engine)]
+            if face < len(s):
+                for other in (0, 1, -1):
+                    tried.append(tuple(other if i == face else j for i, j in enumerate(phase.s)))
+        condition = ("touch", place)
+        for state in dict.fromkeys(tried):
+            if state == phase.s:
+                continue
+            values = np.abs(guards_at(solution.x, self.family.window, q, y, np.array(state, float)))
+            values = np.asarray(values).copy()
+            values[0] = np.inf
+            excursion = Phase(state, int(np.argmin(values)))
+            phases = list(shooting.phases)
+            if since <= 0:
+                phases.insert(p, excursion)
+                edges, new = np.insert(times, p, times[p]), p
+            elif len(phases) == 1:
+                phases = [excursion, Phase(phase.s, guard)]
+                edges, new = np.array([moment, moment, moment + times[-1]]), 0
+            else:
+                phases[p : p + 1] = [Phase(phase.s, guard), excursion, phase]
+                edges, new = np.insert(times, p + 1, [moment, moment]), p + 1
+            yield self._inserted(shooting, at, phases, edges, new, "grazing", condition)
+
+    def _at_switch(self, phase, face, guard):
+        """Contact states that may come before a phase whose guard is zero at its very start."""
+        if face >= len(phase.s):
+            return []
+        slip = 1 if guard == 1 + 2 * face else -1
+        state = slip if phase.s[face] == 0 else 0
+        return [tuple(state if i == face else j for i, j in enumerate(phase.s))]
+
+    def _merged(self, shooting, z, new: Shooting):
+        """On from where an excursion vanishes: located as the grazing of the orbit without it."""
+        found = new.curves.corrected(new.begin)
+        if found is None or np.linalg.norm(found[0] - new.begin) > 0.2:
+            return None
+        start, tangent = found[0], new.curves.tangent(found[1])
+
+        def ahead(length):
+            point = new.curves.corrected(start + length * tangent)
+            return None if point is None else point[0]
+
+        value = new.lowest(start)[0]
+        for length in np.outer(4.0 ** np.arange(-8, -1), [1, -1]).ravel():
+            at = ahead(length)
+            if at is not None and new.lowest(at)[0] * value < 0:
+                graze = self.branch.root(new, start, at, lambda z: new.lowest(z)[0])
+                if graze is None:
+                    continue
+                direction = (at - start) * (1 if new.lowest(at)[0] > 0 else -1)
+                self._change("grazing", new, graze, shooting, new, ("touch", new.lowest(graze)[1]))
+                tangent = new.curves.tangent(new.equations(graze)[1])
+                return new, graze, tangent if tangent @ direction > 0 else -tangent
+        return None
+
+    def _inserted(self, shooting, at, phases, edges, index, kind, condition):
+        """On with a new phase of no duration at an event."""
+        solution = shooting.solution(at)
+        period = edges[-1] - edges[0]
+        for share in _NEW:
+            new = shooting.again(solution, phases, edges)
+            begin = new.begin.copy()
+            begin[new.index(index)] = share * period / new.scale[new.index(index)]
+            found = new.curves.corrected(begin, new.index(index))
+            if found is None or np.linalg.norm(found[0] - new.begin) > 0.2:
+                continue
+            if new.admissibility(found[0]) <= 0:
+                continue
+            tangent = new.curves.tangent(found[1])
+            self._change(kind, shooting, at, shooting, new, condition)
+            self.branch.record(new, found[0])
+            forward = tangent[new.index(index)] > 0
+            return self.branch.accurate(new, found[0], tangent if forward else -tangent)
+        return None
+
+    def _direct(self, shooting, at, phases, edges, p: int, condition):
+        """On without phase p, which has vanished between two others."""
+        new = shooting.again(shooting.solution(at), phases, edges)
+        found = new.curves.corrected(new.begin)
+        if found is None or np.linalg.norm(found[0] - new.begin) > 1e-3:
+            return None
+        tangent = new.curves.tangent(found[1])
+        for direction in (tangent, -tangent):
+            beside = new.curves.corrected(found[0] + 1e-4 * direction)
+            if beside is None or new.admissibility(beside[0]) <= 0:
+                continue
+            if self._switches(new, beside[0], p):
+                self._change("grazing", shooting, at, shooting, new, condition)
+                return new, beside[0], direction
+        return None
+
+    def _switches(self, shooting: Shooting, z, p: int) -> bool:
+        """Whether the motion goes over into phase p by itself where the one before it ends."""
+        p = p % shooting.m
+        solution, last = shooting.solution(z), shooting.phases[p - 1]
+        moment = np.array([solution.times[p]])
+        y = np.asarray(self.family.sampled(solution, moment, 1)[0])[:, 0]
+        s = np.array(last.s, float)
+        state = after_switch(solution.x, self.family.window, solution.u[-1], y, s, last.guard)
+        return tuple(int(i) for i in np.asarray(state)) == shooting.phases[p].s
+
+    def _change(self, kind, where, at, old, new, condition) -> None:
+        self.branch.record(where, at)
+        self.branch.note(kind, where, at, old.itinerary(), new.itinerary(), condition)
+
+
+def _without(phases, times, p: int, guard: int):
+    """Phases and the times at which they begin without phase p, which has no duration."""
+    kept = list(phases)
+    kept[p - 1] = Phase(kept[p - 1].s, guard)
+    del kept[p]
+    return kept, np.delete(times, p)
+
+
+def _after(time, begin, times) -> float:
+    """A time on a periodic orbit, as the first one after `begin`."""
+    return time if time > begin else time + times[-1]
+
+
+def _face(guard: int, faces: int) -> int:
+    """The face or, beyond those, the joint of a guard."""
+    return (guard - 1) // 2 if guard <= 2 * faces else guard - faces
