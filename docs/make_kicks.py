@@ -6,8 +6,8 @@ import numpy as np
 from writing import run, table
 
 import fractaljax as fj
-from fractaljax._dynamics.basin import ellipsoid
 from fractaljax._dynamics.scaled import hybrid_system
+from fractaljax._dynamics.starts import ellipsoid
 
 PAGE = Path(__file__).with_name("kicks.md")
 SURFACES = (2.55, 1e-9), (2.45, 1.2e-10), (2.70, 5e-9), (2.43, 1.23e-10), (2.60, 1e-8)

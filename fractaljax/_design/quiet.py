@@ -17,11 +17,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._dynamics.basin import Basin, basin, ellipsoid, kick_size
+from .._dynamics.basin import Basin, basin
 from .._dynamics.branch import BranchEvent, continue_cycle
 from .._dynamics.cycle import LimitCycle
 from .._dynamics.excitation import compiled_system
 from .._dynamics.scaled import degrees_of_freedom, hybrid_system
+from .._dynamics.starts import ellipsoid, kick_size
 from .._mechanism.mechanism import Mechanism
 from .._stability.stability import growth_rate
 from .cuts import Cuts

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float, Int
 
-from .._base.parts import Record, concrete, flag, number, scalar, whole
+from .._base.parts import Record, concrete, flag, whole
 from .._base.quick import quick_jit
 from .._base.table import table
 from .._mechanism.mechanism import Mechanism
@@ -30,8 +30,8 @@ from .limit_cycle import limit_cycle
 from .scaled import check_rtol, degrees_of_freedom
 from .search import SearchOptions
 from .segments import next_start
+from .starts import starts_of
 
-_MOST_STARTS = 1_000_000
 _LANES, _FEW_LANES = 256, 32  # that run side by side, of many starts and of few
 _CHUNKS = 4  # of lanes, shared by the cores; not their number, on which nothing shall depend
 _STEPS_OF = 0.1, 0.2  # lengths, in scaled time: no eigenfrequency exceeds 1
@@ -111,12 +111,6 @@ class _Lanes(Record):
     approach: Int[Array, " k"]  # rounds in which that fell
     near: Int[Array, " k"]  # rounds in which it was small
     label: Int[Array, " k"]
-
-
-@functools.partial(quick_jit, once=True)
-def _centre(system: HybridSystem) -> tuple[Array, Array]:
-    """The equilibrium without an excitation (2n,), and the units (2n,)."""
-    return system.own(system.equilibrium()), system.units
 
 
 @functools.partial(quick_jit, once=True)
@@ -381,7 +375,7 @@ def basin(
     dtype = system.F.dtype
     tolerance = check_rtol(rtol, dtype)
     max_returns, progress = whole("max_returns", max_returns, 1), flag("progress", progress)
-    given = _starts(system, n, low, high, starts, whole("seed", seed, 0), radius)
+    given = starts_of(system, n, low, high, starts, whole("seed", seed, 0), radius)
     modes = _Modes.of(system)
     y = system.with_excitation(jnp.asarray(given.T / np.asarray(system.units)[:, None], dtype), 0.0)
     lanes = jax.tree.map(np.array, _first(system, y))
@@ -465,74 +459,3 @@ def _conclude(starts, labels, cycles, reasons) -> Basin:
         cycles=tuple(cycles[i] for i in order),
         reasons=reasons,
     )
-
-
-def _starts(system, n, low, high, starts, seed, radius) -> Float[np.ndarray, "k 2n"]:
-    """The starts [m, m/s] in a box, in a ball, or as they are given."""
-    box, listed = low is not None or high is not None, np.ndim(starts) > 0
-    if box + listed + (radius is not None) != 1:
-        raise ValueError("give one of: low and high, radius, or starts of shape (k, 2n)")
-    if listed:
-        given = np.asarray(number("starts", jnp.asarray(starts, dtype=float)))
-        if given.ndim != 2 or given.shape[1] != 2 * n or not len(given):
-            raise ValueError(f"starts must have shape (k, {2 * n}), got {given.shape}")
-        return given
-    count = whole("starts", starts, 1, _MOST_STARTS)
-    if radius is not None:
-        centre, axes = ellipsoid(system, kick_size("radius", radius, n))
-        return centre + _in_unit_ball(count, 2 * n, seed) * axes
-    corners = [_corner("low", low, n), _corner("high", high, n)]
-    if (corners[0] > corners[1]).any():
-        raise ValueError(f"low must be at most high, got {corners[0]} and {corners[1]}")
-    # A fixed coordinate takes no dimension of the points.
-    moves = corners[0] < corners[1]
-    share = np.zeros((count, 2 * n))
-    share[:, moves] = _sobol(count, int(moves.sum()), seed)
-    return corners[0] + share * (corners[1] - corners[0])
-
-
-def kick_size(name: str, given: Any, n: int) -> float | list[float]:
-    """A radius in units of V/omega and V, or the semi-axes (2n,) [m, m/s] of an ellipsoid."""
-    if not isinstance(given, (list, tuple)) and not np.ndim(given):
-        return float(scalar(name, given, above=0))
-    axes = [float(scalar(name, axis, above=0)) for axis in given]
-    if len(axes) != 2 * n:
-        raise ValueError(f"{name} must have {2 * n} semi-axes, got {len(axes)}")
-    return axes
-
-
-def ellipsoid(system: HybridSystem, size: float | list[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Centre and semi-axes (2n,) [m, m/s] of kicks of a size, as `kick_size` gives it."""
-    centre, units = map(np.asarray, _centre(system))
-    return centre * units, np.array(size) if isinstance(size, list) else size * units
-
-
-def _corner(name: str, value: Any, n: int) -> np.ndarray:
-    if value is None:
-        raise ValueError("a box needs both low and high")
-    corner = np.asarray(number(name, jnp.asarray(value, dtype=float)))
-    if corner.shape != (2 * n,):
-        raise ValueError(f"{name} must have shape ({2 * n},), got {corner.shape}")
-    return corner
-
-
-def _sobol(count: int, dimensions: int, seed: int) -> np.ndarray:
-    """Points (count, dimensions) that fill the unit cube evenly."""
-    from scipy.stats import qmc
-
-    if not dimensions:
-        return np.zeros((count, 0))
-    sobol: Any = qmc.Sobol  # SciPy 1.15 renamed `seed`, and takes both names
-    points = sobol(dimensions, seed=seed)
-    # The first ones of a power of two, for which Sobol's points are balanced.
-    return points.random_base2((count - 1).bit_length())[:count]
-
-
-def _in_unit_ball(count: int, dimensions: int, seed: int) -> np.ndarray:
-    """Points (count, dimensions) evenly in the unit ball."""
-    from scipy.special import ndtri
-
-    u = _sobol(count, dimensions + 1, seed)
-    direction = ndtri(np.clip(u[:, 1:], 1e-12, 1 - 1e-12))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    return direction * u[:, :1] ** (1 / dimensions)

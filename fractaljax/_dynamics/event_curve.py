@@ -82,7 +82,7 @@ class _CurveFollower(Follower):
         del self.points[known:]
         return BranchEnd.meets
 
-    def _ends(self, *_) -> BranchEnd:
+    def _jumps(self, *_) -> BranchEnd:
         return BranchEnd.meets
 
 

@@ -139,8 +139,7 @@ class Follower:
             if smooth and self._shrinks(shooting, reached):
                 return self._hopf(shooting, z)
             if shooting.admissibility(reached) < -_ROUNDING:
-                onward = ItineraryChange(self).onward(shooting, z, reached)
-                return BranchEnd.jump if onward is None else onward
+                return self._leaves_itinerary(shooting, z, reached)
             if self._closes(shooting, z, ahead, reached):
                 return BranchEnd.closed
             self._smooth_events(shooting, z, ahead, reached, turned)
@@ -158,6 +157,17 @@ class Follower:
         if smooth and self._shrinks(shooting, z, 5):
             return self._hopf(shooting, z)
         return self._lost(shooting, z)
+
+    def _leaves_itinerary(self, shooting: Shooting, z, reached):
+        """From an admissible z to where the orbit ceases to be, and on from there."""
+        change = ItineraryChange(self, shooting, z, reached)
+        onward = change.onward()
+        return self._jumps(change) if onward is None else onward
+
+    def _jumps(self, change: ItineraryChange) -> BranchEnd:
+        """The end where no cycle with another itinerary goes on."""
+        change.note_grazing()
+        return BranchEnd.jump
 
     def _lost(self, shooting: Shooting, z) -> BranchEnd:
         """Why Newton's method fails beyond z: perhaps friction that grows without bound."""

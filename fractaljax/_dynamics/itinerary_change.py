@@ -23,34 +23,44 @@ _SHORT = 1e-6  # duration of a phase that vanishes, as a share of the period
 
 
 class ItineraryChange:
-    """The ways on for a branch from the end of an itinerary; the branch gets the events."""
+    """The end of an itinerary between z and `reached`, and the ways on for the branch."""
 
-    def __init__(self, branch: "Follower"):
-        self.branch, self.family = branch, branch.family
-
-    def onward(self, shooting: Shooting, z, reached):
-        """Where to go on from the end of an itinerary, between z and `reached`; None if nowhere."""
-        inside, outside = self._bracket(shooting, z, reached)
-        p = int(np.argmin(shooting.durations(inside)))
+    def __init__(self, branch: "Follower", shooting: Shooting, z, reached):
+        self.branch, self.family, self.shooting = branch, branch.family, shooting
+        self.inside, self.outside = self._bracket(z, reached)
+        p = int(np.argmin(shooting.durations(self.inside)))
         # A phase this short is about to vanish, though rounding may touch one of its guards first.
-        vanishes = shooting.durations(inside)[p] < _SHORT
-        if shooting.durations(outside).min() <= 0:
-            vanishes, p = True, int(np.argmin(shooting.durations(outside)))
-        candidates = itertools.chain(
-            self._vanishing(shooting, inside, p) if vanishes else (),
-            self._touching(shooting, inside, outside),
-        )
-        for candidate in candidates:
-            if candidate is not None:
-                return candidate
-        self._ends(shooting, inside, outside, p if vanishes else None)
-        return None
+        vanishes = shooting.durations(self.inside)[p] < _SHORT
+        if shooting.durations(self.outside).min() <= 0:
+            vanishes, p = True, int(np.argmin(shooting.durations(self.outside)))
+        self.vanishing = p if vanishes else None
 
-    def _bracket(self, shooting: Shooting, z, reached) -> tuple[np.ndarray, np.ndarray]:
+    def onward(self):
+        """Where to go on from here; None if nowhere."""
+        p = self.vanishing
+        candidates = itertools.chain(() if p is None else self._vanishing(p), self._touching())
+        return next((candidate for candidate in candidates if candidate is not None), None)
+
+    def note_grazing(self) -> None:
+        """That beyond which no cycle goes on."""
+        shooting, p, found = self.shooting, self.vanishing, None
+        if p is None:
+            at = self._touch()
+            if at is not None:
+                found = at, ("touch", shooting.lowest(at)[1])
+        else:
+            at = self._without_duration(self.inside, p)
+            if at is not None:
+                found = at, ("vanish", p)
+        if found is not None:
+            self.branch.record(shooting, found[0])
+            self.branch.note("grazing", shooting, found[0], shooting.itinerary(), "", found[1])
+
+    def _bracket(self, z, reached) -> tuple[np.ndarray, np.ndarray]:
         """Points inside and outside the itinerary, close to each other where it ends."""
         import scipy.optimize  # not before it is used: it takes its time
 
-        inside, outside = {0.0: z}, {1.0: reached}
+        shooting, inside, outside = self.shooting, {0.0: z}, {1.0: reached}
 
         def along(share):
             at = (inside | outside).get(share)
@@ -70,30 +80,21 @@ class ItineraryChange:
         last = min(outside)
         return inside[max(share for share in inside if share < last)], outside[last]
 
-    def _ends(self, shooting, inside, outside, p: int | None) -> None:
-        """Notes the grazing beyond which no cycle goes on, where phase p vanishes if it is one."""
-        found = None
-        if p is None:
-            at = self.branch.root(shooting, inside, outside, lambda z: shooting.lowest(z)[0])
-            if at is not None:
-                found = at, ("touch", shooting.lowest(at)[1])
-        else:
-            at = self._without_duration(shooting, inside, p)
-            if at is not None:
-                found = at, ("vanish", p)
-        if found is not None:
-            self.branch.record(shooting, found[0])
-            self.branch.note("grazing", shooting, found[0], shooting.itinerary(), "", found[1])
+    def _touch(self) -> np.ndarray | None:
+        """The point of the curve at which a guard touches zero."""
+        shooting, ends = self.shooting, (self.inside, self.outside)
+        return self.branch.root(shooting, *ends, lambda z: shooting.lowest(z)[0])
 
-    def _without_duration(self, shooting, z, p: int) -> np.ndarray | None:
+    def _without_duration(self, z, p: int) -> np.ndarray | None:
         """The point of the curve near z at which phase p has none."""
-        at = z.copy()
+        shooting, at = self.shooting, z.copy()
         at[shooting.index(p)] = 0
         found = shooting.curves.corrected(at, shooting.index(p))
         return None if found is None else found[0]
 
-    def _vanishing(self, shooting: Shooting, z, p: int) -> Iterator[Any]:
-        """Ways on where phase p, nearly of no duration at z, is left out or changes places."""
+    def _vanishing(self, p: int) -> Iterator[Any]:
+        """Ways on where phase p, nearly of no duration inside, is left out or changes places."""
+        shooting, z = self.shooting, self.inside
         phases, m = shooting.phases, shooting.m
         old, new = phases[p - 1], phases[(p + 1) % m]
         solution, times = shooting.solution(z), shooting.times(z)
@@ -110,13 +111,13 @@ class ItineraryChange:
             else:
                 kept, begin = [Phase(new.s, SECTION)], self.family.maximum(solution, times[-1])
                 edges = np.array([begin, begin + times[-1]])
-            yield self._merged(shooting, z, shooting.again(solution, kept, edges))
+            yield self._merged(shooting.again(solution, kept, edges))
         elif old.guard == phases[p].guard:
             # A slip to and fro before a stick: without it the stick begins at its limit.
             kept, edges = _without(phases, times, p, old.guard)
-            yield self._merged(shooting, z, shooting.again(solution, kept, edges))
+            yield self._merged(shooting.again(solution, kept, edges))
         # Otherwise the phase can be brought to no duration at all.
-        at = self._without_duration(shooting, z, p)
+        at = self._without_duration(z, p)
         if at is None:
             return
         solution, times = shooting.solution(at), shooting.times(at)
@@ -128,16 +129,15 @@ class ItineraryChange:
             swapped = list(phases)
             swapped[p - 1] = Phase(old.s, phases[p].guard)
             swapped[p] = Phase(s, old.guard)
-            yield self._inserted(shooting, at, swapped, times, p, "order of switches", condition)
+            yield self._inserted(at, swapped, times, p, "order of switches", condition)
         for guard in (old.guard, phases[p].guard):
             kept, edges = _without(phases, times, p, guard)
-            yield self._direct(shooting, at, kept, edges, p, condition)
+            yield self._direct(at, kept, edges, p, condition)
 
-    def _touching(self, shooting: Shooting, inside, outside) -> Iterator[Any]:
+    def _touching(self) -> Iterator[Any]:
         """Ways on where a guard touches zero between two switches, or at one."""
-        at = None
-        if shooting.durations(outside).min() > 0:
-            at = self.branch.root(shooting, inside, outside, lambda z: shooting.lowest(z)[0])
+        shooting = self.shooting
+        at = self._touch() if shooting.durations(self.outside).min() > 0 else None
         if at is None:
             return
         _, place = shooting.lowest(at)
@@ -181,7 +181,7 @@ class ItineraryChange:
             else:
                 phases[p : p + 1] = [Phase(phase.s, guard), excursion, phase]
                 edges, new = np.insert(times, p + 1, [moment, moment]), p + 1
-            yield self._inserted(shooting, at, phases, edges, new, "grazing", condition)
+            yield self._inserted(at, phases, edges, new, "grazing", condition)
 
     def _at_switch(self, phase, face, guard):
         """Contact states that may come before a phase whose guard is zero at its very start."""
@@ -191,7 +191,7 @@ class ItineraryChange:
         state = slip if phase.s[face] == 0 else 0
         return [tuple(state if i == face else j for i, j in enumerate(phase.s))]
 
-    def _merged(self, shooting, z, new: Shooting):
+    def _merged(self, new: Shooting):
         """On from where an excursion vanishes: located as the grazing of the orbit without it."""
         found = new.curves.corrected(new.begin)
         if found is None or np.linalg.norm(found[0] - new.begin) > 0.2:
@@ -210,13 +210,16 @@ class ItineraryChange:
                 if graze is None:
                     continue
                 direction = (at - start) * (1 if new.lowest(at)[0] > 0 else -1)
-                self._change("grazing", new, graze, shooting, new, ("touch", new.lowest(graze)[1]))
+                self._change(
+                    "grazing", new, graze, self.shooting, new, ("touch", new.lowest(graze)[1])
+                )
                 tangent = new.curves.tangent(new.equations(graze)[1])
                 return new, graze, tangent if tangent @ direction > 0 else -tangent
         return None
 
-    def _inserted(self, shooting, at, phases, edges, index, kind, condition):
+    def _inserted(self, at, phases, edges, index, kind, condition):
         """On with a new phase of no duration at an event."""
+        shooting = self.shooting
         solution = shooting.solution(at)
         period = edges[-1] - edges[0]
         for share in _NEW:
@@ -235,8 +238,9 @@ class ItineraryChange:
             return self.branch.accurate(new, found[0], tangent if forward else -tangent)
         return None
 
-    def _direct(self, shooting, at, phases, edges, p: int, condition):
+    def _direct(self, at, phases, edges, p: int, condition):
         """On without phase p, which has vanished between two others."""
+        shooting = self.shooting
         new = shooting.again(shooting.solution(at), phases, edges)
         found = new.curves.corrected(new.begin)
         if found is None or np.linalg.norm(found[0] - new.begin) > 1e-3:

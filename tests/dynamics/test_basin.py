@@ -10,8 +10,8 @@ from scipy.integrate import solve_ivp
 
 import fractaljax as fj
 import hybrid_truth
-from fractaljax._dynamics.basin import ellipsoid
 from fractaljax._dynamics.scaled import hybrid_system
+from fractaljax._dynamics.starts import ellipsoid
 from mechanisms import PROBLEMS, changed
 from structures import of_problem
 from tools import reference_scene
