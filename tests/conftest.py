@@ -43,31 +43,27 @@ def pytest_configure(config):
     # Of every operation only the innermost line is kept with it, not ten: some 4 to 10 % less time.
     jax.config.update("jax_traceback_in_locations_limit", 1)
     os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "1")
-    # Without optimisation a cycle with both gradients compiles in 4 s instead of 10. Runs with slow
-    # tests have it, as users do: of a hundred thousand scenes some keep their digits only by it.
-    if config.getoption("markexpr") == "not slow":
-        jax.config.update("jax_disable_most_optimizations", True)
-        os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"  # of subprocesses
-        # The library's own options would win, with some optimisation.
-        quick._available = functools.wraps(quick._available)(lambda: False)
+    # The library's own options have some optimisation, and would win over a run without.
+    asked = quick._available
+    quick._available = functools.wraps(asked)(lambda: optimised() and asked())
     # A quarter of tracing is a search for garbage among the modules, which stay.
     gc.freeze()
     gc.set_threshold(50_000, 20, 50)
 
 
-@pytest.fixture
-def unoptimised(monkeypatch):
-    """Programs of a test are compiled as in the default run: it compiles much and computes little.
+def optimised() -> bool:
+    return not jax.config.read("jax_disable_most_optimizations")
 
-    In a run with slow tests optimisation would take as long again.
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    """Without optimisation a cycle with both gradients compiles in 4 s instead of 10.
+
+    Slow tests have it, as users do, but for those that compile much and compute little.
     """
-    from fractaljax._base import quick
-
-    monkeypatch.setattr(quick, "_available", lambda: False)
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
+    compute = item.get_closest_marker("slow") and not item.get_closest_marker("unoptimised")
+    jax.config.update("jax_disable_most_optimizations", not compute)
+    os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "0" if compute else "1"  # of subprocesses
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -16,6 +16,8 @@ from fractaljax.__main__ import main
 from fractaljax._dynamics.summary import cycle_table
 from tools import motionless_scene, reference_cycle, reference_scene, run_command as run
 
+pytestmark = pytest.mark.unoptimised
+
 _CYCLE = ["cycle.csv", "cycle.png"]
 _SEARCH = "fractaljax._dynamics.limit_cycle.limit_cycle"
 _TABLE = "fractaljax._stability.summary.stability_table"

@@ -27,7 +27,7 @@ from tools import (
 )
 
 BELT = PROBLEMS["papangelo_2017"]
-UNOPTIMISED = pytest.mark.usefixtures("unoptimised")
+UNOPTIMISED = pytest.mark.unoptimised
 
 
 @functools.cache

@@ -21,7 +21,7 @@ from mechanisms import PROBLEMS, changed
 from structures import of_problem
 from tools import both_modes, primitives, reference_scene
 
-pytestmark = pytest.mark.usefixtures("unoptimised")
+pytestmark = pytest.mark.unoptimised
 
 SLOW = pytest.mark.slow
 BELT, START = PROBLEMS["papangelo_2017"], [1.5, 0.0]

@@ -28,7 +28,7 @@ REPELLING = PLAIN.__class__(
     1.0, 7040.0, 5190.0, 0.000154, 0.000735, 2.51, 0.307, 5.08e8, 3.23e8, 0.251, 0.14, 0.535
 )
 SLOW = pytest.mark.slow
-UNOPTIMISED = pytest.mark.usefixtures("unoptimised")
+UNOPTIMISED = pytest.mark.unoptimised
 
 
 def scene_of(row) -> fj.Scene:

@@ -65,7 +65,7 @@ def test_cycle(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", DIFFERENTIATED)
-@pytest.mark.usefixtures("unoptimised")
+@pytest.mark.unoptimised
 def test_derivatives(name):
     """Of period, amplitudes and shares by the numbers in `by`, forward and reverse."""
     problem, row = PROBLEMS[name], ROWS[name]

@@ -116,7 +116,7 @@ def extrapolated(known: dict, h: float) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("unoptimised")
+@pytest.mark.unoptimised
 def test_derivatives():
     """One test for all seeds: a worker of its own for each would compile the same again."""
     for seed in SEEDS:
@@ -151,7 +151,7 @@ def assert_derivatives(seed):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("unoptimised")
+@pytest.mark.unoptimised
 def test_a_cycle_of_more_phases_than_the_default_has_segments():
     given, start = numbers(161), np.random.default_rng([161, 2]).standard_normal(6)
     cycle = fj.limit_cycle(of_problem(problem(given)), start, max_returns=1500)

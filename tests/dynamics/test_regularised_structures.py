@@ -20,7 +20,7 @@ from mechanisms import PROBLEMS, changed
 from structures import of_problem
 from tools import both_modes
 
-pytestmark = pytest.mark.usefixtures("unoptimised")
+pytestmark = pytest.mark.unoptimised
 
 SLOW = pytest.mark.slow
 TABLE = json.loads((Path(__file__).parents[1] / "reference" / "mechanisms.json").read_text())

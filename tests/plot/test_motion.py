@@ -11,6 +11,8 @@ from fractaljax import plot
 from structures import belt_cycle
 from tools import assert_whole
 
+pytestmark = pytest.mark.unoptimised
+
 BLOCK: dict[str, Any] = {  # moves along x, with a held edge
     "points": [[0.0, 0.0], [4.0, 0.0], [4.0, 1.0], [0.0, 1.0]],
     "dofs": [[0, -1], [0, -1], [0, -1], [-1, -1]],

@@ -17,6 +17,8 @@ from fractaljax._stability.summary import stability_table, structure_table
 from preloaded import BRAKE, DIGITS, LEVER, PROBLEMS, PULL, measured, problem
 from tools import both_gradients
 
+pytestmark = pytest.mark.unoptimised
+
 slow = pytest.mark.slow
 
 
@@ -65,7 +67,7 @@ def test_eigenvalues_and_normal_forces(name, slope):
     np.testing.assert_allclose(forces, oracle.normal_forces(), rtol=rtol)
 
 
-@pytest.mark.usefixtures("unoptimised")
+@pytest.mark.unoptimised
 @most_slow("scene, load curve")
 def test_gradients(name):
     """By every quantity of every joint, in both modes, against differences in 40 digits."""

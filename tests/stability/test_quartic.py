@@ -69,7 +69,7 @@ def test_roots_are_exact(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FAMILIES)
 def test_roots_of_many_are_exact(name):
-    check(family(name, 1500))
+    check(family(name, 500))
 
 
 def test_opposite_heavy_damping_is_exact_beside_the_largest_root():

@@ -14,7 +14,7 @@ from fractaljax._mechanism.quantities import with_friction_times
 from preloaded import DIGITS, Oracle, problem
 from tools import both_modes
 
-pytestmark = pytest.mark.usefixtures("unoptimised")
+pytestmark = pytest.mark.unoptimised
 
 slow = pytest.mark.slow
 

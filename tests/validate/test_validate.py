@@ -242,7 +242,7 @@ def test_page_has_the_numbers_of_two_cases():
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("unoptimised")
+@pytest.mark.unoptimised
 def test_all_agree_with_numbers_and_pictures_of_the_page(tmp_path):
     """One test: two workers would compute all cases twice."""
     everything = found()
