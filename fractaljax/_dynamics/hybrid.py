@@ -27,7 +27,7 @@ OPEN = 2
 # excited system it is the maximum of the excitation, once in each of its periods.
 SECTION, NONE, UNUSED = 0, -1, -2
 _SMOOTH = 1e-4  # of the way to the opening: nearer, what a load curve adds is below rounding
-_FEW = 4  # degrees of freedom up to which products are written out, which compile into one loop
+FEW = 4  # degrees of freedom up to which products are written out, which compile into one loop
 
 
 class Products(eqx.Module):
@@ -136,10 +136,10 @@ class HybridSystem(eqx.Module):
         own = self.omega.ndim
         if matrix.ndim - own == 1:
             return self._leaf(matrix, x.ndim - 1) * x
-        if len(x) > _FEW and not own:
+        if len(x) > FEW and not own:
             return jnp.tensordot(matrix, x, 1)
         matrix = self._leaf(matrix, x.ndim - 1)
-        if len(x) > _FEW:
+        if len(x) > FEW:
             return jnp.sum(matrix * x[None], axis=1)
         columns = (matrix[:, j] * x[j][None] for j in range(len(x)))
         return sum(columns, start=jnp.zeros((), x.dtype))

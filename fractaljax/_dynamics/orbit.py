@@ -14,12 +14,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
+from .._base.one_kernel import one_kernel
 from .hybrid import NONE, HybridSystem
 from .lanes import product, solve
 from .maps import Maps, axis_of, coarse_maps, in_blocks, maps, segments_together
 from .segments import Segments, chosen_guard, flow, last_of_phase, next_start
 
 _ITERATIONS = 20
+_SMALL = 80  # numbers of a matrix, of all lanes, up to which a chain is one kernel
 _HOPELESS = 8  # iterations after which steps must be small, relative to the orbit
 
 
@@ -33,18 +35,21 @@ def _chain(body: Callable, carry, arrays: tuple, lanes: int, count=None) -> tupl
         carry, found = jax.lax.scan(body, carry, tuple(front))
         return carry, jnp.moveaxis(found, 0, found.ndim - 1 - lanes)
 
-    def at(k):
-        return tuple(jax.lax.dynamic_index_in_dim(x, k, keepdims=False) for x in front)
+    def run(_, carry, front, count):
+        def at(k):
+            return tuple(jax.lax.dynamic_index_in_dim(x, k, keepdims=False) for x in front)
 
-    one = jax.eval_shape(body, carry, at(0))[1]
-    blank = jnp.zeros((len(front[0]), *one.shape), one.dtype)
+        def step(k, so_far):
+            carry, found = so_far
+            carry, one = body(carry, at(k))
+            return carry, jax.lax.dynamic_update_index_in_dim(found, one, k, 0)
 
-    def step(k, so_far):
-        carry, found = so_far
-        carry, one = body(carry, at(k))
-        return carry, jax.lax.dynamic_update_index_in_dim(found, one, k, 0)
+        one = jax.eval_shape(body, carry, at(0))[1]
+        blank = jnp.zeros((len(front[0]), *one.shape), one.dtype)
+        return jax.lax.fori_loop(0, count, step, (carry, blank))
 
-    carry, found = jax.lax.fori_loop(0, count, step, (carry, blank))
+    given = (), carry, tuple(front), count
+    carry, found = one_kernel(run, *given) if carry.size <= _SMALL else run(*given)
     return carry, jnp.moveaxis(found, 0, found.ndim - 1 - lanes)
 
 

@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .._base.one_kernel import one_kernel
 from .events import MOST, step
-from .hybrid import NONE, SECTION, UNUSED, HybridSystem
+from .hybrid import FEW, NONE, SECTION, UNUSED, HybridSystem
 from .lanes import together
 from .segments import Segments, cumulative, flow
 
@@ -115,26 +116,30 @@ class Record(Steps):
         rows, _, lanes = self.steps.shape
         block = together(rows * lanes * self.steps.dtype.itemsize, count)
 
-        def one(k, carry):
-            y, s, guard, sums, reach, some = carry
-            y_new, s_new, dt, guard, reach = step(system, y, s, guard, h, reach)
-            weight = step_weight(system, y, s, 1 if reach is None else h / reach) * dt
-            ended = guard != NONE, guard == SECTION
-            sums = sums + jnp.stack([dt, weight, *(x.astype(dt.dtype) for x in ended)])
-            row = jnp.concatenate([y, s, guard.astype(y.dtype)[None], sums])
-            some = jax.lax.dynamic_update_index_in_dim(some, row, k, 1)
-            return y_new, s_new, guard, sums, reach, some
+        def run(steps, motion, oldest, system, h):
+            def one(k, carry):
+                y, s, guard, sums, reach, some = carry
+                y_new, s_new, dt, guard, reach = step(system, y, s, guard, h, reach)
+                weight = step_weight(system, y, s, 1 if reach is None else h / reach) * dt
+                ended = guard != NONE, guard == SECTION
+                sums = sums + jnp.stack([dt, weight, *(x.astype(dt.dtype) for x in ended)])
+                row = jnp.concatenate([y, s, guard.astype(y.dtype)[None], sums])
+                some = jax.lax.dynamic_update_index_in_dim(some, row, k, 1)
+                return y_new, s_new, guard, sums, reach, some
 
-        def body(k, carry):
-            motion, steps = carry
-            motion = jax.lax.fori_loop(0, block, one, motion)
-            at = self.oldest + k * block
-            return motion, jax.lax.dynamic_update_slice_in_dim(steps, motion[-1], at, 1)
+            def body(k, carry):
+                motion, steps = carry
+                motion = jax.lax.fori_loop(0, block, one, motion)
+                at = oldest + k * block
+                return motion, jax.lax.dynamic_update_slice_in_dim(steps, motion[-1], at, 1)
+
+            return jax.lax.fori_loop(0, count // block, body, (motion, steps))
 
         some = jnp.zeros((rows, block, lanes), self.steps.dtype)
         motion = self.y, self.s, self.guard, self.sums, self.reach, some
-        carry = motion, self.steps
-        (y, s, guard, sums, reach, _), steps = jax.lax.fori_loop(0, count // block, body, carry)
+        given = self.steps, motion, self.oldest, system, h
+        small = lanes == 1 and system.n <= FEW
+        (y, s, guard, sums, reach, _), steps = one_kernel(run, *given) if small else run(*given)
         known = jnp.minimum(self.count + count, self.length)
         oldest = (self.oldest + count) % self.length
         return Record(steps, oldest, y, s, guard, sums, reach, known)
