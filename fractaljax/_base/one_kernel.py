@@ -12,16 +12,11 @@ import jax
 import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
-try:
-    from jax.experimental.xla_metadata import set_xla_metadata
-except ImportError:  # none of JAX's stable parts
-    set_xla_metadata = None
-
 # Versions of JAX whose XLA was seen to do so. It may refuse what others make of an operation.
 _FIRST, _BEYOND = (0, 9), (0, 11)
 _ATTRIBUTES = {"xla_cpu_small_call": "true", "inlineable": "false"}
 # Operations that XLA compiles itself into any kernel; no library's, no search and no scatter.
-_KNOWN = """
+_NAMES = """
 abs acos acosh add add_any and argmax argmin asin asinh atan atan2 atanh broadcast_in_dim cbrt
 ceil clamp concatenate cond convert_element_type copy copy_p cos cosh custom_jvp_call
 custom_vjp_call div dynamic_slice dynamic_update_slice eq erf exp exp2 expand_dims expm1 floor
@@ -30,6 +25,8 @@ or pad pjit pow reduce_and reduce_max reduce_min reduce_or reduce_sum rem reshap
 rsqrt scan select_n sign sin sinh slice split sqrt square squeeze stack stop_gradient sub tan
 tanh transpose while xor
 """
+_KNOWN = frozenset(_NAMES.split())
+_MOST_REDUCED = 1024  # numbers; more may go to a library
 
 
 def one_kernel(function: Callable, large: Any, *small: Any) -> Any:
@@ -40,8 +37,9 @@ def one_kernel(function: Callable, large: Any, *small: Any) -> Any:
     if not _available() or not all(jnp.size(x) for x in jax.tree.leaves((large, small))):
         return function(large, *small)
     program, out = jax.make_jaxpr(function, return_shape=True)(large, *small)
-    if not set(_primitives(program.jaxpr)) <= set(_KNOWN.split()):
+    if not all(_is_known(equation) for equation in _equations(program.jaxpr)):
         return function(large, *small)
+    from jax.experimental.xla_metadata import set_xla_metadata  # none of JAX's stable parts
 
     @jax.jit
     def kernel(consts, large, small):
@@ -51,22 +49,27 @@ def one_kernel(function: Callable, large: Any, *small: Any) -> Any:
         return run(*jax.tree.leaves((large, *small))), jnp.stack(used)
 
     leaves, used = kernel(program.consts, large, small)
-    assert set_xla_metadata is not None
     leaves[0] = set_xla_metadata(leaves[0], **_ATTRIBUTES)
     leaves[0], _ = jax.lax.optimization_barrier((leaves[0], used))  # so that JAX keeps these
     return jax.tree.unflatten(jax.tree.structure(out), leaves)
 
 
 def _available() -> bool:
-    known = _FIRST <= jax.__version_info__ < _BEYOND and set_xla_metadata is not None
-    return known and jax.default_backend() == "cpu"
+    return _FIRST <= jax.__version_info__ < _BEYOND and jax.default_backend() == "cpu"
 
 
-def _primitives(jaxpr) -> Iterator[str]:
-    """The names of all, those of loops and calls included."""
+def _equations(jaxpr) -> Iterator[Any]:
+    """All, those of loops and calls included."""
     for equation in jaxpr.eqns:
-        yield equation.primitive.name
+        yield equation
         for value in jax.tree.leaves(tuple(equation.params.values())):
             inner = getattr(value, "jaxpr", value)
             if hasattr(inner, "eqns"):
-                yield from _primitives(inner)
+                yield from _equations(inner)
+
+
+def _is_known(equation) -> bool:
+    name = equation.primitive.name
+    reduces = name.startswith(("reduce", "arg"))
+    small = not reduces or all(x.aval.size <= _MOST_REDUCED for x in equation.invars)
+    return name in _KNOWN and small
