@@ -86,12 +86,18 @@ def extreme_values(system: HybridSystem, segments: Segments, rows) -> Float[Arra
     least = jnp.where(inside & (d_1 - d_0 > small / 64), cubic(theta), jnp.inf)
     least, k = (x.ravel() for x in _lowest(least, _MINIMA))
     of_row = jnp.arange(len(k)) // _MINIMA
-    theta = jax.lax.stop_gradient(theta[of_row, k])
-    value, rate, change = _along(system, y[:, k], s[:, k], theta * h[k], rows[of_row].T)
-    # The cubic's minimum is near; the parabola there has the orbit's.
-    near = jnp.abs(rate) < change * h[k] / 8
-    value = value - jnp.where(near, rate**2 / jnp.where(near, 2 * change, 1), 0)
-    value = jnp.where(least < jnp.inf, value, jnp.inf).reshape(-1, _MINIMA)
+
+    def refined(t, _):
+        value, rate, change = _along(system, y[:, k], s[:, k], t, rows[of_row].T)
+        # The cubic's minimum is near; the parabola there has the orbit's.
+        near = jnp.abs(rate) < change * h[k] / 8
+        step = jnp.where(near, -rate / jnp.where(near, change, 1), 0)
+        return jax.lax.stop_gradient(t + step), value + rate * step / 2
+
+    # Time and again, for minima that are nearly inflections.
+    t = jax.lax.stop_gradient(theta[of_row, k] * h[k])
+    _, values = jax.lax.scan(refined, t, length=3)
+    value = jnp.where(least < jnp.inf, values[-1], jnp.inf).reshape(-1, _MINIMA)
     value = jnp.min(value, axis=1)
     # Where one ends a segment both are equal to rounding, and the parabola alone follows it.
     node = jnp.min(g_0, axis=1)

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .cycle import SQUARINGS
 from .events import Cubic
-from .hybrid import SECTION, UNUSED, HybridSystem
+from .hybrid import OPEN, SECTION, UNUSED, HybridSystem
 from .lanes import log_spectral_radius
 from .orbit import PeriodicOrbit, accurate_return_jacobian, solve_periodic_orbits
 from .record import ENDED, RETURNED, TIME, WEIGHT, Record, Steps, cut
@@ -52,6 +52,7 @@ class SearchOptions:
     eager: int = 64  # rounds after which orbits are tried less often
     linear: float = 0.5  # size below which a decay at the linear rate ends in equilibrium
     small: float = 1e-2  # size below which any decay without switches does
+    still: float = 1e-6  # size, or with a joint open rate of change, below which it is at rest
     extrapolated: float = 0.02  # growth in a return, without switches, that is extrapolated
     divergence: float = 1e6  # size at which a motion diverges: with a small V, many V are ordinary
     repeats: float = 1e-6  # gap between returns of a motion that has settled, relative
@@ -259,7 +260,11 @@ def _assess(
     steady = smooth & (jnp.abs(rate - rate_before) < 0.1 * jnp.abs(rate)) & (not system.excited)
     linear = steady & (away[0] < options.linear) & (rate < 0.7 * growth * (time[0] - time[1]))
     decays = linear | (smooth & (away[0] < options.small) & (rate < 0))
-    decays = (growth < 0) & (decays | (size < 1e-6))
+    decays = (growth < 0) & (decays | (size < options.still))
+    if any(system.opens):
+        # With a joint open there is another equilibrium.
+        change = jnp.max(jnp.abs(system.field(record.y, record.s)), axis=0)
+        decays = decays | (jnp.any(record.s == OPEN, axis=0) & (change < options.still))
     status = jnp.where(diverged, DIVERGED, jnp.where(decays, EQUILIBRIUM, RUNNING))
     # Amplitude extrapolation: a slow, steady change without switches skips many returns, but at
     # most half of the change that is left if it slows down geometrically.

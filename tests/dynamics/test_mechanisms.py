@@ -99,6 +99,17 @@ def _at(problem, place) -> float:
     return found
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("unoptimised")
+def test_rest_with_an_open_joint():
+    """A force that pulls the joint open leaves the rest to its damping."""
+    joint = fj.Joint(fj.FixedContact(2.0, 0.5, 1.0), fj.Coulomb(0.4), 0, 1, 1.0, preload=True)
+    K = np.array([[1.0, 0.2], [0.2, 1.0]])
+    pulled = fj.Structure(np.eye(2), 0.2 * np.eye(2), K, [joint], F=[0.0, -3.0])
+    found = fj.limit_cycle(pulled, throw=False)
+    assert found.result == fj.CycleResult.equilibrium
+
+
 def test_a_joint_without_speed_is_named():
     """Constant friction has no V of its own, but the motion has."""
     contact = fj.FixedContact(1.0, 0.0, 1.0)
