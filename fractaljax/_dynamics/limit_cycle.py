@@ -85,18 +85,19 @@ def extreme_values(system: HybridSystem, segments: Segments, rows) -> Float[Arra
     theta, inside = cubic.minimum()
     least = jnp.where(inside & (d_1 - d_0 > small / 64), cubic(theta), jnp.inf)
     least, k = (x.ravel() for x in _lowest(least, _MINIMA))
-    of_row = jnp.arange(len(k)) // _MINIMA
+    of_row, most = jnp.arange(len(k)) // _MINIMA, h[k] / 8
 
     def refined(t, _):
         value, rate, change = _along(system, y[:, k], s[:, k], t, rows[of_row].T)
         # The cubic's minimum is near; the parabola there has the orbit's.
-        near = jnp.abs(rate) < change * h[k] / 8
-        step = jnp.where(near, -rate / jnp.where(near, change, 1), 0)
-        return jax.lax.stop_gradient(t + step), value + rate * step / 2
+        near = jnp.abs(rate) < change * most
+        newton = jnp.where(near, -rate / jnp.where(near, change, 1), 0)
+        on = jnp.clip(t + jnp.where(near, newton, -jnp.sign(rate) * most), 0, h[k])
+        return jax.lax.stop_gradient(on), value + rate * newton / 2
 
-    # Time and again, for minima that are nearly inflections.
+    # Time and again: a minimum that is nearly an inflection is not so near.
     t = jax.lax.stop_gradient(theta[of_row, k] * h[k])
-    _, values = jax.lax.scan(refined, t, length=3)
+    _, values = jax.lax.scan(refined, t, length=6)
     value = jnp.where(least < jnp.inf, values[-1], jnp.inf).reshape(-1, _MINIMA)
     value = jnp.min(value, axis=1)
     # Where one ends a segment both are equal to rounding, and the parabola alone follows it.
