@@ -289,8 +289,8 @@ def limit_cycle(
       float32 both are 4.9e-4. It sets the number of segments.
     - `max_returns`: returns of the coarse run after which it gives up.
     - `segments`: most pieces that the orbit is cut into, 64 by default, 256 for more than 8 degrees
-      of freedom, and 512 where a joint follows its load curve; one return takes some 35, more where
-      the highest frequency is far above that of the motion.
+      of freedom or more than one joint, and 512 where a joint follows its load curve; one return
+      takes some 35, more where the highest frequency is far above that of the motion.
       Outside of compiled programs a longer period gets more; inside, the result says that it
       needs them.
     - `throw`: raise unless the result is `converged`. Otherwise `result` says what was found, and
@@ -308,10 +308,11 @@ def limit_cycle(
     tolerance = check_rtol(rtol, jnp.result_type(*jax.tree.leaves(given)))
     returns = jnp.asarray(whole("max_returns", max_returns, 1), float)
     count = _SEGMENTS if segments is None else whole("segments", segments, 16)
-    if segments is None and any(x.follows_load_curve for x in joints_of(mechanism).values()):
+    joints = joints_of(mechanism)
+    if segments is None and any(x.follows_load_curve for x in joints.values()):
         count *= 8  # towards an opening segments are short: less than a second compilation
-    elif segments is None and n > FEW:
-        count *= 4  # a period may be long beside that of the highest frequency
+    elif segments is None and (n > FEW or len(joints) > 1):
+        count *= 4  # a period may be long beside that of the highest frequency, or of many phases
     arguments = mechanism, start, excitation, returns
     cycle = _limit_cycle(*arguments, segments=count, rtol=tolerance)
     while segments is None and count < _MOST_SEGMENTS and _needs_more_segments(cycle, count):

@@ -12,6 +12,7 @@ from jaxtyping import Array, ArrayLike, DTypeLike, Float
 from .._base.parts import concrete, number, require_kind, require_scalar
 from .._contact.load_curve import tabulated
 from .._friction import Friction
+from .._mechanism.joint import Joint
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.scene import Scene, stiffness
 from .._mechanism.structure import Structure, require_single
@@ -40,16 +41,30 @@ def degrees_of_freedom(mechanism: Mechanism) -> int:
 def _require_determinate(structure: Structure) -> None:
     joints = zip(structure.joint_names, structure.joints, strict=True)
     for (name, joint), (other, second) in itertools.combinations(joints, 2):
-        t, d = structure.direction(joint.tangential), structure.direction(second.tangential)
-        V, W = (None if j.V is None else concrete(jnp.asarray(j.V)) for j in (joint, second))
-        if V is None or W is None:
-            continue
-        ratio = t @ d / (t @ t)
-        if np.allclose(d, ratio * t, rtol=0, atol=1e-12 * np.abs(d).max()) and ratio * V == W:
+        if _stick_as_one(structure, joint, second) or _stick_as_one(structure, second, joint):
             raise ValueError(
                 f"joints {name} and {other} slide in one direction at one V: how they share the "
                 "force in stick is not determined, make them one joint"
             )
+
+
+def _stick_as_one(structure: Structure, joint: Joint, other: Joint) -> bool:
+    """Whether one joint sticks along its t exactly when the other does, along its t or its n."""
+    V, W = (None if j.V is None else concrete(jnp.asarray(j.V)) for j in (joint, other))
+    if V is None or W is None:
+        return False
+    t = structure.direction(joint.tangential)
+
+    def one(direction) -> bool:
+        d = structure.direction(direction)
+        ratio = t @ d / (t @ t)
+        return np.allclose(d, ratio * t, rtol=0, atol=1e-12 * np.abs(d).max()) and ratio * V == W
+
+    if one(other.tangential):
+        return True
+    # Without a tangential spring nothing rubs along n.
+    K_t = concrete(other.stiffness()[1]) if other.normal is not None and one(other.normal) else 0
+    return K_t is not None and K_t > 0
 
 
 def hybrid_system(mechanism: Any) -> HybridSystem:

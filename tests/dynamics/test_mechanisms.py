@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
+from fractaljax._dynamics.scaled import degrees_of_freedom
 from mechanisms import PROBLEMS, changed
 from structures import of_problem
 from tools import both_modes
@@ -130,3 +131,18 @@ def test_joints_that_share_a_force_are_named(call):
     disc = fj.Structure(np.eye(1), None, np.eye(1), both)
     with pytest.raises(ValueError, match="joints inner and outer slide in one direction at one V"):
         call(disc)
+
+
+def test_a_joint_that_rubs_along_another_ones_tangent_is_named():
+    """With a tangential spring it sticks there as well; at another V or without one it may."""
+
+    def check(V, K_t):
+        first = fj.Joint(fj.FixedContact(1.0, 0.5, 1.0), fj.Coulomb(0.3), 0, 1, V=0.5, preload=True)
+        other = fj.FixedContact(1.0, K_t, 1.0)
+        second = fj.Joint(other, fj.Coulomb(0.3), 2, 0, V=V, preload=True)
+        degrees_of_freedom(fj.Structure(np.eye(3), None, np.eye(3), [first, second]))
+
+    check(0.5, 0.0)
+    check(0.6, 0.5)
+    with pytest.raises(ValueError, match="joints joint_1 and joint_2 slide in one direction"):
+        check(0.5, 0.5)
