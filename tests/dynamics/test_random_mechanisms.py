@@ -1,7 +1,8 @@
 """Cycles of random mechanisms: derivatives and branches, against the independent solver.
 
 Three degrees of freedom and one joint with oblique lever arms, which sticks, lifts off and rubs
-along its normal. Each direction of the derivative changes every number of the mechanism.
+along its normal; or six and three such joints. Each direction of the derivative changes every
+number of the mechanism.
 """
 
 import itertools
@@ -19,30 +20,37 @@ from fractaljax._dynamics.scaled import hybrid_system
 from structures import monodromy_of, of_problem
 from tools import both_modes
 
-TANGENTIAL, NORMAL = [1.0, 0.0, -0.4], [0.3, 1.0, 0.0]
+ONE_JOINT = [([1.0, 0.0, -0.4], [0.3, 1.0, 0.0])]  # tangential and normal
+THREE_JOINTS = [
+    ([1.0, 0.0, -0.4, 0.0, 0.2, 0.0], [0.0, 1.0, 0.0, 0.3, 0.0, 0.0]),
+    ([0.0, 0.3, 1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0, 0.0, -0.2]),
+    ([0.0, 0.0, 0.0, -0.3, 1.0, 0.0], [0.2, 0.0, 0.0, 0.0, 0.0, 1.0]),
+]
 SEEDS = 0, 1, 2, 3, 10, 11  # 1, 3 and 10 lift off
 STEPS = 1e-3, 5e-4
+SEEDS_OF_THREE = 1, 13  # of three joints; of 1 the first lifts off
 KICK = 1e-7  # scaled
 
 
-def numbers(seed) -> dict:
+def numbers(seed, n=3, shape=()) -> dict:
+    """Those of each joint have that shape."""
     rng = np.random.default_rng(seed)
-    A, B = rng.standard_normal((2, 3, 3))
-    M = np.diag(rng.uniform(0.5, 1.5, 3)) + 0.05 * A @ A.T
-    K = np.diag(rng.uniform(0.5, 3.0, 3)) + 0.15 * B @ B.T
-    mu = rng.uniform(0.3, 1.0)
+    A, B = rng.standard_normal((2, n, n))
+    M = np.diag(rng.uniform(0.5, 1.5, n)) + 0.05 * A @ A.T
+    K = np.diag(rng.uniform(0.5, 3.0, n)) + 0.15 * B @ B.T
+    mu = rng.uniform(0.3, 1.0, shape)
     return {
         "M": M,
         "C": rng.uniform(0, 0.06) * M + rng.uniform(0, 0.04) * K,
         "K": K,
-        "F": 0.5 * rng.standard_normal(3),
-        "P": rng.uniform(0.5, 5.0),
-        "V": rng.uniform(0.1, 1.0),
-        "K_n": rng.uniform(0.5, 6.0),
-        "K_t": rng.uniform(0.1, 1.0),
+        "F": 0.5 * rng.standard_normal(n),
+        "P": rng.uniform(0.5, 5.0, shape),
+        "V": rng.uniform(0.1, 1.0, shape),
+        "K_n": rng.uniform(0.5, 6.0, shape),
+        "K_t": rng.uniform(0.1, 1.0, shape),
         "mu_s": mu,
-        "mu_d": mu * rng.uniform(0.3, 0.8),
-        "v_0": rng.uniform(0.1, 0.8),
+        "mu_d": mu * rng.uniform(0.3, 0.8, shape),
+        "v_0": rng.uniform(0.1, 0.8, shape),
     }
 
 
@@ -59,22 +67,27 @@ def directions(given, seed) -> dict:
 
 def problem(given) -> dict:
     """As both solvers take it."""
-    joint = {name: given[name] for name in ("P", "V", "K_n", "K_t")}
-    law = {name: given[name] for name in ("mu_s", "mu_d", "v_0")}
-    joint |= {"tangential": TANGENTIAL, "normal": NORMAL, "preload": True}
-    joint["friction"] = "exponential", law
-    return {"joints": [joint], **{name: given[name] for name in "MCKF"}}
+    joints, several = [], jnp.ndim(given["P"])
+    for i, (tangential, normal) in enumerate(THREE_JOINTS if several else ONE_JOINT):
+        own = {name: x[i] if several else x for name, x in given.items() if name not in "MCKF"}
+        joint = {name: own[name] for name in ("P", "V", "K_n", "K_t")}
+        law = {name: own[name] for name in ("mu_s", "mu_d", "v_0")}
+        joint |= {"tangential": tangential, "normal": normal, "preload": True}
+        joints.append(joint | {"friction": ("exponential", law)})
+    return {"joints": joints, **{name: given[name] for name in "MCKF"}}
 
 
 def row_of(found: fj.LimitCycle) -> jax.Array:
     shares = found.stick_fraction, found.open_fraction
     extremes = found.amplitude, found.velocity_min, found.velocity_max
-    return jnp.concatenate([found.period[None], *extremes, *shares, found.normal_force[0]])
+    return jnp.concatenate([found.period[None], *extremes, *shares, found.normal_force.ravel()])
 
 
 def sizes_of(row) -> np.ndarray:
     """Velocities, lengths and forces by the largest of their kind; shares by 1."""
-    sizes = [np.full(len(part), abs(part).max()) for part in np.split(row, [1, 4, 10, 12])]
+    n, m = (3, 1) if len(row) == 14 else (6, 3)
+    ends = np.cumsum([1, n, 2 * n, 2 * m])
+    sizes = [np.full(len(part), abs(part).max()) for part in np.split(row, ends)]
     sizes[3][:] = 1
     return np.concatenate(sizes)
 
@@ -86,7 +99,8 @@ def derivatives(given, by, start):
     def outputs(theta):
         at = {name: given[name] + jnp.tensordot(theta, by[name], 1) for name in given}
         structure = of_problem(problem(at))
-        found = fj.limit_cycle(structure, start, segments=128, max_returns=1500, throw=False)
+        segments = None if len(structure.joints) > 1 else 128
+        found = fj.limit_cycle(structure, start, segments=segments, max_returns=1500, throw=False)
         return row_of(found), found
 
     return both_modes(outputs, jnp.zeros(2), has_aux=True)
@@ -101,11 +115,13 @@ def truth(given, near, flow) -> tuple[np.ndarray, list, np.ndarray]:
     core, unit = mechanism.scaled, mechanism.units
     z, T = near[:-1] / unit, near[-1] * mechanism.omega
     z, T, trip = hybrid_truth.closed(core, z, T, 1e-13, mechanism.map_in_units(flow))
-    rows = np.eye(7)[1:]
+    n, m = len(core.M), len(core.joints)
+    rows = np.eye(2 * n + 1)[1:]
     low, high = np.array([hybrid_truth.spread(trip, row) for row in rows]).T * unit
     stick, _, opened = hybrid_truth.shares(core, trip) / T
-    forces = np.maximum(hybrid_truth.spread(trip, core.normal(0)), 0) * mechanism.omega * unit[-1]
-    row = [[T / mechanism.omega], (high - low)[:3], low[3:], high[3:], stick, opened, forces]
+    loads = [hybrid_truth.spread(trip, core.normal(i)) for i in range(m)]
+    forces = np.maximum(np.ravel(loads), 0) * mechanism.omega * unit[-1]
+    row = [[T / mechanism.omega], (high - low)[:n], low[n:], high[n:], stick, opened, forces]
     return np.concatenate(row), [p.mode for p in trip], np.append(z * unit, T / mechanism.omega)
 
 
@@ -123,10 +139,18 @@ def test_derivatives():
         assert_derivatives(seed)
 
 
-def assert_derivatives(seed):
-    given = numbers(seed)
+@pytest.mark.slow
+@pytest.mark.usefixtures("unoptimised")
+def test_derivatives_of_three_joints():
+    """By default options, in a compiled program."""
+    for seed in SEEDS_OF_THREE:
+        assert_derivatives(seed, 6, (3,), (2e-4, 1e-4))
+
+
+def assert_derivatives(seed, n=3, shape=(), steps=STEPS):
+    given = numbers(seed, n, shape)
     by = directions(given, seed)
-    start = np.random.default_rng([seed, 2]).standard_normal(6)
+    start = np.random.default_rng([seed, 2]).standard_normal(2 * n)
     row, forward, reverse, found = derivatives(given, by, start)
     assert found.result == fj.CycleResult.converged
     flow = monodromy_of(found)
@@ -135,7 +159,7 @@ def assert_derivatives(seed):
     np.testing.assert_allclose(row / size, value / size, rtol=0, atol=1e-9)
     for k in range(2):
         slopes, orbits = [], {0.0: orbit}
-        for h in STEPS:
+        for h in steps:
             ends = []
             for sign in (1, -1):
                 at = {name: given[name] + sign * h * by[name][k] for name in given}
