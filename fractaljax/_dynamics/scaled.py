@@ -44,7 +44,7 @@ def _require_determinate(structure: Structure) -> None:
         if _stick_as_one(structure, joint, second) or _stick_as_one(structure, second, joint):
             raise ValueError(
                 f"joints {name} and {other} slide in one direction at one V: how they share the "
-                "force in stick is not determined, make them one joint"
+                "force in stick is not determined, make them one joint or their V two"
             )
 
 
