@@ -157,7 +157,8 @@ class Mechanism:
             slope = none if j.n is None else j.K_n * j.n
             load = j.P if j.preload else 0.0
             found.append(Face(i, j.t, j.V, j.mu, load, slope, still))
-            if j.n is not None and j.K_t:
+            # Both directions of the source's form have their states, also without a force.
+            if j.n is not None and (j.K_t or not j.preload):
                 found.append(Face(i, j.n, j.V, j.mu, 0.0, -j.K_t * j.t, still))
         return tuple(found)
 
@@ -318,8 +319,8 @@ def first_mode(mechanism, z, t) -> tuple[int, ...]:
             mode.append(OPEN)
             continue
         mode.append(int(np.sign(w[i])) if abs(w[i]) > SAME else 0)
-        if mode[-1] == 0:
-            options[i] = (0, 1, -1)
+        if mode[-1] == 0:  # under tension it may slip to either side: it does to that of w
+            options[i] = (0, 1, -1) if w[i] >= 0 else (0, -1, 1)
     return choose(mechanism, z, t, tuple(mode), options)
 
 
@@ -394,7 +395,9 @@ def rate_of(field_, row, by, z, t):
 def land(field_, guard, z, t, h, rtol):
     """The step from z to the zero of a guard near h, integrated instead of interpolated."""
     end, (row, by) = z, guard
-    for _ in range(4 if h > 0 else 0):
+    for _ in range(4):
+        if t + h == t:
+            break
         span, step = (t, t + h), t + h - t
         end = solve_ivp(field_.rates, span, z, "DOP853", rtol=rtol, atol=rtol, first_step=step)
         end = end.y[:, -1]
@@ -593,6 +596,18 @@ def spread(trip, row) -> tuple[float, float]:
     return min(found), max(found)
 
 
+def extremes(mechanism, trip) -> np.ndarray:
+    """The least and the largest value of each state, (2n, 2) in SI units, over a scaled trip."""
+    size = len(mechanism.units)
+    rows = np.hstack([np.zeros((size, 1)), np.eye(size)])
+    return np.array([spread(trip, row) for row in rows]) * mechanism.units[:, None]
+
+
+def largest_first(flow) -> np.ndarray:
+    """The multipliers of a monodromy matrix."""
+    return np.array(sorted(np.linalg.eigvals(flow), key=abs, reverse=True))
+
+
 def shares(mechanism, trip) -> np.ndarray:
     """The times that first faces stick, second faces stick and joints are open, a row each."""
     found = np.zeros((3, len(mechanism.joints)))
@@ -633,29 +648,26 @@ def measure(mechanism, z, T, rtol=1e-12) -> Cycle:
                     inside = [x for x in extrema(c) if 1e-3 < x < (used - t) / (end - t) - 1e-3]
                     slopes = chebyshev.chebder(c, 2)
                     graze += [abs(at(x, c)) for x in inside if at(x, slopes) > 0]
-    rows = np.hstack([np.zeros((2 * n, 1)), np.eye(2 * n)])
-    ends = np.array([spread(trip, row) for row in rows])
+    ends, unit = extremes(mechanism, trip), mechanism.units
     forces = np.array([spread(trip, core.normal(i)) for i in range(m)])
     lifts = np.array([j.lifts for j in core.joints])
     forces = np.where(lifts[:, None], np.maximum(forces, 0), forces)
     flow = monodromy(core, trip, rtol)
-    multipliers = np.array(sorted(np.linalg.eigvals(flow), key=abs, reverse=True))
-    unit = mechanism.units
     lengths = [t for _, t in visits] if len(visits) > 1 else [T]
     if len(visits) > 1 and visits[0][0] == visits[-1][0]:
         lengths = [lengths[0] + lengths[-1], *lengths[1:-1]]
     return Cycle(
         "cycle",
         T / mechanism.omega,
-        (ends[:n, 1] - ends[:n, 0]) * unit[:n],
-        ends[n:, 0] * unit[n:],
-        ends[n:, 1] * unit[n:],
+        ends[:n, 1] - ends[:n, 0],
+        ends[n:, 0],
+        ends[n:, 1],
         stick / T,
         second / T,
         opened / T,
         forces * mechanism.omega * unit[-1],
         z * unit,
-        multipliers,
+        largest_first(flow),
         [(mode, t / mechanism.omega) for mode, t in visits],
         1 + len(tops),
         {"graze": min(graze, default=np.inf), "shortest": min(lengths) / T},
@@ -719,11 +731,7 @@ def forced_cycle(mechanism, start, T, settle=200, rtol=1e-12) -> Cycle:
         z = z + np.linalg.solve(np.eye(2 * n) - monodromy(core, trip, rtol), gap)
     else:
         return Cycle("not periodic")
-    flow = monodromy(core, trip, rtol)
-    rows = np.hstack([np.zeros((2 * n, 1)), np.eye(2 * n)])
-    ends = np.array([spread(trip, row) for row in rows]) * mechanism.units[:, None]
-    stick, _, opened = shares(core, trip) / T
-    multipliers = np.array(sorted(np.linalg.eigvals(flow), key=abs, reverse=True))
+    ends, (stick, _, opened) = extremes(mechanism, trip), shares(core, trip) / T
     return Cycle(
         "cycle",
         T / mechanism.omega,
@@ -733,6 +741,6 @@ def forced_cycle(mechanism, start, T, settle=200, rtol=1e-12) -> Cycle:
         stick,
         open_fraction=opened,
         state=z * mechanism.units,
-        multipliers=multipliers,
+        multipliers=largest_first(monodromy(core, trip, rtol)),
         itinerary=[(p.mode, (p.t1 - p.t0) / mechanism.omega) for p in trip],
     )

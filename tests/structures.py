@@ -16,7 +16,7 @@ import numpy as np
 
 import fractaljax as fj
 import hybrid_truth
-from mechanisms import PROBLEMS
+from mechanisms import PROBLEMS, source_form
 from tools import ROOT, load_script
 
 DIGITS = 50
@@ -240,6 +240,13 @@ def belt_cycle() -> tuple[fj.Structure, fj.LimitCycle]:
     problem = PROBLEMS["papangelo_2017"]
     structure = of_problem(problem)
     return structure, fj.limit_cycle(structure, problem["start"])
+
+
+def source_form_of(scene: fj.Scene) -> dict[str, Any]:
+    """A scene with Stribeck's friction in plain numbers, for the independent solver."""
+    K_n, K_t = fj.stiffness(scene)
+    parts = vars(scene.oscillator) | vars(scene.friction) | {"K_n": K_n, "K_t": K_t}
+    return source_form(**{name: float(value) for name, value in parts.items()})
 
 
 def truth_of(structure: Any) -> hybrid_truth.Mechanism:

@@ -3,6 +3,7 @@
 import functools
 import importlib.util
 import json
+import re
 import subprocess
 import sys
 from collections import Counter
@@ -19,19 +20,21 @@ from jax.flatten_util import ravel_pytree
 import fractaljax as fj
 from fractaljax.__main__ import main
 from fractaljax._base import kept
+from mechanisms import PLAIN
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 
 
+def scene_of(numbers) -> fj.Scene:
+    """Of the numbers of `mechanisms.PLAIN`; constant friction is a Stribeck law without a drop."""
+    x = [numbers[name] for name in PLAIN]
+    return fj.Scene(fj.FixedContact(*x[7:9]), fj.Stribeck(*x[9:]), fj.Oscillator(*x[:7]))
+
+
 def reference_scene() -> fj.Scene:
     """The brake of the source's section 3.3, with its middle stiffness: direction 1 sticks."""
-    pi = np.pi
-    return fj.Scene(
-        fj.FixedContact(4e8, 2e8),
-        fj.Stribeck(0.4, 0.25, 0.5),
-        fj.Oscillator(1.0, 2000 * pi, 1600 * pi, xi_1=0.001, xi_2=0.007, F=5.0, V=0.15),
-    )
+    return scene_of(PLAIN)
 
 
 def state_matrix(o: fj.Oscillator, mu, K_n, K_t) -> np.ndarray:
@@ -117,6 +120,14 @@ def run_command(capsys, *arguments) -> tuple[Any, str, str]:
     return status, *capsys.readouterr()
 
 
+def refused_command(capsys, *arguments) -> str:
+    """What the command says where it refuses: one line, exit status 2, and nothing printed."""
+    status, out, err = run_command(capsys, *arguments)
+    assert (status, out) == (2, ""), arguments
+    assert err.startswith("fractaljax: ") and err.count("\n") == 1, arguments
+    return err.removeprefix("fractaljax: ").rstrip()
+
+
 def primitives(jaxpr) -> Counter[str]:
     """How often each primitive stands in a jaxpr, loops and calls and what is in them included."""
     found = Counter()
@@ -127,6 +138,23 @@ def primitives(jaxpr) -> Counter[str]:
             if hasattr(inner, "eqns"):
                 found += primitives(inner)
     return found
+
+
+def refusals(cases, call=lambda call: call(), kind=ValueError, pattern="{}", plain=False) -> Any:
+    """A test that each case, arguments of `call` and a message, is refused in one line.
+
+    Messages are regular expressions, or `plain` text; a pattern says what stands around them.
+    """
+
+    @pytest.mark.parametrize("case", cases, ids=lambda case: str(case[-1])[:40])
+    def refused(case):
+        *arguments, message = case
+        match = pattern.format(re.escape(message) if plain else message)
+        with pytest.raises(kind, match=match) as caught:
+            call(*arguments)
+        assert "\n" not in str(caught.value)
+
+    return refused
 
 
 def quick_benchmark(name: str, folder: Path) -> tuple[dict, str]:

@@ -1,7 +1,6 @@
 """Basins: labels against brute force by SciPy, the starts, the shares, and what is refused."""
 
 import functools
-from typing import Any
 
 import jax
 import numpy as np
@@ -13,8 +12,8 @@ import hybrid_truth
 from fractaljax._dynamics.scaled import hybrid_system
 from fractaljax._dynamics.starts import ellipsoid
 from mechanisms import PROBLEMS, changed
-from structures import of_problem
-from tools import reference_scene
+from structures import of_problem, source_form_of
+from tools import reference_scene, refusals
 
 # The equilibrium and a stick-slip cycle are both attracting.
 V = 1.5
@@ -80,29 +79,14 @@ def test_belt_comes_to_rest_or_not():
 
 
 @pytest.mark.slow
-def test_many_starts_of_the_belt():
-    assert unlike(1000) <= 0.005 * 1000
-
-
-@pytest.mark.slow
-def test_start_on_the_belt():
+def test_starts_on_and_beside_the_belt():
     """Within the friction limits it sticks, beyond them it slips; w = 0 to rounding is no trap."""
     on_belt = np.array([[x, V] for x in np.linspace(-1.9, 1.9, 12)])
     found = fj.basin(of_problem(BELT), starts=on_belt, progress=False)
     truth = [comes_to_rest(x, V - 1e-9) for x, _ in on_belt]
     np.testing.assert_array_equal(found.labels == 0, truth)
     np.testing.assert_array_equal(found.starts, on_belt)
-
-
-def problem_of(scene):
-    """A scene in the plain numbers of the independent solver."""
-    structure, law = fj.Structure.from_scene(scene), scene.friction
-    K_n, K_t = map(float, fj.stiffness(scene))
-    constants = {name: float(getattr(law, name)) for name in ("mu_s", "mu_m", "v_m")}
-    joint = {"tangential": [1.0, 0.0], "normal": [0.0, 1.0], "V": float(scene.oscillator.V)}
-    joint |= {"K_n": K_n, "K_t": K_t, "preload": False, "friction": ("stribeck", constants)}
-    matrices = {name: np.asarray(getattr(structure, name)).tolist() for name in "MCKF"}
-    return {**matrices, "joints": [joint]}
+    assert unlike(1000) <= 0.005 * 1000
 
 
 def repeats(mechanism, start):
@@ -125,7 +109,7 @@ def repeats(mechanism, start):
 def test_designed_brake_against_the_independent_solver():
     """Kicks of three V: some end in the coexisting cycle of 24.5 um, at once or never."""
     found = fj.basin(DESIGNED, radius=3.0, starts=12, seed=3, progress=False)
-    mechanism = hybrid_truth.Mechanism.of(problem_of(DESIGNED))
+    mechanism = hybrid_truth.Mechanism.of(source_form_of(DESIGNED))
     truth = [repeats(mechanism, start) for start in found.starts]
     assert [found.outcomes[label] == "cycle 1" for label in found.labels] == truth
     assert len(set(truth)) == 2
@@ -146,7 +130,7 @@ def test_labels_are_the_cycles_of_the_search():
     assert len(found.cycles) >= 2
     differ = np.flatnonzero(~np.isclose(periods, alone.period, rtol=1e-7, equal_nan=True))
     assert len(differ) <= 2
-    mechanism, tops = hybrid_truth.Mechanism.of(problem_of(scene)), []
+    mechanism, tops = hybrid_truth.Mechanism.of(source_form_of(scene)), []
     for i in differ:
         start = found.starts[i] / mechanism.units
         for p in hybrid_truth.phases(mechanism.scaled, start, 1e-9, maxima=True):
@@ -172,7 +156,7 @@ def test_excited_belt():
     assert found.shares["equilibrium"] == 0
 
 
-def test_starts_in_a_box_and_in_a_section():
+def test_starts_in_a_box_a_section_a_ball_and_an_ellipsoid():
     found = belt(96)
     low, high = np.array(BOX)
     assert found.starts.shape == (96, 2)
@@ -186,10 +170,7 @@ def test_starts_in_a_box_and_in_a_section():
     np.testing.assert_array_equal(again.starts, found.starts[:4])
     assert not np.isclose(other.starts, again.starts).any()
     assert (line.starts[:, 1] == 0.5).all() and len(set(line.starts[:, 0])) == 4
-
-
-def test_starts_in_a_ball():
-    """Evenly in the volume, about the equilibrium, in units of V/omega and V."""
+    # Evenly in the volume, about the equilibrium, in units of V/omega and V.
     found = fj.basin(of_problem(BELT), radius=0.01, starts=256, progress=False)
     # Of the belt omega is 1, and the equilibrium is at mu(V).
     away = (found.starts - [friction(V), 0.0]) / V
@@ -197,10 +178,7 @@ def test_starts_in_a_ball():
     assert r.max() <= 0.01 and np.mean((r / 0.01) ** 2) == pytest.approx(0.5, abs=0.01)
     assert abs(away.mean(axis=0)).max() < 2e-4
     assert found.shares["equilibrium"] == 1
-
-
-def test_starts_in_an_ellipsoid():
-    """Semi-axes of the ball give its starts; others stretch them about the equilibrium."""
+    # Semi-axes of the ball give its starts; others stretch them about the equilibrium.
     ball = fj.basin(of_problem(BELT), radius=0.01, starts=64, progress=False).starts
     axes = 0.01 * V, 0.01 * V
     alike = fj.basin(of_problem(BELT), radius=axes, starts=64, progress=False).starts
@@ -226,7 +204,7 @@ def test_long_transients_come_to_rest():
     starts = (centre + ways * axes)[[0, 3]]
     found = fj.basin(scene, starts=starts, progress=False)
     assert found.outcomes[found.labels[0]] == "equilibrium" and not found.labels.any()
-    mechanism = hybrid_truth.Mechanism.of(problem_of(scene))
+    mechanism = hybrid_truth.Mechanism.of(source_form_of(scene))
     rest = np.asarray(system.equilibrium())[:4]
     for start in starts:
         *_, last = hybrid_truth.phases(mechanism.scaled, start / mechanism.units, 1e-8, 4000.0)
@@ -236,14 +214,7 @@ def test_long_transients_come_to_rest():
         assert (np.diff(sizes) < 0).all()
 
 
-def test_undecided_with_the_reason():
-    found = fj.basin(of_problem(BELT), *BOX, 4, max_returns=1, progress=False)
-    undecided = np.flatnonzero(found.labels == found.outcomes.index("undecided"))
-    assert len(undecided) and set(found.reasons) == set(undecided.tolist())
-    assert f"undecided, {len(undecided)}: the motion nearly repeats" in str(found)
-
-
-def test_shares_and_their_table():
+def test_shares_their_table_and_what_is_undecided_or_refused():
     found = belt(96)
     count = np.sum(found.labels == 0)
     p = count / 96
@@ -253,10 +224,15 @@ def test_shares_and_their_table():
     assert text[0].split() == ["equilibrium", "cycle", "1", "diverges", "undecided"]
     assert text[1].split() == ["starts", str(count), str(96 - count), "0", "0"]
     assert f"{found.cycles[0].frequency:.6g}" in text[3]
+    found = fj.basin(of_problem(BELT), *BOX, 4, max_returns=1, progress=False)
+    undecided = np.flatnonzero(found.labels == found.outcomes.index("undecided"))
+    assert len(undecided) and set(found.reasons) == set(undecided.tolist())
+    assert f"undecided, {len(undecided)}: the motion nearly repeats" in str(found)
+    with pytest.raises(ValueError, match="call it outside of jit, vmap and grad"):
+        jax.jit(lambda D: fj.basin(DESIGNED.replace(D=D), radius=1.0).labels)(2.4)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
+test_refusals = refusals(
     [
         ({}, r"give one of: low and high, radius, or starts of shape \(k, 2n\)"),
         ({"low": [0.0, 0.0]}, "a box needs both low and high"),
@@ -274,12 +250,5 @@ def test_shares_and_their_table():
         ({"radius": 1.0, "max_returns": 0}, "max_returns must be a whole number of at least 1"),
         ({"radius": 1.0, "rtol": 1.0}, "rtol must be above 0 and at most 0.1, got 1.0"),
     ],
+    lambda arguments: fj.basin(of_problem(BELT), **arguments),
 )
-def test_refusals(arguments: dict[str, Any], message):
-    with pytest.raises(ValueError, match=message):
-        fj.basin(of_problem(BELT), **arguments)
-
-
-def test_refused_inside_a_compiled_program():
-    with pytest.raises(ValueError, match="call it outside of jit, vmap and grad"):
-        jax.jit(lambda D: fj.basin(DESIGNED.replace(D=D), radius=1.0).labels)(2.4)

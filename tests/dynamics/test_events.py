@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from numpy.polynomial import Polynomial
 
-from filippov import PLAIN, phases
 from fractaljax._dynamics.events import Cubic, first_root, step, without_start
 from fractaljax._dynamics.hybrid import NONE, SECTION, HybridSystem
 from fractaljax._dynamics.scaled import hybrid_system
+from hybrid_truth import Mechanism, phases
+from mechanisms import PLAIN, source_form
 from tools import reference_scene
 
 EPS = np.finfo(float).eps
@@ -21,9 +22,6 @@ KINDS = pytest.mark.parametrize("kind", ["any", "guards"])
 equilibrium, field = jax.jit(HybridSystem.equilibrium), jax.jit(HybridSystem.field)
 contact_state = jax.jit(HybridSystem.contact_state)
 found_root = jax.jit(lambda *ends: first_root(Cubic.through(*ends)))
-
-
-# --- cubics -------------------------------------------------------------------------------
 
 
 def cubics(kind, n=2000):
@@ -185,9 +183,6 @@ def test_shallow_dip(depth):
         assert (abs(cubic(found)) < 0.05 * x[0]).all()
 
 
-# --- steps --------------------------------------------------------------------------------
-
-
 @jax.jit
 def _stepped(system, y, h):
     def body(carry, _):
@@ -208,13 +203,20 @@ def stepped(system, y, h):
 def reference():
     """Switches and returns of the reference from its start up to 95/omega: times, signs after."""
     system = jax.jit(hybrid_system)(reference_scene())
-    share = float(system.omega) / PLAIN.omega  # its own unit of time
     start = np.asarray(equilibrium(system)) + np.eye(4)[0]
-    y = start * [1 / share, 1 / share, -1, -1] + [0, 0, 1, 1]
-    run = list(phases(PLAIN, y, 1e-12, 95 / share, maxima=True))
+    truth = Mechanism.of(source_form(**PLAIN))
+    share = float(system.omega) / truth.omega  # its own unit of time
+    y = start * np.asarray(system.units) / truth.units
+    run = list(phases(truth.scaled, y, 1e-12, 95 / share, maxima=True))
     times = np.array([p.t1 * share for p in run[:-1]])
-    signs = np.array([following.signs for _, following in itertools.pairwise(run)])
-    return system, jnp.asarray(start), times, signs, np.array([p.maximum for p in run[:-1]])
+    signs = np.array([following.mode for _, following in itertools.pairwise(run)])
+    return (
+        system,
+        jnp.asarray(start),
+        times,
+        signs,
+        np.array([p.event[0] == "maximum" for p in run[:-1]]),
+    )
 
 
 def test_steps_follow_the_motion():
@@ -233,7 +235,7 @@ def test_steps_follow_the_motion():
     assert (-np.diff(np.log2(worst)) > 3.5).all(), worst
 
 
-def test_end_of_a_step():
+def test_end_of_a_step_and_steps_of_a_batch():
     """After a switch the velocity is the belt's to the last bit, after a return nearly zero."""
     system, start, *_ = reference()
     y, s, _, _, guard = stepped(system, start, 0.25)
@@ -250,12 +252,8 @@ def test_end_of_a_step():
     at = guard == SECTION
     assert abs(y[at, 2]).max() < 1e-3
     assert (field(system, y[at].T, s[at].T)[2] < 0).all()
-
-
-def test_steps_of_a_batch():
-    """Many motions side by side take the same steps as one by one."""
-    system, start, *_ = reference()
-    y, s = (jnp.asarray(x[:60].T) for x in stepped(system, start, 0.25)[:2])
+    # Many motions side by side take the same steps as one by one.
+    y, s = (jnp.asarray(x[:60].T) for x in (y, s))
     one, last = jax.jit(step), np.full(60, NONE)
     together = one(system, y, s, last, 0.25)
     for k in range(0, 60, 7):

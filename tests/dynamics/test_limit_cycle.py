@@ -10,31 +10,29 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
-from filippov import PLAIN, return_slopes
+import hybrid_truth
 from fractaljax._base.parts import substitute
 from fractaljax._dynamics.cycle import repels
 from fractaljax._dynamics.orbit import PeriodicOrbit
 from fractaljax._dynamics.search import growth_of
-from tools import both_modes, motionless_scene, reference_cycle, reference_scene
+from mechanisms import PLAIN, source_form
+from tools import both_modes, motionless_scene, reference_cycle, reference_scene, refusals, scene_of
 
 ROWS = json.loads((Path(__file__).parents[1] / "reference" / "cycle.json").read_text())["rows"]
 CYCLES = [row for row in ROWS if row["kind"] == "cycle"]
-NAMES = ("m", "omega_1", "omega_2", "xi_1", "xi_2", "F", "V", "K_n", "K_t", "mu_s", "mu_m", "v_m")
 INPUTS = ("K_n", "K_t", "mu_s", "V")
 OUTPUTS = ("period", "amplitude_1", "amplitude_2", "stick_fraction_1", "stick_fraction_2")
 OMEGA, V = 2e4, 0.15  # of the reference scene: lengths are in V/OMEGA
 PERIOD = 6.467445952469732345405  # of the reference scene, in 1/OMEGA
-REPELLING = PLAIN.__class__(
-    1.0, 7040.0, 5190.0, 0.000154, 0.000735, 2.51, 0.307, 5.08e8, 3.23e8, 0.251, 0.14, 0.535
+REPELLING = dict(
+    zip(
+        PLAIN,
+        (1.0, 7040.0, 5190.0, 0.000154, 0.000735, 2.51, 0.307, 5.08e8, 3.23e8, 0.251, 0.14, 0.535),
+        strict=True,
+    )
 )
 SLOW = pytest.mark.slow
 UNOPTIMISED = pytest.mark.unoptimised
-
-
-def scene_of(row) -> fj.Scene:
-    """The scene of a row; Coulomb friction is a Stribeck law without a drop."""
-    x = [row[name] for name in NAMES]
-    return fj.Scene(fj.FixedContact(*x[7:9]), fj.Stribeck(*x[9:]), fj.Oscillator(*x[:7]))
 
 
 @functools.partial(jax.jit, static_argnames="segments")
@@ -56,13 +54,13 @@ def everything(row, start, segments):
 
 @functools.cache
 def _solved(numbers, start, segments):
-    row = {name: jnp.asarray(x) for name, x in zip(NAMES, numbers, strict=True)}
+    row = {name: jnp.asarray(x) for name, x in zip(PLAIN, numbers, strict=True)}
     return everything(row, jnp.asarray(start), segments)
 
 
 def solved(row, start, segments=40):
     """`everything` of a row: compiled once for all rows, and run once for all tests."""
-    return _solved(tuple(float(row[name]) for name in NAMES), tuple(start), segments)
+    return _solved(tuple(float(row[name]) for name in PLAIN), tuple(start), segments)
 
 
 def check(row, cycle, forward, reverse):
@@ -165,16 +163,17 @@ def test_motions_without_a_cycle():
 
 def test_orbit_that_repels():
     """The motion passes it slowly: it has numbers and multipliers, but it is no limit."""
-    m = REPELLING
-    cycle = fj.limit_cycle(scene_of(vars(m)), throw=False)
+    scene = scene_of(REPELLING)
+    cycle = fj.limit_cycle(scene, throw=False)
     assert cycle.result == fj.CycleResult.unstable and cycle.returns == 1
-    y = m.scaled(np.asarray(cycle.state))
-    truth = np.linalg.eigvals(return_slopes(m, y[[0, 1, 3]], 1, 1e-12))
-    expected = np.sort(np.abs([*truth, 1.0]))
+    m = hybrid_truth.Mechanism.of(source_form(**REPELLING))
+    start, period = np.asarray(cycle.state) / m.units, float(cycle.period) * m.omega
+    trip = list(hybrid_truth.phases(m.scaled, start, 1e-12, period))
+    expected = np.sort(np.abs(np.linalg.eigvals(hybrid_truth.monodromy(m.scaled, trip))))
     np.testing.assert_allclose(np.sort(np.abs(cycle.multipliers)), expected, rtol=1e-7)
     assert expected[-1] > 1.0001 and np.isfinite(cycle.amplitude).all()
     with pytest.raises(RuntimeError, match="but it repels"):
-        fj.limit_cycle(scene_of(vars(m)))
+        fj.limit_cycle(scene)
     # So near to 1 its growth is not taken from the derivatives of Newton's method.
     segments = jax.tree.map(lambda x: x[..., None], cycle._orbit.segments)
     rough = 1.0005 * jnp.eye(4)[..., None]
@@ -293,7 +292,7 @@ def test_batch():
     """Scenes of every outcome together: each as on its own, and so its gradient."""
     outcomes = [int(solved(row, row["start"])[0].result._value) for row in ROWS]
     rows = [row for i, row in enumerate(ROWS) if outcomes[:i].count(outcomes[i]) < 4]
-    numbers = {name: jnp.array([float(row[name]) for row in rows]) for name in NAMES}
+    numbers = {name: jnp.array([float(row[name]) for row in rows]) for name in PLAIN}
     starts = jnp.array([row["start"] for row in rows])
 
     def size(V, numbers, start):
@@ -317,7 +316,7 @@ def test_batch():
 
 
 @SLOW
-def test_gradient_by_the_surface():
+def test_gradient_by_the_surface_and_second_derivatives():
     """d amplitude/d(D, G) of the reference brake in both modes, against differences."""
 
     def amplitude(x):
@@ -332,11 +331,7 @@ def test_gradient_by_the_surface():
         difference = float(found(at + step)[0] - found(at - step)[0]) / (2 * size)
         assert [float(slope[k]) for slope in slopes] == pytest.approx([difference] * 2, rel=1e-6)
 
-
-@SLOW
-def test_second_derivatives():
-    """The Hessian is that of the orbit's equations too, not of the search."""
-
+    # The Hessian is that of the orbit's equations too, not of the search.
     def period(K_n):
         scene = substitute(reference_scene(), {"K_n": K_n, "K_t": K_n / 2})
         return fj.limit_cycle(scene, throw=False).period
@@ -398,8 +393,7 @@ def test_program_has_what_the_scene_needs():
     assert operations(fixed) < operations(fj.brake_scene())
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
+test_refusals = refusals(
     [
         ({"start": [0.0, 0.0]}, r"start must have shape \(4,\), got \(2,\)"),
         ({"start": [np.nan, 0, 0, 0]}, "start must be finite, got nan"),
@@ -412,9 +406,5 @@ def test_program_has_what_the_scene_needs():
         ({"regularisation": 0.1, "max_steps": 0}, "max_steps must be a whole number of at least 1"),
         ({"starts": [0.0] * 4}, r"starts must have shape \(k, 4\), got \(4,\)"),
     ],
+    lambda bad: (fj.attractors if "starts" in bad else fj.limit_cycle)(reference_scene(), **bad),
 )
-def test_refusals(arguments, message):
-    """One line that names the argument, what it must be and what it was."""
-    call = fj.attractors if "starts" in arguments else fj.limit_cycle
-    with pytest.raises(ValueError, match=message):
-        call(reference_scene(), **arguments)

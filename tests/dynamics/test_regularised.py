@@ -14,8 +14,8 @@ from fractaljax._dynamics.scaled import hybrid_system
 from tools import both_modes, motionless_scene, reference_cycle, reference_scene
 
 K_N = 4e8
-# Of the exact law, by the integrator of tests/filippov.py: peak to peak of x1 in V/sqrt(K_n/m),
-# and its derivative by K_n with K_t/K_n held [m/N].
+# Of the exact law, as in reference/cycle.json: peak to peak of x1 in V/sqrt(K_n/m), and its
+# derivative by K_n with K_t/K_n held [m/N].
 AMPLITUDE = 2.290139035337965
 SLOPE = 1.263706994327e-11
 COARSE, MIDDLE, FINE = 0.03, 1.5e-3, 1.5e-5  # m/s; the belt runs at 0.15
@@ -57,6 +57,11 @@ def test_eps_decides_what_is_found():
     np.testing.assert_allclose(middle.regularisation_error, off, rtol=1e-6)
     with pytest.raises(RuntimeError, match="choose a smaller regularisation"):
         fj.limit_cycle(reference_scene(), regularisation=COARSE)
+    # At 1.5e-5 m/s, with an implicit solver, the cycle is the exact one's to 1e-4.
+    found = cycle(FINE)
+    assert found.result == RESULT.converged
+    assert 0 < float(found.regularisation_error) < 1e-4
+    np.testing.assert_allclose(scaled_amplitude(found), AMPLITUDE, rtol=1e-4)
 
 
 @SLOW
@@ -115,22 +120,23 @@ def test_multipliers():
 
 
 @SLOW
-def test_no_motion():
+def test_no_motion_and_too_few_steps():
     """Where steady sliding attracts there is no cycle of either law."""
     found = fj.limit_cycle(motionless_scene(), regularisation=COARSE, throw=False)
     assert found.result == RESULT.not_periodic
     for value in (found.period, found.amplitude, found.state, found.regularisation_error):
         assert np.isnan(value).all()
+    # Where max_steps ends the integration the result says so, and what to do.
+    stiff = {"regularisation": 1e-5, "max_steps": 64}
+    found = fj.limit_cycle(reference_scene(), throw=False, **stiff)
+    assert found.result == RESULT.too_stiff
+    assert np.isnan([found.period, *found.amplitude, found.regularisation_error]).all()
+    with pytest.raises(RuntimeError, match="Kvaerno5"):
+        fj.limit_cycle(reference_scene(), **stiff)
 
 
 @SLOW
-def test_amplitude_near_slope_far():
-    """Where values are 0.3 percent off, the derivative by K_n is off by more than ten."""
-    assert abs(difference() / SLOPE - 1) > 0.1
-
-
-@SLOW
-def test_derivatives():
+def test_values_are_near_and_derivatives_far():
     """Those of the regularised cycle, in both modes."""
 
     def amplitude(K_n):
@@ -140,29 +146,8 @@ def test_derivatives():
     # Compiled whole: what the amplitude does not need then has no derivatives.
     _, *slopes = jax.jit(lambda x: both_modes(amplitude, x))(jnp.array([K_N]))
     np.testing.assert_allclose(slopes, difference(), rtol=5e-3)
-
-
-@SLOW
-def test_a_fine_eps_converges():
-    """At 1.5e-5 m/s, with an implicit solver, the cycle is the exact one's to 1e-4."""
-    found = cycle(FINE)
-    assert found.result == RESULT.converged
-    assert 0 < float(found.regularisation_error) < 1e-4
-    np.testing.assert_allclose(scaled_amplitude(found), AMPLITUDE, rtol=1e-4)
-
-
-@SLOW
-def test_too_few_steps():
-    """Where max_steps ends the integration the result says so, and what to do."""
-    stiff = {"regularisation": 1e-5, "max_steps": 64}
-    found = fj.limit_cycle(reference_scene(), throw=False, **stiff)
-    assert found.result == RESULT.too_stiff
-    assert np.isnan([found.period, *found.amplitude, found.regularisation_error]).all()
-    with pytest.raises(RuntimeError, match="Kvaerno5"):
-        fj.limit_cycle(reference_scene(), **stiff)
-
-
-# --- the parts ----------------------------------------------------------------------------
+    # Where values are 0.3 percent off, the derivative by K_n is off by more than ten.
+    assert abs(difference() / SLOPE - 1) > 0.1
 
 
 def test_field():
@@ -197,17 +182,14 @@ def cosine(n):
     return t, np.cos(t - 0.3), -np.sin(t - 0.3)
 
 
-def test_extremes():
+def test_extremes_and_share_below_zero():
     """Of four components at once, between the nodes too."""
     t, x, rate = cosine(40)
     factors = np.array([1.0, -2.0, 0.0, 3.0])
     states, rates = (jnp.asarray(c[:, None] * factors) for c in (x, rate))
     found = jax.jit(regularised.extremes)(jnp.asarray(t), states, rates)
     np.testing.assert_allclose(found, [-abs(factors), abs(factors)], rtol=0, atol=1e-5)
-
-
-def test_share_below_zero():
-    """With its derivative in both modes, also where it is 0 or 1."""
+    # With its derivative in both modes, also where it is 0 or 1.
     t, x, rate = (jnp.asarray(c) for c in cosine(60))
 
     def share(level):

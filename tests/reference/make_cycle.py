@@ -1,152 +1,127 @@
-"""Tabulate stick-slip limit cycles and their derivatives, as truth for the tests.
+"""Tabulate stick-slip limit cycles of the source's form and their derivatives, for the tests.
 
-A row of cycle.json holds a mechanism, a start, the kind of motion that it leads to and, for a
-cycle, its numbers with derivatives, all by `tests/filippov.py` in SI units. Derivatives are
-Richardson extrapolations of central differences over the converged cycle, with an estimate of
-their error. To add a mechanism, append a row with its group and quantities only; rows without a
-"kind" are computed, and written as soon as they are. (The rows of the group "random" have K_n in
-1.6e8..6e8 N/m, K_t/K_n in 0.3..0.75, V in 0.05..0.3 m/s, mu_s in 0.3..0.55, mu_m/mu_s in 0.5..0.9,
-v_m in 0.3..0.8 m/s and F in 1..50 N, each uniform.)
+A row of cycle.json holds the numbers of a mechanism, a start, the kind of motion that it leads to
+and, for a cycle, its numbers with derivatives in SI units. To add a mechanism, append a row with
+its group and quantities only; rows without a "kind" are computed with `tests/hybrid_truth.py`, and
+written as soon as they are. (The rows of the group "random" have K_n in 1.6e8..6e8 N/m, K_t/K_n in
+0.3..0.75, V in 0.05..0.3 m/s, mu_s in 0.3..0.55, mu_m/mu_s in 0.5..0.9, v_m in 0.3..0.8 m/s and F
+in 1..50 N, each uniform.)
 
-    python tests/reference/make_cycle.py [--anew]
+The rows with "difference_step" were made by an older solver, for this form alone: it closed a
+return map of (x1, x2, w2) by Broyden's method, and knew no linearised flow. The tests compare both
+solvers by them.
+
+    python tests/reference/make_cycle.py
 """
 
-import argparse
 import json
-import math
 import pathlib
-import sys
-from dataclasses import asdict, fields, replace
+from itertools import pairwise
 
+import make_mechanisms
 import numpy as np
+from make_mechanisms import Mechanism, hybrid_truth
+from numpy.polynomial import chebyshev
 
-HERE = pathlib.Path(__file__).resolve().parent
-sys.path.insert(0, str(HERE.parent))
+from mechanisms import PLAIN, source_form
 
-import filippov  # noqa: E402
-from filippov import Mechanism  # noqa: E402
-
-TABLE = HERE / "cycle.json"
-STEP = 8e-3  # relative; the widest of the differences
-LEVELS = 6  # each half as wide as the one before
-NARROWEST = 1e-7
-NOISE = 4e-15  # relative rounding of a value
-SAFETY = 10.0  # the smallest of the estimates is a lucky one
-BY = ("K_n", "K_t", "mu_s", "V")
+TABLE = pathlib.Path(__file__).resolve().parent / "cycle.json"
+LISTS = ("amplitude", "velocity_min", "velocity_max")
 OF = ("period", "amplitude_1", "amplitude_2", "stick_fraction_1", "stick_fraction_2")
+VALUES = [0, 1, 2, 3, 5]  # of these in `make_mechanisms.numbers`
 ABOUT = (
-    "Stick-slip limit cycles by event-driven DOP853, SI units; made by make_cycle.py. start and "
+    "Stick-slip limit cycles by event-driven DOP853, SI units. Rows with difference_step are of an "
+    "older solver for this form alone, others by make_cycle.py with hybrid_truth. start and "
     "state are [x1, x2, x1', x2']; itinerary is [sign 1, sign 2, duration] with 0 for stick; "
-    "multipliers are [real, imaginary]; value_error is the relative change of period, amplitude "
-    "and stick fraction with a finer step; margins as in filippov.measure; repeatable is false "
-    "where a finer transient leads elsewhere; not periodic means no period of up to 4 maxima of x1 "
-    "within 5000 of them; derivatives are [value, estimated error] by K_n "
+    "multipliers are [real, imaginary], without the trivial 1; value_error is the relative change "
+    "of period, amplitude and stick fraction with a finer step; margins: graze is the smallest "
+    "extremum of what ends a phase, shortest the share of the shortest phase in the period, "
+    "decision the distance from the friction limit where a slip ended (older rows); repeatable is "
+    "false where a finer transient leads elsewhere; not periodic means no period of up to 4 maxima "
+    "of x1 within 5000 of them; derivatives are [value, estimated error] by K_n "
     "(K_t held), K_t, mu_s (mu_m held, or moved along where equal) and V, null where no interval "
     "of one itinerary was wide enough; difference_step is the widest relative step used, of "
     "K_n / 8 where K_t is 0."
 )
 
 
-def numbers(cycle):
-    """The values that have derivatives."""
-    return np.array([cycle.period, *cycle.amplitude, *cycle.stick_fraction])
+def start_of(row):
+    """At rest, a length V/omega beside steady sliding."""
+    problem = source_form(**row)
+    (joint,) = Mechanism.of(problem).joints
+    mu, K_n, K_t = joint.mu(joint.V), joint.K_n, joint.K_t
+    K = np.add(problem["K"], [[K_t, -mu * K_n], [mu * K_t, K_n]])
+    x_1, x_2 = np.linalg.solve(K, problem["F"])
+    return [float(x_1 + joint.V * np.sqrt(row["m"] / K_n)), float(x_2), 0.0, 0.0]
 
 
-def follow(mechanism, cycle, rtol=1e-12):
-    """The cycle of a mechanism near by."""
-    z = mechanism.scaled(cycle.state)[[0, 1, 3]]
-    z = filippov.close(mechanism, z, cycle.returns, rtol, cycle.slopes)
-    return filippov.measure(mechanism, z, cycle.returns, rtol)
+def time_below_zero(trip, row):
+    """How long row.[1, z] is negative in a trip."""
+    total = 0.0
+    for t, end, used, dense in (step for p in trip for step in p.steps):
+        c = hybrid_truth.FIT @ (row[0] + row[1:] @ dense(t + (end - t) * hybrid_truth.NODES))
+        roots = (1 + chebyshev.chebroots(chebyshev.chebtrim(c, 1e-15 * abs(c).max()))) / 2
+        share = (used - t) / (end - t)
+        inside = sorted(x.real for x in roots if abs(x.imag) < 1e-9 and 0 < x.real < share)
+        for a, b in pairwise([0.0, *inside, share]):
+            total += (end - t) * (b - a) * (hybrid_truth.at((a + b) / 2, c) < 0)
+    return float(total)
 
 
-def difference(mechanism, cycle, name, h):
-    """Central difference over 2 h, or None where the itinerary is another on either side."""
-    ends = []
-    for side in (h, -h):
-        moved = replace(mechanism, **{name: getattr(mechanism, name) + side})
-        if name == "mu_s" and mechanism.mu_m == mechanism.mu_s:
-            moved = replace(moved, mu_m=moved.mu_s)  # Coulomb friction it stays
-        try:
-            end = follow(moved, cycle)
-        except (ArithmeticError, np.linalg.LinAlgError):
-            return None
-        if [v[0] for v in end.itinerary] != [v[0] for v in cycle.itinerary]:
-            return None
-        ends.append(numbers(end))
-    return (ends[0] - ends[1]) / (2 * h)
+def derivatives(row, cycle, known):
+    """By the quantities of the table, of `OF`."""
+    problem, found = source_form(**row), {}
+    for name in ("K_n", "K_t", "mu_s", "V"):
+        place = "mu" if row["mu_m"] == row["mu_s"] else "mu_s"
+        path = f"joints.0.friction.{place}" if name == "mu_s" else f"joints.0.{name}"
+        pair = make_mechanisms.derivative(problem, cycle, known, path, row["K_n"] / 8)
+        columns = np.transpose(pair)[VALUES].tolist() if pair else len(OF) * [None]
+        found[name] = dict(zip(OF, columns, strict=True))
+    return found
 
 
-def derivative(mechanism, cycle, name):
-    """Derivatives of `numbers`, their estimated errors, and the widest relative step."""
-    unit = getattr(mechanism, name) or mechanism.K_n / 8
-    step, widest, tables = STEP, None, []
-    best, error = np.full(len(OF), np.nan), np.full(len(OF), np.inf)
-    while len(tables) < LEVELS and step > NARROWEST:
-        row = difference(mechanism, cycle, name, step * unit)
-        if row is None:
-            tables, widest, error[:] = [], None, np.inf
-            step /= 4
-            continue
-        table, widest = [row], widest or step
-        for j, above in enumerate(tables[-1] if tables else []):
-            table.append(table[-1] + (table[-1] - above) / (4 ** (j + 1) - 1))
-            guess = np.maximum(abs(table[-1] - table[-2]), abs(table[-1] - above))
-            guess += NOISE * abs(numbers(cycle)) / (step * unit)
-            best = np.where(guess < error, table[-1], best)
-            error = np.minimum(guess, error)
-        tables.append(table)
-        step /= 2
-    return best, SAFETY * error, widest
-
-
-def make_row(group, mechanism):
+def make_row(group, numbers):
     """One row of the table."""
-    start = mechanism.si(mechanism.equilibrium + np.eye(4)[0])
-    start[2:] = 0
-    start = [float(x) for x in start]
-    cycle, again = (filippov.cycle(mechanism, start, coarse=c) for c in (1e-8, 1e-10))
+    mechanism, start = Mechanism.of(source_form(**numbers)), start_of(numbers)
+    cycle, again = (
+        hybrid_truth.cycle(mechanism, start, coarse=coarse, most=5000, returns=4)
+        for coarse in (1e-8, 1e-10)
+    )
+    row = {"group": group, **numbers, "start": start, "kind": cycle.kind}
     same = cycle.kind == again.kind
-    row = {"group": group, **asdict(mechanism), "start": start, "kind": cycle.kind}
     if cycle.kind != "cycle":
-        return {**row, "repeatable": same}
-    finer, value = numbers(follow(mechanism, cycle, 1e-13)), numbers(cycle)
-    scale = np.where(abs(value) > 1e-12, abs(value), np.inf)
-    slopes = {name: derivative(mechanism, cycle, name) for name in BY}
-    same = same and np.allclose(cycle.state, again.state, rtol=1e-6, atol=1e-9 * mechanism.V)
-    lists = ("amplitude", "velocity_min", "velocity_max", "stick_fraction", "state")
+        return row | {"repeatable": same}
+    same = same and np.allclose(cycle.state / mechanism.units, again.state / mechanism.units, 1e-6)
+    known, finer = (
+        make_mechanisms.numbers(mechanism, cycle.state, cycle.period, cycle.flow, rtol)
+        for rtol in (1e-12, 1e-13)
+    )
+    core, T = mechanism.scaled, cycle.period * mechanism.omega
+    trip = list(hybrid_truth.phases(core, cycle.state / mechanism.units, 1e-12, T))
+    others = np.delete(cycle.multipliers, abs(cycle.multipliers - 1).argmin())
+    scale = np.where(abs(known[2]) > 1e-12, abs(known[2]), np.inf)
     return {
         **row,
         "repeatable": bool(same),
-        "returns": cycle.returns,
+        "returns": cycle.maxima,
         "period": float(cycle.period),
-        **{key: getattr(cycle, key).tolist() for key in lists},
-        "tension_fraction": float(cycle.tension_fraction),
-        "itinerary": [[*signs, float(duration)] for signs, duration in cycle.itinerary],
-        "multipliers": [[float(x.real), float(x.imag)] for x in cycle.multipliers],
-        "margins": {
-            name: float(x) if math.isfinite(x) else None for name, x in cycle.margins.items()
-        },
-        "value_error": float((abs(finer - value) / scale).max()),
-        "derivatives": {
-            name: {
-                key: [float(x), float(e)] if math.isfinite(e) else None
-                for key, x, e in zip(OF, best, error, strict=True)
-            }
-            for name, (best, error, _) in slopes.items()
-        },
-        "difference_step": {name: widest for name, (_, _, widest) in slopes.items()},
+        **{key: getattr(cycle, key).tolist() for key in LISTS},
+        "stick_fraction": [float(cycle.stick_fraction[0]), float(cycle.second_stick_fraction[0])],
+        "state": cycle.state.tolist(),
+        "tension_fraction": time_below_zero(trip, core.normal(0)) / T,
+        "itinerary": [[*mode, float(duration)] for mode, duration in cycle.itinerary],
+        "multipliers": [[float(x.real), float(x.imag)] for x in others],
+        "margins": {k: float(v) if np.isfinite(v) else None for k, v in cycle.margins.items()},
+        "value_error": float((abs(finer[2] - known[2]) / scale).max()),
+        "derivatives": derivatives(numbers, cycle, known),
     }
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--anew", action="store_true", help="compute all rows")
-    anew = parser.parse_args().anew
     rows = json.loads(TABLE.read_text(encoding="utf-8"))["rows"]
-    names = [field.name for field in fields(Mechanism)]
     for i, row in enumerate(rows):
-        if anew or "kind" not in row:
-            rows[i] = make_row(row["group"], Mechanism(*(row[name] for name in names)))
+        if "kind" not in row:
+            rows[i] = make_row(row["group"], {name: row[name] for name in PLAIN})
             lines = ",\n".join(map(json.dumps, rows))
             text = f'{{"about": {json.dumps(ABOUT)},\n"rows": [\n{lines}\n]}}\n'
             TABLE.write_text(text, encoding="utf-8")

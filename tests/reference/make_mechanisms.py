@@ -1,11 +1,12 @@
-"""Tabulate the cycles of `tests/mechanisms.py` and their derivatives, as truth for the tests.
+"""Tabulate the cycles of mechanisms and their derivatives, as truth for the tests.
 
 All by `tests/hybrid_truth.py`. Derivatives are Richardson extrapolations of central differences
-over the converged cycle, with an estimate of their error.
+over the converged cycle, with an estimate of their error. To add a mechanism, append a row with its
+name, note and problem.
 
     python tests/reference/make_mechanisms.py [NAME ...]
 
-Without names it computes those that are not yet in the table.
+Without names it computes the rows that have no "kind".
 """
 
 import copy
@@ -20,9 +21,8 @@ sys.path.insert(0, str(HERE.parent))
 
 import hybrid_truth  # noqa: E402
 from hybrid_truth import Mechanism  # noqa: E402
-from mechanisms import PROBLEMS  # noqa: E402
+from mechanisms import PROBLEMS, TABLE  # noqa: E402
 
-TABLE = HERE / "mechanisms.json"
 STEP = 4e-3  # relative; the widest of the differences
 LEVELS = 3  # each half as wide as the one before
 NARROWEST = 1e-5
@@ -40,13 +40,13 @@ LISTS = [
     "state",
 ]
 ABOUT = (
-    "Periodic motions of the problems of tests/mechanisms.py by event-driven DOP853, SI units; "
-    "made by make_mechanisms.py. state is [x, x'] where t.x of the first joint is largest; "
-    "itinerary is [signs of the faces, duration] from there on, with 0 for stick and 9 for open; "
-    "multipliers are [real, imaginary] and hold the trivial 1; value_error is the relative change "
-    "with a finer step; margins as in hybrid_truth.measure; derivatives by a quantity are [value, "
-    "estimated error] of period, amplitude, stick_fraction and open_fraction, null where no "
-    "interval of one itinerary was wide enough."
+    "Mechanisms as tests/mechanisms.py says, and their periodic motions by event-driven DOP853, "
+    "SI units; made by make_mechanisms.py. state is [x, x'] where t.x of the first joint is "
+    "largest; itinerary is [signs of the faces, duration] from there on, with 0 for stick and 9 "
+    "for open; multipliers are [real, imaginary] and hold the trivial 1; value_error is the "
+    "relative change with a finer step; margins as in hybrid_truth.measure; derivatives by a "
+    "quantity are [value, estimated error] of period, amplitude, stick_fraction and "
+    "open_fraction, null where no interval of one itinerary was wide enough."
 )
 
 
@@ -71,11 +71,10 @@ def numbers(mechanism, state, T, flow=None, rtol=1e-12):
     core, n = mechanism.scaled, len(mechanism.M)
     z, T = hybrid_truth.close(core, state / mechanism.units, T * mechanism.omega, rtol, flow)
     trip = list(hybrid_truth.phases(core, z, rtol, T))
-    rows = np.hstack([np.zeros((n, 1)), np.eye(n, 2 * n)])
-    ends = np.array([hybrid_truth.spread(trip, row) for row in rows])
-    stick, _, opened = hybrid_truth.shares(core, trip) / T
-    period, amplitude = T / mechanism.omega, (ends[:, 1] - ends[:, 0]) * mechanism.units[:n]
-    values = np.concatenate([[period], amplitude, stick, opened])
+    ends = hybrid_truth.extremes(mechanism, trip)[:n]
+    stick, second, opened = hybrid_truth.shares(core, trip) / T
+    period, amplitude = T / mechanism.omega, ends[:, 1] - ends[:, 0]
+    values = np.concatenate([[period], amplitude, stick, opened, second])
     return z * mechanism.units, period, values, [p.mode for p in trip]
 
 
@@ -110,17 +109,21 @@ def differences(problem, cycle, known, path, step):
     return row[-1], SAFETY * (error + NOISE * np.maximum(abs(known[2]), 1e-3) / (2 * step))
 
 
-def derivative(problem, cycle, known, path):
-    """Derivatives of the values, and their estimated errors; None where no step will do."""
+def derivative(problem, cycle, known, path, unit=0.0):
+    """Derivatives of the values, and their estimated errors; None where no step will do.
+
+    Steps are relative, of `unit` where the quantity is 0.
+    """
     where, key = place(problem, path)
+    size = abs(where[key]) or unit
     best, error = np.zeros(len(known[2])), np.full(len(known[2]), np.inf)
     step = STEP
     while step > NARROWEST:
-        found = differences(problem, cycle, known, path, step * abs(where[key]))
+        found = differences(problem, cycle, known, path, step * size)
         if found:
             best = np.where(found[1] < error, found[0], best)
             error = np.minimum(found[1], error)
-            relative = error * abs(where[key]) / np.maximum(abs(known[2]), 1e-3)
+            relative = error * size / np.maximum(abs(known[2]), 1e-3)
             if relative.max() < ENOUGH:
                 break
         step /= 4
@@ -133,16 +136,17 @@ def split(values, errors, n, m):
         "period": pairs[0],
         "amplitude": pairs[1 : n + 1],
         "stick_fraction": pairs[n + 1 : n + m + 1],
-        "open_fraction": pairs[n + m + 1 :],
+        "open_fraction": pairs[n + m + 1 : n + 2 * m + 1],
     }
 
 
-def make_row(name):
-    problem = PROBLEMS[name]
+def make_row(row):
+    row = {name: row[name] for name in ("name", "note", "problem")}
+    problem = PROBLEMS[row["name"]]
     mechanism = Mechanism.of(problem)
     n, m = len(mechanism.M), len(mechanism.joints)
     cycle = hybrid_truth.cycle(mechanism, problem["start"])
-    row = {"name": name, "kind": cycle.kind}
+    row["kind"] = cycle.kind
     if cycle.kind != "cycle":
         return row
     known = numbers(mechanism, cycle.state, cycle.period, cycle.flow)
@@ -162,14 +166,14 @@ def make_row(name):
 
 
 def main():
-    rows = json.loads(TABLE.read_text("utf-8"))["rows"] if TABLE.exists() else []
-    rows = {row["name"]: row for row in rows if row["name"] in PROBLEMS}
-    for name in sys.argv[1:] or [name for name in PROBLEMS if name not in rows]:
-        rows[name] = make_row(name)
-        ordered = [json.dumps(rows[name]) for name in PROBLEMS if name in rows]
-        lines = ",\n".join(ordered)
+    rows = json.loads(TABLE.read_text("utf-8"))["rows"]
+    for i, row in enumerate(rows):
+        if row["name"] not in sys.argv[1:] if sys.argv[1:] else "kind" in row:
+            continue
+        rows[i] = make_row(row)
+        lines = ",\n".join(map(json.dumps, rows))
         TABLE.write_text(f'{{"about": {json.dumps(ABOUT)},\n"rows": [\n{lines}\n]}}\n', "utf-8")
-        print(name, rows[name]["kind"], rows[name].get("value_error"), flush=True)
+        print(row["name"], rows[i]["kind"], rows[i].get("value_error"), flush=True)
 
 
 if __name__ == "__main__":
