@@ -19,7 +19,7 @@ from tools import ROOT, load_script
 pytestmark = pytest.mark.unoptimised
 
 LAW = load_script(ROOT / "tests" / "reference" / "make_contact.py")
-ORDER = 16  # of quadrature, which leaves more digits than a double has
+ORDER = 24  # of quadrature, which leaves more digits than a double has
 
 
 def by_numpy(x) -> Any:
