@@ -26,7 +26,7 @@ def signs(residuals, slack=1e-9):
     return residuals.max(axis=1) > slack
 
 
-def test_residuals_of_structures_have_the_signs_of_their_growth_rates():
+def test_residuals_have_the_signs_of_growth_rates():
     """Of all damping: light, equal, heavy, negative; with real eigenvalues too."""
     rng = np.random.default_rng(0)
     n, count = 3, 400
@@ -46,9 +46,6 @@ def test_residuals_of_structures_have_the_signs_of_their_growth_rates():
     clear = np.abs(above) > 1e-9
     assert clear.mean() > 0.99 and 0.2 < (above > 0).mean() < 0.9
     np.testing.assert_array_equal(signs(residuals)[clear], (above > 0)[clear])
-
-
-def test_residuals_of_scenes_have_the_signs_of_their_growth_rates():
     scene = fj.brake_scene()
     rng = np.random.default_rng(1)
     count = 2000
@@ -63,13 +60,13 @@ def test_residuals_of_scenes_have_the_signs_of_their_growth_rates():
 
     @jax.jit
     @jax.vmap
-    def both(values, target):
+    def of_scenes(values, target):
         x = scene.replace(friction=fj.Coulomb(0.3)).replace(**values)
         growth = fj.growth_rate(x)
         found = of_scene(x, True, growth, target, jnp.array(10.0))
         return growth - target, jnp.stack(found)
 
-    above, residuals = map(np.asarray, both(moved, targets))
+    above, residuals = map(np.asarray, of_scenes(moved, targets))
     clear = np.abs(above) > 1e-6 * np.abs(targets)
     assert clear.mean() > 0.99 and 0.2 < (above > 0).mean() < 0.8
     np.testing.assert_array_equal(signs(residuals)[clear], (above > 0)[clear])

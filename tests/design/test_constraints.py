@@ -18,7 +18,7 @@ from fractaljax._design.constraints import (
     Roughness,
 )
 from fractaljax._surface.roughness import root_mean_square_height
-from tools import both_modes, reference_scene, state_matrix
+from tools import both_modes, reference_scene, refusals, state_matrix
 
 pytestmark = pytest.mark.unoptimised
 
@@ -117,15 +117,7 @@ def test_fully_plastic_joints_know_the_way_back(scene):
     np.testing.assert_allclose(*sides, atol=1e-6)
 
 
-def test_pytrees_under_vmap(scene):
-    """The limits are leaves: many of them at once; a name says nothing of a batch."""
-    limits = jnp.array([2e8, 4e8, 8e8])
-    found = jax.jit(jax.vmap(lambda limit: NormalStiffness(limit)(scene)))(limits)
-    np.testing.assert_allclose(found, 1 - fj.stiffness(scene)[0] / limits, rtol=1e-12)
-    assert hash(jax.tree.structure(ALL["Sq <= 2e-06 m"])) is not None
-
-
-def test_joints_of_given_stiffness(scene):
+def test_joints_of_given_stiffness_and_pytrees_under_vmap(scene):
     """Those that ask for stiffness and modes only need no surface; the others say so."""
     fixed = scene.replace(contact=fj.FixedContact(4e8, 2e8))
     assert NormalStiffness(5e8)(fixed) == pytest.approx(0.2)
@@ -137,6 +129,11 @@ def test_joints_of_given_stiffness(scene):
     ):
         with pytest.raises(ValueError, match=message):
             constraint(fixed)
+    # The limits are leaves: many of them at once; a name says nothing of a batch.
+    limits = jnp.array([2e8, 4e8, 8e8])
+    found = jax.jit(jax.vmap(lambda limit: NormalStiffness(limit)(scene)))(limits)
+    np.testing.assert_allclose(found, 1 - fj.stiffness(scene)[0] / limits, rtol=1e-12)
+    assert hash(jax.tree.structure(ALL["Sq <= 2e-06 m"])) is not None
 
 
 def test_real_area_is_that_of_the_contact_law(scene):
@@ -149,8 +146,7 @@ def test_real_area_is_that_of_the_contact_law(scene):
         assert found == pytest.approx(expected, abs=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
+test_refusals = refusals(
     [
         (lambda: NormalStiffness(0.0), "K_n at_least must be above 0, got 0.0"),
         (lambda: NormalStiffness(cast(Any, None)), "K_n needs at_least or at_most"),
@@ -163,12 +159,8 @@ def test_real_area_is_that_of_the_contact_law(scene):
         (lambda: DampingRatio(2.0), "damping ratio at_least must be above -1 and below 1, got 2.0"),
         (lambda: Frequency(at_most=-1.0), "frequencies at_most must be above 0, got -1.0"),
     ],
+    plain=True,
 )
-def test_refusals(make, message):
-    """One clear line."""
-    with pytest.raises(ValueError) as caught:
-        make()
-    assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_damping_ratio_is_that_of_the_state_matrix():

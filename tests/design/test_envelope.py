@@ -10,9 +10,10 @@ import pytest
 
 import fractaljax as fj
 from fractaljax._design.envelope import condition_text
+from tools import refusals
 
 
-def test_two_numbers_are_a_range_and_more_are_samples():
+def test_ranges_and_samples_and_their_words():
     """Tuples, lists and arrays; an Envelope says the same in so many words."""
     mapped = fj.Envelope.of(
         {"P": [1500, 2500], "mu_s": jnp.array([0.3, 0.4, 0.5]), "mu_m": (0.2, 0.25, 0.3)}
@@ -21,10 +22,7 @@ def test_two_numbers_are_a_range_and_more_are_samples():
     assert mapped == said and fj.Envelope.of(said) is said
     assert mapped.names == ("P", "mu_s", "mu_m") and mapped.sample_count == 3
     assert str(mapped) == "P 1500 to 2500, 3 samples of mu_s, mu_m"
-
-
-def test_samples_are_paired_and_ranges_are_combined():
-    """Every condition holds one measured pair, at a load anywhere in its range."""
+    # Every condition holds one measured pair, at a load anywhere in its range.
     pairs = [(0.3, 0.2), (0.4, 0.25)]
     mu_s, mu_m = zip(*pairs, strict=True)
     envelope = fj.Envelope({"P": (1500, 2500)}, {"mu_s": mu_s, "mu_m": mu_m})
@@ -33,6 +31,11 @@ def test_samples_are_paired_and_ranges_are_combined():
     for pair in pairs:
         loads = values[(values[:, 1:] == pair).all(axis=1), 0]
         assert loads.min() == 1500 and loads.max() == 2500 and len(np.unique(loads)) == len(loads)
+    # As results print them.
+    envelope = fj.Envelope({"P": (1500.0, 2500.0)}, {"mu_s": (0.3, 0.5)})
+    condition = envelope.condition(np.array([1.0, 0.25]))
+    assert condition == {"P": 1750.0, "mu_s": 0.5}
+    assert condition_text(condition) == "P = 1750, mu_s = 0.5"
 
 
 @pytest.mark.parametrize("count", range(1, 7))
@@ -49,12 +52,6 @@ def test_grid_has_every_corner_and_points_inside(count):
     assert 2 < len(likely) <= 8 and [1.5] * count in likely.tolist()
 
 
-def test_cells_are_equally_likely():
-    """The mean over the cells is the mean over the range."""
-    envelope = fj.Envelope({"P": (1000.0, 3000.0), "F": (2.0, 4.0)})
-    np.testing.assert_allclose(envelope.values(envelope.cells()).mean(axis=0), [2000, 3])
-
-
 def test_wide_ranges_are_searched_in_logarithms():
     """More than a decade: the middle is the geometric mean."""
     envelope = fj.Envelope({"xi_1": (1e-4, 1e-2), "P": (1000.0, 3000.0)})
@@ -62,7 +59,7 @@ def test_wide_ranges_are_searched_in_logarithms():
     np.testing.assert_allclose(envelope.values(middle), [[1e-3, 2000]])
 
 
-def test_draws_are_uniform_and_repeat():
+def test_draws_and_cells_are_uniform():
     """Inside the ranges, every sample as often as any other, and by seed."""
     envelope = fj.Envelope({"P": (1000.0, 3000.0)}, {"mu_s": (0.3, 0.4, 0.5)})
     drawn = envelope.values(envelope.drawn(30000, seed=1))
@@ -70,6 +67,9 @@ def test_draws_are_uniform_and_repeat():
     counts = [np.sum(drawn[:, 1] == mu) for mu in (0.3, 0.4, 0.5)]
     np.testing.assert_allclose(counts, 10000, rtol=0.05)
     np.testing.assert_array_equal(drawn, envelope.values(envelope.drawn(30000, seed=1)))
+    # The mean over the cells is the mean over the range.
+    envelope = fj.Envelope({"P": (1000.0, 3000.0), "F": (2.0, 4.0)})
+    np.testing.assert_allclose(envelope.values(envelope.cells()).mean(axis=0), [2000, 3])
 
 
 def test_climb_finds_a_maximum_between_the_points():
@@ -88,26 +88,14 @@ def test_climb_finds_a_maximum_between_the_points():
     np.testing.assert_array_equal(places[1, 1:], [1, 0])
     assert values[0] > -2e-5
     np.testing.assert_array_equal(values, height(places, np.arange(2)))
-
-
-def test_samples_alone_have_nothing_to_climb():
-    """Without ranges the places stay."""
+    # Without ranges the places stay.
     envelope = fj.Envelope(samples={"P": (1.0, 2.0, 3.0)})
     places = envelope.grid()
     np.testing.assert_array_equal(envelope.values(places)[:, 0], [1, 2, 3])
     assert envelope.climb(lambda *_: 1 / 0, places, np.zeros(3))[0] is places
 
 
-def test_conditions_in_words():
-    """As results print them."""
-    envelope = fj.Envelope({"P": (1500.0, 2500.0)}, {"mu_s": (0.3, 0.5)})
-    condition = envelope.condition(np.array([1.0, 0.25]))
-    assert condition == {"P": 1750.0, "mu_s": 0.5}
-    assert condition_text(condition) == "P = 1750, mu_s = 0.5"
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
+test_refusals = refusals(
     [
         (lambda: fj.Envelope.of({}), "must name at least one range or sample, got none"),
         (lambda: fj.Envelope.of({"P": (2.0, 1.0)}), "of P must be (lower, upper), got (2, 1)"),
@@ -129,16 +117,12 @@ def test_conditions_in_words():
         ),
         (lambda: fj.Envelope({c: (1.0, 2.0) for c in "abcdefg"}), "at most 6 ranges, got 7"),
     ],
+    kind=(ValueError, TypeError),
+    plain=True,
 )
-def test_refusals(make, message):
-    """One clear line: what it must be, and what it was."""
-    with pytest.raises((ValueError, TypeError)) as caught:
-        make()
-    assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("conditions", "message"),
+test_scene_refuses = refusals(
     [
         ({"pressure": (1.0, 2.0)}, "envelope names 'pressure'; there are D, G"),
         ({"friction": (1.0, 2.0)}, "envelope names 'friction'; there are D, G"),
@@ -148,9 +132,6 @@ def test_refusals(make, message):
         ({"mu_m": (0.2, 0.5)}, "envelope: mu_s must be at least mu_m = 0.5, got 0.4"),
         ({"nu": (0.2, 0.8)}, "envelope: nu must be"),
     ],
+    lambda conditions: fj.Envelope.of(conditions).check(fj.brake_scene(), ("D", "G")),
+    plain=True,
 )
-def test_scene_refuses(conditions, message):
-    """What the scene lacks, what the design moves, and what is outside a domain."""
-    with pytest.raises(ValueError) as caught:
-        fj.Envelope.of(conditions).check(fj.brake_scene(), ("D", "G"))
-    assert message in str(caught.value) and "\n" not in str(caught.value)

@@ -16,6 +16,7 @@ from fractaljax._design.rows import linearise
 from fractaljax._design.statement import state_problem
 from mechanisms import PROBLEMS
 from structures import of_problem
+from tools import refusals
 
 BOUNDS = {"D": (2.3, 2.8), "G": (1e-11, 1e-9)}
 LOUD: dict[str, Any] = {"target": 1e4, "K_n_min": 0.0, "progress": False}
@@ -145,7 +146,7 @@ def test_nearest_design_below_an_amplitude(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_run_is_repeated_from_its_file(tmp_path):
+def test_a_run_is_repeated_from_its_file_and_a_structure(tmp_path):
     """With the objective, its degree of freedom and the limits."""
     limits = [VelocityLevel(95.0, dof=1)]
     bounds, objective = {"D": (2.39, 2.41)}, CycleAmplitude(dof=1)
@@ -154,11 +155,7 @@ def test_a_run_is_repeated_from_its_file(tmp_path):
     again = fj.repeat_design(tmp_path / "run.toml", progress=False)
     assert again.value == first.value and again.cycles == first.cycles
     assert again.options["objective"].dof == 1 and len(first.cycles or {}) == 2
-
-
-@pytest.mark.slow
-def test_a_structure():
-    """The belt: the speed at which its stick-slip cycle is half as large."""
+    # The belt: the speed at which its stick-slip cycle is half as large.
     belt = of_problem(PROBLEMS["papangelo_2017"])
     own = float(fj.limit_cycle(belt).amplitude[0])
     best = fj.design(belt, {"V": (0.3, 1.5)}, constraints=[CycleAmplitude(0.6 * own)], **LOUD)
@@ -166,8 +163,7 @@ def test_a_structure():
     assert float(fj.limit_cycle(best.scene).amplitude[0]) == pytest.approx(0.6 * own, rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
+test_refusals = refusals(
     [
         (lambda x: problem(constraints=[CycleAmplitude()]), "as a requirement needs at_most"),
         (
@@ -181,8 +177,5 @@ def test_a_structure():
             "velocity level takes no envelope and no tolerance",
         ),
     ],
+    lambda call: call(fj.brake_scene()),
 )
-def test_refusals(call, message):
-    """One line that names what it must be."""
-    with pytest.raises(ValueError, match=message):
-        call(fj.brake_scene())

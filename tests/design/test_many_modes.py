@@ -39,15 +39,12 @@ def test_the_least_growth_rate_is_where_four_modes_meet(target):
         assert float(best.scene.parameters[name]) == pytest.approx(0.75, abs=1e-6)
 
 
-def test_the_nearest_design_keeps_all_modes_from_growing():
+def test_the_nearest_design_and_one_that_cannot_be_met():
     """p, q, r >= 0.6 and p + q + r <= 2.4, from (0.1, 0.2, 0.3): p = q = r = 0.6."""
     x = one_damper(p=0.1, q=0.2, r=0.3)
     best = fj.design(x, BOUNDS, target=-0.3, starts=2, lattice=4, progress=False)
     np.testing.assert_allclose([best.scene.parameters[name] for name in SHARES], 0.6, rtol=1e-6)
     assert "growth_rate of mode 2 <= target" in best.active
-
-
-def test_a_request_that_cannot_be_met_ends_as_close_as_can_be():
     x = one_damper(p=0.1, q=0.2, r=0.3)
     best = fj.design(x, BOUNDS, target=-0.5, starts=2, lattice=4, progress=False)
     assert best.result == DesignResult.infeasible

@@ -39,7 +39,7 @@ def traced(problem, conditions=0):
     return str(jaxpr), sum(primitives(jaxpr.jaxpr).values())
 
 
-def test_only_what_is_asked_is_traced():
+def test_only_what_is_asked_is_traced_and_once():
     """No scatter and no tangential law without them."""
     plain, size = traced(stated())
     assert not any(word in plain for word in ("sort", "cumsum", "log_sum_exp", "f64[55"))
@@ -48,6 +48,16 @@ def test_only_what_is_asked_is_traced():
     enveloped, _ = traced(stated(envelope=fj.Envelope({"P": (1500.0, 2500.0)})), 1)
     assert "cumsum" not in enveloped
     assert traced(stated(fj.brake_scene().replace(stiffness_ratio=0.2)))[1] < size
+    # Two designs of one kind differ in leaves alone.
+    first, second = (
+        stated(
+            envelope=fj.Envelope({"P": (1500.0, high)}),
+            tolerance=Tolerance.of({"D": sigma}),
+            constraints=(NormalStiffness(limit),),
+        )
+        for high, sigma, limit in [(2500.0, 0.005, 1e8), (2600.0, 0.004, 2e8)]
+    )
+    assert jax.tree.structure(first) == jax.tree.structure(second)
 
 
 def test_names_are_in_the_order_of_the_residuals():
@@ -85,7 +95,7 @@ def test_requirements_are_those_of_the_contacts_that_a_design_moves():
     assert stated(fixed, {"K_t/K_n": (0.1, 0.6), "mu": (0.1, 0.5)}).residual_names == only
 
 
-def test_scaled_variables_are_logarithms_of_scales():
+def test_scaled_variables_and_the_default_target():
     bounds = {"D": (2.3, 2.8), "P": (500.0, 8000.0), "mu_s": (0.3, 0.5)}
     problem = stated(bounds=bounds)
     assert problem.logarithmic == (False, True, False)
@@ -95,29 +105,13 @@ def test_scaled_variables_are_logarithms_of_scales():
     np.testing.assert_allclose(problem.scaled(fj.brake_scene()), problem.start, rtol=1e-12)
     moved = problem.moved(jnp.array([0.2, 0.5, 1.0]), problem.own_condition)
     assert pytest.approx(2000) == moved.contact.P and moved.friction.mu_s == pytest.approx(0.5)
-
-
-def test_default_target_is_half_the_least_damping_rate():
-    """Of a scene in closed form; of the same as a structure by its eigenvalues without friction."""
+    # Of a scene in closed form; of the same as a structure by its eigenvalues without friction.
     scene = fj.brake_scene()
     for x, bounds in (
         (scene, {"D": (2.3, 2.8)}),
         (fj.Structure.from_scene(scene), {"D": (2.3, 2.8)}),
     ):
         assert stated(x, bounds).target == pytest.approx(-np.pi, rel=1e-9)
-
-
-def test_new_numbers_need_no_new_program():
-    """Two designs of one kind differ in leaves alone."""
-    first, second = (
-        stated(
-            envelope=fj.Envelope({"P": (1500.0, high)}),
-            tolerance=Tolerance.of({"D": sigma}),
-            constraints=(NormalStiffness(limit),),
-        )
-        for high, sigma, limit in [(2500.0, 0.005, 1e8), (2600.0, 0.004, 2e8)]
-    )
-    assert jax.tree.structure(first) == jax.tree.structure(second)
 
 
 @pytest.mark.slow

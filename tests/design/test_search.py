@@ -198,9 +198,6 @@ def test_averages_and_their_derivatives(risk):
     np.testing.assert_allclose(change, (weights * direction).sum(axis=0), atol=1e-5)
 
 
-# --- a problem whose worst case is known ------------------------------------------------------
-
-
 def outside_disc(scene):
     """Stay outside a disc that travels along a curve with the condition F in [0, 1]."""
     o = scene.oscillator

@@ -12,7 +12,7 @@ import pytest
 import fractaljax as fj
 from fractaljax._design.statement import DEFAULT_BOUNDS
 from fractaljax._design.tolerance import Tolerance, low_discrepancy, nodes, proportion, quantile
-from tools import both_modes
+from tools import both_modes, refusals
 
 NORMAL = NormalDist()
 
@@ -49,10 +49,7 @@ def test_quantile_of_a_radius_and_in_one_dimension():
     assert quantile(jnp.asarray(z[:, 0]), jnp.asarray(weights), 0.95) == pytest.approx(
         NORMAL.inv_cdf(0.95), abs=0.03
     )
-
-
-def test_quantile_of_samples_is_between_its_neighbours():
-    """Equal weights: the mean of the order statistics around the level, whatever the order."""
+    # Equal weights: the mean of the order statistics around the level, whatever the order.
     values = np.random.default_rng(3).permutation(np.arange(100.0))
     found = quantile(jnp.asarray(values), jnp.full(100, 0.01), 0.9)
     assert found == pytest.approx(np.arange(85, 95).mean(), rel=1e-12)
@@ -74,10 +71,15 @@ def test_quantile_is_continuous_with_the_derivative_of_its_nodes():
     assert (np.abs(difference - forward) < 1e-5).mean() > 0.99
 
 
-def test_the_lattice_in_the_plane_is_fibonaccis():
+def test_lattice_proportion_and_what_does_not_scatter():
     i = np.arange(55)
     expected = np.stack([(i + 0.5) / 55, (34 * i % 55 + 0.5) / 55], axis=1)
     np.testing.assert_array_equal(low_discrepancy(55, 2), expected)
+    assert Tolerance.of({"ln G": 0.05, "D": 0.0}).names == ("ln G",)
+    # The usual one in the middle, one over n at nothing and at all.
+    assert proportion(3000, 10000) == (0.3, pytest.approx(math.sqrt(0.21 / 10000), rel=1e-3))
+    assert proportion(0, 10000) == (0.0, pytest.approx(1e-4, rel=1e-3))
+    assert proportion(10000, 10000) == (1.0, pytest.approx(1e-4, rel=1e-3))
 
 
 CORRELATED = np.array([[1.0, 0.985 * 15], [0.985 * 15, 15**2]]) * 6e-3**2
@@ -135,19 +137,7 @@ def test_squeal_probability_under_an_envelope_and_by_seed():
     assert same.value == pytest.approx(first.value, abs=1e-3)
 
 
-def test_proportion_has_a_standard_error_at_its_ends():
-    """The usual one in the middle, one over n at nothing and at all."""
-    assert proportion(3000, 10000) == (0.3, pytest.approx(math.sqrt(0.21 / 10000), rel=1e-3))
-    assert proportion(0, 10000) == (0.0, pytest.approx(1e-4, rel=1e-3))
-    assert proportion(10000, 10000) == (1.0, pytest.approx(1e-4, rel=1e-3))
-
-
-def test_what_does_not_scatter_is_left_out():
-    assert Tolerance.of({"ln G": 0.05, "D": 0.0}).names == ("ln G",)
-
-
-@pytest.mark.parametrize(
-    ("tolerance", "message"),
+test_refusals = refusals(
     [
         ({"D": -0.1}, "tolerance of D must be at least 0, got -0.1"),
         ({"D": math.nan}, "tolerance of D must be at least 0, got nan"),
@@ -158,12 +148,10 @@ def test_what_does_not_scatter_is_left_out():
         (0.1, "tolerance must be a mapping, a Tolerance or an Identification, got 0.1"),
         ({"D": "small"}, "tolerance of D must be a number, got 'small'"),
     ],
+    lambda tolerance: Tolerance.of(tolerance).check(fj.brake_scene(), DEFAULT_BOUNDS),
+    kind=(ValueError, TypeError),
+    plain=True,
 )
-def test_refusals(tolerance, message):
-    """One clear line."""
-    with pytest.raises((ValueError, TypeError)) as caught:
-        Tolerance.of(tolerance).check(fj.brake_scene(), DEFAULT_BOUNDS)
-    assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
-from tools import motionless_scene, reference_scene
+from tools import motionless_scene, reference_scene, refusals
 
 BRAKE = fj.brake_scene()
 # The design of the README.
@@ -29,7 +29,7 @@ def growth(scene):
     return float(fj.growth_rate(scene))
 
 
-def test_every_question_is_the_growth_rate_of_the_scene_that_it_means(found):
+def test_every_question_and_what_it_rests_on(found):
     as_is, loaded, revised, law, ratio, scatter = found.questions
     assert float(as_is.found) == pytest.approx(growth(DESIGNED), rel=1e-5) and as_is.quiet
     preloaded = fj.Scene(DESIGNED.contact, DESIGNED.friction, DESIGNED.oscillator, preload=True)
@@ -53,9 +53,6 @@ def test_every_question_is_the_growth_rate_of_the_scene_that_it_means(found):
     assert float(ratio.found.split()[0]) == pytest.approx(rates[-1], rel=1e-5)
     probability = fj.squeal_probability(DESIGNED, {"D": 0.01, "ln G": 0.1})
     assert f"probability {probability.value:.3g}" in scatter.found
-
-
-def test_what_it_rests_on_is_said(found):
     assert not found.quiet and not found.incurable
     assert found.rests_on[2:] == ("K_t/K_n = 0.355", "D and ln G without scatter")
     assert found.rests_on[:2] == ("friction on K_n x2", "FractalContact")
@@ -63,10 +60,7 @@ def test_what_it_rests_on_is_said(found):
     assert lines[0].split() == ["growth", "rate", "[1/s]"]
     assert lines[-2].startswith("Quiet, but it rests on: friction on K_n x2; FractalContact; K_t")
     assert lines[-1] == "Not asked: kicks (quiet_within)."
-
-
-def test_a_law_takes_surface_material_and_load_from_the_scene(found):
-    """It was given others: those of the brake before the design, 1 N, and a softer material."""
+    # It was given others: those of the brake before the design, 1 N, and a softer material.
     law = persson()
     law = fj.PerssonContact(
         law.surface, fj.Material(1e10, 0.1, 1e8, 1e9), 1.0, 1e-4, law.L, law.L_s
@@ -132,9 +126,6 @@ def test_given_stiffness_ratio_is_doubted_up_to_the_fractal_law():
     assert ratio.name == "K_t/K_n from 0.476 to 0.9"
 
 
-# --- designs under several laws ----------------------------------------------------------------
-
-
 def test_design_meets_every_law_at_once(tmp_path):
     law = persson(stiffness_ratio=0.33)
     best = fj.design(BRAKE, laws=[law], progress=False)
@@ -157,28 +148,14 @@ def test_a_law_that_no_surface_meets_is_named():
     assert "growth_rate <= target by PerssonContact" in best.violated
 
 
-@pytest.mark.parametrize(
-    "laws, message",
+test_refuses_what_is_no_list_of_laws = refusals(
     [
         (persson(), "laws must be a list of contacts, got Pers"),
         ([3.0], r"laws\[0\] must be a Contact, got 3.0"),
     ],
+    lambda laws: fj.design(BRAKE, laws=laws, progress=False),
+    kind=TypeError,
 )
-def test_refuses_what_is_no_list_of_laws(laws, message):
-    with pytest.raises(TypeError, match=message):
-        fj.design(BRAKE, laws=laws, progress=False)
-
-
-def test_refuses_laws_of_a_structure():
-    joint = fj.Joint(fj.FixedContact(1e6, 1e6, 10.0), fj.Coulomb(0.3), 0, 1)
-    x = fj.Structure(jnp.eye(2), 0.1 * jnp.eye(2), jnp.eye(2) * 1e6, {"pad": joint})
-    with pytest.raises(
-        ValueError, match="laws of a structure need a joint whose contact has a surface"
-    ):
-        fj.design(x, {"K_t": (1e5, 1e7)}, laws=[persson()], progress=False)
-
-
-# --- what else cures it ------------------------------------------------------------------------
 
 
 def test_suggestions_are_the_nearest_that_reach_the_target():
@@ -216,6 +193,12 @@ def test_refuses_what_is_no_scene():
         fj.verdict(reference_scene(), area=1e-4)
     with pytest.raises(ValueError, match=r"area must be above 0, got -1\.0"):
         fj.verdict(BRAKE, area=-1.0)
+    joint = fj.Joint(fj.FixedContact(1e6, 1e6, 10.0), fj.Coulomb(0.3), 0, 1)
+    x = fj.Structure(jnp.eye(2), 0.1 * jnp.eye(2), jnp.eye(2) * 1e6, {"pad": joint})
+    with pytest.raises(
+        ValueError, match="laws of a structure need a joint whose contact has a surface"
+    ):
+        fj.design(x, {"K_t": (1e5, 1e7)}, laws=[persson()], progress=False)
 
 
 @pytest.mark.slow
