@@ -144,9 +144,6 @@ def test_slopes_under_a_fixed_load_are_those_of_the_quadrature(point):
                 assert float(slopes[i]) == pytest.approx(expected, rel=1e-9, abs=1e-11), NAMES[i]
 
 
-# --- limits ----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "D, G, P", [(2.4, 1.342e-10, 1907.3), (2.5, 1e-10, 3e3), (2.7, 1e-9, 10.0)]
 )
@@ -222,18 +219,6 @@ def test_finite_and_positive_from_1_newton_to_1e6_with_gradients_of_three_orders
     for found in (value, *slopes, bend):
         assert np.isfinite(found).all()
     assert (np.asarray(slopes[2]) > 0).all() and (np.asarray(slopes[2]) < 1.1).all()
-
-
-def test_the_load_is_found_to_the_last_digit():
-    def load(D, log_G, log_P, log_L_s):
-        law = contact(D, *jnp.exp(jnp.stack([log_G, log_P, log_L_s])), domain_extension=True)
-        return law._solve(MU_M).load
-
-    np.testing.assert_allclose(jax.jit(jax.vmap(load))(*_batch()), np.exp(_batch()[2]), rtol=1e-12)
-
-
-@pytest.mark.slow
-def test_single_precision_is_as_good_as_that():
     exact = jax.vmap(log_K_n)(*_batch())
     with jax.enable_x64(False):
         single = [jnp.asarray(x, jnp.float32) for x in _batch()]
@@ -242,7 +227,12 @@ def test_single_precision_is_as_good_as_that():
     np.testing.assert_allclose(value, exact, atol=1e-4)
 
 
-# --- options ---------------------------------------------------------------------------------
+def test_the_load_is_found_to_the_last_digit():
+    def load(D, log_G, log_P, log_L_s):
+        law = contact(D, *jnp.exp(jnp.stack([log_G, log_P, log_L_s])), domain_extension=True)
+        return law._solve(MU_M).load
+
+    np.testing.assert_allclose(jax.jit(jax.vmap(load))(*_batch()), np.exp(_batch()[2]), rtol=1e-12)
 
 
 @pytest.mark.parametrize("D", ["2.001", "2.4", "2.5", "2.999"])
@@ -260,18 +250,15 @@ def test_domain_extension_solves_its_equation(D):
     assert float(found) == pytest.approx(expected, rel=1e-13)
 
 
-def test_domain_extension_ends_at_the_golden_ratio_and_e():
-    ends = asperity.log_domain_extension(jnp.asarray([2.0, 3.0]))
-    np.testing.assert_allclose(np.exp(ends), [(3 + 5**0.5) / 2, math.e - 1], rtol=1e-14)
-
-
-def test_more_spots_share_the_load():
+def test_domain_extension_shares_the_load_and_has_known_ends():
     """psi adds bases of every size alike: K_n is that of one count under a part of the load."""
     psi = math.exp(float(asperity.log_domain_extension(jnp.asarray(2.4))))
     count = psi ** ((3 - 2.4) / 2)
     more = measures(contact(2.4, 1e-10, 500.0, domain_extension=True))[0]
     part = measures(contact(2.4, 1e-10, 500.0 / count))[0]
     assert float(more) == pytest.approx(count * float(part), rel=1e-12)
+    ends = asperity.log_domain_extension(jnp.asarray([2.0, 3.0]))
+    np.testing.assert_allclose(np.exp(ends), [(3 + 5**0.5) / 2, math.e - 1], rtol=1e-14)
 
 
 def test_tangential_stiffness():

@@ -1,7 +1,6 @@
 """Boundary elements beside closed forms and dense matrices; derivatives, limits, refusals."""
 
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +10,7 @@ from scipy.optimize import minimize
 
 import fractaljax as fj
 from synthetic import rough
-from tools import both_modes
+from tools import both_modes, refusals
 
 MATERIAL = fj.Material(E=1.154e11, nu=0.3, sigma_y=3.55e8, H=9.94e8)
 E, H = float(MATERIAL.E), float(MATERIAL.H)
@@ -245,7 +244,7 @@ def mixed(x):
     )
 
 
-def test_derivatives_of_pressure_and_gap():
+def test_derivatives_of_pressure_gap_and_stiffness():
     """While no point joins or leaves they are linear in heights and load."""
     x = np.append(ROUGH.ravel() / UNITS[0], np.ones(3))
     _, forward, reverse = jax.jit(lambda x: both_modes(mixed, x))(jnp.asarray(x))
@@ -256,10 +255,7 @@ def test_derivatives_of_pressure_and_gap():
         step[i] = 1e-5
         slope = (value(x + step) - value(x - step)) / 2e-5
         np.testing.assert_allclose(forward[:, i], slope, rtol=1e-6, atol=1e-6)
-
-
-def test_derivative_of_the_stiffness():
-    """Westergaard: dln K_n/dln P = 1/ln(p*/p) = -dln K_n/dln(height), to a grid point in 20."""
+    # Westergaard: dln K_n/dln P = 1/ln(p*/p) = -dln K_n/dln(height), to a grid point in 20.
     h, P, *_ = wave(4096, 0.3)
 
     def log_K_n(x):
@@ -368,8 +364,7 @@ def test_what_does_not_converge_says_so(plastic):
         call(rtol=1e-30)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
+test_refusals = refusals(
     [
         ({"heights": np.zeros(8)}, r"^heights must have shape \(nx, ny\), got \(8,\)$"),
         ({"heights": np.zeros((1, 8))}, r"^heights must have shape \(nx, ny\).*\(1, 8\)$"),
@@ -379,11 +374,11 @@ def test_what_does_not_converge_says_so(plastic):
         ({"rtol": 0}, r"^rtol must be above 0 and below 1, got 0\.0$"),
         ({"plastic": 1}, "^plastic must be True or False, got 1$"),
     ],
+    lambda change: fj.boundary_element(
+        **(dict(heights=ROUGH, dx=DX, material=MATERIAL, P=1.0) | change)
+    ),
+    kind=(ValueError, TypeError),
 )
-def test_refusals(change, message):
-    given: dict[str, Any] = dict(heights=ROUGH, dx=DX, material=MATERIAL, P=1.0) | change
-    with pytest.raises((TypeError, ValueError), match=message):
-        fj.boundary_element(**given)
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import pytest
 from scipy.special import erfinv
 
 import fractaljax as fj
-from tools import assert_whole
+from tools import assert_whole, refusals
 
 BRAKE = fj.brake_scene().contact
 SURFACE, MATERIAL = BRAKE.surface, BRAKE.material
@@ -25,7 +25,7 @@ def compared():
     return fj.compare_laws(SURFACE, MATERIAL, LOADS, **SIZES, laws=given, **asked)
 
 
-def test_every_law_is_as_by_itself(compared):
+def test_every_law_is_as_by_itself_and_over_the_seeds(compared):
     names = ["fractal", "asperity", "Persson", "measured", "boundary elements"]
     assert list(compared.curves) == names
     for i, P in enumerate(LOADS):
@@ -38,9 +38,6 @@ def test_every_law_is_as_by_itself(compared):
         for given, alone in zip((found.K_n, found.K_t), law.stiffness(0.4, 0.25), strict=True):
             assert float(given[i]) == pytest.approx(float(alone), rel=1e-12)
         assert float(found.real_area[i]) == pytest.approx(float(law.real_area(0.25)), rel=1e-12)
-
-
-def test_alpha_is_the_logarithmic_slope(compared):
     h = 1e-5
     low, high = (
         fj.compare_laws(SURFACE, MATERIAL, LOADS * x, **SIZES, seeds=0, progress=False).curves
@@ -51,10 +48,7 @@ def test_alpha_is_the_logarithmic_slope(compared):
         np.testing.assert_allclose(compared.curves[name].alpha, slope, rtol=1e-8)
     np.testing.assert_allclose(compared.curves["measured"].alpha, 1.0, rtol=1e-12)
     assert compared.curves["measured"].real_area is None
-
-
-def test_boundary_elements_are_means_over_the_seeds(compared):
-    """Four surfaces side by side on four times the area, each under a quarter of the load."""
+    # Four surfaces side by side on four times the area, each under a quarter of the load.
     stiff, touching = [], []
     for key in jax.random.split(jax.random.key(5), 3):
         z = fj.topography(SURFACE, 1e-2, 64, key=key, L_s=1e-3, periodic=True)
@@ -70,7 +64,7 @@ def test_boundary_elements_are_means_over_the_seeds(compared):
     assert found.K_t is None
 
 
-def test_table(compared):
+def test_table_and_picture(compared):
     lines = repr(compared).splitlines()
     assert len(lines) == 1 + 3 * 5
     assert lines[0].split("  ")[0] == "P [N]"
@@ -81,6 +75,16 @@ def test_table(compared):
     loads = [100.0, 600.0, 6000.0]
     plastic = fj.compare_laws(SURFACE, MATERIAL, loads, **SIZES, seeds=0, progress=False)
     assert plastic.rows()[1][0][2:6] == ["0", "-", "-", "-"]
+    figure = fj.plot.laws(compared)
+    assert_whole(figure)
+    alpha: Any
+    _, alpha, ratio, _ = figure.axes
+    laws = ["fractal", "asperity", "Persson", "measured"]
+    assert [line.get_label() for line in ratio.get_lines()] == laws
+    assert any("Pastewka" in text.get_text() for text in alpha.get_legend().get_texts())
+    assert {ax.get_xlabel() for ax in figure.axes} == {"normal load P [N]"}
+    with pytest.raises(ValueError, match="show must be one of K_n, alpha, ratio, share, got 'P'"):
+        fj.plot.law_curves(compared, show="P")
 
 
 def test_full_contact_is_infinitely_stiff():
@@ -156,21 +160,7 @@ def test_persson_s_law_is_near_boundary_elements_on_surfaces_of_another_program(
     assert min(shares) < 0.04 and 0.85 < max(shares) < 0.98
 
 
-def test_picture(compared):
-    figure = fj.plot.laws(compared)
-    assert_whole(figure)
-    alpha: Any
-    _, alpha, ratio, _ = figure.axes
-    laws = ["fractal", "asperity", "Persson", "measured"]
-    assert [line.get_label() for line in ratio.get_lines()] == laws
-    assert any("Pastewka" in text.get_text() for text in alpha.get_legend().get_texts())
-    assert {ax.get_xlabel() for ax in figure.axes} == {"normal load P [N]"}
-    with pytest.raises(ValueError, match="show must be one of K_n, alpha, ratio, share, got 'P'"):
-        fj.plot.law_curves(compared, show="P")
-
-
-@pytest.mark.parametrize(
-    "wrong, message",
+test_refuses = refusals(
     [
         ({"loads": [2.0, 1.0]}, "loads must be a row of rising numbers, got [2. 1.]"),
         ({"loads": [[1.0, 2.0]]}, "loads must be a row of rising numbers"),
@@ -182,12 +172,11 @@ def test_picture(compared):
         ({"seeds": -1}, "seeds must be a whole number of at least 0, got -1"),
         ({"mu_m": 0.5}, "mu_s must be at least mu_m = 0.5, got 0.4"),
     ],
+    lambda wrong: fj.compare_laws(
+        SURFACE, MATERIAL, **{"loads": [1.0], "area": 1e-4, "progress": False} | wrong
+    ),
+    plain=True,
 )
-def test_refuses(wrong, message):
-    given = {"loads": [1.0], "area": 1e-4, "progress": False} | wrong
-    with pytest.raises(ValueError) as refusal:
-        fj.compare_laws(SURFACE, MATERIAL, given.pop("loads"), **given)
-    assert message in str(refusal.value)
 
 
 def test_refuses_what_is_no_law():

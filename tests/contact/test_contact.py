@@ -30,7 +30,7 @@ from benchmarks.exact_joint import exact_joint
 from fractaljax._base.parts import substitute
 from fractaljax._contact import fractal, load_balance
 from reference import make_contact
-from tools import both_modes, primitives
+from tools import both_modes, primitives, refusals
 
 EPS = float(np.finfo(float).eps)
 EPS32 = float(np.finfo(np.float32).eps)
@@ -193,7 +193,7 @@ def test_finite(dtype, mode):
         assert np.isfinite(slope[rows]).all(), name
 
 
-def test_log_areas():
+def test_log_areas_and_their_loads():
     """ln a_l, ln a_e and their difference, up to 700 decades apart, to 1e-14 of their size."""
     state, a_l, a_e = case("float64")[0]["state"], VALUE["ln_a_l"], VALUE["ln_a_e"]
     # ln a_e is a number of order 10, known to rounding, over 2 - D; and a sum with 2 ln G.
@@ -201,6 +201,16 @@ def test_log_areas():
     assert_within(np.abs(np.log(state.a_e) - a_e), 1e-15 * size)
     assert_within(np.abs(np.log(state.a_l) - a_l), 1e-13 * condition(1, LOG_SLOPE["a_l"]))
     assert_within(np.abs(state.log_area_ratio - (a_l - a_e)), 1e-15 * size)
+    # P of the table's areas and its derivatives at constant A_r, plastic rows included.
+    D, slopes = INPUT[:, 0], LOG_SLOPE["a_l"].copy()
+    A_r = (D - 1) / (3 - D) * VALUE["a_l"]
+    slopes[:, 0] += 1 / (D - 1) + 1 / (3 - D)
+    P, forward, reverse = loads(INPUT, A_r)
+    wanted = np.stack([-slopes[:, 0], -slopes[:, 1], np.ones_like(D)], axis=1) / slopes[:, 2:]
+    scale = condition(D, wanted)
+    assert_within(np.abs(P / INPUT[:, 7] - 1), 1e-14 * scale * (1 + np.abs(VALUE["ln_a_l"])))
+    np.testing.assert_allclose(forward, reverse, rtol=1e-11, atol=1e-11)
+    assert_within(np.abs(forward - wanted).max(axis=1), 1e-11 * scale)
 
 
 @pytest.mark.parametrize("nominal", [1.0, 0.037])
@@ -232,19 +242,6 @@ def loads(x, A_r):
 
     found, *slopes = both_modes(log_P, jnp.zeros(3, x.dtype))
     return jnp.exp(found), *slopes
-
-
-def test_load_of_every_area():
-    """P of the table's areas and its derivatives at constant A_r, plastic rows included."""
-    D, slopes = INPUT[:, 0], LOG_SLOPE["a_l"].copy()
-    A_r = (D - 1) / (3 - D) * VALUE["a_l"]
-    slopes[:, 0] += 1 / (D - 1) + 1 / (3 - D)
-    P, forward, reverse = loads(INPUT, A_r)
-    wanted = np.stack([-slopes[:, 0], -slopes[:, 1], np.ones_like(D)], axis=1) / slopes[:, 2:]
-    scale = condition(D, wanted)
-    assert_within(np.abs(P / INPUT[:, 7] - 1), 1e-14 * scale * (1 + np.abs(VALUE["ln_a_l"])))
-    np.testing.assert_allclose(forward, reverse, rtol=1e-11, atol=1e-11)
-    assert_within(np.abs(forward - wanted).max(axis=1), 1e-11 * scale)
 
 
 # --- a domain far beyond any brake's ----------------------------------------------------------
@@ -462,15 +459,20 @@ def brake_joint(D=2.4, G=1.342e-10, P=1907.3, mu_s=0.4, mu_m=0.25):
     return fj.contact_state(fj.Surface(D, G), MATERIAL, P, mu_s=mu_s, mu_m=mu_m)
 
 
-def test_load_and_area_are_inverse():
+def test_load_and_area_are_inverse_and_regimes_are_outcomes():
     """`contact_state` under the load of an area has this area; H A_r where all is plastic."""
     for G, A_r in ((1.342e-10, 3e-6), (1e-12, 1e-4), (1e-6, 3e-6)):
         P = fj.contact_load(fj.Surface(2.4, G), MATERIAL, A_r, mu_m=0.25)
         np.testing.assert_allclose(brake_joint(G=G, P=float(P)).A_r, A_r, rtol=1e-13)
     np.testing.assert_allclose(P, 9.94e8 * A_r, rtol=1e-15)
+    # Returned with a message, never raised.
+    assert brake_joint(G=1.342e-8).regime == fj.Regime.fully_plastic
+    assert brake_joint(mu_s=0.05, mu_m=0.05).regime == fj.Regime.gross_slip
+    assert "K_n = K_t = 0" in fj.Regime[fj.Regime.fully_plastic]
+    assert "K_t = 0" in fj.Regime[fj.Regime.gross_slip]
 
 
-def test_given_ratio():
+def test_given_ratio_and_friction_correction():
     """stiffness_ratio: K_t is that times K_n, K_n as by the full law, and nothing slips."""
     joint = fj.FractalContact(fj.Surface(2.4, 1.342e-10), MATERIAL, 1907.3, stiffness_ratio=0.25)
     state = joint.state(1e-9, 0.25)
@@ -479,10 +481,7 @@ def test_given_ratio():
     assert state.Q_e is None and state.slip_ratio is None
     assert state.regime == fj.Regime.elastic_plastic
     np.testing.assert_allclose(joint.stiffness(0.4, 0.25), (state.K_n, state.K_t), rtol=1e-13)
-
-
-def test_friction_correction():
-    """Eq. 19 on both sides of 0.3, its step there included."""
+    # Eq. 19 on both sides of 0.3, its step there included.
     mu_m = np.array([0.0, 0.15, 0.3, np.nextafter(0.3, 1), 0.5, 0.9])
     truth = [1, 0.9658, 0.9316, 0.932, 0.932 * np.exp(-0.316), 0.932 * np.exp(-0.948)]
     np.testing.assert_allclose(fractal.friction_correction(jnp.array(mu_m)), truth, rtol=1e-15)
@@ -545,14 +544,6 @@ def test_a_critical_area_beyond_doubles():
         assert not np.isnan(slopes["a_e"]).any()
 
 
-def test_regimes_are_outcomes():
-    """Returned with a message, never raised."""
-    assert brake_joint(G=1.342e-8).regime == fj.Regime.fully_plastic
-    assert brake_joint(mu_s=0.05, mu_m=0.05).regime == fj.Regime.gross_slip
-    assert "K_n = K_t = 0" in fj.Regime[fj.Regime.fully_plastic]
-    assert "K_t = 0" in fj.Regime[fj.Regime.gross_slip]
-
-
 # --- refusals ---------------------------------------------------------------------------------
 
 SURFACE, STAR = BRAKE.surface, {"D": 2.4, "A_r": 1e-3, "a_e": 1e-5}
@@ -563,8 +554,7 @@ def state_of(P: Any = 1907.3, mu_s: Any = 0.4, mu_m: Any = 0.25):
     return fj.contact_state(SURFACE, MATERIAL, P, mu_s=mu_s, mu_m=mu_m)
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
+test_refusals = refusals(
     [
         (lambda: state_of(P=0), r"^P must be above 0, got 0\.0$"),
         (lambda: state_of(mu_s=-0.4), r"^mu_s must be above 0, got -0\.4$"),
@@ -586,14 +576,11 @@ def state_of(P: Any = 1907.3, mu_s: Any = 0.4, mu_m: Any = 0.25):
         (lambda: tangential(2.4, 0.6, 1e-3, 1e-5, 0.2), "^nu must be at least 0 and at most 0.5"),
         (lambda: fj.Contact(), "abstract"),  # pyright: ignore[reportAbstractUsage]
     ],
+    kind=(ValueError, TypeError),
 )
-def test_refusals(call, message):
-    """The argument, the bound and the value."""
-    with pytest.raises((ValueError, TypeError), match=message):
-        call()
 
 
-def test_under_a_trace_what_depends_on_it_is_nan():
+def test_beyond_the_domain_under_a_trace_and_at_its_closed_ends():
     """Also where a law of 0 or a limit would hide it."""
     state = jax.vmap(state_of)(jnp.array([-1.0, 1907.3, jnp.inf]))
     for value in (state.K_n, state.K_t, state.a_l, state.Q_e, state.plastic_share):
@@ -603,9 +590,6 @@ def test_under_a_trace_what_depends_on_it_is_nan():
     assert np.isnan(load(-1e-6)) and load(1e-6) > 0
     fixed = jax.jit(fj.FixedContact)(1e8, -1.0)
     assert fixed.K_n == 1e8 and np.isnan(fixed.K_t)
-
-
-def test_the_closed_ends():
-    """mu_m = 0 and mu_m = 0.9 belong to the domain, in both dtypes; so does mu_m = mu_s."""
+    # mu_m = 0 and mu_m = 0.9 belong to the domain, in both dtypes; so does mu_m = mu_s.
     for mu_m in (0.0, 0.9, jnp.float32(0.9)):
         assert np.isfinite(state_of(mu_m=mu_m, mu_s=0.9).K_n)

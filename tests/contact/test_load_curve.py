@@ -99,7 +99,7 @@ def test_table(law):
     np.testing.assert_allclose(found[1], wanted[1], rtol=1e-8, atol=1e-8)
 
 
-def test_measured_table():
+def test_measured_table_and_laws_without_a_curve():
     """A table whose K_n has kinks at its loads; on one of them, between and beyond."""
     for load in (1200.0, 700.0, 20.0, 9000.0):
         law = fj.MeasuredContact(*TABLE, load, 0.8)
@@ -111,6 +111,13 @@ def test_measured_table():
                 t_eval=side, rtol=1e-11, atol=1e-10 * load, max_step=abs(side[-1]) / 100,
             )  # fmt: skip
             np.testing.assert_allclose(_load(law, found.t), found.y[0], rtol=1e-6)
+    # The source's law, whose K_n ends above P = 0, and a table too steep to open.
+    scene = fj.brake_scene()
+    for law in (scene.contact, power_law(1.2), fj.FixedContact(K_N, K_N, P)):
+        assert law.load_curve(0.4, 0.3) is None
+        with pytest.raises(ValueError, match="load needs a contact law with a load curve, got"):
+            law.load(1e-6)
+        assert not fj.Scene(law, scene.friction, scene.oscillator, True).follows_load_curve
 
 
 def test_derivatives():
@@ -148,13 +155,3 @@ def test_finite_everywhere():
     )
     assert np.isfinite(values).all() and all(np.isfinite(x).all() for x in slopes)
     assert (np.diff(values, axis=1) >= 0).all() and (values >= 0).all()
-
-
-def test_laws_without():
-    """The source's law, whose K_n ends above P = 0, and a table too steep to open."""
-    scene = fj.brake_scene()
-    for law in (scene.contact, power_law(1.2), fj.FixedContact(K_N, K_N, P)):
-        assert law.load_curve(0.4, 0.3) is None
-        with pytest.raises(ValueError, match="load needs a contact law with a load curve, got"):
-            law.load(1e-6)
-        assert not fj.Scene(law, scene.friction, scene.oscillator, True).follows_load_curve

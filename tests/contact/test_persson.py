@@ -14,7 +14,7 @@ from scipy.integrate import quad
 from scipy.special import erf
 
 import fractaljax as fj
-from tools import both_modes, primitives
+from tools import both_modes, primitives, refusals
 
 mp: Any = mpmath
 MATERIAL = fj.Material(E=1.154e11, nu=0.3, sigma_y=3.55e8, H=9.94e8)
@@ -29,7 +29,6 @@ POINTS = [
     (2.7, 1e-9, 1e6, 2.5e-5, L, E),
     (2.1, 1e-9, 1e5, 1e-5, L, E),
 ]
-MODES = ("forward", "reverse")
 
 
 def contact(D, G, P, area=1e-4, L=L, E=E, **others):
@@ -92,7 +91,6 @@ def found(point):
 
 
 @pytest.mark.parametrize("point", POINTS, ids=str)
-# REPLACES test_both_modes_agree
 def test_stiffness_is_the_quadrature(point):
     with mpmath.workdps(40):
         exact = float(mp.log(exact_stiffness(point[0], *map(mp.log, point[1:]))))
@@ -116,11 +114,6 @@ def test_slopes_are_those_of_the_quadrature(point, name):
         exact = float((moved(h) - moved(-h)) / (2 * h))
     for slope in found(point)[1:]:
         assert float(slope[i]) == pytest.approx(exact, rel=1e-9, abs=1e-11)
-
-
-def test_both_modes_agree():
-    for point in POINTS:
-        np.testing.assert_allclose(*found(point)[1:], rtol=1e-10, atol=1e-12)
 
 
 def test_middle_range_is_yang_and_perssons_mean_separation():
@@ -161,9 +154,6 @@ def test_middle_range_is_yang_and_perssons_mean_separation():
     finite = 1.05 * math.exp(1.24 * (D - 2.5)) * E * L * (p * L / (E * Sq)) ** (1 / (4 - D))
     expected = ((1 / middle) ** 2.4 + finite**2.4) ** (1 / 2.4)
     assert float(stiffness(D, G, p * 1e-4)[0]) == pytest.approx(expected, rel=1e-5)
-
-
-# --- limits ----------------------------------------------------------------------------------
 
 
 @pytest.mark.slow  # compiles third derivatives
@@ -232,10 +222,7 @@ def test_mean_gap_falls_with_the_load_by_the_compliance(P):
     assert float(fall) == pytest.approx(layer - 1 / float(K_n), rel=1e-9)
 
 
-# --- tangential ------------------------------------------------------------------------------
-
-
-def test_tangential_stiffness_has_mindlin_s_ratio():
+def test_tangential_stiffness_has_mindlin_s_ratio_or_is_0_in_gross_slip():
     for nu, ratio in ((0.3, 0.8235294117647058), (0.0, 1.0), (0.5, 2 / 3)):
         material = fj.Material(E=E, nu=nu, sigma_y=3.55e8, H=9.94e8)
         law = fj.PerssonContact(fj.Surface(2.4, 1e-10), material, 500.0, 1e-4, L, L_S)
@@ -243,6 +230,11 @@ def test_tangential_stiffness_has_mindlin_s_ratio():
         assert float(K_t / K_n) == pytest.approx(ratio, rel=1e-14)
     given = contact(2.4, 1e-10, 500.0, stiffness_ratio=0.3).stiffness(0.4, 0.25)
     assert float(given[1] / given[0]) == pytest.approx(0.3, rel=1e-14)
+    for Q in (200.0, 200.1, 1e6):  # mu_s P = 200 N
+        assert float(slipping(Q)) == 0 == float(jax.grad(slipping)(Q))
+    assert float(slipping(0.0)) == pytest.approx(float(stiffness(2.4, 1e-10, 500.0)[1]), rel=1e-14)
+    assert 0 < float(slipping(199.999)) < 0.01 * float(slipping(0.0))
+    assert float(jax.grad(slipping)(100.0)) < 0
 
 
 def test_partial_slip_gives_back_the_tangential_displacement():
@@ -261,14 +253,6 @@ def slipping(Q):
     return stiffness(2.4, 1e-10, 500.0, Q=Q)[1]
 
 
-def test_gross_slip_has_no_tangential_stiffness():
-    for Q in (200.0, 200.1, 1e6):  # mu_s P = 200 N
-        assert float(slipping(Q)) == 0 == float(jax.grad(slipping)(Q))
-    assert float(slipping(0.0)) == pytest.approx(float(stiffness(2.4, 1e-10, 500.0)[1]), rel=1e-14)
-    assert 0 < float(slipping(199.999)) < 0.01 * float(slipping(0.0))
-    assert float(jax.grad(slipping)(100.0)) < 0
-
-
 def test_a_scene_without_tangential_load_evaluates_the_law_once():
     counts = [
         primitives(jax.make_jaxpr(lambda P, given=given: stiffness(2.4, 1e-10, P, **given))(500.0))
@@ -276,9 +260,6 @@ def test_a_scene_without_tangential_load_evaluates_the_law_once():
     ]
     assert counts[0]["erf"] == 2  # of the kernel, of the real area
     assert counts[1]["erf"] == 4
-
-
-# --- in a scene --------------------------------------------------------------------------------
 
 
 def brake() -> fj.Scene:
@@ -328,8 +309,7 @@ def test_float32_and_vmap():
     np.testing.assert_allclose(batch, exact, rtol=1e-13)
 
 
-@pytest.mark.parametrize(
-    "wrong, message",
+test_refuses_what_is_outside = refusals(
     [
         ({"P": 0.0}, "P must be above 0, got 0.0"),
         ({"area": -1.0}, "area must be above 0, got -1.0"),
@@ -338,9 +318,9 @@ def test_float32_and_vmap():
         ({"Q": -1.0}, "Q must be at least 0, got -1.0"),
         ({"stiffness_ratio": -1.0}, "stiffness_ratio must be at least 0, got -1.0"),
     ],
+    lambda wrong: fj.PerssonContact(
+        fj.Surface(2.4, 1e-10), MATERIAL, **dict(P=1.0, area=1e-4, L=L, L_s=L_S) | wrong
+    ),
+    pattern="^{}$",
+    plain=True,
 )
-def test_refuses_what_is_outside(wrong, message):
-    given = dict(P=1.0, area=1e-4, L=L, L_s=L_S) | wrong
-    with pytest.raises(ValueError) as refusal:
-        fj.PerssonContact(fj.Surface(2.4, 1e-10), MATERIAL, **given)
-    assert str(refusal.value) == message

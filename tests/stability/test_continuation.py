@@ -22,8 +22,6 @@ def from_point(problem, start):
     return problem.curve(*problem.corrected(np.array(start, float)))
 
 
-# --- any number of unknowns ---------------------------------------------------------------
-
 CIRCLE = curves(lambda u: u @ u - 1, lambda u: 2 * u)
 TILTED = curves(  # the unit sphere and the plane x = z
     lambda u: [u @ u - 1, u[0] - u[2]], lambda u: [2 * u, [1.0, 0.0, -1.0]], n=3
@@ -84,7 +82,7 @@ def test_a_curve_in_three_dimensions_ends_on_the_box():
     assert length == pytest.approx(exact, rel=1e-4)
 
 
-def test_folds_are_points_like_any_other():
+def test_folds_branch_points_and_why_a_curve_ends():
     """x = 3 y^3 - y turns back twice, at y = +-1/3."""
     curve = from_point(FOLDS, [0.0, 0.0])
     x, y = curve.points.T
@@ -93,18 +91,7 @@ def test_folds_are_points_like_any_other():
     assert sorted(x[[0, -1]]) == [-1, 1]
     assert np.count_nonzero(np.diff(np.sign(np.diff(x)))) == 2
     assert x[np.abs(y - 1 / 3) < 0.1].min() == pytest.approx(-2 / 9, abs=1e-4)
-
-
-def lemniscate(**options):
-    return curves(
-        lambda u: (u @ u) ** 2 - u[0] ** 2 + u[1] ** 2,
-        lambda u: 4 * (u @ u) * u - 2 * np.array([u[0], -u[1]]),
-        **options,
-    )
-
-
-def test_a_branch_point_ends_an_oriented_curve_only():
-    """Bernoulli's lemniscate crosses itself at 0: half of it, or the whole figure of eight."""
+    # Bernoulli's lemniscate crosses itself at 0: half of it, or the whole figure of eight.
     half = from_point(lemniscate(), [1, 0])
     assert half.start is half.end is CurveEnd.stuck
     assert np.linalg.norm(half.points[[0, -1]], axis=1).max() < 1e-5
@@ -114,9 +101,6 @@ def test_a_branch_point_ends_an_oriented_curve_only():
     assert whole.points[:, 0].min() == pytest.approx(-1, abs=1e-3)
     length = np.linalg.norm(np.diff(whole.points, axis=0), axis=1).sum()
     assert length == pytest.approx(5.244115108584239, rel=1e-3)  # 2 times the lemniscate constant
-
-
-def test_why_a_curve_ends():
     line = {"residual": lambda u: u[1], "jacobian": lambda u: [0.0, 1.0]}
     assert from_point(curves(**line, most=10), [0, 0]).end is CurveEnd.long
     beyond = from_point(curves(**line, valid=lambda u: u[0] < 1, most=150), [0, 0])
@@ -124,6 +108,14 @@ def test_why_a_curve_ends():
     assert CurveEnd.stuck in (beyond.start, beyond.end)
     undefined = curves(lambda u: u[1] if u[0] < 1 else np.nan, line["jacobian"], most=150)
     assert from_point(undefined, [0, 0]).points[:, 0].max() == pytest.approx(1, abs=1e-6)
+
+
+def lemniscate(**options):
+    return curves(
+        lambda u: (u @ u) ** 2 - u[0] ** 2 + u[1] ** 2,
+        lambda u: 4 * (u @ u) * u - 2 * np.array([u[0], -u[1]]),
+        **options,
+    )
 
 
 def corrected(problem, u, **options) -> Any:
@@ -142,9 +134,6 @@ def test_newtons_method_converges_or_says_so():
     assert fixed.tolist() == pytest.approx([0.6, 0.8], rel=1e-14) and fixed[0] == 0.6
 
 
-# --- all curves in the unit square --------------------------------------------------------
-
-
 def in_square(function, slope, lines=21):
     """`trace` of a function of points (k, 2) with gradient (k, 2)."""
     problem = curves(lambda u: function(u[None])[0], lambda u: slope(u[None])[0], low=0.0, high=1.0)
@@ -158,15 +147,12 @@ def circle(radius, x=0.5):
     )
 
 
-def test_a_loop_is_found_once():
+def test_loops_arcs_tongues_and_no_zero():
     (curve,), negative, untraced = circle(0.3)
     assert curve.start is curve.end is CurveEnd.closed
     np.testing.assert_allclose(np.linalg.norm(curve.points - 0.5, axis=1), 0.3, rtol=1e-14)
     assert (negative, untraced) == (False, 0)
-
-
-def test_arcs_end_on_the_edges():
-    """A circle through all four edges is four arcs; ends have a coordinate of exactly 0 or 1."""
+    # A circle through all four edges is four arcs; ends have a coordinate of exactly 0 or 1.
     found, negative, _ = circle(0.6)
     assert len(found) == 4 and not negative
     for curve in found:
@@ -174,18 +160,12 @@ def test_arcs_end_on_the_edges():
         for p in curve.points[[0, -1]]:
             assert {0.0, 1.0} & set(p.tolist())
             assert np.linalg.norm(p - 0.5) == pytest.approx(0.6, rel=1e-14)
-
-
-def test_tongue_between_two_lines_of_the_lattice():
-    """Thinner than a hundredth of a cell and parallel to the lattice: both its sides."""
+    # Thinner than a hundredth of a cell and parallel to the lattice: both its sides.
     found, *_ = in_square(
         lambda us: (us[:, 1] - 0.512345) ** 2 - 1e-8,
         lambda us: np.stack([0 * us[:, 0], 2 * (us[:, 1] - 0.512345)], axis=-1),
     )
     heights = sorted(float(curve.points[:, 1].mean()) for curve in found)
     assert heights == pytest.approx([0.512245, 0.512445], abs=1e-12)
-
-
-def test_no_zero():
     assert circle(0.1, x=2.0) == ([], False, 0)
     assert circle(9.0) == ([], True, 0)

@@ -34,19 +34,11 @@ def growth_at(scene, factor):
 growths_at = jax.jit(jax.vmap(growth_at, (None, 0)))
 
 
-@pytest.fixture(autouse=True)
-def _forty_digits():
-    with mp.workdps(40):
-        yield
-
-
 def fixed(K_n=4e8, K_t=6e7, friction=None, **changes):
     """The reference oscillator on a joint of known stiffness, with constant friction."""
     friction = fj.Coulomb(0.4) if friction is None else friction
     return fj.Scene(fj.FixedContact(K_n, K_t), friction, BRAKE.oscillator).replace(**changes)
 
-
-# --- the closed form ----------------------------------------------------------------------
 
 NAMES = ("K_n", "K_t", "m", "omega_1", "omega_2", "xi_1", "xi_2")
 
@@ -80,12 +72,6 @@ def test_tabled_values(K_n, ratio, tabled):
     assert float(constant(stribeck)) == pytest.approx(tabled, abs=5e-8)
 
 
-def test_unequal_damping_destabilises():
-    """Light damping: 2 sqrt(c_1 c_2)/(c_1 + c_2) = 0.7171 times the friction without damping."""
-    ratio = constant(fixed(xi_1=1e-6, xi_2=7e-6)) / constant(fixed(xi_1=0.0, xi_2=0.0))
-    assert float(ratio) == pytest.approx(0.7171, abs=5e-5)
-
-
 def test_closed_form_is_the_root_of_the_hurwitz_determinant():
     rng, n = np.random.default_rng(0), 200
     K_n, m, omega = log_uniform(rng, 5, 11, n), log_uniform(rng, -1, 1, n), (2, 5, (2, n))
@@ -97,9 +83,14 @@ def test_closed_form_is_the_root_of_the_hurwitz_determinant():
         # a - b may have lost digits to rounding.
         a, b = x[3] ** 2 + x[1] / x[2], x[4] ** 2 + x[0] / x[2]
         assert abs(float(value) - wanted) <= 1e-14 * wanted * (1 + (a + b) / abs(a - b))
+    # A slope that hardly exists takes the other route to the same number.
+    scene = fixed(friction=fj.Stribeck(0.4, 0.4, 0.5))
+    assert float(fj.critical_friction(scene)) == pytest.approx(float(constant(scene)), rel=1e-13)
+    text = str(jax.make_jaxpr(fj.critical_friction)(fixed()))
+    assert "while" not in text and "scan" not in text
 
 
-def test_gradients_of_the_closed_form():
+def test_gradients_of_the_closed_form_in_a_batch_and_at_held_stiffness():
     at = (4e8, 6e7, 1.0, 6283.0, 5026.0, 0.001, 0.007)
     wanted = []
     for i, x in enumerate(map(mp.mpf, at)):
@@ -109,9 +100,16 @@ def test_gradients_of_the_closed_form():
     for found in jax.jit(lambda x: both_gradients(of_numbers, x))(list(at)):
         np.testing.assert_allclose(found, wanted, rtol=1e-11)
     assert float(gradient(fixed()).friction.mu_s) == 0  # the scene's own friction does not matter
+    scene, Vs = reference_scene(), jnp.array([0.05, 0.15, 0.6])
+    many = jax.vmap(lambda V: fj.critical_friction(scene.replace(V=V)))(Vs)
+    one = [fj.critical_friction(scene.replace(V=V)) for V in Vs]
+    np.testing.assert_allclose(many, one, rtol=1e-12)
+    held = BRAKE.replace(contact=fj.FixedContact(*fj.stiffness(BRAKE)))
+    closed = float(constant(held))
+    assert closed != pytest.approx(float(fj.critical_friction(BRAKE)), rel=1e-3)
+    lin = linearised(with_friction_times(held, closed / sliding_friction(held)), False)
+    assert abs(float(hopf_test_function(lin))) < 1e-15
 
-
-# --- the first root -----------------------------------------------------------------------
 
 SCENES = {
     "slope": reference_scene(),
@@ -140,20 +138,6 @@ def test_first_root_is_where_squeal_starts(name):
         )
         assert factor == pytest.approx(root, rel=1e-12)
         assert abs(float(growth_at(scene, factor))) < 1e-8
-
-
-def test_closed_form_and_first_root_agree():
-    """A slope that hardly exists takes the other route to the same number."""
-    scene = fixed(friction=fj.Stribeck(0.4, 0.4, 0.5))
-    assert float(fj.critical_friction(scene)) == pytest.approx(float(constant(scene)), rel=1e-13)
-
-
-def test_stiffness_can_be_held():
-    held = BRAKE.replace(contact=fj.FixedContact(*fj.stiffness(BRAKE)))
-    closed = float(constant(held))
-    assert closed != pytest.approx(float(fj.critical_friction(BRAKE)), rel=1e-3)
-    lin = linearised(with_friction_times(held, closed / sliding_friction(held)), False)
-    assert abs(float(hopf_test_function(lin))) < 1e-15
 
 
 def leaf(scene, quantity):
@@ -194,8 +178,6 @@ def test_gradients_of_the_first_root(name):
         assert float(bend(scene, at, quantity)) == pytest.approx(bent, rel=1e-4)
 
 
-# --- corner cases -------------------------------------------------------------------------
-
 INFINITE = {
     "no K_t": fixed(K_t=0.0),
     "no K_n": fixed(K_n=0.0),
@@ -212,7 +194,7 @@ def test_no_coupling_no_squeal(name):
     assert all(float(x) == 0 for x in jax.tree.leaves(gradient(INFINITE[name])))
 
 
-def test_without_damping():
+def test_without_or_with_unequal_damping():
     """The friction of coalescence; with one undamped direction, any friction at all."""
     scene = fixed(xi_1=0.0, xi_2=0.0)
     a, b = 6283.185307179586**2 + 6e7, 5026.548245743669**2 + 4e8
@@ -224,9 +206,9 @@ def test_without_damping():
     driven = reference_scene().replace(xi_1=0.0, xi_2=0.0, F=-5.0)
     assert float(fj.critical_friction(driven)) == 0
     assert all(jnp.isfinite(x) for x in jax.tree.leaves(gradient(driven)))
-
-
-def test_what_cannot_be_computed_is_not_stable():
+    # Light damping: 2 sqrt(c_1 c_2)/(c_1 + c_2) = 0.7171 times the friction without damping.
+    ratio = constant(fixed(xi_1=1e-6, xi_2=7e-6)) / constant(fixed(xi_1=0.0, xi_2=0.0))
+    assert float(ratio) == pytest.approx(0.7171, abs=5e-5)
     assert np.isnan(fj.critical_friction(reference_scene().replace(v_m=1e-150)))
 
 
@@ -251,25 +233,10 @@ def test_hopf_test_function_is_negative_exactly_where_it_squeals():
     assert sure.mean() > 0.99
     assert ((growth < 0) & sure).sum() > 5000
     np.testing.assert_array_equal((test < 0)[sure], (growth > 0)[sure])
-
-
-def test_frequency_at_the_boundary():
-    """omega^2 = a_1/a_3 is the imaginary eigenvalue there."""
+    # omega^2 = a_1/a_3 is the imaginary eigenvalue there.
     scene = fixed().replace(mu=fj.critical_friction(fixed()))
     found = critical_frequency(linearised(scene, True))
     assert float(found) == pytest.approx(float(fj.stability(scene).frequency), rel=1e-12)
-
-
-def test_closed_form_traces_no_search():
-    text = str(jax.make_jaxpr(fj.critical_friction)(fixed()))
-    assert "while" not in text and "scan" not in text
-
-
-def test_vmapped_is_looped():
-    scene, Vs = reference_scene(), jnp.array([0.05, 0.15, 0.6])
-    many = jax.vmap(lambda V: fj.critical_friction(scene.replace(V=V)))(Vs)
-    one = [fj.critical_friction(scene.replace(V=V)) for V in Vs]
-    np.testing.assert_allclose(many, one, rtol=1e-12)
 
 
 @pytest.mark.parametrize("scene", [fixed(), pytest.param(BRAKE, marks=slow)])

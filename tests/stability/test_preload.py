@@ -8,13 +8,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mpmath as mp
 import numpy as np
 import pytest
 
 import fractaljax as fj
 from fractaljax._stability.summary import stability_table, structure_table
-from preloaded import BRAKE, DIGITS, LEVER, PROBLEMS, PULL, measured, problem
+from preloaded import BRAKE, LEVER, PROBLEMS, PULL, measured, problem
 from tools import both_gradients
 
 pytestmark = pytest.mark.unoptimised
@@ -26,12 +25,6 @@ def most_slow(*quick):
     """All problems, of which only these are in the default run."""
     each = (name if name in quick else pytest.param(name, marks=slow) for name in PROBLEMS)
     return pytest.mark.parametrize("name", [*each])
-
-
-@pytest.fixture(autouse=True)
-def _forty_digits():
-    with mp.workdps(DIGITS):
-        yield
 
 
 @functools.partial(jax.jit, static_argnames="slope")
@@ -117,9 +110,6 @@ def test_a_scene_is_its_structure(name):
     assert force == pytest.approx(float(wanted.normal_force[0]), rel=1e-11) and float(x_1) > 0
 
 
-# --- known figures ------------------------------------------------------------------------
-
-
 def test_the_reference_brake():
     """The load turns the slope of friction from stabilising to destabilising."""
     brake = BRAKE.replace(preload=True)
@@ -157,8 +147,6 @@ def test_hoffmanns_minimal_model(how):
     assert float(above.growth_rate) == pytest.approx(wanted, rel=1e-6)
 
 
-# --- onset of squeal ----------------------------------------------------------------------
-
 ONSETS = {
     "closed form": BRAKE.replace(
         contact=fj.FixedContact(4e8, 2e8, 500.0), friction=fj.Coulomb(0.3), preload=True
@@ -185,7 +173,7 @@ def test_critical_friction(name):
 
 
 @slow
-def test_boundary():
+def test_boundary_and_onset_on_a_load_curve():
     """Every point of it has a growth rate of 0; a scene without the load has another."""
     scene = ONSETS["slope"]
     window = ("P", 8.0, 60.0), ("mu", 0.05, 0.4)
@@ -197,11 +185,7 @@ def test_boundary():
             growth = fj.growth_rate(scene.replace(P=P, friction=law))
             assert abs(float(growth)) < 1e-6
         assert np.ptp(branch.y) > 0.01  # it depends on the load
-
-
-@slow
-def test_onset_on_a_load_curve():
-    """Where friction, scaled, makes the growth rate 0; and the boundary passes through it."""
+    # Where friction, scaled, makes the growth rate 0; and the boundary passes through it.
     x = fj.Scene(measured(4e8, 1907.3), fj.Coulomb(0.3), BRAKE.oscillator, True).replace(F=1500.0)
     critical = float(fj.critical_friction(x))
     assert abs(float(fj.growth_rate(x.replace(mu=critical)))) < 1e-6
@@ -212,9 +196,6 @@ def test_onset_on_a_load_curve():
     near = np.abs(points[0] - 1907.3).argmin()
     rate = float(fj.growth_rate(x.replace(P=points[0, near], mu=points[1, near])))
     assert abs(rate) < 1e-3
-
-
-# --- open joints --------------------------------------------------------------------------
 
 
 def lifted():
@@ -242,15 +223,7 @@ def test_an_open_joint_has_no_number(which):
     assert np.isfinite(answers(closed)[1]) and "normal force [N]" in table(closed)
 
 
-def test_open_at_equilibrium_on_a_load_curve():
-    """Pulled off the belt there is no steady sliding."""
-    x = problem("scene, load curve")[0].replace(F=1e5)
-    for each in (x, fj.Structure.from_scene(x)):
-        found, growth_rate, _ = answers(each)
-        assert np.isnan(growth_rate) and found.normal_force[0] == 0
-
-
-def test_it_opens_where_the_normal_force_is_0():
+def test_where_a_joint_opens():
     """The load at which it is 0 is found from the forces; the numbers end there."""
     scene = lifted()[0]
 
@@ -264,16 +237,18 @@ def test_it_opens_where_the_normal_force_is_0():
     (below, without), (above, growth_rate) = at(P * (1 - 1e-9)), at(P * (1 + 1e-9))
     assert below < 0 < above
     assert np.isnan(without) and np.isfinite(growth_rate)
-
-
-def test_friction_that_opens_the_joint_first():
-    """Below the critical friction of a nearly open joint it is open: no number."""
+    # Below the critical friction of a nearly open joint it is open: no number.
     scene = ONSETS["closed form"].replace(F=700.0)
     assert float(answers(scene.replace(mu=0.01))[0].normal_force[0]) > 0
     assert np.isnan(fj.critical_friction(scene))
     assert np.isfinite(fj.critical_friction(scene.replace(P=5000.0)))
     with pytest.raises(ValueError, match=r"cannot be computed at .*the joint may be open there"):
         fj.hopf_boundary(scene, ("P", 100.0, 900.0), ("mu", 0.1, 0.5), lines=5)
+    # Pulled off the belt there is no steady sliding.
+    x = problem("scene, load curve")[0].replace(F=1e5)
+    for each in (x, fj.Structure.from_scene(x)):
+        found, growth_rate, _ = answers(each)
+        assert np.isnan(growth_rate) and found.normal_force[0] == 0
 
 
 def test_a_free_body_has_no_pressed_equilibrium():
@@ -288,16 +263,13 @@ def test_a_free_body_has_no_pressed_equilibrium():
         structure_table(free)
 
 
-def test_float32():
+def test_float32_and_no_normal_force_without_preload():
     for name in ("scene", "three kinds"):
         x, _ = problem(name)
         small = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), x)
         found = fj.growth_rate(small)
         assert found.dtype == jnp.float32
         assert float(found) == pytest.approx(float(answers(x)[1]), rel=2e-2)
-
-
-def test_without_preload_there_is_no_normal_force():
-    """Neither of a scene nor of a structure in the source's form."""
+    # Neither of a scene nor of a structure in the source's form.
     for x in (BRAKE, fj.Structure.from_scene(BRAKE)):
         assert jax.eval_shape(fj.stability, x).normal_force is None

@@ -23,12 +23,6 @@ from tools import both_modes
 many_resolutions = jax.jit(jax.vmap(resolutions))
 
 
-@pytest.fixture(autouse=True)
-def _forty_digits():
-    with mp.workdps(40):
-        yield
-
-
 def check(columns):
     """Real parts within their resolution but for 2 in 1000, the largest to 1e-12 or its condition.
 
@@ -72,16 +66,6 @@ def test_roots_of_many_are_exact(name):
     check(family(name, 500))
 
 
-def test_opposite_heavy_damping_is_exact_beside_the_largest_root():
-    """One direction driven, the other damped, both far beyond critical."""
-    a, b, c_1, c_2, g = family("overdamped", 40)
-    columns = a, b, -10 * c_1, 10 * c_2, g
-    growth = np.real(many_rightmost(stacked(columns)))
-    for own, *x in zip(growth, *columns, strict=True):
-        exact = exact_roots(*x)
-        assert abs(float(own) - exact[0].real) <= 1e-10 * max(map(abs, exact))
-
-
 OMEGA = 4096.0
 MULTIPLE = [
     ((OMEGA**2, OMEGA**2, 2 * OMEGA, 2 * OMEGA, 0.0), -OMEGA),  # one quadruple root
@@ -93,10 +77,17 @@ MULTIPLE = [
 ]
 
 
-def test_multiple_roots_are_exact():
+def test_multiple_roots_and_opposite_heavy_damping_are_exact():
     """Critical damping, equal modes, and all four roots in one point: not one digit lost."""
     found = many_rightmost(stacked(np.transpose([column for column, _ in MULTIPLE])))
     np.testing.assert_allclose(found.real, [growth for _, growth in MULTIPLE], rtol=4 * EPS)
+    # One direction driven, the other damped, both far beyond critical.
+    a, b, c_1, c_2, g = family("overdamped", 40)
+    columns = a, b, -10 * c_1, 10 * c_2, g
+    growth = np.real(many_rightmost(stacked(columns)))
+    for own, *x in zip(growth, *columns, strict=True):
+        exact = exact_roots(*x)
+        assert abs(float(own) - exact[0].real) <= 1e-10 * max(map(abs, exact))
 
 
 def test_zero_damping_grows_only_by_flutter():
@@ -119,9 +110,6 @@ def test_float32():
     missed = np.abs(np.real(ours - exact)) / np.sqrt(columns[0] + columns[1])
     assert np.quantile(missed, 0.99) < 1e-6
     assert missed.max() < 1e-3
-
-
-# --- derivatives --------------------------------------------------------------------------
 
 
 def growth(x):

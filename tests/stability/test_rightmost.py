@@ -91,7 +91,7 @@ def test_the_rightmost_of_rough_modes_is_refined_to_rounding(seed, off):
     assert abs(y @ ((2 * s * M + C) @ x) - 1) < 1e-12
 
 
-def test_a_mode_just_beyond_the_band_does_not_count():
+def test_a_mode_just_beyond_the_band_nan_and_a_batch():
     matrices = problem()
     s = modes_of(*matrices)[0]
     s = s[s.imag < 8.5]
@@ -100,6 +100,12 @@ def test_a_mode_just_beyond_the_band_does_not_count():
     band = 0.0, first.imag - 1e-6
     (found, *_), settled = refined(band, *vars(coarse_space(matrices)).values(), *matrices)
     assert settled and abs(found - second) < 1e-12
+    M, C, K = problem()
+    assert jnp.isnan(by(coarse_space((M, C, K)), M, C, np.nan * K))
+    both = [jax.vmap(jax.value_and_grad(f)) for f in along_a_line()]
+    found, wanted = jax.jit(lambda t: [f(t) for f in both])(jnp.linspace(0, 1e-4, 5))
+    for ours, theirs in zip(found, wanted, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-9)
 
 
 def twice(matrices):
@@ -127,11 +133,6 @@ def test_all_modes_decide_where_rough_ones_do_not(spoilt):
     matrices, coarse = spoilt(problem())
     assert not refined(BAND, *vars(coarse).values(), *matrices)[1]
     assert by(coarse, *matrices).real == by(None, *matrices).real
-
-
-def test_nan_stays_nan():
-    M, C, K = problem()
-    assert jnp.isnan(by(coarse_space((M, C, K)), M, C, np.nan * K))
 
 
 @functools.cache
@@ -170,13 +171,6 @@ def test_derivatives_of_every_order_are_those_of_all_modes(orders):
     for found, wanted in zip(*program(0.01), strict=True):
         assert abs(wanted) > 1e-4
         assert found == pytest.approx(float(wanted), rel=1e-9)
-
-
-def test_a_batch():
-    both = [jax.vmap(jax.value_and_grad(f)) for f in along_a_line()]
-    found, wanted = jax.jit(lambda t: [f(t) for f in both])(jnp.linspace(0, 1e-4, 5))
-    for ours, theirs in zip(found, wanted, strict=True):
-        np.testing.assert_allclose(ours, theirs, rtol=1e-9)
 
 
 def test_a_reduced_structure_keeps_its_coarse_space(monkeypatch, tmp_path):

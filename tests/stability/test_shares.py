@@ -9,7 +9,7 @@ import scipy.linalg
 
 import fractaljax as fj
 from structures import beam_on_pad, matrices, state_matrix, two_joints
-from tools import reference_scene
+from tools import reference_scene, refusals
 
 shares_of: Any = fj.energy_shares
 
@@ -117,7 +117,7 @@ def test_contributions_sum_to_the_growth_rate(name, friction_slope):
         np.testing.assert_allclose(shares.sum(axis=1), 1, rtol=1e-12)
 
 
-def test_belt_by_hand():
+def test_belt_and_falling_friction_by_hand():
     """Of two degrees of freedom: friction gives mu (K_n + K_t) Im(x1* x2)/(2 omega m |x|^2)."""
     m, K_n, K_t, mu = 2.0, 3e5, 1e5, 0.6
     c, k = np.array([3.0, 5.0]), np.array([4e5, 3e5])
@@ -138,10 +138,7 @@ def test_belt_by_hand():
     spring = size @ [K_t, K_n] + mu * (K_t - K_n) * (x[:, 0].conj() * x[:, 1]).real
     np.testing.assert_allclose(found.strain[:, 3], spring / (spring + size @ k), rtol=1e-9)
     assert found.growth[0, 3] > 0 > found.growth[1, 3]  # it squeals in one mode only
-
-
-def test_falling_friction_by_hand():
-    """A mass on a belt under the load P: mu' P is a damper, c/2m and mu' P/2m are rates."""
+    # A mass on a belt under the load P: mu' P is a damper, c/2m and mu' P/2m are rates.
     law = fj.ExponentialStribeck(0.6, 0.3, 0.5)
     joint = fj.Joint(fj.FixedContact(0.0, 7.0, 20.0), law, 0, None, 0.2)
     found = shares_of(fj.Structure([[2.0]], [[0.4]], [[50.0]], {"belt": joint}))
@@ -170,8 +167,7 @@ def test_names_and_the_table():
     assert [line.split()[2:4] for line in repr(free).splitlines()[1:]] == [["-", "-"]] * 2
 
 
-@pytest.mark.parametrize(
-    ("given", "options", "message"),
+test_refusals = refusals(
     [
         ((3.0,), {}, "x must be a Scene or a Structure"),
         ((rotor(), "all"), {}, "modes must be a Stability"),
@@ -179,7 +175,6 @@ def test_names_and_the_table():
         ((rotor(),), {"names": {"K 4": "pad"}}, "names must be of M 1, .* K 3, pad, got 'K 4'"),
         ((rotor(),), {"friction_slope": 1}, "friction_slope must be True or False"),
     ],
+    lambda given, options: shares_of(*given, **options),
+    kind=(ValueError, TypeError),
 )
-def test_refusals(given, options, message):
-    with pytest.raises((TypeError, ValueError), match=message):
-        shares_of(*given, **options)

@@ -20,17 +20,9 @@ BRAKE = fj.brake_scene()
 OSCILLATOR = BRAKE.oscillator
 
 
-@pytest.fixture(autouse=True)
-def _forty_digits():
-    with mp.workdps(40):
-        yield
-
-
 def fixed(K_n=4e8, kappa=0.5, mu=0.4):
     return fj.Scene(fj.FixedContact(K_n, kappa * K_n), fj.Coulomb(mu), OSCILLATOR)
 
-
-# --- the chain in 40 digits ---------------------------------------------------------------
 
 NAMES = ("K_n", "K_t", "mu_s", "mu_m", "v_m", "m", "omega_1", "omega_2", "xi_1", "xi_2", "V", "F")
 
@@ -175,9 +167,6 @@ def test_second_derivatives():
             assert abs(float(hessian[i, j]) - wanted.real) <= 1e-8 * abs(wanted), (name, other)
 
 
-# --- exact facts --------------------------------------------------------------------------
-
-
 def test_eigenvalues_rebuild_the_characteristic_polynomial():
     """s^4 + (c1+c2) s^3 + (a+b+c1 c2) s^2 + (c1 b+c2 a) s + (ab + mu^2 K_n K_t/m^2)."""
     scene = fixed().replace(m=2.5, xi_1=0.03, xi_2=0.08)
@@ -207,7 +196,7 @@ def test_growth_of_the_limit_cycle_cases(K_n, growth):
     assert float(fj.growth_rate(scene)) == pytest.approx(growth, abs=0.5)
 
 
-def test_bare_oscillator():
+def test_bare_oscillator_and_its_list_of_modes():
     """Without contact the two directions decay by themselves: -xi_i omega_i, at omega_i."""
     found = fj.stability(fixed(K_n=0.0))
     decay = [float(OSCILLATOR.xi_1 * OSCILLATOR.omega_1)]
@@ -218,9 +207,15 @@ def test_bare_oscillator():
     np.testing.assert_allclose(found.frequency, frequency, 1e-14)
     np.testing.assert_allclose(found.damping_ratio, 0.001, rtol=1e-13)
     np.testing.assert_allclose(np.abs(found.shapes), np.eye(2)[[0, 0, 1, 1]], atol=1e-15)
-
-
-# --- modes --------------------------------------------------------------------------------
+    squeals, undamped = (
+        fj.stability(fixed().replace(**x)) for x in ({}, {"xi_1": 0.0, "xi_2": 0.0, "mu": 0.01})
+    )
+    (mode,) = squeals.unstable()
+    assert (mode.growth_rate, mode.frequency) == (squeals.growth_rate, squeals.frequency)
+    assert mode.resolution == squeals.resolution < 1e-9 and mode.largest == "x1"
+    assert len(undamped.unresolved()) == 2 and not undamped.unstable()
+    assert len(squeals.least_damped(1)) == 1
+    assert "growth_rate=" in repr(squeals) and "\n" not in repr(squeals)
 
 
 @pytest.mark.parametrize("slope", [True, pytest.param(False, marks=pytest.mark.slow)])
@@ -239,21 +234,6 @@ def test_modes_are_those_of_the_structure_of_two_degrees_of_freedom(name, slope)
         assert mine.largest == theirs.largest
         assert mine.frequency == pytest.approx(theirs.frequency, rel=1e-12)
     assert len(own.unstable()) == len(other.unstable())
-
-
-def test_modes_are_listed():
-    squeals, undamped = (
-        fj.stability(fixed().replace(**x)) for x in ({}, {"xi_1": 0.0, "xi_2": 0.0, "mu": 0.01})
-    )
-    (mode,) = squeals.unstable()
-    assert (mode.growth_rate, mode.frequency) == (squeals.growth_rate, squeals.frequency)
-    assert mode.resolution == squeals.resolution < 1e-9 and mode.largest == "x1"
-    assert len(undamped.unresolved()) == 2 and not undamped.unstable()
-    assert len(squeals.least_damped(1)) == 1
-    assert "growth_rate=" in repr(squeals) and "\n" not in repr(squeals)
-
-
-# --- transformations, and what is traced --------------------------------------------------
 
 
 @pytest.mark.slow
@@ -285,10 +265,7 @@ def test_a_scene_traces_what_it_needs_and_nothing_else():
     assert sizes == sorted(set(sizes)), sizes
     assert traced(slope, False).total() < traced(slope).total()
     assert traced(fixed(), False) == traced(fixed())
-
-
-def test_a_fixed_contact_traces_no_contact_law():
-    """The one exp and log are those of the closed form, in single precision; no cbrt, no pow."""
+    # The one exp and log are those of the closed form, in single precision; no cbrt, no pow.
     plain, fractal = traced(fixed()), traced(BRAKE)
     assert not {"log1p", "expm1", "cbrt", "pow", "cos", "acos"} & set(plain)
     assert (plain["exp"], plain["log"]) == (1, 1)
@@ -306,8 +283,6 @@ def test_no_loop_no_lapack_no_callback(function):
         assert not {name for name in names if any(word in name for word in words)}
         assert "custom_call" not in jax.jit(function).lower(scene).as_text()
 
-
-# --- refusals -----------------------------------------------------------------------------
 
 ARRAYS = BRAKE.replace(D=np.array([2.4, 2.5]))
 QUESTIONS: list[Any] = [fj.growth_rate, fj.stability, fj.critical_friction, fj.margin]

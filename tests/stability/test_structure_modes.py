@@ -212,7 +212,7 @@ def test_eigenvalues_and_shapes(n):
     assert [m.damping_ratio for m in least] == sorted(m.damping_ratio for m in least)
 
 
-def test_a_relative_joint_moves_no_common_mode():
+def test_no_common_mode_of_a_joint_and_far_beyond_critical_damping():
     joint = fj.Joint(fj.FixedContact(4e6, 2e6), fj.Coulomb(0.3), (0, 1), (2, 3))
     _, _, K = arrays_of(fj.Structure(np.eye(4), None, np.zeros((4, 4)), joint))
     np.testing.assert_array_equal(K @ np.ones(4), np.zeros(4))
@@ -220,9 +220,14 @@ def test_a_relative_joint_moves_no_common_mode():
     # K x = K_t t (t.x) + K_n n (n.x) - mu K_n t (n.x) + mu K_t n (t.x)
     expected = (2e6 - 0.3 * 4e6 * 3) * t + (4e6 * 3 + 0.3 * 2e6) * n
     np.testing.assert_allclose(K @ x, expected, rtol=1e-15)
+    structure = fj.Structure(np.eye(2), np.diag([1e6, 2e6]), np.diag([1.0, 3.0]), [])
+    exact = [-2e6 + 1.5e-6, -1e6 + 1e-6, -1.5e-6, -1e-6]
+    s = jnp.sort(fj.stability(structure).eigenvalues.real)
+    np.testing.assert_allclose(s, exact, rtol=0, atol=1e-15 * 2e6)
+    assert fj.growth_rate(structure) == pytest.approx(-1e-6, abs=1e-15 * 2e6)
 
 
-def test_a_clamped_beam():
+def test_a_clamped_beam_and_modes_of_a_band():
     """omega = (beta L)^2 sqrt(E I/(rho A)), and damping (alpha + beta omega^2)/2."""
     M, K = beam(50)
     modes = fj.stability(fj.Structure(M, fj.rayleigh_damping(M, K, 3.0, 1e-7), K, []))
@@ -236,6 +241,14 @@ def test_a_clamped_beam():
     assert modes.eigenvalues.shape == (200,)
     assert modes.unstable() == []
     assert modes.margin > 0
+    # Modes that are not there are more damped than any in the band.
+    M, C, K = jnp.eye(3), jnp.diag(jnp.array([6.0, 4.0, 2.0])), jnp.diag(jnp.array([1e4, 4e4, 1e6]))
+    bands = (50.0, 500.0), None
+    in_band, all_of_them = jax.jit(
+        lambda M, C, K: [leading(M, C, K, 3, band).s.real for band in bands]
+    )(M, C, K)
+    np.testing.assert_allclose(in_band, [-2, -3, -500], rtol=1e-9)
+    np.testing.assert_allclose(all_of_them, [-1, -2, -3], rtol=1e-9)
 
 
 @slow
@@ -270,7 +283,16 @@ def test_two_beams_squeal_as_scipy_says():
 
 
 @pytest.mark.slow
-def test_rigid_body_modes_have_eigenvalue_zero():
+def test_a_free_mass_and_rigid_body_modes():
+    for C, rate in [(None, 0.0), ([[6.0]], 0.0), ([[-6.0]], 3.0)]:
+        structure = fj.Structure([[2.0]], C, [[0.0]], [])
+        assert fj.growth_rate(structure) == pytest.approx(rate, rel=1e-14)
+        assert fj.stability(structure).growth_rate == pytest.approx(rate, rel=1e-14)
+    # Its double eigenvalue 0 is defective to the last bit: left and right vector are orthogonal.
+    free = fj.Structure([[2.0]], None, [[0.0]], [])
+    assert jax.grad(lambda C: fj.growth_rate(free.replace(C=C)))(jnp.zeros((1, 1))) == 0
+    shapes = jax.jacfwd(lambda C: fj.stability(free.replace(C=C)).shapes.real)(free.C)
+    assert np.isfinite(shapes).all()
     M, K = beam(8, free=True)
     undamped = fj.Structure(M, None, K, [])
     assert abs(fj.growth_rate(undamped)) <= fj.stability(undamped).resolution
@@ -295,20 +317,7 @@ def test_rigid_body_modes_have_eigenvalue_zero():
     np.testing.assert_allclose(near, 0, atol=1e-3)
 
 
-@pytest.mark.slow
-def test_nothing_but_a_free_mass():
-    for C, rate in [(None, 0.0), ([[6.0]], 0.0), ([[-6.0]], 3.0)]:
-        structure = fj.Structure([[2.0]], C, [[0.0]], [])
-        assert fj.growth_rate(structure) == pytest.approx(rate, rel=1e-14)
-        assert fj.stability(structure).growth_rate == pytest.approx(rate, rel=1e-14)
-    # Its double eigenvalue 0 is defective to the last bit: left and right vector are orthogonal.
-    free = fj.Structure([[2.0]], None, [[0.0]], [])
-    assert jax.grad(lambda C: fj.growth_rate(free.replace(C=C)))(jnp.zeros((1, 1))) == 0
-    shapes = jax.jacfwd(lambda C: fj.stability(free.replace(C=C)).shapes.real)(free.C)
-    assert np.isfinite(shapes).all()
-
-
-def test_zero_damping():
+def test_zero_damping_and_no_force_or_support():
     M, _, K = matrices(6)
     joint = fj.Joint(fj.FixedContact(3e6, 1e6), fj.Coulomb(1e-4), 0, 1)
     structure = fj.Structure(M, None, K, joint)
@@ -322,6 +331,20 @@ def test_zero_damping():
     s = np.sqrt(-(a + b) / 2 + np.sqrt((a - b) ** 2 / 4 - g + 0j))
     growth = fj.growth_rate(fj.Structure(np.eye(2), None, K, []))
     assert growth == pytest.approx(abs(s.real), rel=1e-13)
+    without = STRUCTURE.replace(F=None)
+    with pytest.raises(ValueError, match="F must be given where friction depends on the sliding"):
+        fj.growth_rate(without)
+    K = 1e6 * np.kron(np.eye(2), [[1, -1], [-1, 1]])
+    joint = fj.Joint(fj.FixedContact(1e5, 5e4), fj.Stribeck(0.4, 0.2, 0.5), (0, 1), (2, 3), V=0.1)
+    free = fj.Structure(np.eye(4), None, K, joint, F=[0, 0, 1.0, 2.0])
+    for question in (fj.assemble, fj.growth_rate, fj.stability, fj.margin):
+        with pytest.raises(ValueError, match="F has no static equilibrium"):
+            question(free)
+    many = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), free)
+    assert np.isnan(jax.vmap(fj.growth_rate)(many)).all()
+    assert "callback" not in str(jax.make_jaxpr(fj.growth_rate)(STRUCTURE))
+    for held, slope in ((free, False), (free.replace(K=K + 1e3 * np.eye(4)), True)):
+        assert all(np.isfinite(X).all() for X in arrays_of(held, slope))
 
 
 @slow
@@ -357,14 +380,6 @@ def test_equal_uncoupled_modes():
     np.testing.assert_allclose(found, (-1 / (2 * s + 0.1)).imag * np.eye(2), atol=1e-12)
     slopes = jax.grad(lambda K: fj.growth_rate(structure.replace(K=K)))(structure.K)
     assert np.isfinite(slopes).all()
-
-
-def test_far_beyond_critical_damping():
-    structure = fj.Structure(np.eye(2), np.diag([1e6, 2e6]), np.diag([1.0, 3.0]), [])
-    exact = [-2e6 + 1.5e-6, -1e6 + 1e-6, -1.5e-6, -1e-6]
-    s = jnp.sort(fj.stability(structure).eigenvalues.real)
-    np.testing.assert_allclose(s, exact, rtol=0, atol=1e-15 * 2e6)
-    assert fj.growth_rate(structure) == pytest.approx(-1e-6, abs=1e-15 * 2e6)
 
 
 # --- what rounding can do -----------------------------------------------------------------
@@ -432,16 +447,6 @@ def any_structure(rng):
     return fj.Structure(M, C, K + attached * (rng.random() < 0.6), [])
 
 
-@pytest.mark.slow
-def test_any_structure_is_resolved_or_said_not_to_be():
-    rng, outcomes = np.random.default_rng(0), []
-    for _ in range(20):
-        modes, exact = assert_resolved_or_said(any_structure(rng))
-        outcomes.append(len(modes.unstable()) - len(modes.unresolved()))
-        assert all(mode.resolution < 1e-3 * exact.real.max() for mode in modes.unstable())
-    assert min(outcomes) < 0 < max(outcomes)
-
-
 def test_what_float32_cannot_hold_is_unresolved():
     def single(M, C, K):
         M, C, K = (X.astype(np.float32) for X in (M, C, K))
@@ -461,7 +466,7 @@ def test_what_float32_cannot_hold_is_unresolved():
 
 
 @pytest.mark.slow
-def test_rounding_of_the_equilibrium_counts_in_the_resolution():
+def test_rounding_counts_and_units_do_not():
     """The slope of friction acts through K x_0 = F, of which a stiff spring leaves few digits."""
     K = 1e13 * np.outer([1, -1], [1, -1]) + np.diag([1e3, 1.1e3])
     joint = fj.Joint(fj.FixedContact(20.0, 10.0), fj.Stribeck(0.4, 0.2, 0.5), 0, 1, V=0.1)
@@ -469,13 +474,6 @@ def test_rounding_of_the_equilibrium_counts_in_the_resolution():
     coulomb = structure.replace(friction=fj.Coulomb(0.35))
     # Of the soft mode; the stiff one hardly moves under F.
     assert fj.stability(structure).resolutions.min() > 2 * fj.stability(coulomb).resolutions.min()
-
-
-# --- precision, units, batches, and what is not evaluated ---------------------------------
-
-
-@pytest.mark.slow
-def test_units_of_the_degrees_of_freedom_do_not_matter():
     scale = np.array([1.0, 1e-6, 1e4, 1e-3])
     both = np.outer(scale, scale)
     M, C, K = (X * both for X in arrays_of(STRUCTURE))
@@ -483,6 +481,15 @@ def test_units_of_the_degrees_of_freedom_do_not_matter():
     rate = float(fj.growth_rate(STRUCTURE))
     assert fj.growth_rate(scaled) == pytest.approx(rate, abs=1e-11 * 1e4)
     assert_same_set(fj.stability(scaled).eigenvalues, fj.stability(STRUCTURE).eigenvalues, 1e-7)
+    rng, outcomes = np.random.default_rng(0), []
+    for _ in range(20):
+        modes, exact = assert_resolved_or_said(any_structure(rng))
+        outcomes.append(len(modes.unstable()) - len(modes.unresolved()))
+        assert all(mode.resolution < 1e-3 * exact.real.max() for mode in modes.unstable())
+    assert min(outcomes) < 0 < max(outcomes)
+
+
+# --- precision, units, batches, and what is not evaluated ---------------------------------
 
 
 @jax.jit
@@ -539,31 +546,3 @@ def test_what_a_structure_does_not_need_is_not_there():
     assert "= lu" not in operations(STRUCTURE, False)
     for absent in ("= lu", " log ", " exp ", " sort["):
         assert absent not in operations(coulomb, True)
-
-
-def test_slope_without_force_or_support():
-    without = STRUCTURE.replace(F=None)
-    with pytest.raises(ValueError, match="F must be given where friction depends on the sliding"):
-        fj.growth_rate(without)
-    K = 1e6 * np.kron(np.eye(2), [[1, -1], [-1, 1]])
-    joint = fj.Joint(fj.FixedContact(1e5, 5e4), fj.Stribeck(0.4, 0.2, 0.5), (0, 1), (2, 3), V=0.1)
-    free = fj.Structure(np.eye(4), None, K, joint, F=[0, 0, 1.0, 2.0])
-    for question in (fj.assemble, fj.growth_rate, fj.stability, fj.margin):
-        with pytest.raises(ValueError, match="F has no static equilibrium"):
-            question(free)
-    many = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), free)
-    assert np.isnan(jax.vmap(fj.growth_rate)(many)).all()
-    assert "callback" not in str(jax.make_jaxpr(fj.growth_rate)(STRUCTURE))
-    for held, slope in ((free, False), (free.replace(K=K + 1e3 * np.eye(4)), True)):
-        assert all(np.isfinite(X).all() for X in arrays_of(held, slope))
-
-
-def test_leading_modes_of_a_band():
-    """Modes that are not there are more damped than any in the band."""
-    M, C, K = jnp.eye(3), jnp.diag(jnp.array([6.0, 4.0, 2.0])), jnp.diag(jnp.array([1e4, 4e4, 1e6]))
-    bands = (50.0, 500.0), None
-    in_band, all_of_them = jax.jit(
-        lambda M, C, K: [leading(M, C, K, 3, band).s.real for band in bands]
-    )(M, C, K)
-    np.testing.assert_allclose(in_band, [-2, -3, -500], rtol=1e-9)
-    np.testing.assert_allclose(all_of_them, [-1, -2, -3], rtol=1e-9)

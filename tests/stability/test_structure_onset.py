@@ -11,18 +11,12 @@ import pytest
 
 import fractaljax as fj
 from fractaljax._mechanism.quantities import with_friction_times
-from preloaded import DIGITS, Oracle, problem
+from preloaded import Oracle, problem
 from tools import both_modes
 
 pytestmark = pytest.mark.unoptimised
 
 slow = pytest.mark.slow
-
-
-@pytest.fixture(autouse=True)
-def _forty_digits():
-    with mp.workdps(DIGITS):
-        yield
 
 
 # --- two degrees of freedom ---------------------------------------------------------------

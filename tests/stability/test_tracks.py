@@ -11,7 +11,7 @@ from scipy.stats import ortho_group
 
 import fractaljax as fj
 from structures import beam_on_pad, hoffmann, matrices, state_matrix, two_joints
-from tools import reference_scene
+from tools import reference_scene, refusals
 
 track: Any = fj.track_modes
 ODD, EVEN = np.linspace(-0.5, 0.5, 5), np.linspace(-0.5, 0.5, 6)  # through 0 and past it
@@ -130,12 +130,9 @@ def test_crossing_of_divergence(c):
     assert crossing.frequency == 0 and crossing.starts
 
 
-def test_crossings_without_damping():
+def test_crossings_without_damping_and_of_a_joint():
     """Neutral modes change no sign, whatever their rounding."""
     assert track(hoffmann(), "mu", np.linspace(0.1, 0.7, 6)).crossings() == []
-
-
-def test_crossing_of_a_joint_is_its_critical_friction():
     found = track(two_joints(6), "mu_s", np.linspace(0.31, 1.2, 6))
     for crossing in found.crossings():
         s: Any = np.asarray(fj.stability(two_joints(6).replace(mu_s=crossing.value)).eigenvalues)
@@ -226,29 +223,7 @@ def test_modes_leave_and_enter_a_band():
     np.testing.assert_array_equal(np.isfinite(found.shapes).all(axis=2), there)
 
 
-def test_critical_damping():
-    """A mode goes on as the slower of two real eigenvalues; the other one appears."""
-    c = np.array([0.5, 1.5, 3.0, 4.0])
-    structure = fj.ParametricStructure([[1.0]], [("c", [[1.0]])], [[1.0]], parameters={"c": 1.0})
-    found = track(structure, "c", c)
-    root = np.sqrt(c**2 / 4 - 1 + 0j)
-    other = np.where(c > 2, -c / 2 - root, np.nan)
-    columns = np.argsort(np.isnan(found.eigenvalues).sum(axis=0))
-    np.testing.assert_allclose(found.eigenvalues[:, columns[0]], -c / 2 + root, atol=1e-9)
-    np.testing.assert_allclose(found.eigenvalues[:, columns[1]], other, atol=1e-9)
-
-
-def test_open_joint_has_no_modes():
-    """And those beyond it are the ones before."""
-    joint = fj.Joint(fj.FixedContact(1.0, 0.5, 3.0), fj.Coulomb(0.3), 0, 1, preload=True)
-    M, K = np.eye(2), np.diag([2.0, 3.0])
-    structure = fj.Structure(M, 0.01 * K, K, joint, F=[0.0, -4.0])
-    found = track(structure, "P", [3.0, 0.5, 2.0])
-    assert np.isnan(found.eigenvalues[1]).all() and np.isnan(found.mac).all()
-    np.testing.assert_allclose(found.eigenvalues[0], found.eigenvalues[2], rtol=1e-12)
-
-
-def test_scene_and_rigid_body():
+def test_scene_rigid_body_open_joint_and_critical_damping():
     """A scene has the modes of its `stability`; what K does not hold is left out."""
     scene = reference_scene()
     found = track(scene, "mu_s", [0.3, 0.5])
@@ -262,19 +237,32 @@ def test_scene_and_rigid_body():
     np.testing.assert_allclose(found.eigenvalues[:, 0], 1j * np.sqrt([2, 4, 6]))
     assert found.eigenvalues.shape == (3, 1) and "k: 3 values, modes: 1" in repr(found)
     assert track(structure, "k", [1.0]).mac.shape == (0, 1)
+    # And those beyond it are the ones before.
+    joint = fj.Joint(fj.FixedContact(1.0, 0.5, 3.0), fj.Coulomb(0.3), 0, 1, preload=True)
+    M, K = np.eye(2), np.diag([2.0, 3.0])
+    structure = fj.Structure(M, 0.01 * K, K, joint, F=[0.0, -4.0])
+    found = track(structure, "P", [3.0, 0.5, 2.0])
+    assert np.isnan(found.eigenvalues[1]).all() and np.isnan(found.mac).all()
+    np.testing.assert_allclose(found.eigenvalues[0], found.eigenvalues[2], rtol=1e-12)
+    # A mode goes on as the slower of two real eigenvalues; the other one appears.
+    c = np.array([0.5, 1.5, 3.0, 4.0])
+    structure = fj.ParametricStructure([[1.0]], [("c", [[1.0]])], [[1.0]], parameters={"c": 1.0})
+    found = track(structure, "c", c)
+    root = np.sqrt(c**2 / 4 - 1 + 0j)
+    other = np.where(c > 2, -c / 2 - root, np.nan)
+    columns = np.argsort(np.isnan(found.eigenvalues).sum(axis=0))
+    np.testing.assert_allclose(found.eigenvalues[:, columns[0]], -c / 2 + root, atol=1e-9)
+    np.testing.assert_allclose(found.eigenvalues[:, columns[1]], other, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("x", "name", "values", "message"),
+test_refusals = refusals(
     [
         ("brake", "mu", [1.0], "x must be a Scene or a Struct"),
         (hoffmann(), "nu", [1.0], "no quantity 'nu'"),
         (hoffmann(), "mu", [[1.0]], "mu must be a list"),
         (two_joints(4), "V", [0.1, -1], "V must be above 0"),
+        (hoffmann(), "mu", [1.0], 1, "friction_slope must be True or False"),
     ],
+    lambda x, name, values, slope=True: track(x, name, values, friction_slope=slope),
+    kind=(ValueError, TypeError),
 )
-def test_refusals(x, name, values, message):
-    with pytest.raises((TypeError, ValueError), match=message):
-        track(x, name, values)
-    with pytest.raises(TypeError, match="friction_slope must be True or False"):
-        track(hoffmann(), "mu", [1.0], friction_slope=1)

@@ -13,7 +13,7 @@ from scipy.special import j0
 
 import fractaljax as fj
 from fractaljax._surface.roughness import root_mean_square_height, roughness
-from tools import both_modes
+from tools import both_modes, refusals
 
 L, N, KEYS, GAMMA, G = 1e-3, 48, 150, 1.5, 1e-10
 
@@ -42,11 +42,7 @@ def everything(x, L_s):
 
 @pytest.mark.parametrize(
     "case",
-    [
-        (2.4, 1.342e-10, 1.5, 1e-3, 1e-6),
-        (2.001, 1e-12, 1.3, 1e-2, 1e-7),
-        (2.999, 1e-8, 2, 1, 1e-3),
-    ],
+    [(2.4, 1.342e-10, 1.5, 1e-3, 1e-6), (2.001, 1e-12, 1.3, 1e-2, 1e-7), (2.999, 1e-8, 2, 1, 1e-3)],
 )
 def test_values_and_derivatives(case):
     """Against sums, and differences of sums, in 40 digits."""
@@ -62,17 +58,6 @@ def test_values_and_derivatives(case):
             expected = [float((up - down) / (2 * step)) for up, down in zip(*ends, strict=True)]
             for slope in slopes:
                 np.testing.assert_allclose(slope[:, i], expected, rtol=1e-9)
-
-
-def test_batches():
-    """Of surfaces, and under vmap."""
-    D = jnp.array([2.3, 2.7])
-    found = roughness(fj.Surface(D, G), L, 1e-6)
-    mapped = jax.vmap(lambda D: roughness(fj.Surface(D, G), L, 1e-6))(D)
-    alone = roughness(fj.Surface(2.7, G), L, 1e-6)
-    for name, value in vars(alone).items():
-        np.testing.assert_allclose(getattr(found, name), getattr(mapped, name), rtol=1e-13)
-        assert value == pytest.approx(float(getattr(found, name)[1]), rel=1e-13)
 
 
 @jax.jit
@@ -96,8 +81,16 @@ def test_roughness_scales():
         np.testing.assert_allclose(getattr(larger, name), length * value, rtol=1e-12)
 
 
-def test_powers_of_gamma_count_as_such():
-    """L/L_s a power of gamma or just beside it, in double and in single precision."""
+def test_batches_and_powers_of_gamma():
+    """Of surfaces, and under vmap."""
+    D = jnp.array([2.3, 2.7])
+    found = roughness(fj.Surface(D, G), L, 1e-6)
+    mapped = jax.vmap(lambda D: roughness(fj.Surface(D, G), L, 1e-6))(D)
+    alone = roughness(fj.Surface(2.7, G), L, 1e-6)
+    for name, value in vars(alone).items():
+        np.testing.assert_allclose(getattr(found, name), getattr(mapped, name), rtol=1e-13)
+        assert value == pytest.approx(float(getattr(found, name)[1]), rel=1e-13)
+    # L/L_s a power of gamma or just beside it, in double and in single precision.
     for ratio, count in [(1.5**7, 8), (1.5**7 * 0.999, 7), (1.5**7 * 1.001, 8), (1.01, 1)]:
         waves = sum(1.5 ** (2 * (2.5 - 3) * n) for n in range(count))
         expected = 1e-3 * (1e-10 / 1e-3) ** 0.5 * math.sqrt(math.log(1.5) / 2 * waves)
@@ -109,9 +102,6 @@ def test_powers_of_gamma_count_as_such():
         L_s = L / gamma ** np.arange(1.0, 20.0)
         double = root_mean_square_height(surface, L, L_s)
         np.testing.assert_allclose(root_mean_square_height(single, L, L_s), double, rtol=1e-5)
-
-
-# --- against surfaces -------------------------------------------------------------------------
 
 
 def waves(D, L_s=L / 8):
@@ -208,14 +198,11 @@ def test_mean_absolute_height_is_nearly_gaussian(D):
     assert found.Sa == pytest.approx(math.sqrt(2 / math.pi) * float(found.Sq), rel=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("L", "L_s", "message"),
+test_refusals = refusals(
     [
         (0.0, 1e-6, r"^L must be above 0, got 0\.0$"),
         (1e-3, -1.0, r"^L_s must be above 0, got -1\.0$"),
         (1e-6, 1e-3, r"^L must be at least L_s = 0\.001, got 1e-06$"),
     ],
+    lambda L, L_s: roughness(fj.Surface(2.5, G), L, L_s),
 )
-def test_refusals(L, L_s, message):
-    with pytest.raises(ValueError, match=message):
-        roughness(fj.Surface(2.5, G), L, L_s)

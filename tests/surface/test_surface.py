@@ -3,9 +3,9 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 import fractaljax as fj
+from tools import refusals
 
 
 def test_the_whole_open_interval():
@@ -14,10 +14,11 @@ def test_the_whole_open_interval():
         surface = fj.Surface(D, 1e-10)
         assert (surface.D, surface.G, surface.gamma) == (D, 1e-10, 1.5)
         assert surface.D.dtype == np.float64
+    surface = jax.jit(fj.Surface)(2.4, -1.0)
+    assert surface.D == 2.4 and np.isnan(surface.G)
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
+test_refusals = refusals(
     [
         *((lambda D=D: fj.Surface(D, 1e-10), "^D must be above 2 and below 3") for D in (2, 3)),
         (lambda: fj.Surface(jnp.array([2.5, 3.5]), 1e-10), r"^D .* below 3, got 3\.5$"),
@@ -25,12 +26,5 @@ def test_the_whole_open_interval():
         (lambda: fj.Surface(2.4, 1e-10, 1), r"^gamma must be above 1, got 1\.0$"),
         (lambda: jax.grad(lambda D: fj.Surface(D, 1e-10).D)(3.25), r"^D .* below 3, got 3\.25"),
     ],
+    kind=(ValueError, TypeError),
 )
-def test_refusals(call, message):
-    with pytest.raises((ValueError, TypeError), match=message):
-        call()
-
-
-def test_under_jit_it_is_nan():
-    surface = jax.jit(fj.Surface)(2.4, -1.0)
-    assert surface.D == 2.4 and np.isnan(surface.G)
