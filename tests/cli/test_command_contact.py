@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import fractaljax as fj
-from tools import run_command as run
+from tools import refused_command, run_command as run
 
 QUICK = ("--n", 32, "--seeds", 2, "--points", 2)
 
@@ -48,5 +48,5 @@ def test_scene_with_a_nominal_area(capsys):
 )
 def test_refuses(capsys, arguments, said):
     fj.brake_scene().replace(contact=fj.FixedContact(1e8, 1e8)).save("fixed.toml")
-    status, _, err = run(capsys, "contact", *arguments, "--quiet")
-    assert status == 2 and said in err and not Path("fractaljax-contact").exists()
+    assert said in refused_command(capsys, "contact", *arguments, "--quiet")
+    assert not Path("fractaljax-contact").exists()

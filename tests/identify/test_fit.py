@@ -60,7 +60,7 @@ def test_aliasing_is_the_sum_over_all_bands():
     np.testing.assert_allclose(shape(u, 2.6, True), direct, rtol=1e-8)
 
 
-def test_errors_are_those_of_many_draws():
+def test_errors_and_a_bend_are_measured():
     """Exponential ordinates, as of a Gaussian profile: the covariance is that of the estimates."""
     rng = np.random.default_rng(0)
     drawn = [
@@ -72,9 +72,6 @@ def test_errors_are_those_of_many_draws():
     for values, truth, error in zip(found.T, (math.log(1e-20), 2.0), said, strict=True):
         assert values.mean() == pytest.approx(truth, abs=4 * values.std() / math.sqrt(300))
         assert values.std() < 1.1 * error < 1.7 * values.std()
-
-
-def test_a_bend_is_measured():
     bent = law(2.0) * np.exp(-0.05 * np.log(F / 5e4) ** 2)
     c, _ = curvature(fit(spectrum(bent), BAND, RATIO, flat_deviation=1e-3))
     assert c == pytest.approx(-0.05, abs=0.005)

@@ -9,6 +9,7 @@ import pytest
 
 import fractaljax as fj
 from synthetic import DX, G, cut, gaussian_map, gaussian_profile, surface, traced
+from tools import refusals
 
 KINDS = {"gaussian": gaussian_profile, "cut": cut}
 
@@ -96,7 +97,7 @@ def found(z):
     return fj.identify(z, DX)
 
 
-def test_fields_and_table(found):
+def test_fields_table_and_covariance(found):
     """Covariance, errors, band, formulas and surface belong together; a pytree of numbers."""
     spread = np.sqrt(np.diag(found.covariance))
     np.testing.assert_allclose(spread, [found.D_standard_error, found.ln_G_standard_error])
@@ -107,19 +108,7 @@ def test_fields_and_table(found):
     assert "D                             2." in repr(found) and "decades)" in repr(found)
     assert all(np.asarray(x).dtype.kind in "fib" for x in jax.tree.leaves(found))
     assert repr(jax.tree.map(lambda x: x, found)) == repr(found)
-
-
-def test_a_second_estimate_at_its_bound_is_none():
-    """D = 1.7 is out of its reach: the table says so, and no warning calls it a disagreement."""
-    found = fj.identify(gaussian_profile(np.random.default_rng(0), 1.7, 2048), DX)
-    assert abs(found.D - 1.7) < 0.1
-    assert math.isnan(found.structure_function.D)
-    assert "D by structure function       none: " in repr(found) and "nan" not in repr(found)
-    assert not any("disagree" in line for line in found.warnings)
-
-
-def test_the_covariance_is_that_of_the_law(found):
-    """D and ln G are functions of p and ln A; the profile formula gives the same spectrum."""
+    # D and ln G are functions of p and ln A; the profile formula gives the same spectrum.
     law, h = found.law, 1e-5
 
     def parameters(log_A, p):
@@ -137,6 +126,27 @@ def test_the_covariance_is_that_of_the_law(found):
     D_s = found.D - 1
     formula = found.G_profile ** (2 * (D_s - 1)) / (2 * math.log(1.5)) * 1e5 ** -(5 - 2 * D_s)
     assert math.log(formula) == pytest.approx(law.log_A - law.p * math.log(1e5 / law.nyquist))
+
+
+def test_aliased_waves_and_the_second_estimate():
+    """D = 1.7 is out of its reach: the table says so, and no warning calls it a disagreement."""
+    found = fj.identify(gaussian_profile(np.random.default_rng(0), 1.7, 2048), DX)
+    assert abs(found.D - 1.7) < 0.1
+    assert math.isnan(found.structure_function.D)
+    assert "D by structure function       none: " in repr(found) and "nan" not in repr(found)
+    assert not any("disagree" in line for line in found.warnings)
+    # Points sampled from a profile with finer waves.
+    z = gaussian_profile(np.random.default_rng(1), 2.5, 8192, finer=8)
+    found, told = fj.identify(z, DX), fj.identify(z, DX, aliased=False)
+    assert found.aliased and not told.aliased
+    assert abs(found.D - 2.5) < 3 * found.D_standard_error < 0.06 < told.D - found.D + 0.06
+    rng = np.random.default_rng(0)
+    z = gaussian_profile(rng, 2.3, 8192)
+    found = fj.identify(z + 0.05 * z.std() * rng.standard_normal(z.size), DX, band=(1e3, 2e4))
+    assert found.band == (1e3, 2e4) and found.law.f.min() > 1e3 and found.law.f.max() < 2e4
+    other = found.structure_function
+    assert other.tau.min() * 2e4 >= 1 - 1e-9 and other.tau.max() * 1e3 < 0.5
+    assert other.D_standard_error > 0 and abs(other.D - 2.3) < 4 * other.D_standard_error
 
 
 @pytest.mark.parametrize(
@@ -179,7 +189,7 @@ def test_gaps_and_outliers(harm):
     assert found.outliers == (2 if harm == "spikes" else 0)
 
 
-def test_a_tip_is_taken_into_account():
+def test_a_tip_and_a_resolution():
     """What a tip of 5 um makes of a profile is wrong without its radius, and right with it."""
     rng = np.random.default_rng(0)
     seen = [traced(gaussian_profile(rng, 2.5, 4096, 1e-11, 1e-7), 1e-7, 5e-6) for _ in range(4)]
@@ -188,10 +198,7 @@ def test_a_tip_is_taken_into_account():
     assert blind < 2.45
     assert abs(np.mean([each.D for each in found]) - 2.5) < 0.03
     assert all(abs(each.D - 2.5) < 3 * each.D_standard_error for each in found)
-
-
-def test_a_resolution_ends_the_band():
-    """At a quarter of its frequency; a Gaussian filter of that cut-off does no harm below."""
+    # At a quarter of its frequency; a Gaussian filter of that cut-off does no harm below.
     rng, D = np.random.default_rng(0), []
     for _ in range(6):
         z = gaussian_profile(rng, 2.5, 4096)
@@ -203,36 +210,17 @@ def test_a_resolution_ends_the_band():
     assert abs(np.mean(D)) < 1.5
 
 
-def test_aliased_waves_are_seen():
-    """Points sampled from a profile with finer waves."""
-    z = gaussian_profile(np.random.default_rng(1), 2.5, 8192, finer=8)
-    found, told = fj.identify(z, DX), fj.identify(z, DX, aliased=False)
-    assert found.aliased and not told.aliased
-    assert abs(found.D - 2.5) < 3 * found.D_standard_error < 0.06 < told.D - found.D + 0.06
-
-
-def test_structure_function_keeps_to_the_band():
-    rng = np.random.default_rng(0)
-    z = gaussian_profile(rng, 2.3, 8192)
-    found = fj.identify(z + 0.05 * z.std() * rng.standard_normal(z.size), DX, band=(1e3, 2e4))
-    assert found.band == (1e3, 2e4) and found.law.f.min() > 1e3 and found.law.f.max() < 2e4
-    other = found.structure_function
-    assert other.tau.min() * 2e4 >= 1 - 1e-9 and other.tau.max() * 1e3 < 0.5
-    assert other.D_standard_error > 0 and abs(other.D - 2.3) < 4 * other.D_standard_error
-
-
-@pytest.mark.parametrize(
-    ("line", "option"),
+test_bad_options_are_refused = refusals(
     [
-        ("dx must be above 0", {"dx": 0}),
-        ("dy must be above 0", {"dy": -1.0}),
-        ("band must be two frequencies", {"band": 3}),
-        ("band must rise and lie between 976.562 and", {"band": (1e5, 1e4)}),
-        ("leaves no band above", {"resolution": 1e-3}),
-        ("stylus_radius must be above 0", {"stylus_radius": math.nan}),
-        ("gamma must be above 1", {"gamma": 1}),
+        ({"dx": 0}, "dx must be above 0"),
+        ({"dy": -1.0}, "dy must be above 0"),
+        ({"band": 3}, "band must be two frequencies"),
+        ({"band": (1e5, 1e4)}, "band must rise and lie between 976.562 and"),
+        ({"resolution": 1e-3}, "leaves no band above"),
+        ({"stylus_radius": math.nan}, "stylus_radius must be above 0"),
+        ({"gamma": 1}, "gamma must be above 1"),
     ],
+    lambda option: fj.identify(
+        gaussian_profile(np.random.default_rng(0), 2.5, 2048), **{"dx": DX} | option
+    ),
 )
-def test_bad_options_are_refused(z, line, option):
-    with pytest.raises(ValueError, match=line):
-        fj.identify(z, **({"dx": DX} | option))

@@ -16,7 +16,7 @@ from synthetic import DX, gaussian_map, surface
 BAND, RATIO = (5e4, 3e5), 1.5
 
 
-def test_one_patch_at_many_heights():
+def test_one_patch_at_many_heights_and_its_influence():
     """Only ln A differs between patches, by the variance of their squares beyond 1.3 chance."""
     rng = np.random.default_rng(3)
     patch, height = gaussian_map(rng, shape=(48, 48)), rng.uniform(0.5, 2, (4, 4))
@@ -30,10 +30,7 @@ def test_one_patch_at_many_heights():
     np.testing.assert_allclose(found, [[expected, 0], [0, 0]], rtol=1e-9, atol=1e-12 * expected)
     alike = between_patches(np.tile(patch, (4, 4)), DX, DX, spectrum, law, BAND, RATIO)
     np.testing.assert_array_equal(alike, np.zeros((2, 2)))
-
-
-def test_influence_is_the_slope_of_the_fit():
-    """ln A, p and the flat share against differences by the power of one bin."""
+    # ln A, p and the flat share against differences by the power of one bin.
     spectrum = map_spectra(gaussian_map(np.random.default_rng(1)), DX, DX)[0]
     law = fit(spectrum, BAND, RATIO, scatter=0.0)
     # A law through the means of the bins: influence holds where the fit does.

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from fractaljax._identify.preparation import checked, prepared, spacing
+from tools import refusals
 
 NAN = np.nan
 
@@ -38,16 +39,22 @@ def test_long_gaps_divide(z, sizes, missing, unused):
     np.testing.assert_array_equal(heights.segments[-1], z[-295:] if len(sizes) > 1 else first)
 
 
-def test_spikes_become_gaps():
+def test_spikes_become_gaps_and_a_spacing_is_one_number():
     z = rough(400)
     z[[50, 200, 300]] += [60.0, -80.0, 90.0]
     heights = prepared(z)
     assert heights.outliers == 3 and heights.missing == 0
     np.testing.assert_allclose(heights.segments[0][50], (z[49] + z[51]) / 2)
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(heights.known)), [50, 200, 300])
+    assert spacing("dx", 5) == 5
+    for wrong in (0, -1e-6, NAN, np.inf):
+        with pytest.raises(ValueError, match="dx must be above 0 and finite, in m, got"):
+            spacing("dx", wrong)
+    with pytest.raises(TypeError, match="dx must be a number in m, got"):
+        spacing("dx", [1e-6, 2e-6])  # pyright: ignore
 
 
-def test_gaps_of_a_map_are_interpolated_along_both_axes():
+def test_gaps_of_a_map_and_masked_heights():
     """Exactly, where the map is a plane; a whole missing line as well."""
     z = rough(64, 80)
     plane = np.add.outer(0.3 * np.arange(64.0), -0.2 * np.arange(80.0))
@@ -57,6 +64,9 @@ def test_gaps_of_a_map_are_interpolated_along_both_axes():
     heights = prepared(holes)
     assert heights.missing == 9 + 80
     np.testing.assert_allclose(heights.segments[0][22:38], z[22:38], atol=1e-12)
+    z = np.ma.masked_greater(rough(200), 1e9)
+    z[3] = np.ma.masked
+    assert np.isnan(checked(z)).sum() == 1
 
 
 Z = np.sin(np.arange(500.0) ** 1.5) * 1e-8
@@ -77,23 +87,4 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("z", "message"), REFUSED)
-def test_refused(z, message):
-    with pytest.raises(ValueError, match=message) as refusal:
-        prepared(checked(z))
-    assert "\n" not in str(refusal.value)
-
-
-def test_masked_heights_are_missing():
-    z = np.ma.masked_greater(rough(200), 1e9)
-    z[3] = np.ma.masked
-    assert np.isnan(checked(z)).sum() == 1
-
-
-def test_a_spacing_is_one_number():
-    assert spacing("dx", 5) == 5
-    for wrong in (0, -1e-6, NAN, np.inf):
-        with pytest.raises(ValueError, match="dx must be above 0 and finite, in m, got"):
-            spacing("dx", wrong)
-    with pytest.raises(TypeError, match="dx must be a number in m, got"):
-        spacing("dx", [1e-6, 2e-6])  # pyright: ignore
+test_refused = refusals(REFUSED, lambda z: prepared(checked(z)))

@@ -17,6 +17,7 @@ from fractaljax._identify.grid import equal_steps, map_on_grid
 from fractaljax._identify.instrument_file import _channel
 from fractaljax._identify.measurement import measurement
 from fractaljax._identify.units import metres
+from tools import refusals
 
 NAN, NUMBER = np.nan, r"[-+]?(\d+\.?\d*|\.\d+)(e-?\d+)?"
 U, UM = {"unit": "um"}, {"unit": "um", "dx": 1e-6}
@@ -186,13 +187,15 @@ def test_refused(tmp_path, monkeypatch, capsys, name, content, given, message):
     assert capsys.readouterr() == ("", "")
 
 
-def test_what_is_not_a_file(tmp_path):
+def test_what_cannot_be_read(tmp_path, monkeypatch):
     with pytest.raises(FileNotFoundError):
         read_measurement(tmp_path / "nowhere.csv")
     os.mkfifo(tmp_path / "pipe.csv")
     (tmp_path / "folder.csv").mkdir()
     for name in ("pipe.csv", "folder.csv"):
         assert_refused(tmp_path / name, None, "it is not a regular file")
+    monkeypatch.setitem(sys.modules, "SurfaceTopography", None)
+    assert_refused(tmp_path / "map.x3p", X3P, r'pip install "fractaljax\[formats\]"')
 
 
 def test_random_damage(tmp_path):
@@ -287,21 +290,6 @@ def test_line_scans_and_instrument_limits(tmp_path, package):
     assert_refused(path, None, "positions are not equidistant")
 
 
-def test_without_the_package(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "SurfaceTopography", None)
-    assert_refused(tmp_path / "map.x3p", X3P, r'pip install "fractaljax\[formats\]"')
-
-
-def test_units():
-    found = [
-        metres(unit) for unit in ["m", "cm", "mm", "um", "µm", "μm", "Micron", " nm ", "pm", "Å"]
-    ]
-    assert found == [1.0, 1e-2, 1e-3, 1e-6, 1e-6, 1e-6, 1e-6, 1e-9, 1e-12, 1e-10]
-    for unknown in ["V", "Mm", "", "MM"]:
-        with pytest.raises(ValueError, match=r"the unit must be one of m, cm, mm, um, .* got '"):
-            metres(unknown)
-
-
 def kept(n, *out):
     return np.delete(np.arange(n), out)
 
@@ -327,8 +315,7 @@ def test_equal_steps(x, dx, k, unit):
     np.testing.assert_array_equal(found, k)
 
 
-@pytest.mark.parametrize(
-    ("x", "message"),
+test_unequal_steps = refusals(
     [
         ([0.0], "at least 2 positions, got 1"),
         ([0.0, 1.0, 1.0, 2.0], "positions must rise or fall throughout, got 1 and then 1 m"),
@@ -337,10 +324,8 @@ def test_equal_steps(x, dx, k, unit):
         ([0.0, 1.0, 2.0, 2.8, 4.0], "positions are not equidistant"),
         (np.sort(np.random.default_rng(0).choice(2000, 400, replace=False)) * 0.1, "equidistant"),
     ],
+    lambda x: equal_steps(np.array(x)),
 )
-def test_unequal_steps(x, message):
-    with pytest.raises(ValueError, match=message):
-        equal_steps(np.array(x))
 
 
 def test_map_of_points_in_any_order():
@@ -366,7 +351,7 @@ def test_map_of_points_in_any_order():
             map_on_grid(*points)
 
 
-def test_measurement():
+def test_measurement_and_units():
     """A map without dy has dx; one line of a map is a profile; all gaps are counted."""
     z = np.ones((3, 4))
     z[0, 0], z[0, 1] = NAN, np.inf
@@ -379,10 +364,16 @@ def test_measurement():
     for line, n, dx in ((z[:, :1], 3, 1e-6), (z[:1], 4, 3e-6)):
         read = measurement(line, 1e-6, 3e-6, "")
         assert (read.z.shape, read.dx, read.dy) == ((n,), dx, None)
+    found = [
+        metres(unit) for unit in ["m", "cm", "mm", "um", "µm", "μm", "Micron", " nm ", "pm", "Å"]
+    ]
+    assert found == [1.0, 1e-2, 1e-3, 1e-6, 1e-6, 1e-6, 1e-6, 1e-9, 1e-12, 1e-10]
+    for unknown in ["V", "Mm", "", "MM"]:
+        with pytest.raises(ValueError, match=r"the unit must be one of m, cm, mm, um, .* got '"):
+            metres(unknown)
 
 
-@pytest.mark.parametrize(
-    ("z", "dx", "dy", "message"),
+test_measurement_refused = refusals(
     [
         (np.ones(9), None, None, r"the step between heights is not known: give dx in metres"),
         (np.ones(9), NAN, None, "dx must be above 0 and finite, in m, got nan"),
@@ -391,7 +382,5 @@ def test_measurement():
         (np.ones((2, 2, 2)), 1.0, None, r"of shape \(n,\) or \(n, m\), got \(2, 2, 2\)"),
         (np.full(9, NAN), 1.0, None, "there are no heights in it"),
     ],
+    lambda z, dx, dy: measurement(z, dx, dy, ""),
 )
-def test_measurement_refused(z, dx, dy, message):
-    with pytest.raises(ValueError, match=message):
-        measurement(z, dx, dy, "")

@@ -89,7 +89,7 @@ def test_quantised_surfaces(harm, count):
         assert_right_or_warned(harmed(harm, rng, D), D)
 
 
-def test_clean_surfaces_have_no_warnings():
+def test_clean_surfaces_two_scans_and_anisotropy():
     """Gaps, tilt and an offset included."""
     for seed in range(40):
         rng = np.random.default_rng(seed)
@@ -98,6 +98,19 @@ def test_clean_surfaces_have_no_warnings():
         z = np.where(rng.random(n) < 0.05, np.nan, z + np.linspace(0, seed * 1e-6, n))
         assert not warned(z), seed
     assert not warned(gaussian_map(np.random.default_rng(0), 2.4))
+    # A line of a map, or a point of a profile, from which on everything is higher.
+    z = gaussian_map(np.random.default_rng(0), 2.4)
+    high = z.std() * (np.arange(192) > 70)
+    for joined in (z + high, z + high[:, None], z[0] + 5 * high):
+        (line,) = (line for line in warned(joined) if line.startswith("a jump of"))
+        assert "two scans" in line
+    # Grooves along y on an isotropic map.
+    rng = np.random.default_rng(0)
+    z = gaussian_map(rng, 2.4, (96, 96))
+    grooves = gaussian_profile(rng, 2.4, 96, 1e-8)[:, None]
+    (line,) = (line for line in fj.identify(z + grooves, DX).warnings if "anisotropic" in line)
+    assert "along x have" in line
+    assert not any("anisotropic" in line for line in fj.identify(z, DX).warnings)
 
 
 @pytest.mark.parametrize("kind", ["held", "line", "missing"])
@@ -126,15 +139,6 @@ def test_clipped_heights(ends, tilt):
     z = (z - z.mean()) / z.std()
     clipped = 1e-7 * np.clip(z, *ends) + tilt * np.linspace(0, 1, z.size)
     assert any("clipped" in line for line in warned(clipped))
-
-
-def test_two_scans_in_one():
-    """A line of a map, or a point of a profile, from which on everything is higher."""
-    z = gaussian_map(np.random.default_rng(0), 2.4)
-    high = z.std() * (np.arange(192) > 70)
-    for joined in (z + high, z + high[:, None], z[0] + 5 * high):
-        (line,) = (line for line in warned(joined) if line.startswith("a jump of"))
-        assert "two scans" in line
 
 
 @pytest.mark.parametrize(
@@ -176,16 +180,6 @@ def test_warnings_of_a_profile(line):
     rng = np.random.default_rng(0)
     found = fj.identify(MADE[line](gaussian_profile(rng, 2.2, 4096), rng), DX)
     assert any(line in each for each in found.warnings), found.warnings
-
-
-def test_anisotropy():
-    """Grooves along y on an isotropic map."""
-    rng = np.random.default_rng(0)
-    z = gaussian_map(rng, 2.4, (96, 96))
-    grooves = gaussian_profile(rng, 2.4, 96, 1e-8)[:, None]
-    (line,) = (line for line in fj.identify(z + grooves, DX).warnings if "anisotropic" in line)
-    assert "along x have" in line
-    assert not any("anisotropic" in line for line in fj.identify(z, DX).warnings)
 
 
 @pytest.mark.parametrize(

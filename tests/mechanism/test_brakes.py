@@ -86,17 +86,6 @@ def test_what_a_brake_holds(brake):
         assert brake.names[brake.dofs[node, axis]].endswith(" " + "xyz"[axis])
 
 
-def test_sizes():
-    sizes = [len(brakes.beam_on_pad(refine).names) for refine in (1, 2, 4)]
-    assert sizes == [150, 526, 1950]
-    assert len(brakes.disc_between_pads().names) == 4668
-    with pytest.raises(ValueError, match="angular must be a multiple of 6, got 20"):
-        brakes.disc_between_pads(20)
-
-
-# --- where pads and moving body meet -----------------------------------------------------------
-
-
 def ends(brake, direction):
     """A direction as {body: (place, vector)}."""
     found = {}
@@ -136,27 +125,7 @@ def test_pairs(brake, moving, pads, nodes):
             assert (place[2] > 0) == (pad == "upper")
 
 
-def test_shares_are_of_a_uniform_pressure():
-    """Their resultant acts at the centre of the area of the pad."""
-    places = np.array([ends(SMALL, normal)["disc"][0] for _, normal in SMALL.pairs])
-    a, b, angle = 0.14 - 0.14 / 3, 0.14, np.pi / 3
-    centre = 4 / 3 * (b**3 - a**3) / (b**2 - a**2) * np.sin(angle / 2) / angle
-    expected = [centre * np.cos(angle / 2), centre * np.sin(angle / 2), 0.006]
-    np.testing.assert_allclose(SMALL.shares[:25] @ places[:25], expected, rtol=1e-4)
-
-
-def test_a_brake_is_a_structure():
-    """A `Joint` takes every pair, and stiff joints raise the frequencies."""
-    contact = fj.FixedContact(1e7, 5e6, P=100.0)
-    joints = [fj.Joint(contact, fj.Coulomb(0.3), t, n, preload=True) for t, n in BEAM.pairs]
-    M, K = BEAM.matrices["M"], BEAM.matrices["K"]
-    structure = fj.Structure(M, None, K, joints, names=BEAM.names)
-    for joint, (_, normal) in zip(structure.joints, BEAM.pairs, strict=True):
-        n = structure.direction(joint.normal or ())
-        assert {int(i): n[i] for i in n.nonzero()[0]} == normal
-
-
-def test_quads_cover_the_bodies():
+def test_sizes_quads_and_shares_of_a_brake_as_a_structure():
     """Each face once: with the sides of the ring and of the sectors."""
     solid = 2 * RING + 4 * SECTOR + 0.012 * 2 * np.pi * (0.14 + 0.07)
     solid += 2 * 0.012 * (np.pi / 3 * (0.28 - 0.14 / 3) + 2 * 0.14 / 3)
@@ -165,9 +134,25 @@ def test_quads_cover_the_bodies():
         lengths = [(x * y).sum(1) for x, y in ((c - a, c - a), (d - b, d - b), (c - a, d - b))]
         found = np.sqrt(lengths[0] * lengths[1] - lengths[2] ** 2).sum() / 2
         assert found == pytest.approx(area, rel=3e-3)  # of chords
-
-
-# --- natural frequencies -----------------------------------------------------------------------
+    sizes = [len(brakes.beam_on_pad(refine).names) for refine in (1, 2, 4)]
+    assert sizes == [150, 526, 1950]
+    assert len(brakes.disc_between_pads().names) == 4668
+    with pytest.raises(ValueError, match="angular must be a multiple of 6, got 20"):
+        brakes.disc_between_pads(20)
+    # Their resultant acts at the centre of the area of the pad.
+    places = np.array([ends(SMALL, normal)["disc"][0] for _, normal in SMALL.pairs])
+    a, b, angle = 0.14 - 0.14 / 3, 0.14, np.pi / 3
+    centre = 4 / 3 * (b**3 - a**3) / (b**2 - a**2) * np.sin(angle / 2) / angle
+    expected = [centre * np.cos(angle / 2), centre * np.sin(angle / 2), 0.006]
+    np.testing.assert_allclose(SMALL.shares[:25] @ places[:25], expected, rtol=1e-4)
+    # A `Joint` takes every pair, and stiff joints raise the frequencies.
+    contact = fj.FixedContact(1e7, 5e6, P=100.0)
+    joints = [fj.Joint(contact, fj.Coulomb(0.3), t, n, preload=True) for t, n in BEAM.pairs]
+    M, K = BEAM.matrices["M"], BEAM.matrices["K"]
+    structure = fj.Structure(M, None, K, joints, names=BEAM.names)
+    for joint, (_, normal) in zip(structure.joints, BEAM.pairs, strict=True):
+        n = structure.direction(joint.normal or ())
+        assert {int(i): n[i] for i in n.nonzero()[0]} == normal
 
 
 def frequencies(brake, body, count):
@@ -195,7 +180,7 @@ def test_frequencies_of_a_slender_beam(clamped, roots):
     np.testing.assert_allclose(found[found > 1.0][:3], expected, rtol=5e-3)
 
 
-def test_frequencies_converge_in_fourth_order():
+def test_frequencies_of_plates_and_a_thin_disc():
     """Quadratic elements of a body without corners that a clamp makes singular."""
     found = []
     for refine in (1, 2, 4, 8):
@@ -205,6 +190,16 @@ def test_frequencies_converge_in_fourth_order():
     assert (steps > 0).all()  # from above, as Rayleigh has it
     orders = np.log2(steps[:-1] / steps[1:])
     np.testing.assert_allclose(orders[-1], 4, atol=0.2)
+    # Vogel and Skinner, J. Appl. Mech. 32 (1965) 926: nu = 0.3 and half the radius clamped.
+    found = [plate_frequency(n, 0.3, 0.5) for n in range(4)]
+    np.testing.assert_allclose(found, [13.0, 13.3, 14.7, 18.5], atol=0.1)
+    # The clamped disc as Kirchhoff's plate, each with n > 0 nodal diameters twice.
+    thickness, iron = 0.0028, brakes.IRON
+    brake = brakes.disc_between_pads(24, 6, thickness=thickness)
+    found = frequencies(brake, "disc", 7)
+    speed = np.sqrt(iron.E * thickness**2 / 12 / (1 - iron.nu**2) / iron.rho) / 0.14**2
+    expected = [speed * plate_frequency(n, iron.nu, 0.5) for n in (0, 1, 1, 2, 2, 3, 3)]
+    np.testing.assert_allclose(found, expected, rtol=0.015)
 
 
 def plate_determinant(x, n, nu, ratio):
@@ -231,24 +226,6 @@ def plate_frequency(n, nu, ratio):
     root: Any = brentq(plate_determinant, grid[i], grid[i + 1], (n, nu, ratio))
     return root**2
 
-
-def test_plate_frequencies_are_those_of_the_tables():
-    """Vogel and Skinner, J. Appl. Mech. 32 (1965) 926: nu = 0.3 and half the radius clamped."""
-    found = [plate_frequency(n, 0.3, 0.5) for n in range(4)]
-    np.testing.assert_allclose(found, [13.0, 13.3, 14.7, 18.5], atol=0.1)
-
-
-def test_frequencies_of_a_thin_disc():
-    """The clamped disc as Kirchhoff's plate, each with n > 0 nodal diameters twice."""
-    thickness, iron = 0.0028, brakes.IRON
-    brake = brakes.disc_between_pads(24, 6, thickness=thickness)
-    found = frequencies(brake, "disc", 7)
-    speed = np.sqrt(iron.E * thickness**2 / 12 / (1 - iron.nu**2) / iron.rho) / 0.14**2
-    expected = [speed * plate_frequency(n, iron.nu, 0.5) for n in (0, 1, 1, 2, 2, 3, 3)]
-    np.testing.assert_allclose(found, expected, rtol=0.015)
-
-
-# --- rotation ----------------------------------------------------------------------------------
 
 SPIN = ("M", "K", "G", "K_convective", "K_centrifugal")
 

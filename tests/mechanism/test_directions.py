@@ -9,6 +9,7 @@ import pytest
 
 import fractaljax as fj
 from structures import matrices
+from tools import refusals
 
 M, C, K = matrices(3)
 PRESSED, PLAIN = fj.FixedContact(3e6, 1e6, 50.0), fj.FixedContact(3e6, 1e6)
@@ -69,7 +70,7 @@ def test_an_index_that_is_anothers_name(tmp_path):
         np.testing.assert_array_equal(one.direction(one.joints[0].tangential), [1, 0, -2])
 
 
-def test_preload_of_scenes_in_files_and_replaced():
+def test_preload_of_scenes_and_orthogonal_directions():
     scene = fj.brake_scene()
     assert not scene.preload and scene.normal_load is None
     pressed: Any = scene.replace(preload=True, P=1500.0)
@@ -84,6 +85,8 @@ def test_preload_of_scenes_in_files_and_replaced():
     assert fj.Scene.from_toml(held.to_toml()).normal_load == 20.0
     x = structure("x", "y").replace(**{"pad.P": 30.0, "pad.preload": False})
     assert x.joints[0].normal_load is None and float(x.joints[0].contact.P) == 30.0
+    x = structure((0, 1), {0: 1.0, 1: 1.0})
+    assert x.joints[0].normal == ((0, 1.0), (1, 1.0))
 
 
 def in_trace(weight):
@@ -94,8 +97,7 @@ TURNED = np.array([0.1, 0.2, 0.3])
 NEEDS = "needs a contact with a normal load P, got FixedContact"
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
+test_refusals = refusals(
     [
         (lambda: structure("x", contact=PLAIN), f"^preload {NEEDS}"),
         (lambda: structure("x", contact=PLAIN, preload=False), f"^a joint without normal {NEEDS}"),
@@ -120,13 +122,5 @@ NEEDS = "needs a contact with a normal load P, got FixedContact"
         (lambda: structure((0.1, 0.2, 0.3), 3 * TURNED), "^joint pad: tangential .* are one dir"),
         (lambda: jax.jit(in_trace)(1.0), "^tangential must be known when a program is traced"),
     ],
+    kind=(ValueError, TypeError),
 )
-def test_refusals(call, message):
-    with pytest.raises((ValueError, TypeError), match=message) as caught:
-        call()
-    assert "\n" not in str(caught.value)
-
-
-def test_orthogonal_directions_of_equal_weights_are_two():
-    x = structure((0, 1), {0: 1.0, 1: 1.0})
-    assert x.joints[0].normal == ((0, 1.0), (1, 1.0))

@@ -10,6 +10,7 @@ import scipy.sparse
 import fractaljax as fj
 from fractaljax._mechanism.matrices import array_of, fitting, mass_matrix, mass_normalised, square
 from structures import beam, matrices, state_matrix
+from tools import refusals
 
 M, C, K = matrices(5)
 UNEVEN = jnp.array([[1.0, 0.5], [0.0, 1.0]])
@@ -35,8 +36,7 @@ def test_what_is_no_array_of_real_numbers(value):
         array_of("K", value)
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
+test_refusals = refusals(
     [
         (lambda: fitting("K", np.eye(3), (2, 2)), r"K must have shape \(2, 2\) as M demands, got"),
         (lambda: fitting("K", [[np.nan]], (1, 1)), "K must be finite, got nan"),
@@ -54,11 +54,8 @@ def test_what_is_no_array_of_real_numbers(value):
         (lambda: fj.modal_damping(M, np.triu(K), 0.01), "damping_ratio needs a symmetric K"),
         (lambda: fj.modal_damping(M, K, RATIOS[:2]), r"scalar or have shape \(5,\), got"),
         (lambda: fj.modal_damping(M, K, -0.1), r"damping_ratio must be at least 0, got -0\.1"),
-    ],
+    ]
 )
-def test_refusals(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()
 
 
 def test_under_jit_it_is_nan():
@@ -74,7 +71,7 @@ def test_under_jit_it_is_nan():
     assert np.isnan(damping(wrong[2])).all() and np.isfinite(damping(2 * jnp.eye(2))).all()
 
 
-def test_a_mass_matrix_is_made_exactly_symmetric():
+def test_a_mass_matrix_is_symmetric_and_one_in_its_coordinates():
     uneven = M.copy()
     uneven[0, 1] *= 1 + 1e-9
     found = np.asarray(mass_matrix(jnp.asarray(uneven)))
@@ -83,10 +80,7 @@ def test_a_mass_matrix_is_made_exactly_symmetric():
     weights = np.random.default_rng(0).standard_normal(M.shape)
     slope = jax.grad(lambda M: (mass_matrix(M) * weights).sum())(jnp.asarray(M))
     np.testing.assert_allclose(slope, (weights + weights.T) / 2, rtol=1e-14)
-
-
-def test_coordinates_of_unit_mass():
-    """Frequencies are those of M and K, and M itself is the identity."""
+    # Frequencies are those of M and K, and M itself is the identity.
     L = jnp.linalg.cholesky(M)
     np.testing.assert_allclose(mass_normalised(L, jnp.asarray(M)), np.eye(5), atol=1e-12)
     squares = np.linalg.eigvalsh(mass_normalised(L, jnp.asarray(K)))
@@ -101,15 +95,12 @@ def damping_ratios(C):
     return -s.real / abs(s), abs(s)
 
 
-def test_rayleigh_damping():
+def test_rayleigh_damping_and_rigid_body_modes():
     C = fj.rayleigh_damping(M, scipy.sparse.csr_matrix(K), 2.0, 3e-6)
     np.testing.assert_allclose(C, 2.0 * M + 3e-6 * K)
     ratios, omega = damping_ratios(C)
     np.testing.assert_allclose(ratios, (2.0 / omega + 3e-6 * omega) / 2, rtol=1e-10)
-
-
-def test_rayleigh_damping_of_large_sparse_matrices():
-    """Of a size whose dense matrix would take gigabytes."""
+    # Of a size whose dense matrix would take gigabytes.
     n = 30_000
     X = scipy.sparse.diags_array(2.0 + np.arange(n)) - scipy.sparse.eye_array(n, k=1)
     eye = scipy.sparse.eye_array(n)
@@ -119,6 +110,8 @@ def test_rayleigh_damping_of_large_sparse_matrices():
     few = scipy.sparse.eye_array(2500)
     mixed = fj.rayleigh_damping(few, 2 * np.eye(2500), 3.0, 0.5)
     np.testing.assert_array_equal(mixed, 4.0 * np.eye(2500))
+    C = np.asarray(fj.modal_damping(*beam(5, free=True), 0.02))
+    np.testing.assert_allclose(C @ np.tile([1.0, 0.0], 6), 0, rtol=0, atol=1e-6 * np.abs(C).max())
 
 
 @pytest.mark.parametrize("ratio", [0.01, RATIOS])
@@ -129,8 +122,3 @@ def test_modal_damping(ratio):
     ratios, omega = damping_ratios(C)
     np.testing.assert_allclose(ratios, np.broadcast_to(ratio, 5), rtol=0, atol=1e-12)
     np.testing.assert_allclose(omega**2, scipy.linalg.eigh(K, M, eigvals_only=True), rtol=1e-10)
-
-
-def test_modal_damping_leaves_rigid_body_modes_free():
-    C = np.asarray(fj.modal_damping(*beam(5, free=True), 0.02))
-    np.testing.assert_allclose(C @ np.tile([1.0, 0.0], 6), 0, rtol=0, atol=1e-6 * np.abs(C).max())

@@ -429,22 +429,13 @@ def test_indices_out_of_range(tmp_path, index):
             fj.read_matrices(tmp_path / name)
 
 
-def test_room_for_entries_that_is_not_used(tmp_path):
-    """MATLAB keeps it after entries were removed; what is there means nothing."""
-    full = scipy.sparse.csc_matrix(K)
-    spare = np.array([9, 9]), np.array([np.nan, 7])
-    A = scipy.sparse.csc_matrix(K)
-    A.indices, A.data = (
-        np.append(x, y) for x, y in zip((full.indices, full.data), spare, strict=True)
-    )
-    A.has_sorted_indices = True  # or SciPy would write it without
-    scipy.io.savemat(tmp_path / "x.mat", {"K": A})
-    assert (tmp_path / "x.mat").stat().st_size > 128 + 12 * (full.nnz + 2)
-    found = fj.read_matrices(tmp_path / "x.mat").matrices["K"]
-    np.testing.assert_array_equal(found.toarray(), K)
-
-
-def test_skew_harwell_boeing(tmp_path):
+def test_too_many_rows_and_a_skew_matrix(tmp_path):
+    scipy.sparse.save_npz(tmp_path / "x.npz", scipy.sparse.eye_array(1_000_001).todia())
+    np.savez(tmp_path / "y.npz", y=np.zeros(1_000_001))
+    scipy.io.savemat(tmp_path / "y.mat", {"y": scipy.sparse.csc_matrix((1_000_001, 1))})
+    for name in ("x.npz", "y.npz", "y.mat"):
+        with pytest.raises(ValueError, match=f"^{name}: .*[xy] must have from 1 to 1000000 rows"):
+            fj.read_matrices(tmp_path / name)
     (tmp_path / "G.rb").write_text(
         "gyroscopic\n 3 1 1 1\nrza 3 3 2 0\n(4I2) (2I2) (2F8.3)\n 1 3 3 3\n 2 3\n   1.500  -2.500\n"
     )
@@ -452,16 +443,7 @@ def test_skew_harwell_boeing(tmp_path):
     np.testing.assert_array_equal(found, [[0, -1.5, 2.5], [1.5, 0, 0], [-2.5, 0, 0]])
 
 
-def test_too_many_rows(tmp_path):
-    scipy.sparse.save_npz(tmp_path / "x.npz", scipy.sparse.eye_array(1_000_001).todia())
-    np.savez(tmp_path / "y.npz", y=np.zeros(1_000_001))
-    scipy.io.savemat(tmp_path / "y.mat", {"y": scipy.sparse.csc_matrix((1_000_001, 1))})
-    for name in ("x.npz", "y.npz", "y.mat"):
-        with pytest.raises(ValueError, match=f"^{name}: .*[xy] must have from 1 to 1000000 rows"):
-            fj.read_matrices(tmp_path / name)
-
-
-def test_what_unpacks_to_too_much(tmp_path, monkeypatch):
+def test_what_unpacks_to_too_much_and_room_that_is_not_used(tmp_path, monkeypatch):
     monkeypatch.setattr("fractaljax._mechanism.matrix_file._MOST", 10**6)
     zeros = np.zeros((1000, 1000))
     scipy.io.savemat(tmp_path / "x.mat", {"K": zeros}, do_compression=True)
@@ -473,6 +455,18 @@ def test_what_unpacks_to_too_much(tmp_path, monkeypatch):
             fj.read_matrices(tmp_path / name)
     with pytest.raises(ValueError, match=r"^x\.mtx: the file is larger than 1 MB"):
         fj.read_matrices(tmp_path / "x.mtx")
+    # MATLAB keeps it after entries were removed; what is there means nothing.
+    full = scipy.sparse.csc_matrix(K)
+    spare = np.array([9, 9]), np.array([np.nan, 7])
+    A = scipy.sparse.csc_matrix(K)
+    A.indices, A.data = (
+        np.append(x, y) for x, y in zip((full.indices, full.data), spare, strict=True)
+    )
+    A.has_sorted_indices = True  # or SciPy would write it without
+    scipy.io.savemat(tmp_path / "x.mat", {"K": A})
+    assert (tmp_path / "x.mat").stat().st_size > 128 + 12 * (full.nnz + 2)
+    found = fj.read_matrices(tmp_path / "x.mat").matrices["K"]
+    np.testing.assert_array_equal(found.toarray(), K)
 
 
 @pytest.mark.parametrize("case", ["mtx", "abaqus", "op4", "hb", "mat", "npz"])

@@ -10,6 +10,7 @@ import scipy.io
 import scipy.sparse
 
 from fractaljax._mechanism.matrix_market import read_matrix_market
+from tools import refusals
 
 ONE = "%%MatrixMarket matrix coordinate real general\n1 1 1\n1 1 "
 
@@ -34,7 +35,7 @@ def test_what_scipy_writes(n):
             assert np.iscomplexobj(found) == bool(np.imag(X).any())
 
 
-def test_numbers_as_c_and_fortran_write_them():
+def test_numbers_blanks_and_comments():
     """Each is the float that is nearest to the exact fraction."""
     rng = np.random.default_rng(0)
     exact: list[Any]
@@ -50,6 +51,8 @@ def test_numbers_as_c_and_fortran_write_them():
         exact.append(Fraction(f"{mantissa}e{sign}{exponent}"))
     found = read(f"%%MatrixMarket matrix array real general\n{len(texts)} 1\n" + "\n".join(texts))
     assert found[:, 0].tolist() == [float(value) for value in exact]
+    found = read("%%matrixmarket MATRIX Array Real General\r\n% a\n\n%\n 1\t2 \r\n\n1.5\n\n2\n\n")
+    np.testing.assert_array_equal(found, [[1.5, 2.0]])
 
 
 NONE = (
@@ -85,11 +88,7 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("text", "message"), BAD)
-def test_files_that_are_not_right(text, message):
-    with pytest.raises(ValueError, match=message) as caught:
-        read(f"%%MatrixMarket matrix {text}")
-    assert "\n" not in str(caught.value)
+test_files_that_are_not_right = refusals(BAD, lambda text: read(f"%%MatrixMarket matrix {text}"))
 
 
 def test_other_and_endless_files():
@@ -100,8 +99,3 @@ def test_other_and_endless_files():
         read_matrix_market(file, 4000)
     with pytest.raises(ValueError, match="is larger than"):
         read(f"{ONE}1{' ' * 1000}", largest=5)
-
-
-def test_blank_lines_and_comments():
-    found = read("%%matrixmarket MATRIX Array Real General\r\n% a\n\n%\n 1\t2 \r\n\n1.5\n\n2\n\n")
-    np.testing.assert_array_equal(found, [[1.5, 2.0]])

@@ -80,20 +80,22 @@ def test_growth_rate_and_its_derivatives(form):
     np.testing.assert_allclose(many(x, places), each, rtol=1e-9)
 
 
-def test_a_mass_that_depends_on_a_parameter():
+def test_parameters_in_sweeps_masses_and_refusals():
+    x = parametric("texts")
+    found = fj.sweep(fj.growth_rate, x, Omega=[1.0, 2.0], kr=[0.5, 1.5], progress=False)
+    value = float(answers(x, np.array([2.0, 1.5]))[0])
+    assert found.values[1, 1] == pytest.approx(value, rel=1e-9)
     x = fj.ParametricStructure(
         [("1 + a", M), ("a**2 - 0.25", 0.01 * np.eye(4))], D, K, parameters={"a": 0.5}
     )
     np.testing.assert_allclose(x.M, 1.5 * M, rtol=1e-14)
     with pytest.raises(ValueError, match="M must be positive definite"):
         x.replace(a=-1.05)
-
-
-def test_sweeps_know_parameters():
-    x = parametric("texts")
-    found = fj.sweep(fj.growth_rate, x, Omega=[1.0, 2.0], kr=[0.5, 1.5], progress=False)
-    value = float(answers(x, np.array([2.0, 1.5]))[0])
-    assert found.values[1, 1] == pytest.approx(value, rel=1e-9)
+    x = fj.ParametricStructure(M, D, [(1, K), ("1/Omega", K)], parameters={"Omega": 1.0})
+    with pytest.raises(ValueError, match=r"a coefficient of K at Omega = 0 must be finite"):
+        x.replace(Omega=0.0)
+    with pytest.raises(ValueError, match=r"structure has no quantity 'omega'; it has .*Omega"):
+        fj.sweep(fj.growth_rate, x, omega=[1.0], progress=False)
 
 
 @pytest.mark.slow
@@ -141,14 +143,6 @@ def test_refused(message):
     given = dict(M=M, C=D, K=K, joints=JOINT) | REFUSED[message]
     with pytest.raises((ValueError, TypeError), match=message):
         fj.ParametricStructure(**given)
-
-
-def test_refused_changes():
-    x = fj.ParametricStructure(M, D, [(1, K), ("1/Omega", K)], parameters={"Omega": 1.0})
-    with pytest.raises(ValueError, match=r"a coefficient of K at Omega = 0 must be finite"):
-        x.replace(Omega=0.0)
-    with pytest.raises(ValueError, match=r"structure has no quantity 'omega'; it has .*Omega"):
-        fj.sweep(fj.growth_rate, x, omega=[1.0], progress=False)
 
 
 @pytest.mark.parametrize("coefficient", [2.0, "2", lambda p: 2.0, lambda p: 1.0 + (len(p) > 0)])

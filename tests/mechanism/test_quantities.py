@@ -24,7 +24,7 @@ from fractaljax._mechanism.quantities import (
     with_optional,
 )
 from structures import two_joints
-from tools import reference_scene
+from tools import reference_scene, refusals
 
 BRAKE = fj.brake_scene()
 FIXED = BRAKE.replace(contact=fj.FixedContact(4e8, 2e8))
@@ -36,10 +36,7 @@ def mu_of(mu_s, mu_m, v_m, V):
     return mu_s - 1.5 * (mu_s - mu_m) * V / v_m + (mu_s - mu_m) / 2 * (V / v_m) ** 3
 
 
-# --- names --------------------------------------------------------------------------------
-
-
-def test_own_quantities_are_every_number_with_its_value():
+def test_quantities_with_names_units_and_values():
     own = own_quantities(BRAKE)
     assert own["D"].value == 2.4 and own["V"].value == 0.15
     assert (own["omega_1"].unit, own["P"].meaning) == ("rad/s", "normal load")
@@ -47,16 +44,10 @@ def test_own_quantities_are_every_number_with_its_value():
     stored = [name for name in own if own[name].value is not None]
     assert len(stored) == len(jax.tree.leaves(BRAKE))
     assert not {"contact", "surface", "friction"} & own.keys()
-
-
-def test_names_are_those_of_the_scene_and_the_derived_ones():
-    """mu once, also where the scene stores it."""
+    # mu once, also where the scene stores it.
     names = ["K_n", "K_t", "P", "mu", "m", "omega_1", "omega_2", "xi_1", "xi_2", "F", "V"]
     assert known_quantities(CONSTANT) == [*names, "K_t/K_n", "omega_1/omega_2"]
     assert known_quantities(BRAKE)[-3:] == ["K_t/K_n", "omega_1/omega_2", "mu"]
-
-
-def test_units_and_labels():
     assert [unit(BRAKE, name) for name in ("G", "V", "mu", "K_t/K_n")] == ["m", "m/s", "-", "-"]
     assert label(BRAKE, "D") == "fractal dimension D [-]"
     assert label(CONSTANT, "mu") == "friction coefficient mu [-]"
@@ -65,13 +56,7 @@ def test_units_and_labels():
     assert label(BRAKE, "omega_1/omega_2") == "ratio of natural frequencies ω₁/ω₂ [-]"
 
 
-def test_unknown_names_are_refused_with_the_known_ones():
-    for name in ("nonsense", "contact"):
-        with pytest.raises(ValueError, match=f"no quantity '{name}'; it has K_n, K_t, P, mu"):
-            require_known(CONSTANT, name)
-
-
-def test_two_names_of_one_quantity_are_refused():
+def test_two_names_of_one_quantity_and_unknown_ones_are_refused():
     for scene, names in (
         (CONSTANT, ("mu", "mu")),
         (CONSTANT, ("K_t", "K_t/K_n")),
@@ -84,6 +69,9 @@ def test_two_names_of_one_quantity_are_refused():
     require_independent(CONSTANT, ("K_n", "K_t/K_n"))
     require_independent(BRAKE, ("omega_2", "omega_1/omega_2"))
     require_independent(BRAKE, ("mu", "V", "v_m", "K_t/K_n", "D"))
+    for name in ("nonsense", "contact"):
+        with pytest.raises(ValueError, match=f"no quantity '{name}'; it has K_n, K_t, P, mu"):
+            require_known(CONSTANT, name)
 
 
 def test_a_structure_has_the_numbers_of_its_joints():
@@ -119,9 +107,6 @@ def test_what_is_set_is_what_is_read(name):
         value_of(BRAKE, "stiffness_ratio")
 
 
-# --- values -------------------------------------------------------------------------------
-
-
 def test_values_of_an_axis():
     """Lists as NumPy reads them, integers as numbers, and what is traced."""
     np.testing.assert_array_equal(axis_values(BRAKE, "P", [1000, 2000]), [1000.0, 2000.0])
@@ -131,8 +116,7 @@ def test_values_of_an_axis():
     np.testing.assert_array_equal(found, [2.3, 2.4])
 
 
-@pytest.mark.parametrize(
-    ("name", "values", "message"),
+test_values_that_are_no_axis_are_refused = refusals(
     [
         ("mass", [1.0], "scene has no quantity 'mass'"),
         ("D", 2.4, r"the values of D must be a list, got shape \(\)"),
@@ -140,10 +124,8 @@ def test_values_of_an_axis():
         ("D", [[2.3, 2.4]], r"the values of D must be a list, got shape \(1, 2\)"),
         ("D", [2.3, np.nan], "D must be finite, got nan"),
     ],
+    lambda name, values: axis_values(BRAKE, name, values),
 )
-def test_values_that_are_no_axis_are_refused(name, values, message):
-    with pytest.raises(ValueError, match=message):
-        axis_values(BRAKE, name, values)
 
 
 @pytest.mark.parametrize("place", [replaced, substituted])
@@ -160,7 +142,7 @@ def test_derived_quantities_at_what_is_set_beside_them(place):
     assert moved.contact.surface.D == 2.5
 
 
-def test_a_fractal_contact_takes_a_stiffness_ratio_for_its_law():
+def test_ratios_scaled_laws_and_arrays_are_set():
     assert replaced(BRAKE, {"K_t/K_n": 0.3}).contact.stiffness_ratio == 0.3
     K_n, K_t = fj.stiffness(replaced(BRAKE, {"K_t/K_n": 0.3}))
     assert K_t == pytest.approx(0.3 * float(K_n), rel=1e-14)
@@ -168,19 +150,13 @@ def test_a_fractal_contact_takes_a_stiffness_ratio_for_its_law():
     assert substituted(ready, {"K_t/K_n": 0.3}).contact.stiffness_ratio == 0.3
     assert with_optional(ready, ["stiffness_ratio"]) is ready
     assert with_optional(BRAKE, ["D", "mu"]) is BRAKE
-
-
-def test_a_scaled_law_keeps_its_shape():
     scene = with_friction_times(FIXED, 0.5)
     assert float(scene.friction.mu_s) == 0.2
     assert float(scene.friction.mu_m) == 0.125
     assert float(sliding_friction(scene)) == pytest.approx(float(sliding_friction(FIXED)) / 2)
     assert sliding_friction(FIXED) == pytest.approx(mu_of(0.4, 0.25, 0.5, 0.15), rel=1e-15)
     assert sliding_friction(CONSTANT) == 0.4
-
-
-def test_arrays_take_their_shape_together():
-    """As a grid gives them, and as `vmap` and `jit` see them."""
+    # As a grid gives them, and as `vmap` and `jit` see them.
     mu, V = np.array([[0.2, 0.3]] * 3), np.array([[0.1] * 2, [0.2] * 2, [0.3] * 2])
     grid = replaced(BRAKE, {"mu": mu, "V": V}).friction
     each = jax.jit(jax.vmap(jax.vmap(lambda mu, V: substituted(BRAKE, {"mu": mu, "V": V}))))
@@ -201,8 +177,7 @@ def test_derivatives(mode):
     assert by_V == pytest.approx(-0.3 * 0.4 / at**2 * slope, rel=1e-13)
 
 
-@pytest.mark.parametrize(
-    ("scene", "values", "message"),
+test_values_outside_their_domain_are_refused = refusals(
     [
         (BRAKE, {"K_t/K_n": -0.1}, "K_t/K_n must be at least 0, got -0.1"),
         (BRAKE, {"omega_1/omega_2": 0.0}, "omega_1/omega_2 must be above 0, got 0.0"),
@@ -211,19 +186,14 @@ def test_derivatives(mode):
         (BRAKE, {"mu_s": 0.2}, "mu_s must be at least mu_m = 0.25, got 0.2"),
         (CONSTANT, {"K_t/K_n": np.nan}, "K_t/K_n must be at least 0, got nan"),
     ],
+    replaced,
 )
-def test_values_outside_their_domain_are_refused(scene, values, message):
-    with pytest.raises(ValueError, match=message):
-        replaced(scene, values)
 
 
 def test_values_outside_their_domain_are_nan_when_compiled():
     place = jax.jit(lambda ratio: replaced(CONSTANT, {"omega_1/omega_2": ratio}))
     assert place(2.0).oscillator.omega_1 == 2 * CONSTANT.oscillator.omega_2
     assert np.isnan(place(-1.0).oscillator.omega_1)
-
-
-def test_single_precision_stays():
     scene = jax.tree.map(lambda x: x.astype(jnp.float32), reference_scene())
     moved = substituted(scene, {"mu": jnp.float32(0.3), "K_t/K_n": jnp.float32(0.4)})
     assert {leaf.dtype for leaf in jax.tree.leaves(moved)} == {jnp.dtype(jnp.float32)}

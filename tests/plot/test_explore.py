@@ -16,7 +16,7 @@ from browser import chromium, complaints
 from fractaljax._mechanism.quantities import replaced, substituted, with_optional
 from fractaljax.plot.explore import explored, page, point, points_at, surface_waves
 from fractaljax.plot.javascript import javascript
-from tools import run_command as run
+from tools import refused_command, run_command as run
 
 pytestmark = pytest.mark.unoptimised
 
@@ -42,9 +42,6 @@ def in_node(program, calls):
     return [
         [{"NaN": np.nan, "Infinity": np.inf}.get(x, x) for x in row] for row in json.loads(said)
     ]
-
-
-# --- the program ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -83,7 +80,7 @@ def test_the_translated_program_gives_what_python_gives(scene, windows):
         assert np.any(np.asarray(wanted["growth_rate"]) > 0)
 
 
-def test_operations():
+def test_operations_the_error_function_and_equal_lines():
     """Comparisons, choices, single precision, whole numbers, conjugate parts, infinity."""
 
     def function(x, y):
@@ -97,17 +94,21 @@ def test_operations():
     for (x, y), row in zip(places, found, strict=True):
         wanted = [float(value) for value in function(jnp.array(x), jnp.array(y))]
         np.testing.assert_allclose(np.array(row), np.array(wanted), rtol=1e-15)
-
-
-def test_error_function():
     program = javascript(jax.scipy.special.erf, 1, "f")
     places = [0.0, 1e-300, -1e-9, 0.3, -1.0, 1.9, 2.1, -3.5, 5.9, 5.999, 6.0, -40.0, np.inf, np.nan]
     calls = [f"f([{str(x).replace('inf', 'Infinity').replace('nan', 'NaN')}])" for x in places]
     found = [row[0] for row in in_node(program, calls)]
     np.testing.assert_allclose(np.array(found, float), erf(places), rtol=4e-15)
 
+    def twice(x):
+        jnp.sin(x)
+        return jnp.exp(x) + jnp.exp(x)
 
-def test_what_has_no_counterpart_is_refused():
+    text = javascript(twice, 1, "f")
+    assert text.count("Math.exp") == 1 and "sin" not in text
+
+
+def test_what_has_no_counterpart_is_refused_in_parts_and_in_scenes(tmp_path):
     for function, word in [
         (lambda x: jnp.sort(x * jnp.arange(3.0))[1], "no JavaScript for the operation sort, which"),
         (lambda x: jax.lax.fori_loop(0, 3, lambda _, y: y * x, x), "operation scan, which"),
@@ -116,15 +117,11 @@ def test_what_has_no_counterpart_is_refused():
     ]:
         with pytest.raises(ValueError, match=word):
             javascript(function, 1, "f")
-
-
-def test_equal_and_needless_lines_are_left_out():
-    def function(x):
-        jnp.sin(x)
-        return jnp.exp(x) + jnp.exp(x)
-
-    text = javascript(function, 1, "f")
-    assert text.count("Math.exp") == 1 and "sin" not in text
+    law = fj.AsperityContact(LAW.surface, LAW.material, 1e3, L_s=1e-6)
+    with pytest.raises(ValueError, match="no JavaScript for the operation"):
+        fj.plot.explore(SCENE.replace(contact=law), tmp_path / "a.html")
+    with pytest.raises(TypeError, match="scene must be a Scene"):
+        fj.plot.explore(LAW, tmp_path / "a.html")  # pyright: ignore[reportArgumentType]
 
 
 def test_waves_sum_to_the_topography():
@@ -136,9 +133,6 @@ def test_waves_sum_to_the_topography():
     z = np.tensordot(weights * surface.gamma ** ((surface.D - 3) * k), waves, 1)
     wanted = fj.topography(surface, L, n, key=jax.random.key(0))
     np.testing.assert_allclose(z, wanted, atol=1e-12 * np.abs(wanted).max())
-
-
-# --- the page -------------------------------------------------------------------------------
 
 
 def test_page_is_small_and_whole(tmp_path, capsys):
@@ -160,8 +154,7 @@ def test_page_is_small_and_whole(tmp_path, capsys):
     ],
 )
 def test_command_refuses_in_one_line(over, said, capsys, tmp_path):
-    status, out, err = run(capsys, "explore", "--out", str(tmp_path / "new"), "--over", *over)
-    assert (status, out, err) == (2, "", f"fractaljax: {said}\n")
+    assert refused_command(capsys, "explore", "--out", tmp_path / "new", "--over", *over) == said
     assert not list(tmp_path.iterdir())
 
 
@@ -196,14 +189,6 @@ def test_bad_input_is_refused(arguments, said, tmp_path):
     with pytest.raises(ValueError, match=said):
         fj.plot.explore(**arguments)
     assert not list(tmp_path.iterdir())
-
-
-def test_other_laws_and_structures_are_refused(tmp_path):
-    law = fj.AsperityContact(LAW.surface, LAW.material, 1e3, L_s=1e-6)
-    with pytest.raises(ValueError, match="no JavaScript for the operation"):
-        fj.plot.explore(SCENE.replace(contact=law), tmp_path / "a.html")
-    with pytest.raises(TypeError, match="scene must be a Scene"):
-        fj.plot.explore(LAW, tmp_path / "a.html")  # pyright: ignore[reportArgumentType]
 
 
 def cell(browser, name):
@@ -327,9 +312,6 @@ def test_what_moves_moves_and_nothing_is_cut_off(tmp_path):
             hidden = "return document.getElementById('surface-section').hidden"
             assert browser.execute_script(hidden) == (name == "page")
             assert complaints(browser) == []
-
-
-# --- the widget -----------------------------------------------------------------------------
 
 
 def test_widget_says_what_python_says():

@@ -13,7 +13,14 @@ import pytest
 import fractaljax as fj
 from fractaljax._validate import validate as module
 from fractaljax._validate.case import Case, Check, Curve, Found, Panel, closed, stated
-from tools import DOCS, assert_same_picture, assert_whole, load_script, run_command as run
+from tools import (
+    DOCS,
+    assert_same_picture,
+    assert_whole,
+    load_script,
+    refused_command,
+    run_command as run,
+)
 
 sys.path.insert(0, str(DOCS))  # the script of the page shares a module with others
 BASES = {"stated", "closed form", "SciPy", "corrected"}
@@ -55,9 +62,6 @@ def only(monkeypatch, tmp_path):
     return know
 
 
-# --- numbers and verdicts -----------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("published", "ours", "tolerance", "difference", "agrees"),
     [
@@ -75,14 +79,6 @@ def test_a_number_agrees_within_its_tolerance(published, ours, tolerance, differ
     check = Check("q [-]", published, ours, tolerance, "stated")
     assert check.difference == pytest.approx(difference, abs=1e-12, nan_ok=True)
     assert check.agrees is agrees
-
-
-def test_tolerances_follow_the_digits():
-    """Half of the last digit printed; a closed form relative to its own size."""
-    assert stated("q [m]", 0.15, 0.154, 0.01).agrees
-    assert not stated("q [m]", 0.15, 0.156, 0.01).agrees
-    assert closed("q [m]", -4.0, -4.0003, 1e-4).agrees
-    assert not closed("q [m]", -4.0, -4.0005, 1e-4).agrees
 
 
 def test_two_cases_and_their_table():
@@ -135,16 +131,21 @@ def test_defects_are_not_hidden(only):
         fj.validate(progress=False)
 
 
-def test_refusals():
+def test_refusals_and_tolerances():
     with pytest.raises(ValueError, match=r"^no case 'nobody'; .* source_stiffness, .*brake$"):
         fj.validate("nobody")
     with jax.enable_x64(False), pytest.raises(ValueError, match="validate needs 64 bits"):
         fj.validate("campana")
     with pytest.raises(TypeError, match="progress must be True or False"):
         fj.validate("campana", progress=1)  # type: ignore[arg-type]
+    # Half of the last digit printed; a closed form relative to its own size.
+    assert stated("q [m]", 0.15, 0.154, 0.01).agrees
+    assert not stated("q [m]", 0.15, 0.156, 0.01).agrees
+    assert closed("q [m]", -4.0, -4.0003, 1e-4).agrees
+    assert not closed("q [m]", -4.0, -4.0005, 1e-4).agrees
 
 
-def test_the_brake_says_what_it_lacks(monkeypatch, tmp_path):
+def test_the_brake_says_what_it_lacks_and_who_is_unknown(monkeypatch, tmp_path, capsys):
     monkeypatch.delenv("FRACTALJAX_BRAKE", raising=False)
     without = fj.validate("brake", progress=False)
     assert without.agrees and "not run: no matrices: set FRACTALJAX_BRAKE" in repr(without)
@@ -154,9 +155,9 @@ def test_the_brake_says_what_it_lacks(monkeypatch, tmp_path):
     (tmp_path / "BMLL.npz").touch()
     reason = fj.validate("brake", progress=False).cases["brake"].reason
     assert "no BDLL, BYLL" in reason and "BMLL," not in reason
-
-
-# --- the command --------------------------------------------------------------------------
+    monkeypatch.chdir(tmp_path)
+    said = refused_command(capsys, "validate", "nobody", "--out", "gallery")
+    assert said.startswith("no case 'nobody'; the cases are ") and not Path("gallery").exists()
 
 
 def test_command(capsys, only):
@@ -182,16 +183,6 @@ def test_command_ends_with_1_where_one_differs(capsys, only, case):
     assert Path("gallery/validation.csv").exists()
 
 
-def test_command_refuses_an_unknown_case(capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    status, out, err = run(capsys, "validate", "nobody", "--out", "gallery")
-    assert (status, out) == (2, "") and not Path("gallery").exists()
-    assert err.startswith("fractaljax: no case 'nobody'; the cases are ") and err.count("\n") == 1
-
-
-# --- the cases and the page ---------------------------------------------------------------
-
-
 def test_every_case_names_its_source_and_is_on_the_page():
     known = module.known_cases()
     modules = [sys.modules[f"fractaljax._validate.{name}"] for name in module._MODULES]
@@ -204,6 +195,7 @@ def test_every_case_names_its_source_and_is_on_the_page():
         assert f"]({picture.name})" in PAGE
         assert picture.read_bytes().startswith(b"\x89PNG") and picture.stat().st_size < 60_000
     assert {name for name, case in known.items() if case.doi is None} == {"papangelo"}
+    assert rows_as_on_the_page(found("source_onset", "campana")) == 7
 
 
 def cells(text):
@@ -235,10 +227,6 @@ def rows_as_on_the_page(validation) -> int:
                 assert shown[5] == row[5] == "within"
             compared += 1
     return compared
-
-
-def test_page_has_the_numbers_of_two_cases():
-    assert rows_as_on_the_page(found("source_onset", "campana")) == 7
 
 
 @pytest.mark.slow
