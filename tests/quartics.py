@@ -22,9 +22,6 @@ def stacked(columns):
     return Linearised(*(jnp.asarray(column) for column in columns))
 
 
-# --- families of systems, columns a, b, c_1, c_2, g ---------------------------------------
-
-
 def log_uniform(rng, low, high, n):
     return 10 ** rng.uniform(low, high, n)
 
@@ -99,9 +96,6 @@ FAMILIES = {
 def family(name, n):
     """n systems of a family, always the same."""
     return FAMILIES[name](np.random.default_rng(len(name)), n)
-
-
-# --- independent truths -------------------------------------------------------------------
 
 
 def quartic_roots(coefficients):

@@ -73,11 +73,20 @@ def test_what_is_no_number_or_part_is_refused_by_name(name):
             assert len(message) < 250 and "\n" not in message, message
 
 
-def test_margin_takes_no_flag_for_a_growth_rate():
+def test_arguments_of_the_margin_structures_and_the_boundary():
     """`margin(scene, False)` means the third argument, not the second."""
     for bad in (False, np.False_, jnp.array(True), 1j):
         with pytest.raises(TypeError, match=r"^shift must be a real number"):
             fj.margin(SCENE, bad)
+    with pytest.raises(TypeError, match=r"must be a Scene, got"):
+        fj.stiffness(fj.Structure.from_scene(SCENE))  # pyright: ignore[reportArgumentType]
+    neither: Any = SURFACE
+    with pytest.raises(TypeError, match=r"must be a Scene or a Structure, got"):
+        fj.hopf_boundary(neither, ("mu", 0.1, 0.5), ("P", 1.0, 2.0))
+    bad: Any
+    for bad in (1, np.nan, 10**30, 2.5, "9", None):
+        with pytest.raises(ValueError, match=r"^lines must be a whole number"):
+            fj.hopf_boundary(SCENE, ("mu", 0.1, 0.5), ("P", 1.0, 2.0), lines=bad)
 
 
 @pytest.mark.parametrize(
@@ -87,18 +96,3 @@ def test_margin_takes_no_flag_for_a_growth_rate():
 def test_a_scene_is_asked_for_by_name(function, bad):
     with pytest.raises(TypeError, match=r"must be a Scene.*, got"):
         function(bad)
-
-
-def test_a_structure_is_refused_where_a_scene_is_needed():
-    with pytest.raises(TypeError, match=r"must be a Scene, got"):
-        fj.stiffness(fj.Structure.from_scene(SCENE))  # pyright: ignore[reportArgumentType]
-
-
-def test_arguments_of_the_boundary():
-    neither: Any = SURFACE
-    with pytest.raises(TypeError, match=r"must be a Scene or a Structure, got"):
-        fj.hopf_boundary(neither, ("mu", 0.1, 0.5), ("P", 1.0, 2.0))
-    bad: Any
-    for bad in (1, np.nan, 10**30, 2.5, "9", None):
-        with pytest.raises(ValueError, match=r"^lines must be a whole number"):
-            fj.hopf_boundary(SCENE, ("mu", 0.1, 0.5), ("P", 1.0, 2.0), lines=bad)

@@ -42,15 +42,14 @@ def test_page_has_the_text_that_its_script_generates(name, pattern):
 
 
 @pytest.mark.slow  # compiles the whole chain in two precisions
-def test_float32_page_has_the_numbers_that_are_measured_now():
+def test_pages_have_the_numbers_that_are_found_now():
     committed, now = (numbers(MEASURED, page) for page in pages("float32"))
     assert len(now) > 50
     # Rounding differs from machine to machine.
     np.testing.assert_array_less(np.abs(np.log(committed) - np.log(now)), np.log(3))
-
-
-@pytest.mark.slow
-def test_figures_page_has_the_numbers_that_are_found_now():
+    committed, now = (numbers(NUMBER, page) for page in pages("contact_laws"))
+    assert len(now) > 200
+    np.testing.assert_allclose(committed, now, rtol=0.011, atol=0.011)  # of the last digit shown
     committed, now = (numbers(NUMBER, page) for page in pages("figures_7_to_10"))
     assert len(now) > 100
     # A point of a map on the boundary may change sides on another machine.
@@ -79,11 +78,7 @@ def test_verdicts_follow_from_the_numbers():
     a, b = o.omega_1**2 + kappa * 4e8, o.omega_2**2 + 4e8
     wanted = jnp.sqrt((c_1 * b + c_2 * a) / (c_1 + c_2)) / (2e3 * np.pi)
     assert made.critical_frequency("7", 0.7540173, kappa) == pytest.approx(float(wanted), rel=1e-6)
-
-
-@pytest.mark.slow
-def test_pictures_of_the_figures():
-    """Committed ones are small; drawn anew from few points nothing is cut off."""
+    # Committed ones are small; drawn anew from few points nothing is cut off.
     made = script("figures_7_to_10")
     for name in made.PICTURES:
         assert f"({name})" in pages("figures_7_to_10")[0]
@@ -93,13 +88,6 @@ def test_pictures_of_the_figures():
         figure = made.figure(number, 12)
         assert len(figure.axes) == panels
         assert_whole(figure)
-
-
-@pytest.mark.slow
-def test_contact_laws_page_has_the_numbers_that_are_found_now():
-    committed, now = (numbers(NUMBER, page) for page in pages("contact_laws"))
-    assert len(now) > 200
-    np.testing.assert_allclose(committed, now, rtol=0.011, atol=0.011)  # of the last digit shown
 
 
 def test_contact_laws_are_judged_as_the_page_says(monkeypatch):

@@ -11,7 +11,7 @@ from mpmath import mp, mpf
 import fractaljax as fj
 from fractaljax._friction import LAWS, Scaled
 from fractaljax._mechanism.quantities import replaced, require_independent, substituted, value_of
-from tools import both_modes
+from tools import both_modes, refusals
 
 STRIBECK, COULOMB = fj.Stribeck(0.4, 0.25, 0.5), fj.Coulomb(0.4)
 SPEEDS = np.array([1e-300, 1e-9, 0.01, 0.15, 0.3, 0.4999, 0.5, 0.75, 1.0, 3.0])
@@ -62,7 +62,7 @@ def equation_38(v, mu_s=mpf(0.4), mu_m=mpf(0.25), v_m=mpf(0.5)):  # noqa: B008
     return mu_s - 3 * (mu_s - mu_m) / (2 * v_m) * v + (mu_s - mu_m) / (2 * v_m**3) * v**3
 
 
-def test_slope():
+def test_slope_in_both_precisions_and_nan_under_jit():
     """Against differences in 60 digits of Eq. 38; even in the velocity; its minimum; a constant."""
     with mp.workdps(60):
         h = mpf("1e-20")  # truncation h^2, rounding 1e-60/h
@@ -77,6 +77,14 @@ def test_slope():
     assert STRIBECK.slope(0.5) == 0.0 and not COULOMB.velocity_dependent
     np.testing.assert_array_equal(COULOMB.mu(SPEEDS), 0.4)
     np.testing.assert_array_equal(COULOMB.slope(SPEEDS), 0)
+    single = jax.tree.map(lambda x: x.astype(jnp.float32), STRIBECK)
+    v = SPEEDS[1:].astype(np.float32)
+    assert single.mu(v).dtype == single.slope(v).dtype == np.float32
+    np.testing.assert_allclose(single.mu(v), STRIBECK.mu(SPEEDS[1:]), rtol=1e-6)
+    assert np.isnan(jax.jit(fj.Stribeck)(0.4, 0.5, 0.5).mu(0.1))
+    cubic = jax.jit(lambda high: Cubic(high, 0.1, 0.5).mu(jnp.array(0.1)))
+    np.testing.assert_allclose(cubic(0.4), Cubic(0.4, 0.1, 0.5).mu(jnp.array(0.1)), rtol=1e-15)
+    assert np.isnan(cubic(-0.4)) and np.isnan(jax.jit(lambda mu_s: Peaked(mu_s).mu(0.1))(0.5))
 
 
 def viscous(s, d, v, c, w):
@@ -196,10 +204,7 @@ class Question(NamedTuple):
     friction: Any
 
 
-QUESTIONS = {
-    "fixed": BRAKE.replace(contact=fj.FixedContact(4e8, 1.3e8)),
-    "fractal": BRAKE,
-}
+QUESTIONS = {"fixed": BRAKE.replace(contact=fj.FixedContact(4e8, 1.3e8)), "fractal": BRAKE}
 
 
 @jax.jit
@@ -307,15 +312,7 @@ def test_branches(law):
         np.testing.assert_allclose(found, cubic(BOTH_WAYS), rtol=1e-15, atol=5e-16)
 
 
-def test_float32():
-    single = jax.tree.map(lambda x: x.astype(jnp.float32), STRIBECK)
-    v = SPEEDS[1:].astype(np.float32)
-    assert single.mu(v).dtype == single.slope(v).dtype == np.float32
-    np.testing.assert_allclose(single.mu(v), STRIBECK.mu(SPEEDS[1:]), rtol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
+test_refusals = refusals(
     [
         (lambda: fj.Stribeck(0.0, 0.0, 0.5), r"^mu_s must be above 0, got 0\.0$"),
         (lambda: fj.Stribeck(0.4, -0.1, 0.5), r"^mu_m must be at least 0, got -0\.1$"),
@@ -334,14 +331,5 @@ def test_float32():
         (lambda: Scaled(CUBIC, 0.0), r"^factor must be above 0, got 0\.0"),
         (lambda: Peaked(0.5), r"^mu_s must be mu\(0\) = 0\.25, got 0\.5"),
     ],
+    kind=(ValueError, TypeError),
 )
-def test_refusals(call, message):
-    with pytest.raises((ValueError, TypeError), match=message):
-        call()
-
-
-def test_under_jit_it_is_nan():
-    assert np.isnan(jax.jit(fj.Stribeck)(0.4, 0.5, 0.5).mu(0.1))
-    cubic = jax.jit(lambda high: Cubic(high, 0.1, 0.5).mu(jnp.array(0.1)))
-    np.testing.assert_allclose(cubic(0.4), Cubic(0.4, 0.1, 0.5).mu(jnp.array(0.1)), rtol=1e-15)
-    assert np.isnan(cubic(-0.4)) and np.isnan(jax.jit(lambda mu_s: Peaked(mu_s).mu(0.1))(0.5))

@@ -21,10 +21,12 @@ def printed(code):
     return set(run.stdout.split())
 
 
-def test_the_import_loads_nothing():
+def test_the_import_loads_nothing_and_knows_its_names():
     """Not even JAX: it comes with the first name that is used."""
     assert not {*HEAVY, *ARRAYS} & printed(f"import fractaljax; {LOADED}")
     assert not {*HEAVY, *ARRAYS} & printed(f"import fractaljax.__main__; {LOADED}")
+    with pytest.raises(AttributeError, match=r"^module 'fractaljax' has no attribute 'nonsense'$"):
+        fj.nonsense  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def test_a_growth_rate_loads_what_it_needs():
@@ -35,11 +37,6 @@ def test_a_growth_rate_loads_what_it_needs():
     assert packages == {
         "_base", "_contact", "_friction", "_mechanism", "_stability", "_surface", "_version"
     }  # fmt: skip
-
-
-def test_an_error_names_what_there_is_not():
-    with pytest.raises(AttributeError, match=r"^module 'fractaljax' has no attribute 'nonsense'$"):
-        fj.nonsense  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
 
 
 @pytest.mark.parametrize("package", [fj, fj.plot])

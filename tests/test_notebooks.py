@@ -80,11 +80,6 @@ def test_notebook_is_kept_stripped(path):
     assert notebook.cells[0].source.startswith("# ")
 
 
-def test_page_lists_every_notebook():
-    page = (FOLDER / "README.md").read_text(encoding="utf-8")
-    assert all(f"({path.name})" in page for path in NOTEBOOKS)
-
-
 def test_stripping_leaves_the_cells():
     """Outputs, counts and metadata go; sources and ids stay; twice is as once."""
     cell = new_code_cell("1 + 1", id="sum", execution_count=3, metadata={"tags": ["x"]})
@@ -97,9 +92,11 @@ def test_stripping_leaves_the_cells():
     assert (head.source, head.id, cell.source, cell.id) == ("# A", "head", "1 + 1", "sum")
     assert (cell.outputs, cell.execution_count, cell.metadata) == ([], None, {})
     assert "widgets" not in once and "tags" not in once
+    page = (FOLDER / "README.md").read_text(encoding="utf-8")
+    assert all(f"({path.name})" in page for path in NOTEBOOKS)
 
 
-def test_faults_are_seen():
+def test_faults_errors_and_long_cells_are_seen(tmp_path):
     """A warning, an Axes in place of its picture, a picture without a sentence, pyplot."""
     picture = new_output("display_data", {"image/png": PNG, "text/plain": "<Axes: >"})
     axes = new_output("execute_result", {"text/plain": "<Axes: >"})
@@ -116,9 +113,6 @@ def test_faults_are_seen():
         (fault,) = found(picture, below=below)
         assert fault == "here has a picture without a sentence below it"
     assert found(picture, "import matplotlib.pyplot") == ["here uses pyplot"]
-
-
-def test_errors_and_long_cells_are_raised(tmp_path):
     with pytest.raises(CellExecutionError, match="ZeroDivisionError"):
         execute(new_notebook(cells=[new_code_cell("1 / 0")]), tmp_path)
     with pytest.raises(CellTimeoutError):

@@ -37,17 +37,11 @@ def test_examples_print_what_is_printed(page, capsys, tmp_path, monkeypatch):
         assert_same_picture(tmp_path / "cycle.png", "cycle.png")
 
 
-def test_example_of_readme_is_short():
+def test_readme_has_a_short_example_the_scene_and_the_commands_of_ci():
     (code,) = blocks(README, "python")
     assert len([line for line in code.splitlines() if line.strip()]) <= 15
-
-
-def test_scene_file_is_the_one_the_command_writes():
     assert blocks(GUIDE, "toml") == [fj.brake_scene().to_toml()]
-
-
-def test_commands_are_those_that_ci_runs():
-    """README shows two commands for a fresh machine. CI runs both."""
+    # README shows two commands for a fresh machine. CI runs both.
     text = (ROOT / README).read_text()
     first, second = re.findall(r"^    (python -m pip .*)$", text, flags=re.MULTILINE)
     ci = (ROOT / ".ci" / "run").read_text()

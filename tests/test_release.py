@@ -18,7 +18,7 @@ def listed(section: str) -> set[str]:
     return {item.replace(" ", "") for item in re.findall(r"- (.*)", items)}
 
 
-def test_recipe_asks_for_what_pyproject_asks_for():
+def test_recipe_asks_for_what_pyproject_asks_for_in_one_version():
     project, found = PROJECT["project"], {"python>=${{python_min}}"}
     for need in project["dependencies"]:
         name, bound = need.split(">=")
@@ -31,9 +31,6 @@ def test_recipe_asks_for_what_pyproject_asks_for():
     (command,) = project["scripts"].items()
     for said in (" = ".join(command), project["description"], f"license: {project['license']}"):
         assert said in RECIPE
-
-
-def test_one_version():
     assert re.findall(r'  version: "(.*)"', RECIPE) == [fj.__version__]
     assert f"version: {fj.__version__}\n" in (ROOT / "CITATION.cff").read_text()
     first = re.findall(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.M)[0]

@@ -56,16 +56,13 @@ def test_stability_table_has_the_friction_that_starts_to_squeal():
     assert ["critical friction", "none"] in [re.split("  +", line) for line in lines]
 
 
-def test_every_active_constraint_has_a_line():
+def test_lines_and_columns_of_tables():
     """Several active constraints stand below each other."""
     scene = fj.brake_scene()
     text = comparison_table(scene, scene, True, ("one", "two", "three"))
     assert [line.split()[-1] for line in text.splitlines()[-3:]] == ["one", "two", "three"]
     assert comparison_table(scene, scene, True, ()).splitlines()[-1].split()[-1] == "-"
-
-
-def test_columns_are_aligned():
-    """Titles stand above their columns; many columns are rows, so that lines stay short."""
+    # Titles stand above their columns; many columns are rows, so that lines stay short.
     text = table(["a", "b"], [{"row": "1", "longer row": "22"}, {"row": "3", "longer row": "4"}])
     assert text == "            a   b\nrow         1   3\nlonger row  22  4"
     lines = table([*"abcdef"], [{"row": str(i), "longer row": "22"} for i in range(6)]).splitlines()
@@ -77,7 +74,7 @@ def cells(text):
     return [re.split(r"  +", line.strip()) for line in text.splitlines()]
 
 
-def test_cycle_table_agrees_with_the_cycle():
+def test_cycle_tables_agree_with_their_cycles(monkeypatch):
     """Three blocks: the whole cycle, its two directions, its switches."""
     scene, cycle = reference_scene(), reference_cycle()
     whole, directions, switches = cycle_table(scene, cycle).split("\n\n")
@@ -114,6 +111,15 @@ def test_cycle_table_agrees_with_the_cycle():
         assert float(time) == pytest.approx(1e3 * at.time, abs=1e-6)
         assert float(share[:-1]) == pytest.approx(100 * at.time / period, abs=0.01)
         assert rest == [f"x{at.direction}", words[at.before], words[at.after]]
+    # Of an inaccurate cycle, of one of the regularised law, and of one without switches.
+    text = cycle_table(scene, eqx.tree_at(lambda c: c.result, cycle, fj.CycleResult.inaccurate))
+    assert text.startswith("result                a limit cycle was found, but not to rtol")
+    assert "Floquet multiplier 4" in text and "switch 5" in text and "off the exact" not in text
+    text = cycle_table(scene, eqx.tree_at(lambda c: c.regularisation_error, cycle, 0.0123))
+    assert "off the exact law by  1.2e-02" in text and "switch" not in text
+    monkeypatch.setattr(fj.LimitCycle, "switches", lambda _: [])
+    text = cycle_table(scene, cycle)
+    assert "switch" not in text and text.splitlines()[-1].startswith("sticks")
 
 
 @pytest.mark.slow
@@ -125,22 +131,6 @@ def test_cycle_table_without_a_cycle():
         ["result", "the motion dies out: the sliding equilibrium attracts it"],
         ["growth rate [1/s]", growth, "(stable against small disturbances)"],
     ]
-
-
-def test_cycle_tables_of_other_cycles(monkeypatch):
-    """An inaccurate one has all numbers and a warning; one without switches has no list of them.
-
-    One of the regularised law has none, and a difference from the exact law.
-    """
-    scene, cycle = reference_scene(), reference_cycle()
-    text = cycle_table(scene, eqx.tree_at(lambda c: c.result, cycle, fj.CycleResult.inaccurate))
-    assert text.startswith("result                a limit cycle was found, but not to rtol")
-    assert "Floquet multiplier 4" in text and "switch 5" in text and "off the exact" not in text
-    text = cycle_table(scene, eqx.tree_at(lambda c: c.regularisation_error, cycle, 0.0123))
-    assert "off the exact law by  1.2e-02" in text and "switch" not in text
-    monkeypatch.setattr(fj.LimitCycle, "switches", lambda _: [])
-    text = cycle_table(scene, cycle)
-    assert "switch" not in text and text.splitlines()[-1].startswith("sticks")
 
 
 UNCOMPUTABLE = [
@@ -161,13 +151,7 @@ def test_what_cannot_be_computed_is_not_called_stable(changes, message):
         stability_table(scene)
 
 
-def test_a_growth_rate_of_zero_is_neither():
-    """Without damping rounding would decide."""
-    scene = fj.brake_scene().replace(xi_1=0.0, xi_2=0.0, mu_s=0.01, mu_m=0.01)
-    assert "+0  (0 to rounding: it neither grows nor dies out)" in stability_table(scene)
-
-
-def test_friction_beyond_its_law_is_remarked():
+def test_remarks_on_friction_beyond_its_law_and_a_growth_rate_of_zero():
     """Beyond sqrt(3) v_m the cubic exceeds mu_s."""
     scene = fj.brake_scene()
     speeds = 0.5 * np.sqrt(3) * np.array([0.0, 0.999, 1.0])
@@ -177,3 +161,6 @@ def test_friction_beyond_its_law_is_remarked():
     assert line.startswith("remark: at a sliding speed of 0.87 m/s the friction law gives 0.40")
     assert stability_table(scene.replace(V=5.0)).splitlines()[-1].startswith("remark: at a sliding")
     assert "remark" not in stability_table(scene)
+    # Without damping rounding would decide.
+    scene = fj.brake_scene().replace(xi_1=0.0, xi_2=0.0, mu_s=0.01, mu_m=0.01)
+    assert "+0  (0 to rounding: it neither grows nor dies out)" in stability_table(scene)

@@ -114,14 +114,6 @@ class Elsewhere(fj.Friction):
         return self.mu_s
 
 
-def test_classes_and_functions_from_elsewhere_are_not_kept(folder):
-    law = Elsewhere(jnp.asarray(0.3), jnp.asarray(0.2))
-    assert quick.command_jit(lambda law: law.mu(0.0))(law) == 0.3
-    applied = quick.command_jit(lambda x, function: function(x), "function")
-    assert applied(2.0, function=lambda x: 3 * x) == 6
-    assert not [*folder.iterdir()]
-
-
 def test_two_ways_to_compile_one_function_are_two_programs(folder):
     for once in (False, True):
         program = quick.quick_jit(square, once=once)
@@ -144,11 +136,16 @@ def test_programs_that_call_it_find_lapack(folder, monkeypatch, function, needed
     assert asked == [True] * needed
 
 
-def test_within_a_trace_nothing_is_kept(folder):
+def test_within_a_trace_and_from_elsewhere_nothing_is_kept(folder):
     program, _ = counted()
     assert jax.grad(lambda x: program(x)["value"])(3.0) == 6
     assert jax.jit(lambda: program(3.0)["value"])() == 9
     assert (jax.vmap(program)(jnp.arange(2.0))["value"] == jnp.arange(2.0)).all()
+    assert not [*folder.iterdir()]
+    law = Elsewhere(jnp.asarray(0.3), jnp.asarray(0.2))
+    assert quick.command_jit(lambda law: law.mu(0.0))(law) == 0.3
+    applied = quick.command_jit(lambda x, function: function(x), "function")
+    assert applied(2.0, function=lambda x: 3 * x) == 6
     assert not [*folder.iterdir()]
 
 

@@ -29,6 +29,7 @@ from fractaljax._base.parts import (
     substitute,
     whole,
 )
+from tools import refusals
 
 SURFACE = fj.Surface(2.4, 1.342e-10)
 MATERIAL = fj.Material(1.154e11, 0.3, 3.55e8, 9.94e8)
@@ -51,9 +52,6 @@ def same(a, b):
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         assert (x.dtype, x.shape) == (y.dtype, y.shape)
         np.testing.assert_array_equal(x, y)
-
-
-# --- checks -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -88,8 +86,7 @@ ONE, TWO = jnp.array(1.0), jnp.array([1.0, 2.0])
 BELOW = jax.jit(lambda x: number("x", x, below=1))
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
+test_refusals = refusals(
     [
         (lambda: number("x", 1.0, above=1), r"^x must be above 1, got 1\.0$"),
         (lambda: number("x", 1.0, at_least=1.5), r"^x must be at least 1\.5, got 1\.0$"),
@@ -113,14 +110,11 @@ BELOW = jax.jit(lambda x: number("x", x, below=1))
         (lambda: substitute(CONTACT, {"nonsense": ONE}), "nonsense"),
         (lambda: require_scalar(rebuild(CONTACT, {"G": TWO})), r"^G must be a scalar.*jax\.vmap"),
     ],
+    kind=(ValueError, TypeError, KeyError),
 )
-def test_refusals(call, message):
-    """The name, the bound and the value."""
-    with pytest.raises((ValueError, TypeError, KeyError), match=message):
-        call()
 
 
-def test_what_is_traced_becomes_nan():
+def test_what_is_traced_becomes_nan_and_is_found():
     """Each number by itself, with its derivative, and nothing else in the batch."""
     half, nan = jnp.array([0.5, 1.0]), np.nan
     np.testing.assert_array_equal(BELOW(half), [0.5, nan])
@@ -138,10 +132,7 @@ def test_what_is_traced_becomes_nan():
     unbounded = jnp.array([complex(1, np.inf), 1j])
     np.testing.assert_array_equal(nan_where(False, unbounded), unbounded)
     assert np.isnan(nan_where(jnp.array([True, True]), unbounded).imag).all()
-
-
-def test_refused_numbers_are_found():
-    """Among traced numbers alone: those that are known were checked at once."""
+    # Among traced numbers alone: those that are known were checked at once.
     assert refused((SURFACE, 1.0)) is None
     found = jax.jit(lambda x, k: refused((x, k, SURFACE)))
     assert found(jnp.array([1.0, np.nan]), 1) and not found(TWO, 1)
@@ -173,9 +164,6 @@ def test_what_is_known_stays_known_at_trace_time():
     assert look(2.4) == 1.4 and known == [None, 1e-10, 1.4]
     jax.grad(lambda x: (known.append(concrete(x)), x)[1])(3.0)
     assert known[-1] == 3.0  # inside an eager gradient
-
-
-# --- pytrees ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("part", [*PARTS, STATE], ids=lambda part: type(part).__name__)
@@ -225,9 +213,6 @@ def test_every_quantity_says_what_it_is():
     assert scales == {"G", "E", "sigma_y", "H", "P", "K_n", "K_t"}
 
 
-# --- named quantities -------------------------------------------------------------------------
-
-
 class Table(Part):
     """A part of parts."""
 
@@ -239,7 +224,7 @@ class Table(Part):
         self.height = number("height", height)
 
 
-def test_quantities():
+def test_quantities_are_listed_replaced_and_substituted():
     """Every name below a part, sub-parts included, with the path that leads to it."""
     table = Table(SURFACE, 1.0)
     assert quantities(table) == {
@@ -254,19 +239,11 @@ def test_quantities():
     for part in PARTS:  # names are unambiguous
         paths = list(quantities(part).values())
         assert len({path[-1] for path in paths}) == len(paths)
-
-
-def test_rebuild():
-    """Quantities and parts change wherever they live; what holds none of them is kept."""
     changed = rebuild(CONTACT, {"D": 2.5, "P": 100.0})
     assert (changed.surface.D, changed.surface.G, changed.P) == (2.5, 1.342e-10, 100.0)
     assert changed.material is MATERIAL and rebuild(CONTACT, {}) is CONTACT
     scene: Any = rebuild(fj.brake_scene(), {"friction": fj.Coulomb(0.3), "mu": 0.2})
     assert scene.friction.mu_s == 0.2
-
-
-def test_substitute():
-    """The same change without checks: equal results, and values outside the domain pass."""
     changes = {"D": jnp.array(2.5), "P": jnp.array(100.0)}
     same(substitute(CONTACT, changes), rebuild(CONTACT, changes))
     assert substitute(CONTACT, {"D": jnp.array(3.5)}).surface.D == 3.5

@@ -7,12 +7,6 @@ import pytest
 from fractaljax._base.ranges import is_logarithmic, within
 
 
-def test_logarithmic_from_a_decade_on():
-    assert is_logarithmic(1e-12, 1e-8) and is_logarithmic(1e8, 1e9)
-    for low, high in ((1e8, 9e8), (-1.0, 10.0), (0.0, 1.0), (-10.0, -1.0)):
-        assert not is_logarithmic(low, high)
-
-
 def test_values_along_a_range():
     """Both ends to the last bit; between them the arithmetic or the geometric mean."""
     random = np.random.default_rng(0)
@@ -23,3 +17,6 @@ def test_values_along_a_range():
     at = np.linspace(0, 1, 5)
     traced = jax.jit(lambda at: within(1e-4, 1e-2, at))(at)
     np.testing.assert_allclose(traced, within(1e-4, 1e-2, at), rtol=1e-14)
+    assert is_logarithmic(1e-12, 1e-8) and is_logarithmic(1e8, 1e9)
+    for low, high in ((1e8, 9e8), (-1.0, 10.0), (0.0, 1.0), (-10.0, -1.0)):
+        assert not is_logarithmic(low, high)

@@ -46,13 +46,6 @@ def relative(found, truth):
     return float(abs(mpf(float(found)) / truth - 1))
 
 
-def test_polynomial_has_its_highest_power_first():
-    x = np.linspace(-2, 2, 6).reshape(2, 3)
-    found = polynomial([3.0, -1.0, 0.0, 0.5], jnp.asarray(x))
-    np.testing.assert_allclose(found, 3 * x**3 - x**2 + 0.5, rtol=1e-14)
-    assert polynomial([1.0, 2.0], jnp.float32(3)).dtype == jnp.float32
-
-
 @ORDERS
 def test_exprel(first, second):
     """(e^x - 1)/x, slope and curvature at x = 0, beside it and across the series radius."""
@@ -63,7 +56,7 @@ def test_exprel(first, second):
             assert relative(value, exprel_truth(x)[order]) < bound, (order, x)
 
 
-def test_exprel_limit_and_float32():
+def test_exprel_limit_float32_and_polynomials():
     assert exprel(0.0) == 1.0 and jax.grad(exprel)(0.0) == 0.5
     points = POINTS.astype(np.float32)
     found, slope = exprel(points), jax.vmap(jax.grad(exprel))(points)
@@ -71,6 +64,10 @@ def test_exprel_limit_and_float32():
     for x, value, derivative in zip(points, found, slope, strict=True):
         truth = exprel_truth(float(x))
         assert relative(value, truth[0]) < 1e-6 and relative(derivative, truth[1]) < 1e-5, x
+    x = np.linspace(-2, 2, 6).reshape(2, 3)
+    found = polynomial([3.0, -1.0, 0.0, 0.5], jnp.asarray(x))
+    np.testing.assert_allclose(found, 3 * x**3 - x**2 + 0.5, rtol=1e-14)
+    assert polynomial([1.0, 2.0], jnp.float32(3)).dtype == jnp.float32
 
 
 def boxcox_truth(t, r):

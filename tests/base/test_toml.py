@@ -63,13 +63,10 @@ def test_refusals(tmp_path, old, new, message):
     assert str(caught.value).startswith(f"{path}: {message}") and "\n" not in str(caught.value)
 
 
-def test_whole_numbers_and_defaults():
+def test_whole_numbers_defaults_and_parts_without_a_name():
     """Integers are numbers, and what has a default may be left out."""
     text = GOOD.replace("P = 1907.3", "P = 2000").replace("gamma = 1.5", "")
     assert fj.Scene.from_toml(text).replace(P=1907.3).to_toml() == GOOD
-
-
-def test_parts_of_kinds_without_a_name_are_refused():
     laws = {"contact": {"fixed": fj.FixedContact}}
     with pytest.raises(ValueError, match="a file holds as contact one of FixedContact, got Frac"):
         part_table(fj.brake_scene(), laws)

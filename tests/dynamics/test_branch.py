@@ -18,13 +18,7 @@ from benchmarks import transients
 from fractaljax._mechanism.quantities import replaced
 from mechanisms import PROBLEMS, changed
 from structures import of_problem
-from tools import (
-    DOCS,
-    assert_same_picture,
-    both_modes,
-    labels,
-    load_script,
-)
+from tools import DOCS, assert_same_picture, both_modes, labels, load_script
 
 BELT = PROBLEMS["papangelo_2017"]
 UNOPTIMISED = pytest.mark.unoptimised
@@ -44,9 +38,6 @@ def belt():
 @functools.cache
 def branch(name, quantity, low, high):
     return fj.continue_cycle(of_problem(PROBLEMS[name]), quantity, (low, high), cycle(name))
-
-
-# --- the one-mass belt, whose phase plane says where its cycles end ---
 
 
 def test_belt():
@@ -126,9 +117,6 @@ def test_picture(tmp_path):
     assert ax.get_ylabel() == "peak-to-peak amplitude [m]"
     with pytest.raises(ValueError, match="direction must be from 1 to 1, got 2"):
         fj.plot.branch(belt(), direction=2)
-
-
-# --- any mechanism, against the independent solver ---
 
 
 def assert_truth(problem, quantity, found, i):

@@ -19,7 +19,7 @@ import fractaljax as fj
 from hybrid_truth import Mechanism, forced_cycle, simulate
 from mechanisms import PROBLEMS, changed
 from structures import of_problem
-from tools import both_modes, primitives, reference_scene
+from tools import both_modes, primitives, reference_scene, refusals
 
 pytestmark = pytest.mark.unoptimised
 
@@ -79,12 +79,17 @@ def test_motion():
 
 
 @SLOW
-def test_motion_with_lift_off():
+def test_motion_and_orbit_with_lift_off():
     """Two degrees of freedom with a phase each."""
     arguments = [0.5, 0.8], 0.21, [0.2, -1.1]
     given = fj.Excitation({1: 0.8, 0: 0.5}, 0.21, [-1.1, 0.2])
     found = fj.simulate(of_problem(LIFT), LIFT["start"], T1, t0=T0, excitation=given)
     agree(LIFT, LIFT["start"], *arguments, found)
+    # A subharmonic of two degrees of freedom.
+    arguments = [0.3, 0.3], 2 * LIFT_FREE, 0.3
+    found = fj.limit_cycle(of_problem(LIFT), LIFT["start"], excitation=fj.Excitation(*arguments))
+    assert int(found.returns) == 2 and 0.5 < float(found.open_fraction[0]) < 0.6
+    same(LIFT, found, forced_cycle(forced(LIFT, *arguments), found.state, 1 / LIFT_FREE, settle=30))
 
 
 def test_linear_motion():
@@ -134,7 +139,7 @@ def test_saveat_of_a_motion_cut_short():
 
 
 @SLOW
-def test_scene_is_its_structure():
+def test_motion_and_orbit_of_a_scene():
     """A scene's matrices are diagonal and its faces its degrees of freedom; a structure's not."""
     scene, start, t1 = reference_scene(), [1e-6, 2e-6, 0.1, 0.0], 5e-4
     given = fj.Excitation({"x2": 300.0, "x1": 200.0}, 2500.0, (0.4, 0.1))
@@ -144,6 +149,15 @@ def test_scene_is_its_structure():
     scale = np.array([1e-6, 1e-6, 0.1, 0.1])
     np.testing.assert_allclose(found[0] / scale, found[1] / scale, rtol=0, atol=1e-8)
     assert (abs(found[0] - still) / scale).max() > 0.1
+    # Entrained by a force along the belt: the event-driven motion closes after its period.
+    scene, f = reference_scene(), 3092.0
+    given = fj.Excitation({"x1": 400.0}, f)
+    found = fj.limit_cycle(scene, excitation=given, segments=512)
+    np.testing.assert_allclose(found.period * f, 1, rtol=1e-12)
+    again = fj.simulate(scene, found.state, float(found.period), excitation=given)
+    scale = np.array([1e-6, 1e-6, 0.1, 0.1])
+    np.testing.assert_allclose(again.end / scale, found.state / scale, rtol=0, atol=1e-8)
+    assert len(again.switches()) >= 2 and (abs(found.multipliers) < 1).all()
 
 
 @SLOW
@@ -228,28 +242,6 @@ def test_orbit(a, ratio, returns):
 
 
 @SLOW
-def test_orbit_with_lift_off():
-    """A subharmonic of two degrees of freedom."""
-    arguments = [0.3, 0.3], 2 * LIFT_FREE, 0.3
-    found = fj.limit_cycle(of_problem(LIFT), LIFT["start"], excitation=fj.Excitation(*arguments))
-    assert int(found.returns) == 2 and 0.5 < float(found.open_fraction[0]) < 0.6
-    same(LIFT, found, forced_cycle(forced(LIFT, *arguments), found.state, 1 / LIFT_FREE, settle=30))
-
-
-@SLOW
-def test_orbit_of_a_scene():
-    """Entrained by a force along the belt: the event-driven motion closes after its period."""
-    scene, f = reference_scene(), 3092.0
-    given = fj.Excitation({"x1": 400.0}, f)
-    found = fj.limit_cycle(scene, excitation=given, segments=512)
-    np.testing.assert_allclose(found.period * f, 1, rtol=1e-12)
-    again = fj.simulate(scene, found.state, float(found.period), excitation=given)
-    scale = np.array([1e-6, 1e-6, 0.1, 0.1])
-    np.testing.assert_allclose(again.end / scale, found.state / scale, rtol=0, atol=1e-8)
-    assert len(again.switches()) >= 2 and (abs(found.multipliers) < 1).all()
-
-
-@SLOW
 def test_linear_orbit():
     """Where nothing switches it is the linear response, also close to resonance."""
     for f, a in ((0.1, 0.5), (0.16, 0.05), (0.7, 2.0)):
@@ -321,7 +313,7 @@ def test_attractors():
 # --- structure and refusals ---------------------------------------------------------------
 
 
-def test_what_is_not_excited_has_no_force():
+def test_what_is_not_excited_and_what_cannot_be():
     """No cosine is traced, nor another degree of freedom; a phase is data, not structure."""
 
     def trace(excitation):
@@ -333,29 +325,6 @@ def test_what_is_not_excited_has_no_force():
     one, other = fj.Excitation({0: 0.7}, 0.17), fj.Excitation({0: 0.1}, 0.3, 1.0)
     assert jax.tree.structure(one) == jax.tree.structure(other)
     assert copy.copy(one).dofs == (0,)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (([1.0, 2.0], 1.0), r"amplitude of the excitation must have shape \(1,\), got \(2,\)"),
-        ((1.0, 1.0), r"amplitude of the excitation must have shape \(1,\), got \(\)"),
-        (([1.0], 1.0, [0.0, 0.0]), r"phase of the .* shape \(\) or \(1,\), got \(2,\)"),
-        (([1.0], 0.0), "frequency must be above 0, got 0.0"),
-        (([1.0], np.ones(1)), r"frequency must be a single number, got shape \(1,\)"),
-        (([np.nan], 1.0), "amplitude must be finite, got nan"),
-        (({}, 1.0), "amplitude must hold at least one degree of freedom"),
-        (({"x9": 1.0}, 1.0), "unknown degree of freedom 'x9'; the structure has no names"),
-        (({1: 1.0}, 1.0), "unknown degree of freedom 1; the structure has 0"),
-        (({0: np.inf}, 1.0), "amplitude at 0 must be finite, got inf"),
-    ],
-)
-def test_refusals(arguments, message):
-    with pytest.raises(ValueError, match=f"^{message}"):
-        motion(BELT, fj.Excitation(*arguments))
-
-
-def test_refusals_of_a_scene():
     scene, start = reference_scene(), np.zeros(4)
     for dof in ("x3", 2, True):
         with pytest.raises(
@@ -368,8 +337,25 @@ def test_refusals_of_a_scene():
         fj.limit_cycle(scene, excitation=3)  # pyright: ignore[reportArgumentType]
 
 
-@pytest.mark.parametrize(
-    ("bad", "message"),
+test_refusals = refusals(
+    [
+        (([1.0, 2.0], 1.0), r"amplitude of the excitation must have shape \(1,\), got \(2,\)"),
+        ((1.0, 1.0), r"amplitude of the excitation must have shape \(1,\), got \(\)"),
+        (([1.0], 1.0, [0.0, 0.0]), r"phase of the .* shape \(\) or \(1,\), got \(2,\)"),
+        (([1.0], 0.0), "frequency must be above 0, got 0.0"),
+        (([1.0], np.ones(1)), r"frequency must be a single number, got shape \(1,\)"),
+        (([np.nan], 1.0), "amplitude must be finite, got nan"),
+        (({}, 1.0), "amplitude must hold at least one degree of freedom"),
+        (({"x9": 1.0}, 1.0), "unknown degree of freedom 'x9'; the structure has no names"),
+        (({1: 1.0}, 1.0), "unknown degree of freedom 1; the structure has 0"),
+        (({0: np.inf}, 1.0), "amplitude at 0 must be finite, got inf"),
+    ],
+    lambda arguments: motion(BELT, fj.Excitation(*arguments)),
+    pattern="^{}",
+)
+
+
+test_refused_times = refusals(
     [
         ({"t0": 30.0}, "t1 must be above 30, got 25.0"),
         ({"t0": np.nan}, "t0 must be finite, got nan"),
@@ -379,7 +365,6 @@ def test_refusals_of_a_scene():
         ({"saveat": 2.0}, r"saveat must have shape \(k,\) with k at least 1, got \(\)"),
         ({"saveat": []}, r"saveat must have shape \(k,\) with k at least 1, got \(0,\)"),
     ],
+    lambda bad: fj.simulate(of_problem(BELT), START, T1, **{"t0": T0} | bad),
+    pattern="^{}",
 )
-def test_refused_times(bad, message):
-    with pytest.raises(ValueError, match=f"^{message}"):
-        fj.simulate(of_problem(BELT), START, T1, **{"t0": T0} | bad)

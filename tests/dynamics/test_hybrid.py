@@ -112,7 +112,7 @@ def test_field(x):
         equal(found[2:][np.array(s) == 0], 0)
 
 
-def test_equilibrium():
+def test_equilibrium_and_coulomb():
     """Steady sliding at V > 0 is where the field vanishes, and Eq. 40's."""
     for seed, V in itertools.product(SEEDS, (0.05, 0.15, 1.3)):
         x = numbers(seed) | {"V": V}
@@ -123,10 +123,7 @@ def test_equilibrium():
         close(here, 0, 1e-15 * float(abs(y).max() + 1))
         force = acceleration(x, y * factors, (1, 1))[:, 0] * x["m"]
         close(force, 0, 1e-11 * abs(x["F"]))
-
-
-def test_coulomb():
-    """Constant friction: no cubic is traced, the field is affine, and friction has no slope."""
+    # Constant friction: no cubic is traced, the field is affine, and friction has no slope.
     stribeck = reference_scene()
     coulomb = stribeck.replace(friction=fj.Coulomb(0.4))
     y, s = states((1, 1))
@@ -279,7 +276,7 @@ def test_each_guard():
                 equal(np.asarray(found)[:, columns == guard], alone[:, columns == guard])
 
 
-def test_first_contact_state():
+def test_first_contact_state_and_start():
     """Off the belt's velocity its sign; on it, the side that leaves (or forward), else stick."""
     seen = np.zeros(4, int)
     for seed in SEEDS:
@@ -294,17 +291,14 @@ def test_first_contact_state():
             equal(s, expected)
             seen += np.bincount((2 * leaves[0] + leaves[1])[u == 1], minlength=4)
     assert (seen > 50).all(), seen
-
-
-# --- arguments ----------------------------------------------------------------------------
-
-
-def test_start():
-    """Lists, whole numbers and arrays become one array of floats."""
+    # Lists, whole numbers and arrays become one array of floats.
     for start in ([1, 2, 3, 4], np.arange(1, 5), jnp.arange(1.0, 5)):
         found = start_state(start, 2)
         assert found.dtype == np.float64
         equal(found, [1, 2, 3, 4])
+
+
+# --- arguments ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -221,7 +221,7 @@ def test_end_by_quantities():
         np.testing.assert_allclose(forward[:, i], wanted, rtol=1e-4, atol=1e-6 * abs(wanted).max())
 
 
-def test_constant_stiffness_is_the_linear_spring():
+def test_constant_stiffness_is_the_linear_spring_without_a_curve():
     """alpha = 0: the load curve of a law whose stiffness does not depend on the load."""
     contact = power_law(0.0, ratio=0.3)
     start = [4e-5, -1e-5, 0.0, 0.3]
@@ -236,10 +236,7 @@ def test_constant_stiffness_is_the_linear_spring():
     size = np.repeat([1e-5, 0.1], 2)
     for end in ends[1:]:
         np.testing.assert_allclose(ends[0] / size, end / size, atol=1e-9)
-
-
-def test_only_a_load_curve_is_looked_up():
-    """Linear springs have no table: structure decides it."""
+    # Linear springs have no table: structure decides it.
     for law, form, tabled in (
         (power_law(1 / 3), True, True),
         (power_law(1 / 3), "linear", False),
@@ -283,7 +280,7 @@ def test_many_cycles_side_by_side():
 
 
 @pytest.mark.slow
-def test_regularised_law():
+def test_regularised_law_basin_and_branch():
     """tanh(v/eps) in place of the sign: its cycle approaches the exact one."""
     eps = 1e-3 * OSCILLATOR.V
     found = fj.limit_cycle(coupled(), cycle().state, regularisation=eps, throw=False)
@@ -291,11 +288,7 @@ def test_regularised_law():
     np.testing.assert_allclose(found.period, cycle().period, rtol=2e-3)
     np.testing.assert_allclose(found.normal_force, cycle().normal_force, rtol=2e-2, atol=1e-6)
     np.testing.assert_allclose(found.open_fraction, cycle().open_fraction, rtol=2e-2)
-
-
-@pytest.mark.slow
-def test_basin_and_branch():
-    """Both take the curve: the same cycle from all around it, and over the load."""
+    # Both take the curve: the same cycle from all around it, and over the load.
     x = coupled()
     branch = fj.continue_cycle(x, "P", (2950.0, 3050.0), start=cycle())
     inside = np.argmin(abs(branch.parameter - 3000.0))

@@ -30,7 +30,7 @@ def system_of(n):
     return system(rods(n))
 
 
-def test_largest_rate():
+def test_largest_rate_and_the_factor_of_a_step():
     """Within a per cent; damping makes some modes faster than their frequency."""
     system = system_of(40)
     eye, zero = np.eye(40), np.zeros((40, 40))
@@ -41,6 +41,19 @@ def test_largest_rate():
     excited: Any = jax.jit(excited_system)(rods(16), fj.Excitation({0: 1.0}, 1e3))
     assert excited.products.matrix.shape == (3 * 6 + 17, 34)
     assert excited.fastest == pytest.approx(2e3 * np.pi / float(excited.omega))
+    # Of a linear field; to eighth order the exponential's.
+    found = stability_polynomial(tableau())
+    np.testing.assert_allclose(found[:9] * np.cumprod([1, *range(1, 9)]), 1, rtol=1e-12)
+    system = system_of(12)
+    y, s = jnp.ones((24, 1)), jnp.ones((6, 1))
+    slope, still, moved = programs(system, y, s)
+    rest = np.linalg.solve(slope, still)
+    z, A = 1.5 * np.asarray(slope), np.zeros((24, 24))
+    for c in found[::-1]:
+        A = A @ z + c * np.eye(24)
+    # Friction falls with speed: its slope is not the same everywhere.
+    gap = np.asarray(moved) - (A @ (1 + rest) - rest)
+    assert abs(gap).max() < 0.05
 
 
 @pytest.mark.parametrize("s", [(1, 1, 1, 1, 1, 1), (0, 0, -1, -1, 2, 2), (0, 1, 0, 1, 1, 1)])
@@ -62,24 +75,8 @@ def programs(system, y, s):
     return slope, system.field(0 * y, s)[:, 0], end[:, 0]
 
 
-def test_stability_polynomial_is_the_factor_of_a_step():
-    """Of a linear field; to eighth order the exponential's."""
-    found = stability_polynomial(tableau())
-    np.testing.assert_allclose(found[:9] * np.cumprod([1, *range(1, 9)]), 1, rtol=1e-12)
-    system = system_of(12)
-    y, s = jnp.ones((24, 1)), jnp.ones((6, 1))
-    slope, still, moved = programs(system, y, s)
-    rest = np.linalg.solve(slope, still)
-    z, A = 1.5 * np.asarray(slope), np.zeros((24, 24))
-    for c in found[::-1]:
-        A = A @ z + c * np.eye(24)
-    # Friction falls with speed: its slope is not the same everywhere.
-    gap = np.asarray(moved) - (A @ (1 + rest) - rest)
-    assert abs(gap).max() < 0.05
-
-
 @pytest.mark.slow
-def test_cycle_of_forty_degrees_of_freedom_in_a_compiled_program():
+def test_cycles_of_many_degrees_of_freedom():
     """Period, state, shares and slope beside the independent solver; 300/omega a period."""
     structure = rods(40)
 
@@ -108,15 +105,11 @@ def test_cycle_of_forty_degrees_of_freedom_in_a_compiled_program():
     ends = [T / own.omega for own, _, T, _ in map(closed, (1 - 1e-4, 1 + 1e-4))]
     assert slope == pytest.approx((ends[1] - ends[0]) / 2e-4, rel=1e-6)
 
-
-@pytest.mark.slow
-def test_many_cycles_of_many_degrees_of_freedom():
-    """Under `jax.vmap` periods and slopes are those of each alone."""
-
-    def period(P):
+    # Under `jax.vmap` periods and slopes are those of each alone.
+    def period_of(P):
         return fj.limit_cycle(rods(12).replace(**{"tip.P": P}), throw=False).period
 
-    function, P = jax.value_and_grad(period), jnp.array([0.9, 1.1])
+    function, P = jax.value_and_grad(period_of), jnp.array([0.9, 1.1])
     alone = jax.jit(function)
     np.testing.assert_allclose(
         jnp.stack(jax.jit(jax.vmap(function))(P)),

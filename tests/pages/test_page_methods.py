@@ -120,11 +120,15 @@ def test_truth_and_lapacks_matrices_are_of_the_same_systems(family):
         assert abs(float(exact) - np.roots(scaled).real.max() * unit) < 1e-10 * size
 
 
-def test_extremes_of_a_sine_are_read_between_its_points():
+def test_extremes_of_a_sine_and_slopes_of_a_cycle():
     t = np.linspace(0, 20, 401)
     found, values = transients.extremes_of(t, np.sin(t), np.cos(t), -np.sin(t))
     np.testing.assert_allclose(found, np.pi * (0.5 + np.arange(len(found))), atol=1e-7)
     np.testing.assert_allclose(np.abs(values), 1, atol=1e-8)
+    truth = np.array(list(limit_cycle.SLOPES.values())).T
+    found = limit_cycle.differences(lambda place: truth @ place, 1e-3)
+    np.testing.assert_allclose(found, truth, rtol=1e-9)
+    assert not limit_cycle.slope_errors(truth).any()
 
 
 @pytest.mark.slow
@@ -156,14 +160,7 @@ def test_every_integrator_solves_the_same_law():
             np.testing.assert_allclose(read[-1], read[0], rtol=bound)
 
 
-def test_slopes_are_compared_in_the_order_in_which_they_are_given():
-    truth = np.array(list(limit_cycle.SLOPES.values())).T
-    found = limit_cycle.differences(lambda place: truth @ place, 1e-3)
-    np.testing.assert_allclose(found, truth, rtol=1e-9)
-    assert not limit_cycle.slope_errors(truth).any()
-
-
-def test_ratio_of_one_cycle_is_to_the_quickest_peer_that_is_as_accurate():
+def test_ratios_are_to_the_quickest_peer_at_no_larger_an_error():
     own, events = limit_cycle.OWN, limit_cycle.EVENTS
     rows, times = [], {}
     for group, setting, error, own_times in (
@@ -178,9 +175,6 @@ def test_ratio_of_one_cycle_is_to_the_quickest_peer_that_is_as_accurate():
         times[rows[-1]["name"]] = own_times
     (head,) = limit_cycle.headline(rows, times)
     assert head["ratio"] == 3.5 and "fine" in head["what"] and head["what"].endswith("long")
-
-
-def test_ratio_of_many_cycles_is_to_all_cores_at_no_larger_an_error():
     names = ("fj.limit_cycle, default", "fj.limit_cycle, 24 segments", "heyoka by events")
     times = [[0.1, 0.1], [1.0, 2.0], [9.0, 12.0]]
     rows = [
@@ -210,7 +204,7 @@ def test_package_and_loop_evaluate_a_design_alike(task):
     np.testing.assert_allclose(np.transpose(ends), list(task.bounds.values()))
 
 
-def test_searches_on_the_loop_end_in_the_optimum_from_nearby():
+def test_searches_on_the_loop_and_on_grids():
     """Where the slip limit meets the bound on G, by hand; no method misses it by more."""
     task, start = designs.TASKS[0], np.array([0.45, 0.9])
     loop = designs.by_loop(task)
@@ -221,8 +215,6 @@ def test_searches_on_the_loop_end_in_the_optimum_from_nearby():
     assert abs(row[2]) < 1e-9 and row[1:].max() < designs.MEETS  # Q_e at its limit
     assert row[0] < loop(simplex.answer)[0] < row[0] + 1
 
-
-def test_grids_keep_the_best_that_meets_every_requirement():
     def rows(us):
         away = np.sum((us - 0.3) ** 2, axis=1)
         return np.column_stack([away, 0.25 - us[:, 0]])  # the first variable is at least 0.25
@@ -291,9 +283,6 @@ def test_the_row_without_a_part_traces_fewer_operations(quick):
         assert row.without is None or counts[row.without] < counts[-1]
 
 
-# Extremes ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_scipys_user_has_the_same_brake():
     """The joint and the growth rate by other code, in two regimes and at the reference."""
@@ -303,6 +292,14 @@ def test_scipys_user_has_the_same_brake():
         found = scipy_user.joint(D, G)[:2]
         np.testing.assert_allclose(found, fj.stiffness(moved), rtol=1e-11)
         np.testing.assert_allclose(scipy_user.growth_rate(D, G), fj.growth_rate(moved), rtol=1e-9)
+    # Stiffness to a hundred roundings of its inputs, growth rates to a few of their own.
+    for row, truth, numbers in corner_rows():
+        # Exactly coalescing eigenvalues keep half the digits, where a rounding separates them.
+        wide, narrow = (1e-7, 1e-3) if row["corner"] == "exact coalescence" else (1e-15, 1e-6)
+        if row["quantity"] == "K_n":
+            condition = condition_number(truth, numbers)
+            wide, narrow = (100 * np.finfo(x).eps * (1 + condition) for x in ("f8", "f4"))
+        assert row["float64"] < wide and row["float32"] < narrow, row["corner"]
 
 
 # The quick run of the page measures two others, tests/contact all quantities of the joint.
@@ -318,18 +315,6 @@ def test_a_family_is_exact_to_what_its_inputs_allow(name):
         assert found["worst"] < tight.get(name, 1e-6)
         assert found["not_finite_gradient"] == 0
         assert found["not_finite"] == 0 or name == "mu_c"  # K_t = 0 never squeals
-
-
-@pytest.mark.slow
-def test_corners():
-    """Stiffness to a hundred roundings of its inputs, growth rates to a few of their own."""
-    for row, truth, numbers in corner_rows():
-        # Exactly coalescing eigenvalues keep half the digits, where a rounding separates them.
-        wide, narrow = (1e-7, 1e-3) if row["corner"] == "exact coalescence" else (1e-15, 1e-6)
-        if row["quantity"] == "K_n":
-            condition = condition_number(truth, numbers)
-            wide, narrow = (100 * np.finfo(x).eps * (1 + condition) for x in ("f8", "f4"))
-        assert row["float64"] < wide and row["float32"] < narrow, row["corner"]
 
 
 def condition_number(truth, numbers):

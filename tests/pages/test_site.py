@@ -16,10 +16,7 @@ SOURCES = sorted((DOCS / "site").rglob("*.md"))
 SETTINGS = (DOCS / "site" / "zensical.toml").read_text(encoding="utf-8")
 
 
-# --- what it is made of ---------------------------------------------------------------------
-
-
-def test_every_public_name_is_on_one_page_of_the_api():
+def test_every_name_and_page_is_there_once():
     names = [name for names in BUILD.public_names().values() for name in names]
     assert len(names) == len(set(names)) > 100
     assert {"growth_rate", "Scene", "plot.explore", "constraints.CycleAmplitude"} <= set(names)
@@ -28,6 +25,7 @@ def test_every_public_name_is_on_one_page_of_the_api():
         n for n in names if "." not in n
     }
     assert all(BUILD.first_line(name) for name in names)
+    assert [path.name for path in DOCS.glob("*.md") if f'"docs/{path.name}"' not in SETTINGS] == []
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.stem)
@@ -38,10 +36,6 @@ def test_sources_name_what_there_is(path):
         assert hasattr(fj, name), name
     page = path.relative_to(DOCS / "site").as_posix()
     assert f'"{page}"' in SETTINGS
-
-
-def test_every_page_of_docs_is_in_the_navigation():
-    assert [path.name for path in DOCS.glob("*.md") if f'"docs/{path.name}"' not in SETTINGS] == []
 
 
 def test_notebooks_become_pages(tmp_path):
@@ -88,9 +82,6 @@ def test_equations_become_mathml():
     text = BUILD.with_equations(page)
     assert text.count("<math") == 2 and "arithmatex" not in text and "\\" not in text
     assert "<span>(21)</span>" in text and "<mfrac>" in text and "&#x0003C;" in text  # <
-
-
-# --- the site in a browser ------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

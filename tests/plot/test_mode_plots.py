@@ -16,7 +16,7 @@ import pytest
 
 import fractaljax as fj
 from structures import hoffmann, two_joints
-from tools import assert_whole, labels
+from tools import assert_whole, labels, refusals
 
 plot: Any = fj.plot
 WAVE = 2 * np.pi / 0.5  # 1/m, along a strip of one metre
@@ -102,9 +102,6 @@ def corners(ax):
     return np.stack([path.vertices[:4] for path in ax.collections[-1].get_paths()])
 
 
-# --- tracks and charts ----------------------------------------------------------------------
-
-
 def test_tracks():
     """All modes of few, thick where they grow; their labels have units."""
     figure = plot.mode_tracks(tracks())
@@ -125,7 +122,7 @@ def test_tracks():
     assert frequency.get_ylabel() == "frequency [kHz]" and rate.get_ylim()[0] > -1000
 
 
-def test_chart_over_two_quantities():
+def test_charts_over_one_and_two_quantities():
     """A colour for each number of unstable modes, and the stability boundary."""
     result = chart(mu_s=(0.31, 1.2, 5), v_m=(0.3, 3.0, 4))
     ax = plot.stability_chart(result)
@@ -138,9 +135,6 @@ def test_chart_over_two_quantities():
     np.testing.assert_array_equal(shown, expected.T)
     assert len(np.unique(expected)) > 2
     assert ax.get_xlabel() == "static friction coefficient mu_s [-]"
-
-
-def test_chart_over_one_quantity():
     result = chart(mu_s=(0.31, 1.2, 9))
     ax = plot.stability_chart(result)
     assert_whole(ax.figure)
@@ -149,9 +143,6 @@ def test_chart_over_one_quantity():
     count = ax.collections[0].get_array().reshape(2, 9)
     s, error = result.values.eigenvalues, result.values.resolutions
     np.testing.assert_array_equal(count, [((s.imag >= 0) & (s.real > error)).sum(axis=1)] * 2)
-
-
-# --- shapes ----------------------------------------------------------------------------------
 
 
 def test_deformed_mesh():
@@ -241,8 +232,7 @@ def test_shape_of_a_reduced_structure():
     np.testing.assert_allclose(corners(ax)[:, 0, 1], expected[CELLS[:, 0]])
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
+test_refusals = refusals(
     [
         (lambda: plot.complex_mode(np.eye(2)), r"one number a degree of freedom, got \(2, 2\)"),
         (lambda: plot.complex_mode(["a"]), "one number a degree of freedom"),
@@ -262,8 +252,5 @@ def test_shape_of_a_reduced_structure():
         (lambda: plot.animate_mode(SHAPE, frames=1), "frames must be a whole number of at least 2"),
         (lambda: plot.stability_chart(rates()), "a chart needs a sweep of stability"),
         (lambda: plot.stability_chart(one_point()), "a chart needs two values or more"),
-    ],
+    ]
 )
-def test_refusals(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()

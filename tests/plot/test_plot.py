@@ -27,6 +27,7 @@ from tools import (
     motionless_scene,
     reference_cycle,
     reference_scene,
+    refusals,
     state_matrix,
 )
 
@@ -38,7 +39,7 @@ SAMPLES = {"wide": np.array([3.0, -1.0, 0.5, 2.0]), "narrow": [0.1, 0.2]}
 MU, KAPPA = np.linspace(0.02, 1, 41), np.linspace(0.0, 1.4, 30)
 
 
-def test_a_png_has_the_pixels_of_savefig():
+def test_a_png_and_a_notebook_are_given_the_picture():
     figure, other = (plot.topography(Z, 1e-6).figure for _ in range(2))  # layouts move on
     found, expected, dpi = io.BytesIO(figure.png(60)), io.BytesIO(), figure.dpi
     other.savefig(expected, format="png", dpi=60)
@@ -46,6 +47,15 @@ def test_a_png_has_the_pixels_of_savefig():
     expected.seek(0)
     pixels = matplotlib.image.imread(found)
     np.testing.assert_array_equal(pixels, matplotlib.image.imread(expected))
+    # Of the size asked for, with what was drawn, again after more is drawn, also unpickled.
+    ax = plot.new_figure().add_subplot()
+    ax.set_axis_off()
+    blank = picture(ax.figure)
+    assert blank.shape[:2] == (640, 840) and np.all(blank == 1)
+    ax.plot([0, 1], [0, 1], "k")
+    assert picture(ax.figure).min() == 0
+    again = pickle.loads(pickle.dumps(ax.figure))
+    assert picture(again).shape == (640, 840, 4)
 
 
 @functools.cache
@@ -121,11 +131,7 @@ PICTURES: dict[str, tuple[Any, str, str]] = {
     "growth map": (lambda ax: plot.growth_map(modes(), ax), *MAP),
     "growth map of a surface": (lambda ax: plot.growth_map(rates(), ax), *SURFACE),
     "frequency map": (lambda ax: plot.frequency_map(modes(), ax, mode=2), *MAP),
-    "mode lines": (
-        lambda ax: plot.mode_lines(modes(), ax),
-        MAP[1],
-        "real part [1/s] of all modes",
-    ),
+    "mode lines": (lambda ax: plot.mode_lines(modes(), ax), MAP[1], "real part [1/s] of all modes"),
     "mode frequencies": (
         lambda ax: plot.mode_lines(modes(), ax, quantity="frequency"),
         MAP[1],
@@ -207,8 +213,7 @@ def test_whole_figures(name):
     assert not any(one.overlaps(other) for one, other in itertools.combinations(boxes, 2))
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
+test_refusals = refusals(
     [
         (lambda: plot.phase_portrait(reference_cycle(), direction=3), "direction must be 1 or 2"),
         (lambda: plot.spectrum(batch()), "index the batch first"),
@@ -238,11 +243,8 @@ def test_whole_figures(name):
         (lambda: plot.growth_map(cube()), "a map needs two axes of two values or more"),
         (lambda: plot.stability_map(reference_scene()), "scene has no quantity 'D'"),
         (lambda: plot.basin(section(1.0, 21)), "starts that differ in 2 coordinates, got 1"),
-    ],
+    ]
 )
-def test_refusals(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()
 
 
 # --- maps ---------------------------------------------------------------------------------
@@ -356,7 +358,6 @@ def test_curves_of_stiffness_and_their_marks():
 
 
 @pytest.mark.parametrize("direction", [1, 2])
-# REPLACES test_sticking_is_drawn_where_it_is
 def test_phase_portrait_has_the_extent_of_the_cycle(direction):
     """A closed curve, as wide as the amplitude and as high as the velocity range; V dashed.
 
@@ -385,21 +386,7 @@ def test_phase_portrait_has_the_extent_of_the_cycle(direction):
     np.testing.assert_allclose(orbit_v[inside], 0.15, rtol=1e-9)
 
 
-@pytest.mark.parametrize("direction", [1, 2])
-def test_sticking_is_drawn_where_it_is(direction):
-    """At the velocity of the belt, as far as the belt moves meanwhile, along the orbit."""
-    ax = plot.phase_portrait(both_stick(), direction=direction)
-    ((x, v),) = drawn(ax, "sticks")
-    np.testing.assert_array_equal(v, 0.15)
-    time = both_stick().stick_fraction[direction - 1] * both_stick().period
-    assert x[1] - x[0] == pytest.approx(1e6 * 0.15 * float(time), rel=1e-3)
-    ((orbit_x, orbit_v),) = drawn(ax, "limit cycle")
-    inside = (orbit_x > x[0]) & (orbit_x < x[1]) & (orbit_v > 0)
-    assert inside.sum() > 5
-    np.testing.assert_allclose(orbit_v[inside], 0.15, rtol=1e-9)
-
-
-def test_spectrum_shows_the_harmonics():
+def test_spectrum_and_cycles_side_by_side():
     """Stems at the multiples of 1/period, as high as `LimitCycle.spectrum` says."""
     cycle = reference_cycle()
     ax = plot.spectrum(cycle, direction=2)
@@ -412,6 +399,19 @@ def test_spectrum_shows_the_harmonics():
     # A period of two returns has twice as many lines.
     twice = eqx.tree_at(lambda cycle: cycle.returns, cycle, jnp.array(2))
     assert drawn(plot.spectrum(twice), "harmonics")[0].shape == (2, 39)
+    # Orbits and lines as they are alone, a named row each, stems on the common axis.
+    given = {"soft": reference_cycle(), "hard": both_stick()}
+    figure = plot.cycles(given, direction=2)
+    assert [part.get_suptitle() for part in figure.subfigs] == ["soft", "hard"]
+    rows = [part.axes for part in figure.subfigs]
+    for (portrait, spectrum), cycle in zip(rows, given.values(), strict=True):
+        alone = plot.phase_portrait(cycle, direction=2)
+        np.testing.assert_array_equal(drawn(portrait, "limit cycle"), drawn(alone, "limit cycle"))
+        stems = np.array(spectrum.collections[0].get_segments())
+        assert (stems[:, 0, 1] == spectrum.get_ylim()[0]).all()
+        np.testing.assert_allclose(stems[1:, 1], drawn(spectrum, "harmonics")[0].T)
+    for column in zip(*rows, strict=True):
+        assert len({(ax.get_xlim(), ax.get_ylim()) for ax in column}) == 1
 
 
 def test_cycle_of_a_structure():
@@ -445,22 +445,6 @@ def test_cycle_of_a_structure():
         plot.spectrum(cycle, direction=2)
 
 
-def test_cycles_have_common_axes():
-    """Orbits and lines as they are alone, a named row each, stems on the common axis."""
-    given = {"soft": reference_cycle(), "hard": both_stick()}
-    figure = plot.cycles(given, direction=2)
-    assert [part.get_suptitle() for part in figure.subfigs] == ["soft", "hard"]
-    rows = [part.axes for part in figure.subfigs]
-    for (portrait, spectrum), cycle in zip(rows, given.values(), strict=True):
-        alone = plot.phase_portrait(cycle, direction=2)
-        np.testing.assert_array_equal(drawn(portrait, "limit cycle"), drawn(alone, "limit cycle"))
-        stems = np.array(spectrum.collections[0].get_segments())
-        assert (stems[:, 0, 1] == spectrum.get_ylim()[0]).all()
-        np.testing.assert_allclose(stems[1:, 1], drawn(spectrum, "harmonics")[0].T)
-    for column in zip(*rows, strict=True):
-        assert len({(ax.get_xlim(), ax.get_ylim()) for ax in column}) == 1
-
-
 def test_amplitudes_with_gaps_and_tangents():
     over, slopes = np.array([1.0, 2.0, 5.0]), np.array([-2e-6, np.nan, 1e-6])
     ax = plot.amplitudes(batch(), over, label="x", slopes=slopes)
@@ -478,7 +462,6 @@ def test_amplitudes_with_gaps_and_tangents():
 
 
 @pytest.mark.parametrize("direction", [1, 2])
-# REPLACES test_sticking_is_marked_in_the_motion
 def test_motion_is_drawn_as_it_is(direction):
     """From the start to the end, every step among them.
 
@@ -503,23 +486,10 @@ def test_motion_is_drawn_as_it_is(direction):
     assert moved == pytest.approx(1e3 * 0.15, rel=1e-6)  # um/ms
 
 
-def test_sticking_is_marked_in_the_motion():
-    """For the time that the contact states say, at the velocity of the belt."""
-    ((t, x),) = drawn(plot.trajectory(motion()), "sticks")
-    inside = np.isfinite(x[1:]) & np.isfinite(x[:-1])
-    sticks = np.diff(motion().times)[np.asarray(motion().contact_states)[:-1, 0] == 0].sum()
-    # The last sample before its end is not drawn: one of some 180.
-    assert sticks > 0 and np.diff(t)[inside].sum() == pytest.approx(1e3 * sticks, rel=0.03)
-    moved = np.diff(x)[inside].sum() / np.diff(t)[inside].sum()
-    assert moved == pytest.approx(1e3 * 0.15, rel=1e-6)  # um/ms
-    slides = fj.simulate(motionless_scene(), [1e-8, 0, 0, 0], TIME)
-    assert labels(plot.trajectory(slides)) == ["motion"]
-
-
 # --- surfaces and samples -----------------------------------------------------------------
 
 
-def test_share_below_every_value():
+def test_distribution_and_identification():
     """A step of 1/n at each of the sorted samples, and the limit."""
     ax = plot.distribution(SAMPLES, label="growth rate [1/s]", limit=0.0)
     for name, values in SAMPLES.items():
@@ -527,9 +497,6 @@ def test_share_below_every_value():
         np.testing.assert_allclose(y[1:], [(np.asarray(values) <= at).mean() for at in x[1:]])
         np.testing.assert_array_equal(np.sort(values), x[1:])
     assert (drawn(ax, "limit 0")[0][0] == 0).all()
-
-
-def test_identification_shows_spectrum_fit_and_limit():
     found = spectrum_of_profile()
     ax = plot.identification(found)
     assert "limit of the instrument 6.25e+04 1/m" in labels(ax)
@@ -541,7 +508,7 @@ def test_identification_shows_spectrum_fit_and_limit():
     assert "of the map" in plot.power_spectrum(of_map).get_ylabel()
 
 
-def test_topography_shows_heights_about_their_mean():
+def test_heights_of_one_and_two_topographies():
     z = Z.copy()
     z[5, 3] = np.nan  # left out, also of the mean and the scale
     image = plot.topography(z, 2e-6, dy=3e-6).images[0]
@@ -549,9 +516,6 @@ def test_topography_shows_heights_about_their_mean():
     assert image.get_extent() == pytest.approx([0, 12, 0, 12]) and image.origin == "lower"
     assert image.get_clim() == pytest.approx(((0 - np.nanmean(z)) * 1e6, 34 - np.nanmean(z) * 1e6))
     assert plot.topography(Z, 1e-6).images[0].get_extent() == pytest.approx([0, 6, 0, 4])
-
-
-def test_topographies_have_one_colour_scale():
     left, right, _ = plot.topographies(best(), n=32).axes
     surfaces = best().topographies(32)
     for ax, z in ((left, surfaces.before), (right, surfaces.after)):
@@ -570,18 +534,6 @@ def picture(figure):
     """The pixels that Jupyter is given, (height, width, 4)."""
     data, _ = DisplayFormatter().format(figure)
     return matplotlib.image.imread(io.BytesIO(data["image/png"]))
-
-
-def test_a_notebook_is_given_the_picture():
-    """Of the size asked for, with what was drawn, again after more is drawn, also unpickled."""
-    ax = plot.new_figure().add_subplot()
-    ax.set_axis_off()
-    blank = picture(ax.figure)
-    assert blank.shape[:2] == (640, 840) and np.all(blank == 1)
-    ax.plot([0, 1], [0, 1], "k")
-    assert picture(ax.figure).min() == 0
-    again = pickle.loads(pickle.dumps(ax.figure))
-    assert picture(again).shape == (640, 840, 4)
 
 
 # --- basins ---------------------------------------------------------------------------------

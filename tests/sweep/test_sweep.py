@@ -19,7 +19,7 @@ import fractaljax as fj
 from fractaljax._base.versions import versions
 from fractaljax._sweep.batches import _batch
 from fractaljax._sweep.store import Store
-from tools import reference_scene
+from tools import reference_scene, refusals
 
 SCENE, GIVEN = fj.brake_scene(), reference_scene()
 D = np.linspace(2.35, 2.45, 5)
@@ -101,13 +101,15 @@ def test_pytrees_of_a_measure():
     assert bool((regimes == regime(alone))[4, 1, 0])
 
 
-def test_a_sweep_of_several_arrays_is_taken_apart():
+def test_sweeps_of_several_arrays_and_of_a_scene_with_arrays():
     found = fj.sweep(fj.stiffness, SCENE, progress=False, P=[1e3, 2e3])
     np.testing.assert_array_equal(found[0], found.values[0])
     with pytest.raises(TypeError, match="take them from"):
         np.asarray(found)
     with pytest.raises(AttributeError, match="growth"):
         _ = found.growth
+    with pytest.raises(ValueError, match="D must be a scalar"):
+        fj.sweep(fj.growth_rate, SCENE.replace(D=D), G=G)
 
 
 @pytest.mark.slow
@@ -125,7 +127,7 @@ def test_without_xarray_it_says_so(monkeypatch):
         grown().to_xarray()
 
 
-def test_one_program_serves_every_batch_and_every_sweep_of_a_kind():
+def test_one_program_serves_every_batch_and_every_sweep_of_a_kind(tmp_path):
     traces = []
 
     def measure(scene):
@@ -139,21 +141,18 @@ def test_one_program_serves_every_batch_and_every_sweep_of_a_kind():
     fj.sweep(lambda scene: fj.growth_rate(scene), SCENE, 4, False, D=D, G=G)
     assert programs._cache_size() <= compiled + 1
     assert len(traces) == 2
-
-
-def test_what_a_measure_captures_is_taken_as_it_is_now(tmp_path):
     factor = [1.0]
 
-    def measure(scene):
+    def captured(scene):
         return factor[0] * scene.contact.surface.D
 
     for out in (None, tmp_path):
         factor[0] = 1.0
-        np.testing.assert_array_equal(fj.sweep(measure, SCENE, None, False, out=out, D=D), D)
+        np.testing.assert_array_equal(fj.sweep(captured, SCENE, None, False, out=out, D=D), D)
     factor[0] = 2.0
-    np.testing.assert_array_equal(fj.sweep(measure, SCENE, None, False, D=D), 2 * D)
+    np.testing.assert_array_equal(fj.sweep(captured, SCENE, None, False, D=D), 2 * D)
     with pytest.raises(ValueError, match="holds another sweep: measure or scene differ"):
-        fj.sweep(measure, SCENE, None, False, out=tmp_path, D=D)
+        fj.sweep(captured, SCENE, None, False, out=tmp_path, D=D)
 
 
 def test_progress_goes_to_standard_error(capsys):
@@ -168,8 +167,7 @@ def test_progress_goes_to_standard_error(capsys):
 LARGE = {name: np.full(10**5, x) for name, x in {"D": 2.4, "G": 1e-10, "P": 1e3}.items()}
 
 
-@pytest.mark.parametrize(
-    ("axes", "message"),
+test_refusals = refusals(
     [
         ({}, "sweep needs an axis"),
         ({"d": [2.4]}, "scene has no quantity 'd'; it has D, G, "),
@@ -183,15 +181,8 @@ LARGE = {name: np.full(10**5, x) for name, x in {"D": 2.4, "G": 1e-10, "P": 1e3}
         ({"devices": [], "D": D}, "at least one device"),
         (LARGE, "a sweep of 1000000000000000 points would take 8.00e.15 b"),
     ],
+    lambda axes: fj.sweep(fj.growth_rate, SCENE, progress=False, **axes),
 )
-def test_refusals(axes, message):
-    with pytest.raises(ValueError, match=message):
-        fj.sweep(fj.growth_rate, SCENE, progress=False, **axes)
-
-
-def test_scene_with_arrays():
-    with pytest.raises(ValueError, match="D must be a scalar"):
-        fj.sweep(fj.growth_rate, SCENE.replace(D=D), G=G)
 
 
 # --- stores -------------------------------------------------------------------------------

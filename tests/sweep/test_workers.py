@@ -109,26 +109,24 @@ def test_what_travels(tmp_path):
     assert executor.calls == 1
 
 
-def test_a_worker_traces_what_its_caller_traced():
+def test_what_is_traced_and_settings_of_jax_travel():
     """Numbers that the worker has otherwise are an error, not another result."""
     executor = Posted()
     with pytest.raises(RuntimeError, match=r"^a worker of executor has fractaljax .* another prog"):
         swept(_counted, executor=executor)
 
-
-def _counted(scene):
-    """Another program each time it is traced."""
-    _counted.times = getattr(_counted, "times", 0) + 1
-    return _counted.times * fj.growth_rate(scene)
-
-
-def test_settings_of_jax_travel():
     def draws(scene):
         return jax.random.normal(jax.random.key(0), (3,)) * scene.contact.surface.D
 
     for changed in (jax.threefry_partitionable(False), jax.default_prng_impl("rbg")):
         with changed:
             assert_same(swept(draws, executor=Posted()), swept(draws))
+
+
+def _counted(scene):
+    """Another program each time it is traced."""
+    _counted.times = getattr(_counted, "times", 0) + 1
+    return _counted.times * fj.growth_rate(scene)
 
 
 class Stubborn:
@@ -139,11 +137,16 @@ class Stubborn:
         raise RuntimeError("not for sale")
 
 
-def test_what_cannot_be_sent(tmp_path):
+def test_what_cannot_be_sent_and_what_is_no_executor(tmp_path):
     with pytest.raises(TypeError, match=r"^executor cannot send measure and x to its .*not for sa"):
         swept(Stubborn(), executor=Posted())
     with ThreadPoolExecutor(1) as executor:
         assert_same(swept(Stubborn(), executor=executor), swept(Stubborn()))
+    executor: Any
+    for executor in (3, ThreadPoolExecutor, "threads", multiprocessing, print):
+        with pytest.raises(TypeError, match=r"^executor must have the methods of conc"):
+            swept(executor=executor, out=tmp_path / "run.zarr")
+    assert not list(tmp_path.iterdir())
 
 
 def test_without_cloudpickle_functions_of_a_module_travel(monkeypatch):
@@ -184,7 +187,7 @@ class Dying(Posted):
         return result
 
 
-def test_a_pool_that_dies(tmp_path):
+def test_a_pool_that_dies_or_forks(tmp_path):
     with pytest.raises(RuntimeError, match=r"^a worker of executor died; out would keep what is d"):
         swept(executor=Dying())
     with pytest.raises(RuntimeError, match=r"^a worker .* died; out .*run\.zarr keeps what is don"):
@@ -192,17 +195,6 @@ def test_a_pool_that_dies(tmp_path):
     executor = Posted()
     assert_same(swept(executor=executor, out=tmp_path / "run.zarr"), swept())
     assert executor.calls == 4
-
-
-def test_what_is_no_executor(tmp_path):
-    executor: Any
-    for executor in (3, ThreadPoolExecutor, "threads", multiprocessing, print):
-        with pytest.raises(TypeError, match=r"^executor must have the methods of conc"):
-            swept(executor=executor, out=tmp_path / "run.zarr")
-    assert not list(tmp_path.iterdir())
-
-
-def test_processes_that_fork_and_devices_are_refused():
     if "fork" in multiprocessing.get_all_start_methods():
         forking = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("fork"))
         with pytest.raises(ValueError, match="executor must not fork, which JAX does not survive"):
