@@ -140,7 +140,9 @@ def primitives(jaxpr) -> Counter[str]:
     return found
 
 
-def refusals(cases, call=lambda call: call(), kind=ValueError, pattern="{}", plain=False) -> Any:
+def refusals(
+    cases, call=lambda call: call(), kind: Any = ValueError, pattern="{}", plain=False
+) -> Any:
     """A test that each case, arguments of `call` and a message, is refused in one line.
 
     Messages are regular expressions, or `plain` text; a pattern says what stands around them.

@@ -58,13 +58,14 @@ def _stick_as_one(structure: Structure, joint: Joint, other: Joint) -> bool:
     def one(direction) -> bool:
         d = structure.direction(direction)
         ratio = t @ d / (t @ t)
-        return np.allclose(d, ratio * t, rtol=0, atol=1e-12 * np.abs(d).max()) and ratio * V == W
+        along = np.allclose(d, ratio * t, rtol=0, atol=1e-12 * np.abs(d).max())
+        return bool(along and ratio * V == W)
 
     if one(other.tangential):
         return True
     # Without a tangential spring nothing rubs along n.
     K_t = concrete(other.stiffness()[1]) if other.normal is not None and one(other.normal) else 0
-    return K_t is not None and K_t > 0
+    return K_t is not None and bool(K_t > 0)
 
 
 def hybrid_system(mechanism: Any) -> HybridSystem:

@@ -101,7 +101,7 @@ def _at(problem, place) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("unoptimised")
+@pytest.mark.unoptimised
 def test_rest_with_an_open_joint():
     """A force that pulls the joint open leaves the rest to its damping."""
     joint = fj.Joint(fj.FixedContact(2.0, 0.5, 1.0), fj.Coulomb(0.4), 0, 1, 1.0, preload=True)

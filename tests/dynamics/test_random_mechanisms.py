@@ -140,7 +140,7 @@ def test_derivatives():
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("unoptimised")
+@pytest.mark.unoptimised
 def test_derivatives_of_three_joints():
     """By default options, in a compiled program."""
     for seed in SEEDS_OF_THREE:
