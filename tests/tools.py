@@ -20,6 +20,7 @@ from jax.flatten_util import ravel_pytree
 import fractaljax as fj
 from fractaljax.__main__ import main
 from fractaljax._base import kept
+from fractaljax._base.one_kernel import equations
 from mechanisms import PLAIN
 
 ROOT = Path(__file__).parents[1]
@@ -130,14 +131,7 @@ def refused_command(capsys, *arguments) -> str:
 
 def primitives(jaxpr) -> Counter[str]:
     """How often each primitive stands in a jaxpr, loops and calls and what is in them included."""
-    found = Counter()
-    for equation in jaxpr.eqns:
-        found[equation.primitive.name] += 1
-        for value in jax.tree.leaves(tuple(equation.params.values())):
-            inner = getattr(value, "jaxpr", value)
-            if hasattr(inner, "eqns"):
-                found += primitives(inner)
-    return found
+    return Counter(equation.primitive.name for equation in equations(jaxpr))
 
 
 def refusals(

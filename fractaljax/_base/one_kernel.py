@@ -37,7 +37,7 @@ def one_kernel(function: Callable, large: Any, *small: Any) -> Any:
     if not _available() or not all(jnp.size(x) for x in jax.tree.leaves((large, small))):
         return function(large, *small)
     program, out = jax.make_jaxpr(function, return_shape=True)(large, *small)
-    if not all(_is_known(equation) for equation in _equations(program.jaxpr)):
+    if not all(_is_known(equation) for equation in equations(program.jaxpr)):
         return function(large, *small)
     from jax.experimental.xla_metadata import set_xla_metadata  # none of JAX's stable parts
 
@@ -58,14 +58,14 @@ def _available() -> bool:
     return _FIRST <= jax.__version_info__ < _BEYOND and jax.default_backend() == "cpu"
 
 
-def _equations(jaxpr) -> Iterator[Any]:
+def equations(jaxpr) -> Iterator[Any]:
     """All, those of loops and calls included."""
     for equation in jaxpr.eqns:
         yield equation
         for value in jax.tree.leaves(tuple(equation.params.values())):
             inner = getattr(value, "jaxpr", value)
             if hasattr(inner, "eqns"):
-                yield from _equations(inner)
+                yield from equations(inner)
 
 
 def _is_known(equation) -> bool:

@@ -21,9 +21,6 @@ def _event(system: HybridSystem, y, s, h, g_0, g_1, d_0, d_1):
     k = len(g_0)
     lanes = jnp.broadcast_to(y[:, None], (len(y), k)), jnp.broadcast_to(s[:, None], (len(s), k))
 
-    def pick(values):
-        return jnp.diagonal(values[1:])
-
     def value(y):
         return jnp.diagonal(system.guards(y, lanes[1])[1:])
 
