@@ -90,6 +90,7 @@ def test_verdicts_follow_from_the_numbers():
         assert_whole(figure)
 
 
+@pytest.mark.slow
 def test_contact_laws_are_judged_as_the_page_says(monkeypatch):
     """With fewer and coarser surfaces; the picture is whole."""
     made = script("contact_laws")

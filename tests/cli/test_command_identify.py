@@ -130,6 +130,7 @@ def test_no_scene(capsys, z, message):
     assert SCENE.read_text() == ""
 
 
+@pytest.mark.slow
 def test_force_writes_a_scene_all_the_same(capsys, monkeypatch):
     """Of a surface that is not fractal, and of one with five warnings."""
     ripple = 3e-7 * np.sin(2 * np.pi * DX * np.arange(4096) / 3e-5)

@@ -162,7 +162,7 @@ def test_starts_outside_the_elastic_regime(scene, surface):
 @pytest.mark.parametrize(
     ("request_", "violated"),
     [
-        ({"target": -100.0}, ("growth_rate <= target",)),
+        pytest.param({"target": -100.0}, ("growth_rate <= target",), marks=pytest.mark.slow),
         ({"K_n_min": 1e14}, ("K_n >= K_n_min",)),
         ({"bounds": {"D": (2.39, 2.41), "G": (1.3e-10, 1.4e-10)}}, ("growth_rate <= target",)),
     ],
@@ -306,6 +306,7 @@ def test_envelope_holds_everywhere(best, enveloped):
     assert under(plain.scene, drawn(plain.scene, 4004, 1))[0].max() > 0
 
 
+@pytest.mark.slow
 def test_envelope_optimum_is_the_nearest_surface(scene, enveloped):
     """No surface of a lattice that is nearer holds at nine conditions."""
     best, meets = enveloped, True

@@ -29,7 +29,7 @@ def one_damper(**start):
     )
 
 
-@pytest.mark.parametrize("target", [None, 1e6])
+@pytest.mark.parametrize("target", [pytest.param(None, marks=pytest.mark.slow), 1e6])
 def test_the_least_growth_rate_is_where_four_modes_meet(target):
     """However far away the target is."""
     x = one_damper(p=0.1, q=0.2, r=0.6)
@@ -99,6 +99,7 @@ def test_what_holds_the_least_growth_rate():
     assert "no small change lowers it" in words and "3 of 3 starts end within 1 %" in words
 
 
+@pytest.mark.slow
 def test_bounds_and_requirements_hold_it_as_well():
     """Only r may move, up to 0.5: the rate of its mode is held by the bound, 1/2 a unit of r."""
     x = one_damper(p=0.7, q=0.7, r=0.3)
@@ -118,6 +119,7 @@ def test_bounds_and_requirements_hold_it_as_well():
     assert found.held_by == pytest.approx({"growth_rate <= target": 1.0, "most": 0.05}, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_requirements_that_contradict_one_another_are_named():
     """p <= 0.2 and p >= 0.6: both lack 0.2 at p = 0.4, where half the weight is on each."""
     x = one_damper(p=0.1, q=0.2, r=0.3)

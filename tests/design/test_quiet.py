@@ -93,6 +93,7 @@ def test_belt_is_quiet_over_a_range_of_loads():
     assert "shared by the worst conditions" in str(best)
 
 
+@pytest.mark.slow
 def test_unchanged_where_the_ball_is_held(monkeypatch, tmp_path):
     """Of a few draws; the slow tests make all of them."""
     monkeypatch.setattr("fractaljax._design.quiet.VERIFIED", 512)

@@ -126,6 +126,7 @@ def test_given_stiffness_ratio_is_doubted_up_to_the_fractal_law():
     assert ratio.name == "K_t/K_n from 0.476 to 0.9"
 
 
+@pytest.mark.slow
 def test_design_meets_every_law_at_once(tmp_path):
     law = persson(stiffness_ratio=0.33)
     best = fj.design(BRAKE, laws=[law], progress=False)

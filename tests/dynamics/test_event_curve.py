@@ -133,6 +133,7 @@ def test_map(tmp_path, capsys, monkeypatch):
     assert [float(r["mu_s"]) for r in rows if r["kind"] == "grazing"] == curve.y.tolist()
 
 
+@pytest.mark.slow
 def test_refusals():
     event, hopf = belt().grazings[0], belt().hopf[0]
 

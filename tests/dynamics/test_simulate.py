@@ -164,6 +164,7 @@ def test_stick_in_both_directions_and_a_short_slip():
     agree(m, start, 0.8 / 52283.1 * omega(m), ends=1e-10)
 
 
+@pytest.mark.slow
 def test_start_beside_the_belt():
     """Velocities a few ulp, or up to 1e-6, off the belt's: no root behind the start is taken."""
     rng, reversals = np.random.default_rng(0), 0

@@ -180,6 +180,7 @@ def test_frequencies_of_a_slender_beam(clamped, roots):
     np.testing.assert_allclose(found[found > 1.0][:3], expected, rtol=5e-3)
 
 
+@pytest.mark.slow
 def test_frequencies_of_plates_and_a_thin_disc():
     """Quadratic elements of a body without corners that a clamp makes singular."""
     found = []

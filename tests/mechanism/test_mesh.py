@@ -66,6 +66,7 @@ test_refused = refusals(
 )
 
 
+@pytest.mark.slow
 def test_stability_draws_the_modes_of_a_mesh(tmp_path, capsys):
     from fractaljax.__main__ import main
 

@@ -303,9 +303,8 @@ def test_scipys_user_has_the_same_brake():
 
 
 # The quick run of the page measures two others, tests/contact all quantities of the joint.
-@pytest.mark.parametrize(
-    "name", [pytest.param("mechanism", marks=pytest.mark.slow), "critical friction"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["mechanism", "critical friction"])
 def test_a_family_is_exact_to_what_its_inputs_allow(name):
     (family,) = (family for family in FAMILIES if family.name == name)
     tight = {"margin": 1e-12, "growth_rate": 1e-12, "real": 1e-12}

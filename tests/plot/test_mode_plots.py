@@ -122,6 +122,7 @@ def test_tracks():
     assert frequency.get_ylabel() == "frequency [kHz]" and rate.get_ylim()[0] > -1000
 
 
+@pytest.mark.slow
 def test_charts_over_one_and_two_quantities():
     """A colour for each number of unstable modes, and the stability boundary."""
     result = chart(mu_s=(0.31, 1.2, 5), v_m=(0.3, 3.0, 4))

@@ -414,6 +414,7 @@ def test_spectrum_and_cycles_side_by_side():
         assert len({(ax.get_xlim(), ax.get_ylim()) for ax in column}) == 1
 
 
+@pytest.mark.slow
 def test_cycle_of_a_structure():
     """A joint's t.x and a degree of freedom, scaled; a row for each joint."""
     belt, cycle = belt_cycle()

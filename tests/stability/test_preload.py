@@ -34,7 +34,10 @@ def answers(x, slope=True):
 
 
 # What is constant friction for one law is so for all: a scene and two structures have it.
-CONSTANT = [(name, False) for name in ("scene", "lever arms", "three kinds")]
+CONSTANT = [
+    ("scene", False),
+    *(pytest.param(name, False, marks=slow) for name in ("lever arms", "three kinds")),
+]
 
 
 EACH = [pytest.param(x, True, marks=slow if x == "load curves" else ()) for x in PROBLEMS]

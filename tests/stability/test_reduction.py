@@ -45,7 +45,11 @@ def full_structure(name):
     )
 
 
-@pytest.fixture(scope="module", params=PROBLEMS)
+SLOW = ("no joints", "mass")
+EACH = [pytest.param(x, marks=pytest.mark.slow) if x in SLOW else x for x in PROBLEMS]
+
+
+@pytest.fixture(scope="module", params=EACH)
 def problem(request):
     full, over = full_structure(request.param), PROBLEMS[request.param]["over"]
     return full, fj.reduce(full, over, BAND, tol=1e-8), over
@@ -234,6 +238,7 @@ def test_an_industrial_brake():
     assert abs(slope - (101.849147 + 3.428201j)) < 2e-6
 
 
+@pytest.mark.slow
 def test_right_vectors_begin_where_left_ones_are_small():
     """Two chains of unlike stiffness, coupled as by friction: s^2 + 2 s + lambda_j = 0, no joints.
 

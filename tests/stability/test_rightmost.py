@@ -165,7 +165,11 @@ DERIVATIVES = {
 }
 
 
-@pytest.mark.parametrize("orders", DERIVATIVES)
+SLOW = "first and second, reverse"
+ORDERS = [pytest.param(x, marks=pytest.mark.slow) if x == SLOW else x for x in DERIVATIVES]
+
+
+@pytest.mark.parametrize("orders", ORDERS)
 def test_derivatives_of_every_order_are_those_of_all_modes(orders):
     program = jax.jit(lambda t: [DERIVATIVES[orders](f)(t) for f in along_a_line()])
     for found, wanted in zip(*program(0.01), strict=True):
@@ -173,6 +177,7 @@ def test_derivatives_of_every_order_are_those_of_all_modes(orders):
         assert found == pytest.approx(float(wanted), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_reduced_structure_keeps_its_coarse_space(monkeypatch, tmp_path):
     """On disk too; growth rates and slopes are those of all its modes."""
     monkeypatch.setattr(reduction, "_WORTH", (10, 1.0))

@@ -187,6 +187,7 @@ def brake() -> fj.Structure:
     )
 
 
+@pytest.mark.slow
 def test_coarse_steps_of_a_brake_are_those_of_fine_ones():
     """150 modes, of which four become unstable."""
     structure = brake()
@@ -223,6 +224,7 @@ def test_modes_leave_and_enter_a_band():
     np.testing.assert_array_equal(np.isfinite(found.shapes).all(axis=2), there)
 
 
+@pytest.mark.slow
 def test_scene_rigid_body_open_joint_and_critical_damping():
     """A scene has the modes of its `stability`; what K does not hold is left out."""
     scene = reference_scene()
