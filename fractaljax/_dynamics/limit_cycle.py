@@ -149,16 +149,21 @@ def _monodromy(system: HybridSystem, segments: Segments, local: Maps) -> Float[A
     return product
 
 
-@functools.partial(quick_jit, static_argnames=("segments", "rtol"))
-def _limit_cycle(
-    mechanism: Mechanism, start, excitation, max_returns, *, segments: int, rtol: float
-) -> LimitCycle:
+# Apart from the cycle's program, which another contact law then does not compile again.
+@functools.partial(quick_jit, once=True)
+def _posed(mechanism: Mechanism, excitation) -> tuple[HybridSystem, Float[Array, ""]]:
+    """The scaled system, and its growth rate at the equilibrium."""
     system = excited_system(mechanism, excitation)
     # An excited motion does not end in equilibrium.
     growth = jnp.ones_like(system.omega) if system.excited else growth_rate(mechanism)
-    frozen, equilibrium, growth = jax.lax.stop_gradient(
-        (system, system.equilibrium(), growth / system.omega)
-    )
+    return system, growth / system.omega
+
+
+@functools.partial(quick_jit, static_argnames=("of_scene", "segments", "rtol"))
+def _limit_cycle(
+    system: HybridSystem, growth, start, max_returns, *, of_scene: bool, segments: int, rtol: float
+) -> LimitCycle:
+    frozen, equilibrium, growth = jax.lax.stop_gradient((system, system.equilibrium(), growth))
     y = scaled_start(system, start)
     h = 0.25 if system.fastest is None else 0.2  # a finer mesh would take a second solution
     h = jnp.asarray(h * (rtol / 1e-9) ** 0.125, y.dtype)
@@ -206,7 +211,7 @@ def _limit_cycle(
         return jnp.sum(jnp.where(of, duration[None], 0), axis=1) / period
 
     # A scene says it of both directions, a structure of each joint.
-    shown = slice(None) if isinstance(mechanism, Scene) else tangential
+    shown = slice(None) if of_scene else tangential
     pulls = [
         jnp.zeros_like(period)
         if opens or not faces[1:]
@@ -222,7 +227,7 @@ def _limit_cycle(
         velocity_max=only(high[n:]),
         stick_fraction=only(share(closed.s == 0))[shown],
         open_fraction=only(share(closed.s == OPEN))[tangential],
-        tension_fraction=only(pulls[0] if isinstance(mechanism, Scene) else jnp.stack(pulls)),
+        tension_fraction=only(pulls[0] if of_scene else jnp.stack(pulls)),
         normal_force=only(forces.T),
         state=only(system.own(y[:, 0]) * scale),
         error=only(error),
@@ -313,12 +318,13 @@ def limit_cycle(
         count *= 8  # towards an opening segments are short: less than a second compilation
     elif segments is None and (n > FEW or len(joints) > 1):
         count *= 4  # a period may be long beside that of the highest frequency, or of many phases
-    arguments = mechanism, start, excitation, returns
-    cycle = _limit_cycle(*arguments, segments=count, rtol=tolerance)
+    arguments = *_posed(mechanism, excitation), start, returns
+    options = {"of_scene": isinstance(mechanism, Scene), "rtol": tolerance}
+    cycle = _limit_cycle(*arguments, segments=count, **options)
     while segments is None and count < _MOST_SEGMENTS and _needs_more_segments(cycle, count):
         # A long period, or one of many returns.
         count *= 8
-        cycle = _limit_cycle(*arguments, segments=count, rtol=tolerance)
+        cycle = _limit_cycle(*arguments, segments=count, **options)
     if regularisation is not None:
         from .regularised import regularised_cycle
 

@@ -12,6 +12,7 @@ import pytest
 import fractaljax as fj
 import hybrid_truth
 from fractaljax._base.parts import substitute
+from fractaljax._dynamics import search
 from fractaljax._dynamics.cycle import repels
 from fractaljax._dynamics.orbit import PeriodicOrbit
 from fractaljax._dynamics.search import growth_of
@@ -408,3 +409,14 @@ test_refusals = refusals(
     ],
     lambda bad: (fj.attractors if "starts" in bad else fj.limit_cycle)(reference_scene(), **bad),
 )
+
+
+def test_another_contact_law_needs_no_other_program(monkeypatch):
+    """The search knows stiffnesses and loads alone, so that users do not wait for it twice."""
+    reference_cycle()
+    traced, find = [], search.find
+    monkeypatch.setattr(search, "find", lambda *given: traced.append(given) or find(*given))
+    fj.limit_cycle(reference_scene().replace(contact=fj.brake_scene().contact))
+    assert not traced
+    jax.make_jaxpr(lambda x: fj.limit_cycle(x, segments=47))(reference_scene())
+    assert len(traced) == 1  # the test sees it
