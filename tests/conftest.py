@@ -68,10 +68,26 @@ def pytest_runtest_setup(item):
 
 @pytest.fixture(autouse=True, scope="module")
 def bounded_memory():
-    """Files share what is compiled. Beyond 3.5 GB of memory each lets go of what there is."""
+    """Files share what is compiled. Beyond a bound on memory all of it goes, and the bound rises.
+
+    What is let go of is used again, but most of it stays with the process.
+    """
+    global most_memory
     yield
-    if memory() > 3.5e9:
+    if memory() > most_memory:
         jax.clear_caches()
+        most_memory = memory() + 1e9
+
+
+def memory_of_machine() -> float:
+    """[bytes]."""
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (AttributeError, ValueError, OSError):  # Windows
+        return 16e9
+
+
+most_memory = memory_of_machine() / 6  # of a worker
 
 
 def memory() -> float:

@@ -96,6 +96,7 @@ def test_stripping_leaves_the_cells():
     assert all(f"({path.name})" in page for path in NOTEBOOKS)
 
 
+@pytest.mark.slow
 def test_faults_errors_and_long_cells_are_seen(tmp_path):
     """A warning, an Axes in place of its picture, a picture without a sentence, pyplot."""
     picture = new_output("display_data", {"image/png": PNG, "text/plain": "<Axes: >"})

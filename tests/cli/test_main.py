@@ -265,6 +265,7 @@ def test_output_that_cannot_be_written(arguments, status, message):
     assert message in done.stderr and done.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_module_in_double_precision():
     """`python -m fractaljax` is the same command, and chooses float64 itself."""
     done = subprocess.run(

@@ -221,6 +221,7 @@ def test_end_by_quantities():
         np.testing.assert_allclose(forward[:, i], wanted, rtol=1e-4, atol=1e-6 * abs(wanted).max())
 
 
+@pytest.mark.slow
 def test_constant_stiffness_is_the_linear_spring_without_a_curve():
     """alpha = 0: the load curve of a law whose stiffness does not depend on the load."""
     contact = power_law(0.0, ratio=0.3)

@@ -192,7 +192,8 @@ BEFORE_A_STEP = {
 }
 
 
-@pytest.mark.parametrize("seed", [pytest.param(45, marks=pytest.mark.slow), 50])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", BEFORE_A_STEP)
 def test_steps_go_on(seed):
     """Where the next root of a guard is not at the start of the step."""
     system = jax.jit(hybrid_system)(of_problem(problem(numbers(seed))))
