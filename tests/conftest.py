@@ -59,9 +59,9 @@ def optimised() -> bool:
 def pytest_runtest_setup(item):
     """Without optimisation a cycle with both gradients compiles in 4 s instead of 10.
 
-    Slow tests have it, as users do, but for those that compile much and compute little.
+    Slow tests that are marked so have it, as users do: most compile much and compute little.
     """
-    compute = item.get_closest_marker("slow") and not item.get_closest_marker("unoptimised")
+    compute = item.get_closest_marker("slow") and item.get_closest_marker("optimised")
     jax.config.update("jax_disable_most_optimizations", not compute)
     os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "0" if compute else "1"  # of subprocesses
 

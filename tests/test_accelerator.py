@@ -62,7 +62,6 @@ def test_public_programs_lower_for_cuda(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PROGRAMS)
-@pytest.mark.unoptimised
 def test_what_is_invalid_is_nan(name):
     """Never a number that one could believe; the same program gives numbers for what is valid."""
     program = PROGRAMS[name]

@@ -11,6 +11,8 @@ import pytest
 import fractaljax as fj
 from tools import DOCS, assert_same_picture, assert_whole, load_script
 
+pytestmark = pytest.mark.optimised
+
 sys.path.insert(0, str(DOCS))  # the scripts share a module
 MEASURED = re.compile(r"\d\.?\d*e[+-]\d\d")
 NUMBER = re.compile(r"\d+\.?\d*(?:e[+-]?\d+)?")

@@ -13,6 +13,8 @@ import pytest
 import fractaljax as fj
 from fractaljax._base import kept, quick
 
+pytestmark = pytest.mark.optimised
+
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):

@@ -22,8 +22,6 @@ from tools import (
     run_command as run,
 )
 
-pytestmark = pytest.mark.unoptimised
-
 _CYCLE = ["cycle.csv", "cycle.png"]
 _SEARCH = "fractaljax._dynamics.limit_cycle.limit_cycle"
 _TABLE = "fractaljax._stability.summary.stability_table"

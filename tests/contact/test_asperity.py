@@ -15,8 +15,6 @@ import fractaljax as fj
 from fractaljax._contact import asperity, fractal
 from tools import both_modes
 
-pytestmark = pytest.mark.unoptimised
-
 mp: Any = mpmath
 E, NU, SIGMA_Y, H, GAMMA, MU_M = 1.154e11, 0.3, 3.55e8, 9.94e8, 1.5, 0.25
 LOG_L_S = math.log(1e-4)

@@ -273,7 +273,6 @@ def test_derivatives_of_pressure_gap_and_stiffness():
 
 
 @pytest.mark.slow
-@pytest.mark.unoptimised
 def test_derivatives_of_a_surface_and_many_seeds():
     """d mean gap and d ln K_n to D and ln G; `vmap` over seeds equals one by one."""
     L, n = 1e-3, 16

@@ -11,6 +11,8 @@ from scipy.special import erfinv
 import fractaljax as fj
 from tools import assert_whole, refusals
 
+pytestmark = pytest.mark.optimised
+
 BRAKE = fj.brake_scene().contact
 SURFACE, MATERIAL = BRAKE.surface, BRAKE.material
 SIZES: dict[str, Any] = {"area": 4e-4, "L": 1e-2, "L_s": 1e-3}

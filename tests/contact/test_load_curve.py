@@ -13,8 +13,6 @@ from fractaljax._base.parts import substitute
 from fractaljax._contact.load_curve import tabulated
 from tools import both_modes
 
-pytestmark = pytest.mark.unoptimised
-
 MATERIAL = fj.Material(E=1.154e11, nu=0.3, sigma_y=3.55e8, H=9.94e8)
 P, K_N = 1907.3, 4e8
 TABLE = np.array([50.0, 300.0, 1200.0, 4000.0]), np.array([4e7, 1.6e8, 3e8, 7e8])

@@ -157,7 +157,6 @@ def test_middle_range_is_yang_and_perssons_mean_separation():
 
 
 @pytest.mark.slow  # compiles third derivatives
-@pytest.mark.unoptimised
 def test_finite_and_positive_from_1_newton_to_1e6_with_gradients_of_three_orders():
     def log_K_n(D, log_G, log_P, area):
         return jnp.log(stiffness(D, jnp.exp(log_G), jnp.exp(log_P), area)[0])
@@ -285,7 +284,6 @@ def test_scene_takes_the_law():
 
 
 @pytest.mark.slow
-@pytest.mark.unoptimised
 def test_design_moves_the_surface_of_the_law():
     scene = brake()
     best = fj.design(scene, {"K_t/K_n": (0.2, 1), "G": (1e-12, 1e-8)}, K_n_min=1e8, progress=False)

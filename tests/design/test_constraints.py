@@ -20,8 +20,6 @@ from fractaljax._design.constraints import (
 from fractaljax._surface.roughness import root_mean_square_height
 from tools import both_modes, reference_scene, refusals, state_matrix
 
-pytestmark = pytest.mark.unoptimised
-
 ALL = {
     "K_n >= 4e+08 N/m": NormalStiffness(4e8),
     "elastic share >= 0.3": ElasticShare(0.3),

@@ -102,6 +102,7 @@ def squealing_scenes(count, seed=2026):
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_fifty_random_scenes_reach_the_grid_optimum():
     """Within 1 percent of the least distance on a 700 x 700 grid, whichever basin it is in."""
     for scene in squealing_scenes(50):
@@ -111,6 +112,7 @@ def test_fifty_random_scenes_reach_the_grid_optimum():
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_other_requests_reach_the_grid_optimum():
     """The same where K_n, the slip limit, corners and other bounds decide."""
     rng = random.Random(7)
@@ -459,6 +461,7 @@ def excess_on_grid(scene, target, K_n_min, surfaces, conditions):
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_robust_designs_beat_a_refined_grid():
     """Eight scenes over an envelope with scatter: a 400 x 400 grid refined by Nelder-Mead.
 

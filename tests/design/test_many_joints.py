@@ -121,6 +121,7 @@ def test_limits_of_joints_are_those_of_each_condition(tolerance):
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_a_design_of_many_joints_stays_near():
     """From an even spread over the bounds alone the nearest that is found is at 0.27."""
     x = several_joints(4, mu=0.5)

@@ -18,6 +18,8 @@ from mechanisms import PROBLEMS, changed
 from structures import of_problem, source_form_of, two_joints
 from tools import ROOT, refusals
 
+pytestmark = pytest.mark.optimised
+
 GRAZING = 1.8366009722  # the belt's speed at which its stick-slip cycle ends
 OPTIONS: dict[str, Any] = dict(
     K_n_min=None, constraints=(), envelope=None, tolerance=None, quantile=0.95

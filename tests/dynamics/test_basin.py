@@ -15,6 +15,8 @@ from mechanisms import PROBLEMS, changed
 from structures import of_problem, source_form_of
 from tools import reference_scene, refusals
 
+pytestmark = pytest.mark.optimised
+
 # The equilibrium and a stick-slip cycle are both attracting.
 V = 1.5
 BELT = changed(PROBLEMS["papangelo_2017"], ["joints.0.V"], [V])

@@ -21,7 +21,6 @@ from structures import of_problem
 from tools import DOCS, assert_same_picture, both_modes, labels, load_script
 
 BELT = PROBLEMS["papangelo_2017"]
-UNOPTIMISED = pytest.mark.unoptimised
 
 
 @functools.cache
@@ -97,7 +96,6 @@ def values_of_events(kinds, *branch):
 
 
 @pytest.mark.slow
-@UNOPTIMISED
 def test_derivatives_of_the_belt():
     """In both modes against central differences, of both events of one branch."""
 
@@ -162,7 +160,6 @@ def assert_truth(problem, quantity, found, i):
         ),
     ],
 )
-@UNOPTIMISED
 def test_points(name, window, kinds):
     """Cycles of every itinerary on the way, and the kinds of events between them."""
     found = branch(name, "V", *window)
@@ -190,7 +187,6 @@ def test_a_branch_meets_the_search():
 
 
 @pytest.mark.slow
-@UNOPTIMISED
 def test_derivatives_of_events():
     """Of the joint's P, against central differences of the branch itself: three on each."""
     problem, start = PROBLEMS["lift_off"], cycle("lift_off")
@@ -220,7 +216,6 @@ def test_event_in_two_quantities(kind):
 
 
 @pytest.mark.slow
-@UNOPTIMISED
 def test_a_branch_runs_away_where_friction_does():
     """The cubic law at a hundred times v_m; every point on the way keeps its accuracy."""
     found = fj.continue_cycle(transients.reference(), "V", (0.05, 1.0))
@@ -255,7 +250,6 @@ def test_scene():
 
 
 @pytest.mark.slow
-@UNOPTIMISED
 def test_a_fold_moves_with_the_surface():
     """Its derivatives by D and ln G, against the folds of other surfaces."""
     start = fj.limit_cycle(BRAKE)

@@ -17,7 +17,6 @@ from mechanisms import PROBLEMS
 from structures import of_problem
 from tools import DOCS, assert_same_picture, labels, load_script, run_command
 
-pytestmark = pytest.mark.unoptimised
 BELT = of_problem(PROBLEMS["papangelo_2017"])  # x'' + 0.1 x' + x = mu(w), mu_s 1, mu_d 0.5, v_0 0.5
 WINDOW = (0.5, 2.5)
 

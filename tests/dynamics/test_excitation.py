@@ -21,8 +21,6 @@ from mechanisms import PROBLEMS, changed
 from structures import of_problem
 from tools import both_modes, primitives, reference_scene, refusals
 
-pytestmark = pytest.mark.unoptimised
-
 SLOW = pytest.mark.slow
 BELT, START = PROBLEMS["papangelo_2017"], [1.5, 0.0]
 FREE = 0.15548755708948883  # Hz, of its limit cycle without excitation

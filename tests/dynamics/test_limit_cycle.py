@@ -33,7 +33,6 @@ REPELLING = dict(
     )
 )
 SLOW = pytest.mark.slow
-UNOPTIMISED = pytest.mark.unoptimised
 
 
 @functools.partial(jax.jit, static_argnames="segments")
@@ -112,7 +111,7 @@ def test_forty_digits():
 
 
 @SLOW
-@UNOPTIMISED
+@pytest.mark.optimised
 def test_derivatives_of_forty_digits():
     """By K_n at fixed K_t/K_n, of period and amplitude in SI, in forward and in reverse mode."""
     _, *jacobians = solved(CYCLES[0], CYCLES[0]["start"])
@@ -122,7 +121,6 @@ def test_derivatives_of_forty_digits():
         np.testing.assert_allclose(by_K_n, truth, rtol=1e-8)
 
 
-@UNOPTIMISED
 def test_cycles_of_one_return():
     """Random and special scenes: all numbers, multipliers, and derivatives in both modes."""
     simple = [row for row in CYCLES if row["returns"] == 1]
@@ -132,7 +130,7 @@ def test_cycles_of_one_return():
 
 
 @SLOW
-@UNOPTIMISED
+@pytest.mark.optimised
 def test_cycles_of_several_returns():
     """Up to four in one period, on more segments, from a state on the cycle."""
     several = [row for row in CYCLES if row["returns"] > 1]
@@ -142,7 +140,6 @@ def test_cycles_of_several_returns():
 
 
 @SLOW
-@UNOPTIMISED
 def test_motions_without_a_cycle():
     """The equilibrium attracts, the motion diverges, or it never repeats: three results."""
     R = fj.CycleResult
@@ -217,7 +214,6 @@ def test_orbit():
         pytest.param({"K_n": 8e8, "omega_1": 295.0, "xi_1": 0.01}, marks=SLOW),
     ],
 )
-@UNOPTIMISED
 def test_mass_on_a_belt_under_constant_load(slow):
     """K_t = 0 and F < 0: x2 does not move, and x1 is the classic stick-slip oscillator.
 
@@ -273,7 +269,6 @@ def test_repels(largest):
 
 
 @SLOW
-@UNOPTIMISED
 def test_error_falls_with_the_eighth_power():
     """Order of convergence in the number of segments, the estimate and what it corrects."""
     counts = (16, 28)
@@ -289,6 +284,7 @@ def test_error_falls_with_the_eighth_power():
 
 
 @SLOW
+@pytest.mark.optimised
 def test_batch():
     """Scenes of every outcome together: each as on its own, and so its gradient."""
     outcomes = [int(solved(row, row["start"])[0].result._value) for row in ROWS]

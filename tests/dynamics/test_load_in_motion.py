@@ -161,7 +161,6 @@ def cycle():
 
 
 @pytest.mark.slow
-@pytest.mark.unoptimised
 def test_cycle():
     """A cycle that sticks and lifts off closes in the other solver, with its forces and shares."""
     found, exact = cycle(), Truth(COUPLING)
@@ -181,7 +180,6 @@ def test_cycle():
 
 
 @pytest.mark.slow
-@pytest.mark.unoptimised
 def test_cycle_by_quantities():
     """Derivatives of the period by load, friction and V, in both modes, against differences."""
     names = ("P", "mu_s", "V")
@@ -202,7 +200,6 @@ def test_cycle_by_quantities():
 
 
 @pytest.mark.slow
-@pytest.mark.unoptimised
 def test_end_by_quantities():
     """Derivatives of a motion with lift-off by load and start, in both modes."""
     start = jnp.array(STARTS["lift off"][0])
@@ -267,7 +264,6 @@ def test_many_scenes_side_by_side():
 
 
 @pytest.mark.slow
-@pytest.mark.unoptimised
 def test_many_cycles_side_by_side():
     base, loads = coupled(), jnp.array([2900.0, 3000.0])
 

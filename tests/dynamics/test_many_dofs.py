@@ -19,8 +19,6 @@ from fractaljax._dynamics.scaled import hybrid_system
 from fractaljax._dynamics.segments import flow, tableau
 from structures import monodromy_of, truth_of
 
-pytestmark = pytest.mark.unoptimised
-
 system = jax.jit(hybrid_system)
 field, guards = jax.jit(HybridSystem.field), jax.jit(HybridSystem.guards)
 

@@ -21,6 +21,7 @@ from tools import both_modes
 TABLE = json.loads((Path(__file__).parents[1] / "reference" / "mechanisms.json").read_text())
 ROWS = {row["name"]: row for row in TABLE["rows"]}
 QUICK = ("papangelo_2017",)
+MARKS = {"four_dof": (pytest.mark.slow, pytest.mark.optimised)}
 # A joint slides forwards (V > 0). Backwards, with a second face along n, it is another joint.
 BACKWARDS = {
     name
@@ -28,7 +29,7 @@ BACKWARDS = {
     if any(joint["V"] < 0 and joint.get("K_t") for joint in problem["joints"])
 }
 NAMES = [
-    name if name in QUICK else pytest.param(name, marks=pytest.mark.slow)
+    name if name in QUICK else pytest.param(name, marks=MARKS.get(name, pytest.mark.slow))
     for name in PROBLEMS
     if name not in BACKWARDS
 ]
@@ -66,7 +67,6 @@ def test_cycle(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", DIFFERENTIATED)
-@pytest.mark.unoptimised
 def test_derivatives(name):
     """Of period, amplitudes and shares by the numbers in `by`, forward and reverse."""
     problem, row = PROBLEMS[name], ROWS[name]
@@ -101,7 +101,6 @@ def _at(problem, place) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.unoptimised
 def test_rest_with_an_open_joint():
     """A force that pulls the joint open leaves the rest to its damping."""
     joint = fj.Joint(fj.FixedContact(2.0, 0.5, 1.0), fj.Coulomb(0.4), 0, 1, 1.0, preload=True)

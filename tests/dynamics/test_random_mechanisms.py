@@ -132,7 +132,6 @@ def extrapolated(known: dict, h: float) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.unoptimised
 def test_derivatives():
     """One test for all seeds: a worker of its own for each would compile the same again."""
     for seed in SEEDS:
@@ -140,7 +139,7 @@ def test_derivatives():
 
 
 @pytest.mark.slow
-@pytest.mark.unoptimised
+@pytest.mark.optimised
 def test_derivatives_of_three_joints():
     """By default options, in a compiled program."""
     for seed in SEEDS_OF_THREE:
@@ -175,7 +174,6 @@ def assert_derivatives(seed, n=3, shape=(), steps=STEPS):
 
 
 @pytest.mark.slow
-@pytest.mark.unoptimised
 def test_a_cycle_of_more_phases_than_the_default_has_segments():
     given, start = numbers(161), np.random.default_rng([161, 2]).standard_normal(6)
     cycle = fj.limit_cycle(of_problem(problem(given)), start, max_returns=1500)

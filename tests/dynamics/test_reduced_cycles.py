@@ -51,7 +51,6 @@ def test_cycle_of_a_reduction_is_that_of_the_structure(top, n, close):
 
 
 @pytest.mark.slow
-@pytest.mark.unoptimised
 def test_derivative_of_the_period_of_a_reduction():
     reduced = fj.reduce(rods(), {"middle.P": (0.4, 0.6)}, (0, 12.0), tol=1e-9, progress=False)
 

@@ -20,8 +20,6 @@ from mechanisms import PROBLEMS, changed
 from structures import of_problem
 from tools import both_modes
 
-pytestmark = pytest.mark.unoptimised
-
 SLOW = pytest.mark.slow
 TABLE = json.loads((Path(__file__).parents[1] / "reference" / "mechanisms.json").read_text())
 ROWS = {row["name"]: row for row in TABLE["rows"]}

@@ -13,6 +13,8 @@ from benchmarks.__main__ import PAGES
 from fractaljax._sweep.blocks import blocks
 from tools import ROOT, quick_benchmark
 
+pytestmark = pytest.mark.optimised
+
 RESULTS = ROOT / "benchmarks" / "results"
 STORED = page.stored(RESULTS)
 

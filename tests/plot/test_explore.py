@@ -18,8 +18,6 @@ from fractaljax.plot.explore import explored, page, point, points_at, surface_wa
 from fractaljax.plot.javascript import javascript
 from tools import refused_command, run_command as run
 
-pytestmark = pytest.mark.unoptimised
-
 SCENE = fj.brake_scene()
 DUSTY = fj.Scene(fj.FixedContact(4e8, 2e8, P=50.0), fj.Coulomb(0.4), SCENE.oscillator, preload=True)
 WINDOWS = dict(D=(2.2, 2.6), G=(1e-11, 1e-9), P=(1e2, 1e4), mu=(0.05, 0.6))

@@ -11,8 +11,6 @@ from fractaljax import plot
 from structures import belt_cycle, two_joints
 from tools import assert_whole, refusals
 
-pytestmark = pytest.mark.unoptimised
-
 BLOCK: dict[str, Any] = {  # moves along x, with a held edge
     "points": [[0.0, 0.0], [4.0, 0.0], [4.0, 1.0], [0.0, 1.0]],
     "dofs": [[0, -1], [0, -1], [0, -1], [-1, -1]],

@@ -15,8 +15,6 @@ from fractaljax._base.ranges import is_logarithmic, within
 from fractaljax._mechanism.quantities import sliding_friction
 from tools import refusals
 
-pytestmark = pytest.mark.unoptimised
-
 BRAKE = fj.brake_scene()
 FIXED = BRAKE.replace(contact=fj.FixedContact(402628934.268313, 191682502.096783))
 CONSTANT = fj.Scene(fj.FixedContact(4e8, 6e7), fj.Coulomb(0.4), BRAKE.oscillator)

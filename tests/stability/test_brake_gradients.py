@@ -16,8 +16,6 @@ import fractaljax as fj
 from random_brakes import PAIRS, random_brake
 from tools import ROOT, load_script
 
-pytestmark = pytest.mark.unoptimised
-
 LAW = load_script(ROOT / "tests" / "reference" / "make_contact.py")
 ORDER = 24  # of quadrature, which leaves more digits than a double has
 

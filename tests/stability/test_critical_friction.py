@@ -17,8 +17,6 @@ from fractaljax._stability.linearise import linearised
 from quartics import log_uniform, many_rightmost, stacked
 from tools import both_gradients, both_modes, reference_scene
 
-pytestmark = pytest.mark.unoptimised
-
 BRAKE = fj.brake_scene()
 slow = pytest.mark.slow
 

@@ -23,8 +23,6 @@ from quartics import (
 from structures import two_joints
 from tools import DOCS, assert_same_picture, both_modes, load_script
 
-pytestmark = pytest.mark.unoptimised
-
 
 def flat(a, b, c_1, c_2, g, shift):
     return margin_of(Linearised(a, b, c_1, c_2, g), shift)

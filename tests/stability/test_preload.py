@@ -16,8 +16,6 @@ from fractaljax._stability.summary import stability_table, structure_table
 from preloaded import BRAKE, LEVER, PROBLEMS, PULL, measured, problem
 from tools import both_gradients
 
-pytestmark = pytest.mark.unoptimised
-
 slow = pytest.mark.slow
 
 
@@ -63,7 +61,6 @@ def test_eigenvalues_and_normal_forces(name, slope):
     np.testing.assert_allclose(forces, oracle.normal_forces(), rtol=rtol)
 
 
-@pytest.mark.unoptimised
 @most_slow("scene, load curve")
 def test_gradients(name):
     """By every quantity of every joint, in both modes, against differences in 40 digits."""

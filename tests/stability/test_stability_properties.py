@@ -144,6 +144,7 @@ def test_growth_rates_of_thousands_are_lapacks():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("program", [programs.squeal, programs.rest, programs.critical_friction])
+@pytest.mark.optimised
 def test_gradients_of_a_hundred_thousand_mechanisms(program):
     x = mechanisms(places(np.random.default_rng(9), 100_000, MECHANISM_COLUMNS))
     compare_gradients(x, *(of(x) for of in programs.of_rows(program)))
@@ -159,6 +160,7 @@ def test_gradients_of_a_hundred_thousand_mechanisms(program):
         check_unit_of_time,
     ],
 )
+@pytest.mark.optimised
 def test_a_hundred_thousand_mechanisms(check: Callable):
     slow = check is check_eigenvalues_rebuild_the_polynomial
     check(places(np.random.default_rng(7), 10_000 if slow else 100_000, MECHANISM_COLUMNS))

@@ -14,8 +14,6 @@ from fractaljax._mechanism.quantities import with_friction_times
 from preloaded import Oracle, problem
 from tools import both_modes
 
-pytestmark = pytest.mark.unoptimised
-
 slow = pytest.mark.slow
 
 

@@ -199,6 +199,7 @@ def test_coarse_steps_of_a_brake_are_those_of_fine_ones():
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_brake_by_brute_force():
     structure, values = brake(), np.linspace(0.02, 0.6, 4)
     found = track(structure, "mu", values)

@@ -25,8 +25,6 @@ from fractaljax._sweep.batches import Batches
 from fractaljax._sweep.store import Store
 from fractaljax._sweep.workers import Job
 
-pytestmark = pytest.mark.unoptimised  # bits are compared with those of other processes
-
 SCENE = fj.brake_scene()
 AXES: dict[str, Any] = {"D": np.linspace(2.35, 2.45, 6), "G": np.geomspace(5e-11, 3e-10, 5)}
 

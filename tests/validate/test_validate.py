@@ -230,7 +230,6 @@ def rows_as_on_the_page(validation) -> int:
 
 
 @pytest.mark.slow
-@pytest.mark.unoptimised
 def test_all_agree_with_numbers_and_pictures_of_the_page(tmp_path):
     """One test: two workers would compute all cases twice."""
     everything = found()
