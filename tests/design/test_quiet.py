@@ -234,16 +234,16 @@ def test_brake_survives_the_kicks_of_an_independent_solver(monkeypatch):
     plain = fj.design(scene, bounds, progress=False)
     assert plain.value < best.value < 0.01
     random = np.random.default_rng(5)
-    ways = random.standard_normal((12, 4))
+    ways = random.standard_normal((6, 4))
     ways *= 1.99 / np.linalg.norm(ways, axis=1, keepdims=True)
     ends = []
-    for x, chosen, most in ((best.scene, ways, 1500), (plain.scene, ways[:6], 400)):
+    for x, most in ((best.scene, 1500), (plain.scene, 400)):
         mechanism = Mechanism.of(source_form_of(x))
         (joint,) = mechanism.joints
         mu, K_n, K_t = joint.mu(joint.V), joint.K_n, joint.K_t
         K = mechanism.K + np.array([[K_t, -mu * K_n], [mu * K_t, K_n]])
         units = joint.V * np.array([K_n**-0.5, K_n**-0.5, 1, 1])
-        starts = np.append(np.linalg.solve(K, mechanism.F), [0, 0]) + chosen * units
+        starts = np.append(np.linalg.solve(K, mechanism.F), [0, 0]) + ways * units
         ends.append([squeals(mechanism, start, most) for start in starts])
     assert not any(ends[0])
     assert ends[1] == [True, False, True, True, False, True]
