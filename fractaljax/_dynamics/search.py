@@ -55,6 +55,7 @@ class SearchOptions:
     still: float = 1e-6  # size, or with a joint open rate of change, below which it is at rest
     extrapolated: float = 0.02  # growth in a return, without switches, that is extrapolated
     divergence: float = 1e6  # size at which a motion diverges: with a small V, many V are ordinary
+    settles: float = 0.95  # factor by which gaps shrink in a quarter of a run that does
     repeats: float = 1e-6  # gap between returns of a motion that has settled, relative
     settling: int = 8  # rounds without growth after which the record must hold two returns
     patience: int = 512  # rounds without a maximum
@@ -208,7 +209,7 @@ class _Progress(eqx.Module):
     error: Float[Array, "2 B"]  # of that orbit, and its growth in a period
     distance: Float[Array, " B"]  # of the run from that orbit
     approach: Int[Array, " B"]  # rounds in which it fell
-    widest: Float[Array, " B"]  # gap between returns, in the later half of the run
+    widest: Float[Array, "2 B"]  # gap between returns, in the last two quarters of the run
     tried: Float[Array, " B"]  # gap at the last attempt
     returns: Float[Array, " B"]
     idle: Int[Array, " B"]  # rounds without a return
@@ -351,9 +352,13 @@ def _assess(
     # This near, the multipliers decide whether it attracts.
     ok = ok | (found & (now < options.accepted * scale))
     distance = jnp.where(found & ~ok, now, distance)
-    late = returns > max_returns / 2
-    widest = jnp.where(late, jnp.maximum(known.widest, closest / scale), known.widest)
-    over = jnp.where((widest < 0.02) | (smooth & (growth < 0)), EXHAUSTED, NOT_PERIODIC)
+    # The widest gaps of the third and the last quarter say whether it settles.
+    quarter = jnp.stack([returns < 0.75 * max_returns, returns >= 0.75 * max_returns])
+    wider = jnp.maximum(known.widest, (closest / scale)[None])
+    widest = jnp.where(quarter & (returns > max_returns / 2)[None], wider, known.widest)
+    settles = jnp.max(widest, axis=0) < 0.02
+    settles = settles & ((widest[0] == 0) | (widest[1] < options.settles * widest[0]))
+    over = jnp.where(settles | (smooth & (growth < 0)), EXHAUSTED, NOT_PERIODIC)
     # A motion that repeats was no orbit if segments of length h, and one a phase, are too many.
     last = jnp.stack([at[0], jnp.take_along_axis(at, repeated[None], axis=0)[0]])
     weight, phases = (record.past(row, last, lane[None]) for row in (WEIGHT, ENDED))
@@ -384,7 +389,7 @@ def _assess(
         error=known.error,
     )
     progress = jax.tree.map(
-        lambda new, old: jnp.where(active, new, old) if new.ndim == 1 else old, progress, known
+        lambda new, old: old if new is old else jnp.where(active, new, old), progress, known
     )
     # Where an orbit was found its lane was active.
     progress = eqx.tree_at(lambda known: (known.orbit, known.error), progress, (orbit, error))
@@ -449,7 +454,7 @@ def _find(
         error=jnp.stack([zero, zero]),
         distance=far,
         approach=none,
-        widest=zero,
+        widest=jnp.stack([zero, zero]),
         tried=far,
         returns=zero,
         idle=none,

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
+import hybrid_truth
 from fractaljax._dynamics.scaled import degrees_of_freedom
 from mechanisms import PROBLEMS, changed
 from structures import of_problem
@@ -98,6 +99,32 @@ def _at(problem, place) -> float:
         found = found[int(key)] if key.isdigit() else found[key]
         found = found[1] if isinstance(found, tuple) else found
     return found
+
+
+@pytest.mark.slow
+def test_motion_on_a_torus():
+    """Its returns come ever nearer to earlier ones, never after 16: more of them change nothing."""
+    joint = {"tangential": [1.0, 0.0], "normal": [0.0, 1.0], "V": 0.545, "P": 0.94, "K_n": 2.805}
+    law = "stribeck", {"mu_s": 0.868, "mu_m": 0.635, "v_m": 1.067}
+    problem = {
+        "M": [[0.759, -0.122], [-0.122, 0.738]],
+        "C": [[0.052, -0.001], [-0.001, 0.055]],
+        "K": [[1.174, 0.096], [0.096, 1.341]],
+        "F": [0.507, 0.476],
+        "joints": [joint | {"friction": law, "K_t": 0.0, "preload": True}],
+    }
+    start = np.array([-0.39, -0.76, 0.01, -0.69])
+    found = fj.limit_cycle(of_problem(problem), start, max_returns=1500, throw=False)
+    assert found.result == fj.CycleResult.not_periodic
+    mechanism, returns = hybrid_truth.Mechanism.of(problem), []
+    phases = hybrid_truth.phases(mechanism.scaled, start / mechanism.units, 1e-9, maxima=True)
+    while len(returns) < 350:
+        end = next(phases).end
+        if abs(end[2]) < 1e-9:  # the velocity along t
+            returns.append(end)
+    later = np.array(returns[200:])
+    gaps = [np.abs(later[k:] - later[:-k]).max(axis=1).min() for k in range(1, 100)]
+    assert min(gaps[:16]) > 0.05 and min(gaps[16:]) < 0.005
 
 
 @pytest.mark.slow
