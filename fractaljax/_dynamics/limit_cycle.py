@@ -85,20 +85,33 @@ def extreme_values(system: HybridSystem, segments: Segments, rows) -> Float[Arra
     theta, inside = cubic.minimum()
     least = jnp.where(inside & (d_1 - d_0 > small / 64), cubic(theta), jnp.inf)
     least, k = (x.ravel() for x in _lowest(least, _MINIMA))
-    of_row, most = jnp.arange(len(k)) // _MINIMA, h[k] / 8
+    of_row = jnp.arange(len(k)) // _MINIMA
+    exists, given = least < jnp.inf, (system, y[:, k], s[:, k], h[k], rows[of_row].T)
 
-    def refined(t, _):
-        value, rate, change = _along(system, y[:, k], s[:, k], t, rows[of_row].T)
-        # The cubic's minimum is near; the parabola there has the orbit's.
+    def refined(given, t):
+        """The minimum by the parabola at t, and a step towards it."""
+        system, y, s, h, row = given
+        value, rate, change = _along(system, y, s, t, row)
+        most = h / 8
         near = jnp.abs(rate) < change * most
         newton = jnp.where(near, -rate / jnp.where(near, change, 1), 0)
-        on = jnp.clip(t + jnp.where(near, newton, -jnp.sign(rate) * most), 0, h[k])
-        return jax.lax.stop_gradient(on), value + rate * newton / 2
+        return value + rate * newton / 2, jnp.where(near, newton, -jnp.sign(rate) * most)
 
-    # Time and again: a minimum that is nearly an inflection is not so near.
-    t = jax.lax.stop_gradient(theta[of_row, k] * h[k])
-    _, values = jax.lax.scan(refined, t, length=6)
-    value = jnp.where(least < jnp.inf, values[-1], jnp.inf).reshape(-1, _MINIMA)
+    # The cubic's minimum is near, but where it is nearly an inflection. The last parabola, of third
+    # order, carries the derivative.
+    frozen, t = jax.lax.stop_gradient((given, theta[of_row, k] * h[k]))
+
+    def going(carry):
+        _, change, steps = carry
+        return (steps < 5) & jnp.any(exists & (jnp.abs(change) > frozen[3] / 1024))
+
+    def step(carry):
+        t, _, steps = carry
+        change = refined(frozen, t)[1]
+        return jnp.clip(t + change, 0, frozen[3]), change, steps + 1
+
+    t, *_ = jax.lax.while_loop(going, step, (t, frozen[3], 0))
+    value = jnp.where(exists, refined(given, t)[0], jnp.inf).reshape(-1, _MINIMA)
     value = jnp.min(value, axis=1)
     # Where one ends a segment both are equal to rounding, and the parabola alone follows it.
     node = jnp.min(g_0, axis=1)

@@ -176,6 +176,7 @@ def test_every_law_has_its_modes():
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_a_structure_is_designed_under_two_laws():
     x: Any = fractal_joints()
     law = fj.AsperityContact(fj.Surface(2.2, 1e-9), x.joints[0].contact.material, 1.0, 1e-5)

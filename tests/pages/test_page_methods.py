@@ -144,6 +144,7 @@ def test_transient_is_over_where_it_is_read():
 
 
 @pytest.mark.slow  # compiles with diffrax and numba
+@pytest.mark.optimised
 def test_every_integrator_solves_the_same_law():
     """Shorter than a cycle needs: what they read agrees to what their tolerance lets pass."""
     law, read = transients.law(), []
