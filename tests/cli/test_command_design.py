@@ -33,6 +33,7 @@ def failing(error):
     return fail
 
 
+@pytest.mark.slow
 def test_design_without_arguments(capsys, tmp_path):
     """The main job: a progress bar, a table, and files that hold what was found."""
     status, out, err = run(capsys, "design")

@@ -196,6 +196,7 @@ def test_from_a_measurement_to_a_design(capsys):
     assert fj.growth_rate(start) > 0 > fj.growth_rate(end)
 
 
+@pytest.mark.slow
 def test_the_joint_of_the_measured_surface_and_what_it_rests_on(capsys):
     """K_n, K_t and growth rate with the errors of D and ln G; the verdict with their scatter."""
     np.save("map.npy", gaussian_map(np.random.default_rng(1), D, (256, 256), G=G, dx=DX))

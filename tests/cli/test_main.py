@@ -228,6 +228,7 @@ sys.exit(main(["cycle", "--out", "a/b"]))
 """
 
 
+@pytest.mark.slow
 def test_termination_leaves_nothing(tmp_path):
     """SIGTERM as Ctrl-C: one line, exit status 143, and no folder before there are files."""
     with tempfile.TemporaryFile("w+") as errors:  # a pipe that nobody reads may fill up

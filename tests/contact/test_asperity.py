@@ -266,6 +266,7 @@ def test_tangential_stiffness():
     assert float(K_t / K_n) == 0.5
 
 
+@pytest.mark.slow
 def test_scene_comes_back_from_its_file_and_has_gradients():
     law = contact(2.4, 1.342e-10, 1907.3, domain_extension=True)
     scene = fj.brake_scene().replace(contact=law)

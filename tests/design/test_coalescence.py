@@ -93,6 +93,7 @@ def test_residuals_are_smooth_through_coalescence():
     np.testing.assert_allclose(by_m, -slope / unit, rtol=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("c", [2e-2, 2e-4])
 def test_nearest_design_on_the_wall(c):
     """m^2 - p^2 <= 4 r^2 (W - c^2/4 + r^2), r = target + c/2, a hyperbola: the nearest of it."""

@@ -204,6 +204,7 @@ def test_objective_replaces_distance(scene):
     assert best.growth_rate <= growth[meets].min() + 1e-3
 
 
+@pytest.mark.slow
 def test_own_constraint_and_one_variable_alone(scene):
     """A function of the scene as a requirement; two of them meet in a corner."""
 

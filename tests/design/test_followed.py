@@ -54,7 +54,8 @@ def belt_cycle():
     return fj.limit_cycle(of_problem(belt), belt["start"])
 
 
-@pytest.mark.parametrize("found", [pytest.param(brake_cycle, marks=pytest.mark.slow), belt_cycle])
+@pytest.mark.slow
+@pytest.mark.parametrize("found", [brake_cycle, belt_cycle])
 def test_root_mean_square_velocity(found):
     """By quadrature of the orbit between its switches; the level is relative to 1 nm/s."""
     cycle = found()

@@ -52,6 +52,7 @@ def test_the_nearest_design_and_one_that_cannot_be_met():
     assert best.violated and best.growth_rate == pytest.approx(-0.75 / 2, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_leading_eigenvalues_and_their_derivatives():
     structure = two_joints(4)
 

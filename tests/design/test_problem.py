@@ -80,6 +80,7 @@ def test_names_are_in_the_order_of_the_residuals():
     assert row[0] == 0 and row[-2] == pytest.approx(2.4 - 2.42) and row.shape == (8,)
 
 
+@pytest.mark.slow
 def test_requirements_are_those_of_the_contacts_that_a_design_moves():
     """Of a structure every fractal joint by name; nothing of a joint that stays as it is."""
     structure = fractal_joints()

@@ -130,6 +130,7 @@ def test_crossing_of_divergence(c):
     assert crossing.frequency == 0 and crossing.starts
 
 
+@pytest.mark.slow
 def test_crossings_without_damping_and_of_a_joint():
     """Neutral modes change no sign, whatever their rounding."""
     assert track(hoffmann(), "mu", np.linspace(0.1, 0.7, 6)).crossings() == []

@@ -246,6 +246,7 @@ def spawned(workers):
     return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
 
 
+@pytest.mark.slow
 def test_a_process_pool(tmp_path):
     """Its process has 32 bits, and begins with nothing."""
     with spawned(1) as executor:
