@@ -66,6 +66,9 @@ def pytest_runtest_setup(item):
     os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "0" if compute else "1"  # of subprocesses
 
 
+most_memory = 3.5e9  # of a worker [bytes]
+
+
 @pytest.fixture(autouse=True, scope="module")
 def bounded_memory():
     """Files share what is compiled. Beyond a bound on memory all of it goes, and the bound rises.
@@ -77,17 +80,6 @@ def bounded_memory():
     if memory() > most_memory:
         jax.clear_caches()
         most_memory = memory() + 1e9
-
-
-def memory_of_machine() -> float:
-    """[bytes]."""
-    try:
-        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    except (AttributeError, ValueError, OSError):  # Windows
-        return 16e9
-
-
-most_memory = memory_of_machine() / 6  # of a worker
 
 
 def memory() -> float:

@@ -39,25 +39,14 @@ def branch(name, quantity, low, high):
     return fj.continue_cycle(of_problem(PROBLEMS[name]), quantity, (low, high), cycle(name))
 
 
-def assert_events(found):
-    """Grazing and Hopf point of the belt's branch."""
-    (at,), (hopf,) = found.grazings, found.hopf
+def test_belt():
+    """Grazing and Hopf point."""
+    (at,), (hopf,) = belt().grazings, belt().hopf
     graze: Any = brentq(least_speed, 1.7, 1.95, xtol=1e-13)
     np.testing.assert_allclose(at.value, graze, rtol=1e-9)
     np.testing.assert_allclose(hopf.value, 0.5 * np.log(10), rtol=1e-9)
-    assert {at.before, at.after} == {"0 +", "+"} and len(found.events) == 2
-    assert float(found.error.max()) < 1e-9
-
-
-@pytest.mark.slow
-def test_belt_from_its_hopf_point():
-    again = fj.continue_cycle(of_problem(BELT), "V", (0.5, 2.5), "hopf")
-    assert_events(again)
-    assert bool(again.start == fj.BranchEnd.hopf) and bool(again.end == fj.BranchEnd.window)
-
-
-def test_belt():
-    assert_events(belt())
+    assert {at.before, at.after} == {"0 +", "+"} and len(belt().events) == 2
+    assert float(belt().error.max()) < 1e-9
     stable = np.array([i < belt().grazings[0].index for i in range(len(belt().parameter))])
     np.testing.assert_array_equal(belt().stable[stable], True)
     np.testing.assert_array_equal(belt().stable[~stable][1:], False)

@@ -33,6 +33,7 @@ def grazing():
 
 def test_grazing_of_the_belt():
     """On the phase plane's, from edge to edge, with the stable cycles at lower speeds."""
+    assert bool(belt().start == fj.BranchEnd.hopf) and bool(belt().end == fj.BranchEnd.window)
     curve = grazing()
     assert curve.kind == "grazing" and curve.names == ("V", "mu_s") and "85 points" in repr(curve)
     assert bool(curve.start == fj.BranchEnd.window) and bool(curve.end == fj.BranchEnd.window)

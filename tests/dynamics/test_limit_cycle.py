@@ -94,9 +94,6 @@ def check(row, cycle, forward, reverse):
     np.testing.assert_array_less(np.abs(forward - value)[moves], bound[moves])
 
 
-# --- against the tables -------------------------------------------------------------------
-
-
 def test_forty_digits():
     """The reference cycle: period, amplitudes, stick fraction and itinerary."""
     cycle = reference_cycle()
@@ -180,9 +177,6 @@ def test_orbit_that_repels():
     np.testing.assert_allclose(growth, np.log(expected[-1]), rtol=1e-4)
 
 
-# --- the orbit ----------------------------------------------------------------------------
-
-
 def test_orbit():
     """`simulate`, which searches its events, runs through the same states and switches."""
     scene, cycle = reference_scene(), reference_cycle()
@@ -263,9 +257,6 @@ def test_repels(largest):
     np.testing.assert_array_equal(found, expected)
     # Within the error of the orbit it is left open.
     assert not np.any(one(jnp.asarray(matrices), jnp.asarray(rates), 1e-2)) or largest > 1.1
-
-
-# --- the search ---------------------------------------------------------------------------
 
 
 @SLOW

@@ -202,9 +202,6 @@ def test_steps_go_on(seed):
     assert float(after.sums[0, 0]) > 10
 
 
-# --- branches ---
-
-
 def followed(seed, quantity, low) -> fj.Branch | None:
     """The branch through the limit cycle of a random mechanism, where it has one.
 

@@ -185,9 +185,6 @@ test_refusals = refusals(
 )
 
 
-# --- stores -------------------------------------------------------------------------------
-
-
 def test_an_interrupted_sweep_loses_what_is_not_written(tmp_path, monkeypatch):
     written, write = [], Store.write
 
@@ -313,8 +310,6 @@ def test_a_full_disk_loses_one_batch(tmp_path, monkeypatch):
         assert len(written) == files - there - 2 * complete
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 
-
-# --- devices and processes ----------------------------------------------------------------
 
 _SETUP = """
     import sys

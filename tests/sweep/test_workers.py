@@ -239,9 +239,6 @@ def test_a_job_is_as_large_as_what_it_holds():
     assert Job.__module__.startswith("fractaljax.")
 
 
-# --- processes ----------------------------------------------------------------------------
-
-
 def spawned(workers):
     return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
 
