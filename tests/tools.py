@@ -134,6 +134,11 @@ def primitives(jaxpr) -> Counter[str]:
     return Counter(equation.primitive.name for equation in equations(jaxpr))
 
 
+def mostly_slow(values, *quick) -> list:
+    """Parameters of a test, of which only `quick` are in the default run."""
+    return [x if x in quick else pytest.param(x, marks=pytest.mark.slow) for x in values]
+
+
 def refusals(
     cases, call=lambda call: call(), kind: Any = ValueError, pattern="{}", plain=False
 ) -> Any:

@@ -85,8 +85,8 @@ def extreme_values(system: HybridSystem, segments: Segments, rows) -> Float[Arra
     theta, inside = cubic.minimum()
     least = jnp.where(inside & (d_1 - d_0 > small / 64), cubic(theta), jnp.inf)
     least, k = (x.ravel() for x in _lowest(least, _MINIMA))
-    of_row = jnp.arange(len(k)) // _MINIMA
-    exists, given = least < jnp.inf, (system, y[:, k], s[:, k], h[k], rows[of_row].T)
+    of_row, length = jnp.arange(len(k)) // _MINIMA, h[k]
+    exists, given = least < jnp.inf, (system, y[:, k], s[:, k], length, rows[of_row].T)
 
     def refined(given, t):
         """The minimum by the parabola at t, and a step towards it."""
@@ -99,18 +99,18 @@ def extreme_values(system: HybridSystem, segments: Segments, rows) -> Float[Arra
 
     # The cubic's minimum is near, but where it is nearly an inflection. The last parabola, of third
     # order, carries the derivative.
-    frozen, t = jax.lax.stop_gradient((given, theta[of_row, k] * h[k]))
+    frozen, length, t = jax.lax.stop_gradient((given, length, theta[of_row, k] * length))
 
     def going(carry):
         _, change, steps = carry
-        return (steps < 5) & jnp.any(exists & (jnp.abs(change) > frozen[3] / 1024))
+        return (steps < 5) & jnp.any(exists & (jnp.abs(change) > length / 1024))
 
     def step(carry):
         t, _, steps = carry
         change = refined(frozen, t)[1]
-        return jnp.clip(t + change, 0, frozen[3]), change, steps + 1
+        return jnp.clip(t + change, 0, length), change, steps + 1
 
-    t, *_ = jax.lax.while_loop(going, step, (t, frozen[3], 0))
+    t, *_ = jax.lax.while_loop(going, step, (t, length, 0))
     value = jnp.where(exists, refined(given, t)[0], jnp.inf).reshape(-1, _MINIMA)
     value = jnp.min(value, axis=1)
     # Where one ends a segment both are equal to rounding, and the parabola alone follows it.

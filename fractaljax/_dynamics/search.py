@@ -55,6 +55,7 @@ class SearchOptions:
     still: float = 1e-6  # size, or with a joint open rate of change, below which it is at rest
     extrapolated: float = 0.02  # growth in a return, without switches, that is extrapolated
     divergence: float = 1e6  # size at which a motion diverges: with a small V, many V are ordinary
+    nearly: float = 0.02  # gap below which returns nearly repeat, relative
     settles: float = 0.95  # factor by which gaps shrink in a quarter of a run that does
     repeats: float = 1e-6  # gap between returns of a motion that has settled, relative
     settling: int = 8  # rounds without growth after which the record must hold two returns
@@ -356,7 +357,7 @@ def _assess(
     quarter = jnp.stack([returns < 0.75 * max_returns, returns >= 0.75 * max_returns])
     wider = jnp.maximum(known.widest, (closest / scale)[None])
     widest = jnp.where(quarter & (returns > max_returns / 2)[None], wider, known.widest)
-    settles = jnp.max(widest, axis=0) < 0.02
+    settles = jnp.max(widest, axis=0) < options.nearly
     settles = settles & ((widest[0] == 0) | (widest[1] < options.settles * widest[0]))
     over = jnp.where(settles | (smooth & (growth < 0)), EXHAUSTED, NOT_PERIODIC)
     # A motion that repeats was no orbit if segments of length h, and one a phase, are too many.

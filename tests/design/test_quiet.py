@@ -97,7 +97,7 @@ def test_belt_is_quiet_over_a_range_of_loads():
 
 @pytest.mark.slow
 def test_unchanged_where_the_ball_is_held(monkeypatch, tmp_path):
-    """Of a few draws; the slow tests make all of them."""
+    """Of a few draws; others make all of them."""
     monkeypatch.setattr("fractaljax._design.quiet.VERIFIED", 512)
     best = designed(1.5, 0.6)
     assert best.result == fj.DesignResult.unchanged and best.quiet_radius == 0.6

@@ -15,7 +15,7 @@ from fractaljax._mechanism.quantities import sliding_friction, with_friction_tim
 from fractaljax._stability.critical_friction import critical_frequency, hopf_test_function
 from fractaljax._stability.linearise import linearised
 from quartics import log_uniform, many_rightmost, stacked
-from tools import both_gradients, both_modes, reference_scene
+from tools import both_gradients, both_modes, mostly_slow, reference_scene
 
 BRAKE = fj.brake_scene()
 slow = pytest.mark.slow
@@ -120,9 +120,7 @@ SCENES = {
 QUICK = ("slope", "driven", "fractal")
 
 
-@pytest.mark.parametrize(
-    "name", [name if name in QUICK else pytest.param(name, marks=slow) for name in SCENES]
-)
+@pytest.mark.parametrize("name", mostly_slow(SCENES, *QUICK))
 def test_first_root_is_where_squeal_starts(name):
     """No growth below, growth 0 at it and squeal above; the same as Brent's method finds."""
     scene = SCENES[name]

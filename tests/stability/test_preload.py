@@ -14,15 +14,14 @@ import pytest
 import fractaljax as fj
 from fractaljax._stability.summary import stability_table, structure_table
 from preloaded import BRAKE, LEVER, PROBLEMS, PULL, measured, problem
-from tools import both_gradients
+from tools import both_gradients, mostly_slow
 
 slow = pytest.mark.slow
 
 
 def most_slow(*quick):
     """All problems, of which only these are in the default run."""
-    each = (name if name in quick else pytest.param(name, marks=slow) for name in PROBLEMS)
-    return pytest.mark.parametrize("name", [*each])
+    return pytest.mark.parametrize("name", mostly_slow(PROBLEMS, *quick))
 
 
 @functools.partial(jax.jit, static_argnames="slope")

@@ -13,6 +13,7 @@ from scipy.sparse import csr_array
 import fractaljax as fj
 from fractaljax._stability.sparse_modes import Factors
 from structures import beam, state_matrix
+from tools import mostly_slow
 
 BAND = (0.0, 9000.0)
 M0, K0 = beam(20)
@@ -45,11 +46,7 @@ def full_structure(name):
     )
 
 
-SLOW = ("no joints", "mass")
-EACH = [pytest.param(x, marks=pytest.mark.slow) if x in SLOW else x for x in PROBLEMS]
-
-
-@pytest.fixture(scope="module", params=EACH)
+@pytest.fixture(scope="module", params=mostly_slow(PROBLEMS, "two joints"))
 def problem(request):
     full, over = full_structure(request.param), PROBLEMS[request.param]["over"]
     return full, fj.reduce(full, over, BAND, tol=1e-8), over

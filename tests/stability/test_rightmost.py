@@ -15,6 +15,7 @@ from fractaljax._stability import reduction
 from fractaljax._stability.quadratic import solve
 from fractaljax._stability.rightmost import _refined, rightmost
 from structures import state_matrix
+from tools import mostly_slow
 
 N, BAND = 24, (0.0, 8.5)
 
@@ -165,11 +166,7 @@ DERIVATIVES = {
 }
 
 
-FIRST, *SLOW = DERIVATIVES
-ORDERS = [FIRST, *(pytest.param(x, marks=pytest.mark.slow) for x in SLOW)]
-
-
-@pytest.mark.parametrize("orders", ORDERS)
+@pytest.mark.parametrize("orders", mostly_slow(DERIVATIVES, "first and third"))
 def test_derivatives_of_every_order_are_those_of_all_modes(orders):
     program = jax.jit(lambda t: [DERIVATIVES[orders](f)(t) for f in along_a_line()])
     for found, wanted in zip(*program(0.01), strict=True):
