@@ -27,7 +27,7 @@ def pytest_configure(config):
     # Most of a run is compilation. It takes a fifth less time so.
     # Split for several threads, of which workers have none to spare, it takes a tenth more.
     flags = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
-    passes = "while-loop-invariant-code-motion,simplify-while-loops"
+    passes = "while-loop-invariant-code-motion,simplify-while-loops,tree_reduction_rewriter"
     os.environ.setdefault("XLA_FLAGS", f"{flags} --xla_disable_hlo_passes={passes}")
     # Workers, subprocesses and later runs share what is compiled.
     from fractaljax._base import quick

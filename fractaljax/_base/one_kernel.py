@@ -29,12 +29,14 @@ _KNOWN = frozenset(_NAMES.split())
 _MOST_REDUCED = 1024  # numbers; more may go to a library
 
 
-def one_kernel(function: Callable, large: Any, *small: Any) -> Any:
+def one_kernel(function: Callable, large: Any, *small: Any, wanted: bool = True) -> Any:
     """function(large, *small), on a CPU one kernel where XLA can make one of its operations.
 
-    `large` are arrays of which the function changes a part. All others are small.
+    `large` are arrays of which the function changes a part. All others are small: where they are
+    not, one kernel is not `wanted`.
     """
-    if not _available() or not all(jnp.size(x) for x in jax.tree.leaves((large, small))):
+    empty = not all(jnp.size(x) for x in jax.tree.leaves((large, small)))
+    if empty or not wanted or not _available():
         return function(large, *small)
     program, out = jax.make_jaxpr(function, return_shape=True)(large, *small)
     if not all(_is_known(equation) for equation in equations(program.jaxpr)):

@@ -11,12 +11,15 @@ from .kept import is_traced, kept
 
 # Of XLA on CPU. Its fusion emitters take most of the time, and as much for a small loop as for a
 # large one. A program that runs many times is slower with these, by up to two thirds.
+_PASSES = "while-loop-invariant-code-motion,simplify-while-loops"
 _OPTIONS: dict[str, Any] = {
     "xla_backend_optimization_level": 1,
     "xla_cpu_use_fusion_emitters": False,
-    "xla_disable_hlo_passes": "while-loop-invariant-code-motion,simplify-while-loops",
+    "xla_disable_hlo_passes": _PASSES,
 }
-_RUNS_ONCE = _OPTIONS | {"xla_backend_optimization_level": 0}  # up to three times as slow
+# That pass makes long sums ones of short sums, which is more exact in float32. Ours are short.
+_OWN = _OPTIONS | {"xla_disable_hlo_passes": f"{_PASSES},tree_reduction_rewriter"}
+_RUNS_ONCE = _OWN | {"xla_backend_optimization_level": 0}  # up to three times as slow
 
 
 @functools.cache
@@ -34,7 +37,7 @@ def _available() -> bool:
 def quick_compilation() -> dict[str, Any]:
     """Options with which a program of yours compiles in about half the time, for `jax.jit`.
 
-    `jax.jit(function, compiler_options=fj.quick_compilation())`: fractaljax has them in programs
+    `jax.jit(function, compiler_options=fj.quick_compilation())`: fractaljax has such in programs
     of its own, but JAX takes them for the outermost program only. A program runs up to two thirds
     longer with them. Empty where the default backend is no CPU, or XLA does not know them.
     """
@@ -48,7 +51,7 @@ def quick_jit(
 
     `once` halves that again for a program which runs a few times, or on few numbers.
     """
-    plain, outermost = _jitted(function, static_argnames, _RUNS_ONCE if once else _OPTIONS)
+    plain, outermost = _jitted(function, static_argnames, _RUNS_ONCE if once else _OWN)
 
     @functools.wraps(plain)
     def call(*args, **kwargs):
@@ -59,7 +62,7 @@ def quick_jit(
 
 def outermost_jit(function: Callable, static_argnames: str | tuple[str, ...] = ()) -> Callable:
     """`quick_jit` of a program that is never traced, without the time to look whether it is."""
-    plain, outermost = _jitted(function, static_argnames, _OPTIONS)
+    plain, outermost = _jitted(function, static_argnames, _OWN)
 
     @functools.wraps(plain)
     def call(*args, **kwargs):
@@ -72,7 +75,7 @@ def command_jit(
     function: Callable, static_argnames: str | tuple[str, ...] = (), *, once: bool = False
 ) -> Callable:
     """`jax.jit`; a command, which runs the program a few times, compiles it as `quick_jit` does."""
-    plain, outermost = _jitted(function, static_argnames, _RUNS_ONCE if once else _OPTIONS)
+    plain, outermost = _jitted(function, static_argnames, _RUNS_ONCE if once else _OWN)
     return kept(plain, static_argnames, outermost, "once" if once else "")
 
 

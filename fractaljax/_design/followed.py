@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._base.quick import quick_jit
+from .._dynamics.acceptance import HARDLY, admissible, growth_of
 from .._dynamics.cycle import CycleResult
 from .._dynamics.limit_cycle import extreme_values, limit_cycle
 from .._dynamics.orbit import orbit, solve_periodic_orbits
 from .._dynamics.scaled import check_rtol, hybrid_system
-from .._dynamics.search import HARDLY, admissible, growth_of
 from .._dynamics.segments import Segments, mean_square
 from .._stability.stability import growth_rate
 from .constraints import CycleConstraint

@@ -27,11 +27,11 @@ OPEN = 2
 # excited system it is the maximum of the excitation, once in each of its periods.
 SECTION, NONE, UNUSED = 0, -1, -2
 _SMOOTH = 1e-4  # of the way to the opening: nearer, what a load curve adds is below rounding
-FEW = 4  # degrees of freedom up to which products are written out, which compile into one loop
+FEW = 4  # degrees of freedom up to which a product is a sum, which compiles into one loop
 
 
 class Products(eqx.Module):
-    """What a field takes of a state in one product: each would take as long as all together."""
+    """What a field takes of a state in one product, which runs and compiles as fast as one part."""
 
     matrix: Float[Array, "3f+n 2n"]  # L x, T u, T (K x + C u), K x + C u
     W: Float[Array, "f f"]  # T B
@@ -62,11 +62,11 @@ class HybridSystem(eqx.Module):
     # Of many degrees of freedom the largest rate of the mechanism without friction, within a per
     # cent: steps then follow the motion, as far as that allows. None: steps are those of rate 1.
     fastest: Float[Array, ""] | None = None
-    products: Products | None = None  # of many degrees of freedom
+    products: Products | None = None  # of a structure
 
     def with_products(self) -> "HybridSystem":
-        """With them, if it has many degrees of freedom; T, B, K and C are matrices then."""
-        if self.fastest is None or self.T is None or self.B is None:
+        """With them, if its faces have directions of their own; K and C are matrices then."""
+        if self.T is None or self.B is None:
             return self
         both, zero = jnp.concatenate([self.K, self.C], axis=1), jnp.zeros_like(self.T)
         seen = [jnp.concatenate([self.L, zero], axis=1), jnp.concatenate([zero, self.T], axis=1)]
@@ -136,13 +136,10 @@ class HybridSystem(eqx.Module):
         own = self.omega.ndim
         if matrix.ndim - own == 1:
             return self._leaf(matrix, x.ndim - 1) * x
-        if len(x) > FEW and not own:
+        if len(x) > 2 * FEW and not own:
             return jnp.tensordot(matrix, x, 1)
         matrix = self._leaf(matrix, x.ndim - 1)
-        if len(x) > FEW:
-            return jnp.sum(matrix * x[None], axis=1)
-        columns = (matrix[:, j] * x[j][None] for j in range(len(x)))
-        return sum(columns, start=jnp.zeros((), x.dtype))
+        return jnp.sum(matrix * x[None], axis=1)
 
     def along(self, x) -> Array:
         """t.x for each face (f, ...)."""
@@ -277,9 +274,9 @@ class HybridSystem(eqx.Module):
     def held(self, accelerations, held) -> Array:
         """Forces (f, ...) on the faces `held` that cancel their accelerations t.x'' (f, ...)."""
         wanted = jnp.where(held, -accelerations, 0)
-        if self.T is None or self.B is None:
+        if self.products is None:
             return wanted
-        W = self._leaf(jnp.sum(self.T[:, :, None] * self.B[None], axis=1), held.ndim - 1)
+        W = self._leaf(self.products.W, held.ndim - 1)
         own = jnp.eye(len(W), dtype=W.dtype).reshape(len(W), len(W), *(1,) * (held.ndim - 1))
         W = jnp.where(held[:, None] & held[None], W, own)
 

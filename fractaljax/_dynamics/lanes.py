@@ -49,10 +49,9 @@ def solve(W, b) -> Array:
     if len(b) == 1:
         return b / W[0]
     if len(b) == 2:
-        det = W[0, 0] * W[1, 1] - W[0, 1] * W[1, 0]
-        first = W[1, 1] * b[0] - W[0, 1] * b[1]
-        second = W[0, 0] * b[1] - W[1, 0] * b[0]
-        return jnp.stack([first, second]) / det[None]
+        entries = W.reshape(4, *W.shape[2:])
+        own, other = entries[::3], entries[1:3]
+        return (own[::-1] * b - other * b[::-1]) / (own[0] * own[1] - other[0] * other[1])[None]
     W, b = jnp.moveaxis(W, (0, 1), (-2, -1)), jnp.moveaxis(b, 0, -1)
     return jnp.moveaxis(jnp.linalg.solve(W, b[..., None])[..., 0], -1, 0)
 

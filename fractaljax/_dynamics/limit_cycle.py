@@ -1,7 +1,7 @@
 """The stick-slip limit cycle: amplitude, frequency and share of sticking, with gradients."""
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import jax
@@ -49,39 +49,31 @@ _RESULTS = (
 def _along(system: HybridSystem, y, s, t, row):
     """row @ y and its first two derivatives by time, each lane at its own time t."""
     y = flow(system, y, t, s)
-
-    def derivative(function):
-        return lambda y: jax.jvp(function, (y,), (system.field(y, s),))[1]
-
-    def value(y):
-        return jnp.sum(row * y, axis=0)
-
-    rate = derivative(value)
-    return value(y), rate(y), derivative(rate)(y)
+    rate = system.field(y, s)
+    _, change = jax.jvp(lambda y: system.field(y, s), (y,), (rate,))
+    return tuple(jnp.sum(row * x, axis=0) for x in (y, rate, change))
 
 
 def _lowest(x, count: int) -> tuple[Array, Array]:
     """The lowest values (r, count) in the rows of x (r, k), and where: quicker than sorting."""
-    x, found = x.T, []
-    for _ in range(count):
+
+    def without(x, _):
         k, least = first_least(x)
-        found.append((least, k))
-        x = jnp.where(row_numbers(x) == k[None], jnp.inf, x)
-    least, k = (jnp.stack(each, axis=1) for each in zip(*found, strict=True))
-    return least, k
+        return jnp.where(row_numbers(x) == k[None], jnp.inf, x), (least, k)
+
+    _, (least, k) = jax.lax.scan(without, x.T, length=count)
+    return least.T, k.T
 
 
 def extreme_values(system: HybridSystem, segments: Segments, rows) -> Float[Array, "2 r"]:
     """Smallest and largest value along the orbit of linear functions rows @ y, rows (r, 2n)."""
     y, h, s = segments.y, segments.duration, segments.s
-    ends = next_start(y)
-    along = (y, ends, h[None] * system.field(y, s), h[None] * system.field(ends, s))
-    values = (system.times(rows, x) for x in along)
-    g_0, g_1, d_0, d_1 = (jnp.concatenate([x, -x]) for x in values)
     rows = jnp.concatenate([rows, -rows])
+    (g_0, g_1), (d_0, d_1) = _at_nodes(system, segments, lambda x: system.times(rows, x))
     # Minima inside of segments, by the cubic through the ends. Of those nearly as low it cannot say
     # which is the lowest, so that a few are refined. A row at rest has none.
-    cubic, small = Cubic.through(g_0, g_1, d_0, d_1), jnp.max(rounding(y))
+    through = jax.lax.stop_gradient((g_0, g_1, d_0, d_1))
+    cubic, small = Cubic.through(*through), jnp.max(rounding(y))
     theta, inside = cubic.minimum()
     least = jnp.where(inside & (d_1 - d_0 > small / 64), cubic(theta), jnp.inf)
     least, k = (x.ravel() for x in _lowest(least, _MINIMA))
@@ -120,12 +112,19 @@ def extreme_values(system: HybridSystem, segments: Segments, rows) -> Float[Arra
     return jnp.stack([low, -high])
 
 
+def _at_nodes(system: HybridSystem, segments: Segments, values: Callable) -> tuple[Array, Array]:
+    """Linear `values` of the states at both ends of segments (2, ..., N), and their slopes."""
+    both = jnp.stack([segments.y, next_start(segments.y)], axis=1)
+    rates = segments.duration[None, None] * system.field(both, segments.s[:, None])
+    g, d = values(both), values(rates)
+    return jnp.moveaxis(g, -2, 0), jnp.moveaxis(d, -2, 0)
+
+
 def _time_below_zero(system: HybridSystem, segments: Segments, row, offset) -> Float[Array, ""]:
     """How long row @ y + offset is negative in one period."""
     y, h, s = segments.y, segments.duration, segments.s
-    ends = next_start(y)
-    g_0, g_1 = row @ y + offset, row @ ends + offset
-    d_0, d_1 = (h * (row @ system.field(at, s)) for at in (y, ends))
+    (g_0, g_1), (d_0, d_1) = _at_nodes(system, segments, lambda x: system.times(row[None], x)[0])
+    g_0, g_1 = g_0 + offset, g_1 + offset
     whole_segments = jnp.sum(jnp.where(g_0 < 0, h, 0))
     # In a segment with crossings: from its start to the first zero, and from the last to its end.
     sign, reversed_sign = jnp.where(g_0 < 0, -1, 1), jnp.where(g_0 * g_1 < 0, -1, 1)

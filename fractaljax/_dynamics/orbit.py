@@ -49,7 +49,7 @@ def _chain(body: Callable, carry, arrays: tuple, lanes: int, count=None) -> tupl
         return jax.lax.fori_loop(0, count, step, (carry, blank))
 
     given = (), carry, tuple(front), count
-    carry, found = one_kernel(run, *given) if carry.size <= _SMALL else run(*given)
+    carry, found = one_kernel(run, *given, wanted=carry.size <= _SMALL)
     return carry, jnp.moveaxis(found, 0, found.ndim - 1 - lanes)
 
 

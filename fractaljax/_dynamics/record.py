@@ -74,7 +74,10 @@ class Steps(eqx.Module):
 
     def row(self, row, number, lane) -> Array:
         """A row of the steps of those numbers in those lanes, or of `slice` several."""
-        return self.steps[row, (self.oldest + number) % self.length, lane]
+        place = jax.lax.rem(self.oldest + number + self.length, self.length)
+        row = row if isinstance(row, slice) else row % len(self.steps)
+        kept = self.steps.at[row, place, lane]
+        return kept.get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def step_weight(system: HybridSystem, y, s, least=1) -> Array:
@@ -139,7 +142,7 @@ class Record(Steps):
         motion = self.y, self.s, self.guard, self.sums, self.reach, some
         given = self.steps, motion, self.oldest, system, h
         small = lanes == 1 and system.n <= FEW
-        (y, s, guard, sums, reach, _), steps = one_kernel(run, *given) if small else run(*given)
+        (y, s, guard, sums, reach, _), steps = one_kernel(run, *given, wanted=small)
         known = jnp.minimum(self.count + count, self.length)
         oldest = (self.oldest + count) % self.length
         return Record(steps, oldest, y, s, guard, sums, reach, known)
@@ -167,6 +170,28 @@ class Record(Steps):
         return jnp.where((number == self.length - 1)[None], self.y[:, None], following)
 
 
+class Stretch(eqx.Module):
+    """Steps of g lanes: of their coarse runs, or of orbits that were found near these."""
+
+    run: Record
+    lane: Int[Array, " g"]  # of the run
+    orbit: Steps
+    of_run: Bool[Array, ""]
+
+    @property
+    def length(self) -> int:
+        """How many steps it holds at most."""
+        return self.run.length
+
+    def row(self, row, number) -> Array:
+        """A row of the steps of those numbers (g, k), or of `slice` several."""
+        # Both are looked up: what is done with a row compiles once, not once for each.
+        of_run = self.run.row(row, number, self.lane[:, None])
+        number = jnp.minimum(number, self.orbit.length - 1)
+        of_orbit = self.orbit.row(row, number, jnp.arange(len(number))[:, None])
+        return jnp.where(self.of_run, of_run, of_orbit)
+
+
 class Phases(eqx.Module):
     """Phases of motions in g lanes: steps of one contact state, from one return to another."""
 
@@ -176,29 +201,29 @@ class Phases(eqx.Module):
     weight: Float[Array, "g p"]
 
     @classmethod
-    def between(cls, steps: Steps, lane, first, last, most: int) -> "Phases":
-        """At most so many, from after step `first` (g,) to step `last` (g,) of lanes (g, 1)."""
+    def between(cls, steps: Stretch, first, last, most: int) -> "Phases":
+        """At most so many, from after step `first` (g,) to step `last` (g,)."""
         first, last = first[:, None], last[:, None]
         p = jnp.arange(most)[None]
-        before = steps.row(ENDED, first, lane)
-        exists = p < steps.row(ENDED, last, lane) - before
+        before = steps.row(ENDED, first)
+        exists = p < steps.row(ENDED, last) - before
         ends = first_reached(
-            lambda number: steps.row(ENDED, number, lane) > before + p, exists.shape, steps.length
+            lambda number: steps.row(ENDED, number) > before + p, exists.shape, steps.length
         )
         ends = jnp.where(exists, ends, first)
         starts = jnp.concatenate([first, ends[:, :-1]], axis=1)
-        weight = steps.row(WEIGHT, ends, lane) - steps.row(WEIGHT, starts, lane)
+        weight = steps.row(WEIGHT, ends) - steps.row(WEIGHT, starts)
         return cls(exists, starts + 1, ends, jnp.where(exists, weight, 0))
 
 
-def cut(system: HybridSystem, steps: Steps, lane, first, last, h, length: int) -> Segments:
-    """The steps after `first` (g,) up to `last` (g,) of lanes (g,) in at most `length` segments.
+def cut(system: HybridSystem, steps: Stretch, first, last, h, length: int) -> Segments:
+    """The steps after `first` (g,) up to `last` (g,) in at most `length` segments.
 
     Those of a phase have equal weight, at most h (g,) where so few suffice. Unused ones have no
     duration.
     """
-    lane, n = lane[:, None], 2 * system.n
-    phases = Phases.between(steps, lane, first, last, min(length, _PHASES))
+    n = 2 * system.n
+    phases = Phases.between(steps, first, last, min(length, _PHASES))
     # How many segments each phase has.
     free = jnp.maximum(length - jnp.sum(phases.exists, axis=-1), 1)
     h = jnp.maximum(h, jnp.sum(phases.weight, axis=-1) / free)[:, None]
@@ -214,22 +239,20 @@ def cut(system: HybridSystem, steps: Steps, lane, first, last, h, length: int) -
     )
     place = number[None] - before
     # The step in which each segment starts, and the time since then.
-    begin = steps.row(WEIGHT, low - 1, lane)
+    begin = steps.row(WEIGHT, low - 1)
     share = place.astype(h.dtype) / jnp.maximum(count, 1).astype(h.dtype)
     weight = begin + _take(phases.weight, phase) * share
-    at = first_reached(
-        lambda number: steps.row(WEIGHT, number, lane) > weight, low.shape, steps.length
-    )
+    at = first_reached(lambda number: steps.row(WEIGHT, number) > weight, low.shape, steps.length)
     at = jnp.clip(at, low, high)
     both = slice(TIME, ENDED)
-    time, begin = steps.row(both, at - 1, lane)
-    duration, own = steps.row(both, at, lane) - jnp.stack([time, begin])
+    time, begin = steps.row(both, at - 1)
+    duration, own = steps.row(both, at) - jnp.stack([time, begin])
     after = jnp.clip((weight - begin) / jnp.where(own > 0, own, 1), 0, 1) * duration
-    end = steps.row(TIME, last[:, None], lane)
+    end = steps.row(TIME, last[:, None])
     duration = jnp.diff(jnp.where(used, time + after, end), axis=-1, append=end)
-    guard = steps.row(GUARD, high, lane).astype(int)
+    guard = steps.row(GUARD, high).astype(int)
     guard = jnp.where(used, jnp.where(place + 1 == count, guard, NONE), UNUSED)
-    states = steps.row(slice(GUARD), at, lane)
+    states = steps.row(slice(GUARD), at)
     # An unused segment stays in the last contact state, at the first state.
     final = _take(states, jnp.maximum(until[:, -1:] - 1, 0)[None])
     states = jnp.where(used[None], states, final)

@@ -15,18 +15,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from .cycle import SQUARINGS
-from .events import Cubic
-from .hybrid import OPEN, SECTION, UNUSED, HybridSystem
-from .lanes import log_spectral_radius
-from .orbit import PeriodicOrbit, accurate_return_jacobian, solve_periodic_orbits
-from .record import ENDED, RETURNED, TIME, WEIGHT, Record, Steps, cut
-from .segments import Segments, cumulative, next_start
+from .acceptance import HARDLY, admissible, growth_of, has_shorter_period
+from .hybrid import OPEN, UNUSED, HybridSystem
+from .orbit import PeriodicOrbit, solve_periodic_orbits
+from .record import ENDED, RETURNED, TIME, WEIGHT, Record, Steps, Stretch, cut
+from .segments import Segments
 
-HARDLY = 1e-3  # growth in a period up to which an orbit that repels is kept
-_FEW_SQUARINGS, _UNSURE = 13, 1e-2  # of coarse Jacobians, and growth that they do not tell from 0
 _MESHES = 4  # on which a candidate is solved, each finer, until it is accurate
 
 RUNNING, CONVERGED, EQUILIBRIUM, DIVERGED, NOT_PERIODIC, EXHAUSTED, TOO_LONG = range(7)
@@ -74,64 +70,6 @@ class Attractor(eqx.Module):
     returns: Float[Array, "..."]  # of the run
 
 
-def _quintic(y, d, x):
-    """The quintic with values y (3, ...) and slopes d (3, ...) at 0, 1/2 and 1, at x."""
-    u, v, w = x, x - 0.5, x - 1
-    # Lagrange weights squared, each with the correction of its own slope.
-    at_0, at_m, at_1 = 4 * (v * w) ** 2, 16 * (u * w) ** 2, 4 * (u * v) ** 2
-    first, last = y[0] + u * (d[0] + 6 * y[0]), y[2] + w * (d[2] - 6 * y[2])
-    return at_0 * first + at_m * (y[1] + v * d[1]) + at_1 * last
-
-
-def admissible(system: HybridSystem, segments: Segments, middle) -> Bool[Array, " g"]:
-    """Whether orbits obey the friction law along their itinerary; `middle` are the midpoints.
-
-    No guard is below zero inside a segment, and every switch leads to the next contact state.
-    """
-    y, s, h, ends = segments.y, segments.s, segments.duration, next_start(segments.y)
-    at = jnp.stack([y, middle, ends])
-    d = jax.vmap(lambda y: h[None] * system.field(y, s))(at)
-    guards = jax.vmap(lambda y: system.guards(y, s)[1:])  # but the section
-    scale = 1 + jnp.max(jnp.abs(y), axis=(0, 1), keepdims=True)
-    # Half a segment each: the cubic through a guard's ends and a point between says where it is
-    # lowest. There the guard itself is evaluated.
-    places = jnp.arange(7) / 6
-    inside = jax.vmap(lambda x: _quintic(at, d, x))(places)
-    g = guards(inside)
-    cubics = (Cubic.at_thirds(g[:4]), Cubic.at_thirds(g[3:]))
-    lowest = []
-    for k, cubic in enumerate(cubics):
-        theta, _ = cubic.minimum()
-        theta = jnp.take_along_axis(theta, jnp.argmin(cubic(theta), axis=0)[None], axis=0)[0]
-        lowest.append(_quintic(at, d, (k + theta)[None] / 2))
-    g = jnp.concatenate([g, guards(jnp.stack(lowest))])
-    # The quintic is this good in a segment of the default length.
-    holds = jnp.all(g > -1e-8 * scale[None], axis=(0, 1)) & (h > -1e-10)
-    _, after = system.switch(ends, s, segments.guard)
-    return jnp.all(holds & jnp.all(after == next_start(s), axis=0), axis=0)
-
-
-def growth_of(system: HybridSystem, orbit: PeriodicOrbit) -> Float[Array, " g"]:
-    """ln of the largest Floquet multiplier, but the one of the motion itself, in modulus."""
-    growth = log_spectral_radius(orbit.return_jacobian, _FEW_SQUARINGS)
-    unsure = orbit.converged & (jnp.abs(growth) < _UNSURE)
-
-    def exactly():
-        jacobian = accurate_return_jacobian(system, orbit.segments)
-        return jnp.where(unsure, log_spectral_radius(jacobian, SQUARINGS), growth)
-
-    return jax.lax.cond(jnp.any(unsure), exactly, lambda: growth)
-
-
-def _has_shorter_period(orbit: Segments, returns) -> Bool[Array, " g"]:
-    """Whether orbits are back at their start before the last of their returns (g,)."""
-    start = orbit.y[:, :1]
-    away = jnp.max(jnp.abs(next_start(orbit.y) - start), axis=0)
-    at_section = orbit.guard == SECTION
-    early = at_section & (returns[None] > cumulative(at_section.T).T)
-    return jnp.any(early & (away < 1e-5 * (1 + jnp.max(jnp.abs(start), axis=0))), axis=0)
-
-
 def _no_segments(y, faces: int, length: int) -> Segments:
     """Unused ones, of orbits of the lanes of states y (2n, B)."""
     shape = (length, y.shape[1])
@@ -170,18 +108,13 @@ def _solved(system, record, lane, wanted, given: _Candidates, *, length, options
 
     def solve(carry):
         found, h, tries = carry
-
-        def of_the_run():
-            return cut(system, record, lane, given.first, given.last, h, length)
-
-        def of_the_orbit():
-            # Its phases have other lengths and weights than those of the steps.
-            steps, number = Steps.along(system, found.segments, h), jnp.arange(len(lane))
-            last = jnp.sum(found.segments.used, axis=0)
-            return cut(system, steps, number, 0 * last, last, h, length)
-
-        own = wanted & ((tries == 0) | unsettled(found))
-        segments = jax.lax.cond(tries == 0, of_the_run, of_the_orbit)
+        of_run = tries == 0
+        # The orbit's phases have other lengths and weights than those of the run.
+        steps = Stretch(record, lane, Steps.along(system, found.segments, h), of_run)
+        first = jnp.where(of_run, given.first, 0)
+        last = jnp.where(of_run, given.last, jnp.sum(found.segments.used, axis=0))
+        segments = cut(system, steps, first, last, h, length)
+        own = wanted & (of_run | unsettled(found))
         reach = options.reach * scale
         new = solve_periodic_orbits(system, segments, own, reach, given.rtol)
         # The method is of order 8; where the motion is not as smooth, halves do.
@@ -198,7 +131,7 @@ def _solved(system, record, lane, wanted, given: _Candidates, *, length, options
     growth = growth_of(system, found)
     ok = wanted & found.converged & near & moves & (growth < HARDLY)
     ok = ok & admissible(system, orbit, found.middle)
-    return orbit, jnp.stack([found.error, growth]), ok & ~_has_shorter_period(orbit, given.returns)
+    return orbit, jnp.stack([found.error, growth]), ok & ~has_shorter_period(orbit, given.returns)
 
 
 class _Progress(eqx.Module):

@@ -13,9 +13,9 @@ import fractaljax as fj
 import hybrid_truth
 from fractaljax._base.parts import substitute
 from fractaljax._dynamics import search
+from fractaljax._dynamics.acceptance import growth_of
 from fractaljax._dynamics.cycle import repels
 from fractaljax._dynamics.orbit import PeriodicOrbit
-from fractaljax._dynamics.search import growth_of
 from mechanisms import PLAIN, source_form
 from tools import both_modes, motionless_scene, reference_cycle, reference_scene, refusals, scene_of
 
