@@ -277,7 +277,7 @@ class HybridSystem(eqx.Module):
         if self.products is None:
             return wanted
         W = self._leaf(self.products.W, held.ndim - 1)
-        own = jnp.eye(len(W), dtype=W.dtype).reshape(len(W), len(W), *(1,) * (held.ndim - 1))
+        own = np.eye(len(W), dtype=W.dtype).reshape(len(W), len(W), *(1,) * (held.ndim - 1))
         W = jnp.where(held[:, None] & held[None], W, own)
 
         def solved():

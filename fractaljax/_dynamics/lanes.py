@@ -51,7 +51,7 @@ def solve(W, b) -> Array:
     if len(b) == 2:
         entries = W.reshape(4, *W.shape[2:])
         own, other = entries[::3], entries[1:3]
-        return (own[::-1] * b - other * b[::-1]) / (own[0] * own[1] - other[0] * other[1])[None]
+        return (own[::-1] * b - other * b[::-1]) / (own * own[::-1] - other * other[::-1])
     W, b = jnp.moveaxis(W, (0, 1), (-2, -1)), jnp.moveaxis(b, 0, -1)
     return jnp.moveaxis(jnp.linalg.solve(W, b[..., None])[..., 0], -1, 0)
 

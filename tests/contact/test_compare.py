@@ -100,9 +100,7 @@ def test_full_contact_is_infinitely_stiff():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "D, waves", [(2.1, 16), (2.1, 64), (2.5, 16), (2.5, 64), (2.9, 16), (2.9, 64)]
-)
+@pytest.mark.parametrize("D, waves", [(2.1, 16), (2.1, 64), (2.5, 16), (2.9, 64)])
 def test_persson_s_law_is_near_boundary_elements(D, waves):
     """Within 35 % below half contact, within a factor of 2 to nearly full; area and roughness."""
     n, side = 256, 5e-3
@@ -135,7 +133,7 @@ def random_phases(seed, D, sides, waves, n):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("D", [2.1, 2.3, 2.55, 2.8, 2.9])
+@pytest.mark.parametrize("D", [2.1, 2.55, 2.9])
 def test_persson_s_law_is_near_boundary_elements_on_surfaces_of_another_program(D):
     """Three loads on two areas, mean over seeds: 35 % below half contact, a factor of 2 beyond."""
     n, side, waves = 256, 5e-3, 32

@@ -48,7 +48,7 @@ def test_the_table_can_be_derived_again():
     """Rows of each regime by quadrature, digit for digit."""
     rng = random.Random(7)
     for regime in make_contact.REGIMES:
-        for row in rng.sample([row for row in ROWS if row["regime"] == regime], 12):
+        for row in rng.sample([row for row in ROWS if row["regime"] == regime], 4):
             assert make_contact.joint(row) == row
 
 

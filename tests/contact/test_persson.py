@@ -101,7 +101,7 @@ def test_stiffness_is_the_quadrature(point):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("point", POINTS[::2], ids=str)
+@pytest.mark.parametrize("point", POINTS[::3], ids=str)
 def test_slopes_are_those_of_the_quadrature(point, name):
     i = NAMES.index(name)
     with mpmath.workdps(40):
