@@ -60,8 +60,12 @@ def test_public_programs_lower_for_cuda(name):
     assert EIG not in found or "structure" in name or "batch" in name
 
 
+# Each compiles the search again, whose NaN the other cycles show.
+REPEATED = "limit_cycle, pressed", "limit_cycle, batch"
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PROGRAMS)
+@pytest.mark.parametrize("name", [name for name in PROGRAMS if name not in REPEATED])
 def test_what_is_invalid_is_nan(name):
     """Never a number that one could believe; the same program gives numbers for what is valid."""
     program = PROGRAMS[name]
