@@ -9,15 +9,15 @@ import jax.numpy as jnp
 
 from .kept import is_traced, kept
 
+_PASSES = "while-loop-invariant-code-motion,simplify-while-loops"
 # Of XLA on CPU. Its fusion emitters take most of the time, and as much for a small loop as for a
 # large one. A program that runs many times is slower with these, by up to two thirds.
-_PASSES = "while-loop-invariant-code-motion,simplify-while-loops"
 _OPTIONS: dict[str, Any] = {
     "xla_backend_optimization_level": 1,
     "xla_cpu_use_fusion_emitters": False,
     "xla_disable_hlo_passes": _PASSES,
 }
-# That pass makes long sums ones of short sums, which is more exact in float32. Ours are short.
+# This pass makes a long sum one of short sums, which is more exact in float32. Ours are short.
 _OWN = _OPTIONS | {"xla_disable_hlo_passes": f"{_PASSES},tree_reduction_rewriter"}
 _RUNS_ONCE = _OWN | {"xla_backend_optimization_level": 0}  # up to three times as slow
 

@@ -63,7 +63,9 @@ def solve_positive(W, b) -> Array:
     if len(b) > SMALL:
         # Many right-hand sides, such as tangents, share the inverse.
         return product(_positive_inverse(W), b[:, None])[:, 0]
-    A = jnp.concatenate([W, b[:, None]], axis=1)
+    lanes = jnp.broadcast_shapes(W.shape[2:], b.shape[1:])
+    parts = (jnp.broadcast_to(x, (*x.shape[:2], *lanes)) for x in (W, b[:, None]))
+    A = jnp.concatenate([*parts], axis=1)
     for k in range(len(b)):
         A = _eliminated(k, A)
     return A[:, -1]

@@ -115,8 +115,7 @@ def extreme_values(system: HybridSystem, segments: Segments, rows) -> Float[Arra
 def _at_nodes(system: HybridSystem, segments: Segments, values: Callable) -> tuple[Array, Array]:
     """Linear `values` of the states at both ends of segments (2, ..., N), and their slopes."""
     both = jnp.stack([segments.y, next_start(segments.y)], axis=1)
-    s = jnp.stack([segments.s, segments.s], axis=1)
-    rates = segments.duration[None, None] * system.field(both, s)
+    rates = segments.duration[None, None] * system.field(both, segments.s[:, None])
     g, d = values(both), values(rates)
     return jnp.moveaxis(g, -2, 0), jnp.moveaxis(d, -2, 0)
 

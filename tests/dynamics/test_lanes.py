@@ -38,3 +38,13 @@ def test_solution_and_its_derivatives(method, n):
     found, wanted = (jax.jit(lambda f=f: everything(f))() for f in (ours, theirs))
     for x, y in zip(found, wanted, strict=True):
         np.testing.assert_allclose(x, y, rtol=0, atol=1e-13 * max(1, abs(y).max()))
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 6, 7])
+def test_lanes_of_one_matrix(n):
+    """As of a matrix for each of them."""
+    rng = np.random.default_rng(n)
+    W, b = rng.standard_normal((n, n, 1)), rng.standard_normal((n, 4))
+    W = np.einsum("ikl,jkl->ijl", W, W) + n * np.eye(n)[:, :, None]
+    found = jax.jit(solve_positive)(W, b)
+    np.testing.assert_allclose(found, np.linalg.solve(W[:, :, 0], b), rtol=0, atol=1e-13)
