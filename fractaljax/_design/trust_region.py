@@ -2,7 +2,8 @@
 
 Growth rates cost eigenvalues and are linear in a step; what joints alone require costs next to
 nothing and is curved, so that steps keep to it as it is. What a step leaves unmet is penalised by
-its largest. (R. Fletcher, "Practical methods of optimization", 1987, sections 12.4 and 14.4.)
+its largest. Near coalescing modes growth rates bend sharply: a step that fails by that is corrected
+to second order. (R. Fletcher, "Practical methods of optimization", 1987, sections 12.4 and 14.4.)
 """
 
 import functools
@@ -21,6 +22,7 @@ _HARDER, _TIMES = 100.0, 2  # penalties of what is unmet
 _NEARLY = 0.1  # unmet by so little, it is worth a way of its own
 _INSIDE, _HELD = 1e-7, 1e-6  # by how much steps are inside limits, and within what one holds them
 _STEP_ITERATIONS = 40
+_POOR = 0.25  # share of what a step promised, below which it is corrected, and the next is shorter
 _FLAT = 1e-8  # of a change of slopes and a step: nothing is learnt
 
 
@@ -74,6 +76,13 @@ class Local(NamedTuple):
             unmet=self.unmet + self.unmet_slopes @ step,
         )
 
+    def bent(self, step: np.ndarray, there: "Local") -> "Local":
+        """The same, with residuals shifted so that the slopes give after `step` what is there."""
+        return self._replace(
+            aimed=there.aimed - self.aimed_slopes @ step,
+            unmet=there.unmet - self.unmet_slopes @ step,
+        )
+
 
 def in_trust_region(
     at: Callable[[np.ndarray], Local],
@@ -122,12 +131,21 @@ def _descended(at, u, learnt, limits, curvature, accuracy, radius, penalty):
         if promised <= accuracy.gain * abs(here.merit(penalty)):
             break
         there, steps = at(u + step), steps + 1
-        learnt = _learnt(here, there, expected, step, bounds, held, learnt, curvature, penalty)
         ratio = (here.merit(penalty) - there.merit(penalty)) / promised
+        if ratio < _POOR and there.excess > expected.excess:
+            bent = here.bent(step, there)
+            other, *others = _step(bent, limits, u, learnt, radius, penalty)
+            if others[1] is not None:
+                end, steps = at(u + other), steps + 1
+                if end.merit(penalty) < min(here.merit(penalty), there.merit(penalty)):
+                    step, (bounds, held), there = other, others, end
+                    expected = here.moved(step, learnt)
+                    ratio = (here.merit(penalty) - there.merit(penalty)) / promised
+        learnt = _learnt(here, there, expected, step, bounds, held, learnt, curvature, penalty)
         length = float(np.abs(step).max())
         if ratio <= 0.05:
             radius = min(radius, length) / 2.5
-        elif ratio < 0.25:
+        elif ratio < _POOR:
             radius = max(length, radius / 4) / 2
         elif ratio > 0.6 and length > 0.9 * radius:
             radius = min(2 * radius, _RADIUS_MAX)

@@ -127,12 +127,12 @@ def test_a_design_of_many_joints_stays_near():
     x = several_joints(4, mu=0.5)
     found = fj.design(x, bounds_of(x), progress=False)
     assert not found.violated and found.growth_rate <= found.target
-    assert found.value < 0.0035
-    # With the limits of joints among the other requirements the nearest was at 0.00391.
+    assert found.value < 0.002531
+    # Without corrections to second order it ends at 0.00385 to 0.00386, by the processor.
     x = several_joints(4, mu=0.5)
     found = fj.design(x, bounds_of(x), envelope={"j0.mu": (0.45, 0.6)}, progress=False)
     assert not found.violated and found.growth_rate <= found.target
-    assert found.value < 0.00386
+    assert found.value < 0.003848
 
 
 @functools.cache

@@ -105,6 +105,18 @@ def test_it_comes_back_from_a_cliff_without_a_slope():
     np.testing.assert_allclose(u, [0.6, 0.0], atol=1e-4)
 
 
+def test_along_a_sharply_bent_edge():
+    """Steps along its tangent leave it at once: they are corrected to second order."""
+
+    def c(u):
+        return 3e4 * ((u - 0.5) @ (u - 0.5) - 0.16)
+
+    at, _ = asked(lambda u: u[0] + 0.05 * u[1], c)
+    u = in_trust_region(at, free, np.array([0.7, 0.8]), 0.0, FINE, 10.0, 1e-9)
+    down = np.array([1, 0.05]) / np.hypot(1, 0.05)
+    np.testing.assert_allclose(u, 0.5 - 0.4 * down, atol=1e-4)
+
+
 def test_a_rough_way_takes_fewer_steps_and_ends_near():
     """Rosenbrock's valley, scaled to the bounds."""
 
