@@ -182,7 +182,7 @@ _SMOOTH = 1e-6  # m/s: sgn(w) is tanh(w/_SMOOTH) for SciPy
 def _cycle_by_scipy(K_n):
     """Period, share of sticking, peak-to-peak x1 and x2, largest dx2/dt, and the orbit (4, n).
 
-    Of Eq. 44, by LSODA with a smooth sgn, after 40 periods from near the equilibrium.
+    Of Eq. 44, by LSODA with a smooth sgn, after 80 periods from near the equilibrium.
     """
     K_t, (w_1, w_2), (xi_1, xi_2) = K_n / 2, (2000 * np.pi, 1600 * np.pi), (0.001, 0.007)
     drop = (_MU_S - _MU_M) / (2 * _V_M)
@@ -196,22 +196,26 @@ def _cycle_by_scipy(K_n):
         a_2 = -_F / np.sqrt(2) - mu(_V - v_2) * K_t * x_1 - 2 * xi_2 * w_2 * v_2
         return [v_1, v_2, a_1 - (w_1**2 + K_t) * x_1, a_2 - (w_2**2 + K_n) * x_2]
 
-    def maximum(_, y):
-        return y[2]
+    def slides(_, y):
+        return abs(_V - y[2]) - 10 * _SMOOTH
 
-    maximum.direction = -1
+    # Extremes of both directions, and sticking, between steps: the steps alone miss them by 4e-4.
+    events = [lambda _, y: y[2], lambda _, y: y[3], slides]
     period = 2 * np.pi / np.sqrt(w_1**2 + w_2**2 + K_n) * 1.05
     options = {"method": "LSODA", "rtol": 1e-8, "atol": [1e-14, 1e-14, 1e-10, 1e-10]}
     found = solve_ivp(
-        rate, (0, 40 * period), [9e-6, 0, 0, 0], events=maximum, max_step=period / 100, **options
+        rate, (0, 80 * period), [9e-6, 0, 0, 0], events=events, max_step=period / 100, **options
     )
-    first, last = found.t_events[0][-2:]
-    inside = (found.t >= first) & (found.t <= last)
-    t, orbit = found.t[inside], found.y[:, inside]
-    sticks = np.abs(_V - orbit[2]) < 1e-4 * _V
-    both = sticks[1:] & sticks[:-1]
-    share = np.sum(np.diff(t)[both]) / (last - first)
-    return last - first, share, np.ptp(orbit[0]), np.ptp(orbit[1]), orbit[3].max(), orbit
+    first, last = found.t_events[0][[-3, -1]]
+    sizes = [
+        np.ptp(states[(times >= first) & (times <= last), i])
+        for i, (times, states) in enumerate(zip(found.t_events[:2], found.y_events, strict=False))
+    ]
+    # Entries and exits alternate; of the last few stays the longest is that of sticking.
+    change = found.t_events[2]
+    share = np.diff(change[: len(change) // 2 * 2])[::2][-4:].max() / (last - first)
+    orbit = found.y[:, (found.t >= first) & (found.t <= last)]
+    return last - first, share, *sizes, orbit[3].max(), orbit
 
 
 def _cycles() -> Found:
@@ -228,8 +232,8 @@ def _cycles() -> Found:
     slides = "printed as pure sliding, below 1; direction 2 reverses its sliding in every period"
     checks = [
         solved("period at 4e8 N/m [s]", middle[0], cycle.period, 1e-4),
-        solved("peak to peak of x1 at 4e8 N/m [m]", middle[2], size[1, 0], 2e-3),
-        solved("peak to peak of x2 at 4e8 N/m [m]", middle[3], size[1, 1], 2e-3),
+        solved("peak to peak of x1 at 4e8 N/m [m]", middle[2], size[1, 0], 1e-4),
+        solved("peak to peak of x2 at 4e8 N/m [m]", middle[3], size[1, 1], 1e-4),
         Check(
             "x1 at 5e8 over x1 at 3e8 N/m (falls) [-]",
             (0.0, 1.0),
@@ -248,7 +252,7 @@ def _cycles() -> Found:
             "share of sticking at 5e8 over that at 3e8 N/m [-]",
             theirs[2][1] / theirs[0][1],
             share[2] / share[0],
-            0.05,
+            0.01,
             CORRECTED,
             f"{rises}where the article has it fall. SciPy smooths sgn(w) over 1e-6 m/s",
         ),
