@@ -23,6 +23,7 @@ _NEARLY = 0.1  # unmet by so little, it is worth a way of its own
 _INSIDE, _HELD = 1e-7, 1e-6  # by how much steps are inside limits, and within what one holds them
 _STEP_ITERATIONS = 40
 _POOR = 0.25  # share of what a step promised, below which it is corrected, and the next is shorter
+_CORRECTION = 0.5  # share of a step, above which a correction is not worth an evaluation
 _FLAT = 1e-8  # of a change of slopes and a step: nothing is learnt
 
 
@@ -133,9 +134,9 @@ def _descended(at, u, learnt, limits, curvature, accuracy, radius, penalty):
         there, steps = at(u + step), steps + 1
         ratio = (here.merit(penalty) - there.merit(penalty)) / promised
         if ratio < _POOR and there.excess > expected.excess:
-            bent = here.bent(step, there)
-            other, *others = _step(bent, limits, u, learnt, radius, penalty)
-            if others[1] is not None:
+            other, *others = _step(here.bent(step, there), limits, u, learnt, radius, penalty)
+            small = np.abs(other - step).max() <= _CORRECTION * np.abs(step).max()
+            if small and others[1] is not None:
                 end, steps = at(u + other), steps + 1
                 if end.merit(penalty) < min(here.merit(penalty), there.merit(penalty)):
                     step, (bounds, held), there = other, others, end
