@@ -12,9 +12,10 @@ from .._base.quick import outermost_jit
 from .._mechanism.quantities import joints_of
 from .joints import states_of
 from .problem import UNKNOWN, DesignProblem
-from .rows import BATCH, paired
+from .rows import paired
 from .tolerance import quantile
 
+_BATCH = 8  # designs: of a step in a trust region there are few at once
 _INSIDE, _INSIDE_STEPS = 0.01, 40  # by how much designs that are screened are inside the limits
 
 Limits = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -24,26 +25,16 @@ def limits_of_joints(problem: DesignProblem) -> Limits:
     """A function: what joints alone require (n, r) of designs (n, v), and Jacobians.
 
     Each design is at a condition (n, c). Stiffness counts by its logarithm, which many steps of a
-    design change evenly. To take the problem apart once, not at each call, and to fill up no batch
-    saves three quarters of a call.
+    design change evenly. To take the problem apart once, not at each call, saves half of a call.
     """
     leaves, structure = jax.tree.flatten(problem)
     program = functools.partial(_limits_of_joints, leaves, structure=structure)
     dtype = problem.low.dtype
 
     def limits(us, conditions):
-        single = len(us) <= BATCH and not problem.conditions
-        pairs = np.asarray(us, dtype), np.asarray(conditions, dtype)
-        return in_batches(program, 1 if single else BATCH, *pairs)
+        return in_batches(program, _BATCH, np.asarray(us, dtype), np.asarray(conditions, dtype))
 
     return limits
-
-
-def limits_at(limits: Limits, us: np.ndarray, conditions: np.ndarray):
-    """What joints alone require (n, m r) of us (n, v) at conditions (m, c), and Jacobians."""
-    residuals, slopes = limits(*paired(us, conditions))
-    n, v = us.shape
-    return residuals.reshape(n, -1), slopes.reshape(n, -1, v)
 
 
 def within_joints(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray) -> np.ndarray:
@@ -53,10 +44,11 @@ def within_joints(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray
     where no growth rate says anything. Their limits take no eigenvalues. By Levenberg and
     Marquardt's method.
     """
-    limits = limits_of_joints(problem)
+    limits, (n, v) = limits_of_joints(problem), us.shape
 
     def lacking(us):
-        residuals, slopes = limits_at(limits, us, conditions)
+        residuals, slopes = limits(*paired(us, conditions))
+        residuals, slopes = residuals.reshape(n, -1), slopes.reshape(n, -1, v)
         r = np.clip(np.nan_to_num(residuals, nan=UNKNOWN) + _INSIDE, 0, UNKNOWN)
         return r, np.nan_to_num(slopes) * (r > 0)[:, :, None]
 

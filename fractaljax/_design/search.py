@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .evaluator import Evaluation, Evaluator, OnAverage
-from .joint_limits import limits_at, limits_of_joints, within_joints
+from .joint_limits import limits_of_joints, within_joints
 from .problem import UNKNOWN, DesignProblem
 from .rows import linearise
 from .solvers import Solver
@@ -119,11 +119,12 @@ def _least_violated(functions: _Functions, start: np.ndarray) -> np.ndarray:
     return least_squares(unmet, np.clip(start, 1e-3, 1 - 1e-3), **more).x
 
 
-def in_lockstep(tasks: Sequence[Callable], answer: Callable[[list], list]) -> list:
+def in_lockstep(tasks: Sequence[Callable], answer: Callable[[dict], dict]) -> list:
     """The results of tasks, each a function of `ask`, run side by side.
 
     What all of them ask next is answered at once, in this thread: one call of a compiled program
-    costs about as much for many designs as for one.
+    costs about as much for many designs as for one. `answer` takes {task: question}, and may leave
+    some to be asked again with those of the tasks that it answers.
     """
     asked, replies = queue.SimpleQueue(), [queue.SimpleQueue() for _ in tasks]
 
@@ -141,15 +142,17 @@ def in_lockstep(tasks: Sequence[Callable], answer: Callable[[list], list]) -> li
             asked.put((i, None))
 
     with concurrent.futures.ThreadPoolExecutor(max(1, len(tasks))) as pool:
-        results, running = [pool.submit(run, i) for i in range(len(tasks))], len(tasks)
+        results = [pool.submit(run, i) for i in range(len(tasks))]
+        questions, due = {}, len(tasks)
         try:
-            while running:
-                questions = dict(asked.get() for _ in range(running))
-                pending = [i for i in sorted(questions) if questions[i] is not None]
-                running = len(pending)
-                answers = answer([questions[i] for i in pending]) if pending else []
-                for i, reply in zip(pending, answers, strict=True):
+            while due:
+                questions |= dict(asked.get() for _ in range(due))
+                questions = {i: questions[i] for i in sorted(questions) if questions[i] is not None}
+                answers = answer(questions) if questions else {}
+                for i, reply in answers.items():
+                    del questions[i]
                     replies[i].put(reply)
+                due = len(answers)
         except BaseException as error:  # the others wait for a reply
             for reply in replies:
                 reply.put(error)
@@ -411,7 +414,7 @@ class Search:
             if self.solver:
                 end = self._solved(functions, path[-1], how)
             else:
-                end, merit = self._stepped(functions, path[-1], how, working)
+                end, merit = self._stepped(functions, path[-1], how, working, ask)
             path += [*functions.seen, end]
             new = ask((self.evaluator.exchange, path[-1], working))
             if not len(new):
@@ -432,7 +435,7 @@ class Search:
         z = solver(functions.objective, functions.constraints, start, bounds)
         return np.clip(np.asarray(z, float)[:v], 0, 1)
 
-    def _stepped(self, functions: _Functions, start: np.ndarray, accuracy: Accuracy, working):
+    def _stepped(self, functions: _Functions, start, accuracy: Accuracy, working, ask):
         """Where steps in a trust region end, and what is left there to lower.
 
         The limits of joints are those at the working conditions (m, c).
@@ -456,12 +459,12 @@ class Search:
                 *_compressed(unmet, slopes[:, limited].reshape(-1, v)),
             )
 
-        of_joints, slack = limits_of_joints(problem), self.slack.max()
+        slack = self.slack.max()
 
         def limits(u):
             if not keep:
                 return np.zeros(0), np.zeros((0, v))
-            residuals, slopes = (x[0] for x in limits_at(of_joints, u[None], working))
+            residuals, slopes = ask((self._limits, u, working))
             residuals, slopes = _finite(residuals, slopes)
             return _compressed(residuals + slack, slopes)
 
@@ -475,19 +478,39 @@ class Search:
         return end, at(end).merit(1.0)
 
     def _answer(self, questions):
-        """What (method, design (v,), working conditions (m, c)) ask, each method once for all."""
+        """What (method, design (v,), working conditions (m, c)) ask, each method once for all.
+
+        What takes no eigenvalues first: more tasks then ask together for what does.
+        """
+        methods = [self._linearise, self.evaluator.exchange]
+        if any(question[0] == self._limits for question in questions.values()):
+            methods = [self._limits]
         replies: dict[int, Any] = {}
-        for method in (self._linearise, self.evaluator.exchange):
-            asked = [i for i, question in enumerate(questions) if question[0] == method]
+        for method in methods:
+            asked = [i for i, question in questions.items() if question[0] == method]
             if asked:
                 us, working = zip(*(questions[i][1:] for i in asked), strict=True)
                 replies |= zip(asked, method(np.array(us), working), strict=True)
-        return [replies[i] for i in range(len(questions))]
+        return replies
 
     def _linearise(self, us, working):
         """Rows and Jacobians of each of us (n, v) at its working conditions."""
-        counts = [len(conditions) for conditions in working]
-        many = np.repeat(us, counts, axis=0)
-        found = linearise(self.evaluator.problem, many, np.concatenate(working))[:2]
-        pieces = (np.split(x, np.cumsum(counts)[:-1]) for x in found)
-        return [self.evaluator.average(*piece) for piece in zip(*pieces, strict=True)]
+        linearised = functools.partial(linearise, self.evaluator.problem)
+        return [self.evaluator.average(*piece) for piece in _at_each(linearised, us, working)]
+
+    def _limits(self, us, working):
+        """Residuals of joints and their slopes, of each of us (n, v) at its working conditions."""
+        pieces = _at_each(self._limits_of_joints, us, working)
+        return [(r.ravel(), slopes.reshape(-1, us.shape[1])) for r, slopes in pieces]
+
+    @functools.cached_property
+    def _limits_of_joints(self):
+        return limits_of_joints(self.evaluator.problem)
+
+
+def _at_each(function, us, working) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Values and slopes of each of us (n, v) at its own conditions (m, c), in one call."""
+    counts = [len(conditions) for conditions in working]
+    found = function(np.repeat(us, counts, axis=0), np.concatenate(working))[:2]
+    pieces = (np.split(x, np.cumsum(counts)[:-1]) for x in found)
+    return list(zip(*pieces, strict=True))

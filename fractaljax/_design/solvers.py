@@ -21,11 +21,13 @@ def slsqp(objective: Callable, constraints: Callable, start: np.ndarray, bounds:
     return minimized(objective, start, bounds, limits, 100)
 
 
-def minimized(objective: Callable, start: np.ndarray, bounds: Any, constraints: Any, steps: int):
+def minimized(
+    objective: Callable, start: np.ndarray, bounds: Any, constraints: Any, steps: int, ftol=1e-12
+):
     """The point (n,) at which SLSQP ends; `objective` gives value and gradient."""
     from scipy.optimize import minimize
 
-    more: Any = {"method": "SLSQP", "options": {"ftol": 1e-12, "maxiter": steps}}
+    more: Any = {"method": "SLSQP", "options": {"ftol": ftol, "maxiter": steps}}
     with warnings.catch_warnings():
         # Before SciPy 1.16 a step may leave a bound by rounding, and says so.
         warnings.filterwarnings("ignore", "Values in x were outside bounds", RuntimeWarning)

@@ -22,6 +22,7 @@ _HARDER, _TIMES = 100.0, 2  # penalties of what is unmet
 _NEARLY = 0.1  # unmet by so little, it is worth a way of its own
 _INSIDE, _HELD = 1e-7, 1e-6  # by how much steps are inside limits, and within what one holds them
 _STEP_ITERATIONS = 40
+_EXACT, _LEAST = 1e-2, 1e-12  # what is lost by a step: as a share of the gain, and at least
 _POOR = 0.25  # share of what a step promised, below which it is corrected, and the next is shorter
 _CORRECTION = 0.5  # share of a step, above which a correction is not worth an evaluation
 _FLAT = 1e-8  # of a change of slopes and a step: nothing is learnt
@@ -123,7 +124,8 @@ def _descended(at, u, learnt, limits, curvature, accuracy, radius, penalty):
     """As far down the merit as it goes, the curvature there, and what is unmet."""
     here, steps = at(u), 0
     while steps < accuracy.steps and radius >= accuracy.radius:
-        step, bounds, held = _step(here, limits, u, learnt, radius, penalty)
+        exact = max(_EXACT * accuracy.gain * abs(here.merit(penalty)), _LEAST)
+        step, bounds, held = _step(here, limits, u, learnt, radius, penalty, exact)
         expected = here.moved(step, learnt)
         promised = here.merit(penalty) - expected.merit(penalty)
         if held is None or promised <= 0:  # none was found inside the limits
@@ -134,7 +136,9 @@ def _descended(at, u, learnt, limits, curvature, accuracy, radius, penalty):
         there, steps = at(u + step), steps + 1
         ratio = (here.merit(penalty) - there.merit(penalty)) / promised
         if ratio < _POOR and there.excess > expected.excess:
-            other, *others = _step(here.bent(step, there), limits, u, learnt, radius, penalty)
+            other, *others = _step(
+                here.bent(step, there), limits, u, learnt, radius, penalty, exact
+            )
             small = np.abs(other - step).max() <= _CORRECTION * np.abs(step).max()
             if small and others[1] is not None:
                 end, steps = at(u + other), steps + 1
@@ -155,7 +159,7 @@ def _descended(at, u, learnt, limits, curvature, accuracy, radius, penalty):
     return u, learnt, here.excess
 
 
-def _step(here: Local, limits: Limits, u, curvature, radius, penalty):
+def _step(here: Local, limits: Limits, u, curvature, radius, penalty, exact):
     """The best step (v,) by slopes and curvature, its bounds (v, 2), and the slopes of limits.
 
     These (h, v) are of the limits that hold it; None where it is outside of one.
@@ -193,7 +197,7 @@ def _step(here: Local, limits: Limits, u, curvature, radius, penalty):
     start = np.concatenate([np.zeros(v), [here.largest, here.excess]])
     asked = {"type": "ineq", "fun": constraints, "jac": slopes}
     all_bounds = [*bounds, largest, (0.0, np.inf)]
-    end = minimized(merit, start, all_bounds, asked, _STEP_ITERATIONS)
+    end = minimized(merit, start, all_bounds, asked, _STEP_ITERATIONS, exact)
     step = np.clip(end[:v], *bounds.T)
     residuals, of_limits = limits_at(step)
     inside = residuals.max(initial=-np.inf) <= 0

@@ -80,11 +80,13 @@ def test_tasks_in_lockstep_are_answered_together_and_in_this_thread():
 
     def answer(questions):
         assert threading.get_ident() == here
-        asked.append(questions)
-        return [10 * question for question in questions]
+        asked.append(dict(questions))
+        # What has an even number waits for those without.
+        odd = {i: n for i, n in questions.items() if n % 2} or questions
+        return {i: 10 * n for i, n in odd.items()}
 
     assert in_lockstep([task(count) for count in (3, 1, 2)], answer) == [90, 10, 40]
-    assert asked == [[3, 1, 2], [3, 2], [3]]
+    assert asked == [{0: 3, 1: 1, 2: 2}, {0: 3, 2: 2}, {0: 3, 2: 2}, {2: 2}, {2: 2}]
 
     def interrupt(questions):
         raise KeyboardInterrupt
