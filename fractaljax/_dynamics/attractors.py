@@ -1,7 +1,7 @@
 """The distinct attractors of a mechanism, found from many starts."""
 
+import functools
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,10 +9,11 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from .._base.parts import number
+from .._base.quick import quick_jit
 from .._mechanism.mechanism import Mechanism
 from .cycle import CycleResult, LimitCycle
 from .excitation import Excitation
-from .limit_cycle import limit_cycle
+from .limit_cycle import STATIC, checked, posed, refined, solved
 from .scaled import degrees_of_freedom, hybrid_system
 
 
@@ -38,10 +39,9 @@ def attractors(
     starts = number("starts", jnp.asarray(starts, dtype=float))
     if starts.ndim != 2 or starts.shape[1] != 2 * n:
         raise ValueError(f"starts must have shape (k, {2 * n}), got {starts.shape}")
-    options: dict[str, Any] = {"excitation": excitation, "rtol": rtol, "throw": False}
-    cycles = jax.vmap(
-        lambda start: limit_cycle(mechanism, start, max_returns=max_returns, **options)
-    )(starts)
+    returns, segments, static = checked(mechanism, starts, excitation, rtol, max_returns)
+    system, growth = posed(mechanism, excitation)
+    cycles = _from_each(system, growth, starts, returns, segments=segments, **static)
     distinct: list[LimitCycle] = []
     for i in range(len(starts)):
         cycle = jax.tree.map(lambda x, i=i: x[i], cycles)
@@ -49,11 +49,20 @@ def attractors(
             continue
         if bool(cycle.result == CycleResult.inaccurate):
             # On its own it gets the segments it needs. It may then equal a known one.
-            cycle = limit_cycle(mechanism, cycle.state, **options)
+            cycle = refined(cycle, (system, growth, cycle.state, returns), segments, static)
             if any(_same(cycle, other) for other in distinct):
                 continue
         distinct.append(cycle)
     return distinct
+
+
+@functools.partial(quick_jit, static_argnames=STATIC)
+def _from_each(
+    system, growth, starts, returns, *, of_scene: bool, segments: int, rtol: float
+) -> LimitCycle:
+    """The cycles (k,) that starts (k, 2n) end in."""
+    static = {"of_scene": of_scene, "segments": segments, "rtol": rtol}
+    return jax.vmap(lambda start: solved(system, growth, start, returns, **static))(starts)
 
 
 @jax.jit

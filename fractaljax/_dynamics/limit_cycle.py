@@ -161,9 +161,12 @@ def _monodromy(system: HybridSystem, segments: Segments, local: Maps) -> Float[A
     return product
 
 
+STATIC = "of_scene", "segments", "rtol"  # of the cycle's program
+
+
 # Apart from the cycle's program, which another contact law then does not compile again.
 @functools.partial(quick_jit, once=True)
-def _posed(mechanism: Mechanism, excitation) -> tuple[HybridSystem, Float[Array, ""]]:
+def posed(mechanism: Mechanism, excitation) -> tuple[HybridSystem, Float[Array, ""]]:
     """The scaled system, and its growth rate at the equilibrium."""
     system = excited_system(mechanism, excitation)
     # An excited motion does not end in equilibrium.
@@ -171,8 +174,8 @@ def _posed(mechanism: Mechanism, excitation) -> tuple[HybridSystem, Float[Array,
     return system, growth / system.omega
 
 
-@functools.partial(quick_jit, static_argnames=("of_scene", "segments", "rtol"))
-def _limit_cycle(
+@functools.partial(quick_jit, static_argnames=STATIC)
+def solved(
     system: HybridSystem, growth, start, max_returns, *, of_scene: bool, segments: int, rtol: float
 ) -> LimitCycle:
     frozen, equilibrium, growth = jax.lax.stop_gradient((system, system.equilibrium(), growth))
@@ -252,13 +255,36 @@ def _limit_cycle(
     )
 
 
-def _needs_more_segments(cycle: LimitCycle, count: int) -> bool:
-    """Known only of one cycle outside of a compiled program."""
+def refined(cycle: LimitCycle, arguments: tuple, count: int, static: dict) -> LimitCycle:
+    """A cycle found with `count` segments, again with as many as a long period needs.
+
+    Known only of one cycle outside of a compiled program.
+    """
     if concrete(cycle.period) is None or cycle.period.ndim:
-        return False
-    # 512 segments keep 16,384 steps: a motion without a period shall not take longer.
-    too_long = bool(cycle.result == CycleResult.too_long) and count < 8 * _SEGMENTS
-    return too_long or bool(cycle.result == CycleResult.inaccurate)
+        return cycle
+    while count < _MOST_SEGMENTS:
+        # 512 segments keep 16,384 steps: a motion without a period shall not take longer.
+        too_long = bool(cycle.result == CycleResult.too_long) and count < 8 * _SEGMENTS
+        if not too_long and not bool(cycle.result == CycleResult.inaccurate):
+            break
+        count *= 8
+        cycle = solved(*arguments, segments=count, **static)
+    return cycle
+
+
+def checked(mechanism, start, excitation, rtol, max_returns, segments=None):
+    """Options of a search: `max_returns` as a number, how many segments, and what is static."""
+    n, joints = degrees_of_freedom(mechanism), joints_of(mechanism)
+    if excitation is not None:
+        require_kind("excitation", excitation, Excitation)
+    rtol = check_rtol(rtol, jnp.result_type(*jax.tree.leaves((mechanism, start, excitation))))
+    returns = jnp.asarray(whole("max_returns", max_returns, 1), float)
+    count = _SEGMENTS if segments is None else whole("segments", segments, 16)
+    if segments is None and any(x.follows_load_curve for x in joints.values()):
+        count *= 8  # towards an opening segments are short: less than a second compilation
+    elif segments is None and (n > FEW or len(joints) > 1):
+        count *= 4  # a period may be long beside that of the highest frequency, or of many phases
+    return returns, count, {"of_scene": isinstance(mechanism, Scene), "rtol": rtol}
 
 
 def limit_cycle(
@@ -317,31 +343,17 @@ def limit_cycle(
     precision can hold, less than 16 segments or max_returns below 1; `RuntimeError` if `throw`.
     Under a trace (`jit`, `vmap`) everything is NaN instead.
     """
-    n = degrees_of_freedom(mechanism)
-    start = None if start is None else start_state(start, n)
-    if excitation is not None:
-        require_kind("excitation", excitation, Excitation)
+    start = None if start is None else start_state(start, degrees_of_freedom(mechanism))
     given = mechanism, start, excitation
-    tolerance = check_rtol(rtol, jnp.result_type(*jax.tree.leaves(given)))
-    returns = jnp.asarray(whole("max_returns", max_returns, 1), float)
-    count = _SEGMENTS if segments is None else whole("segments", segments, 16)
-    joints = joints_of(mechanism)
-    if segments is None and any(x.follows_load_curve for x in joints.values()):
-        count *= 8  # towards an opening segments are short: less than a second compilation
-    elif segments is None and (n > FEW or len(joints) > 1):
-        count *= 4  # a period may be long beside that of the highest frequency, or of many phases
-    arguments = *_posed(mechanism, excitation), start, returns
-    options = {"of_scene": isinstance(mechanism, Scene), "rtol": tolerance}
-    cycle = _limit_cycle(*arguments, segments=count, **options)
-    while segments is None and count < _MOST_SEGMENTS and _needs_more_segments(cycle, count):
-        # A long period, or one of many returns.
-        count *= 8
-        cycle = _limit_cycle(*arguments, segments=count, **options)
+    returns, count, static = checked(*given, rtol, max_returns, segments)
+    arguments = *posed(mechanism, excitation), start, returns
+    cycle = solved(*arguments, segments=count, **static)
+    if segments is None:
+        cycle = refined(cycle, arguments, count, static)
     if regularisation is not None:
         from .regularised import regularised_cycle
 
         eps = number("regularisation", regularisation, above=0)
         steps = whole("max_steps", max_steps, 1)
-        arguments = mechanism, start, excitation, eps
-        cycle = regularised_cycle(*arguments, cycle, solver, tolerance, steps)
+        cycle = regularised_cycle(*given, eps, cycle, solver, static["rtol"], steps)
     return raise_unless(CycleResult.converged, cycle) if throw else cycle

@@ -189,7 +189,7 @@ def test_commands_in_new_processes(tmp_path):
         jax.monitoring.register_event_duration_secs_listener(hear)
         from fractaljax.__main__ import main
         main(sys.argv[1:])
-        own = {"linearised", "_limit_cycle", "_stability", "_growth_rate", "_numbers", "_of_scene"}
+        own = {"linearised", "solved", "_stability", "_growth_rate", "_numbers", "_of_scene"}
         print("scipy.linalg" in sys.modules, file=sys.stderr)
         print(sorted(own & set(traced)), file=sys.stderr)
     """
@@ -197,7 +197,7 @@ def test_commands_in_new_processes(tmp_path):
     environment.pop("XLA_FLAGS", None)
     for command, traced in (
         (["stability"], ["_numbers", "_of_scene"]),
-        (["cycle", "--out", "cycle"], ["_limit_cycle", "_stability"]),
+        (["cycle", "--out", "cycle"], ["solved", "_stability"]),
     ):
         runs = [
             subprocess.run(
