@@ -13,10 +13,11 @@ from jax import export
 import fractaljax as fj
 from fractaljax._design import rows
 from fractaljax._dynamics import basin, itinerary
+from fractaljax._dynamics.limit_cycle import posed
 from fractaljax._stability import boundary, tracks
 from fractaljax._sweep import batches
 from mechanisms import PROBLEMS
-from programs import BRAKE, PROGRAMS, STRUCTURE
+from programs import BRAKE, FORCE, PRESSED, PROGRAMS, STRUCTURE, of
 from structures import of_problem
 from tools import primitives
 
@@ -60,15 +61,20 @@ def test_public_programs_lower_for_cuda(name):
     assert EIG not in found or "structure" in name or "batch" in name
 
 
-# Each compiles the search again, whose NaN the other cycles show.
-REPEATED = "limit_cycle, pressed", "limit_cycle, batch"
+# Each compiles the search again, whose NaN the other cycles show; here what it is given has it.
+SYSTEMS = {
+    "limit_cycle, pressed": of(lambda x: posed(x, None), PRESSED),
+    "limit_cycle, excited": of(lambda x: posed(x, FORCE)),
+    "limit_cycle of a structure": of(lambda x: posed(x, None), STRUCTURE),
+}
+SEARCHED = [name for name in PROGRAMS if name not in (*SYSTEMS, "limit_cycle, batch")]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in PROGRAMS if name not in REPEATED])
+@pytest.mark.parametrize("name", [*SEARCHED, *SYSTEMS])
 def test_what_is_invalid_is_nan(name):
     """Never a number that one could believe; the same program gives numbers for what is valid."""
-    program = PROGRAMS[name]
+    program = (PROGRAMS | SYSTEMS)[name]
     compiled = jax.jit(program.function)
     good, bad = (compiled(jnp.asarray(x, float)) for x in (program.value, program.invalid))
     moved = compiled(jnp.asarray(program.value * (1 + 1e-6)))

@@ -234,7 +234,7 @@ def test_brake_survives_the_kicks_of_an_independent_solver(monkeypatch):
     plain = fj.design(scene, bounds, progress=False)
     assert plain.value < best.value < 0.01
     random = np.random.default_rng(5)
-    ways = random.standard_normal((3, 4))
+    ways = random.standard_normal((2, 4))
     ways *= 1.99 / np.linalg.norm(ways, axis=1, keepdims=True)
     ends = []
     for x, most in ((best.scene, 1500), (plain.scene, 400)):
@@ -246,4 +246,4 @@ def test_brake_survives_the_kicks_of_an_independent_solver(monkeypatch):
         starts = np.append(np.linalg.solve(K, mechanism.F), [0, 0]) + ways * units
         ends.append([squeals(mechanism, start, most) for start in starts])
     assert not any(ends[0])
-    assert ends[1] == [True, False, True]
+    assert ends[1] == [True, False]
