@@ -6,8 +6,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 
-from .kept import is_traced, kept
+from .kept import kept
 
 _PASSES = "while-loop-invariant-code-motion,simplify-while-loops"
 # Of XLA on CPU. Its fusion emitters take most of the time, and as much for a small loop as for a
@@ -49,15 +50,34 @@ def quick_jit(
 ) -> Callable:
     """`jax.jit`, compiled quickly where it is the outermost program: only there JAX has options.
 
+    It is that too where `jax.vmap`, `jax.jvp` or `jax.jacfwd` call it outside of any other program.
+
     `once` halves that again for a program which runs a few times, or on few numbers.
     """
     plain, outermost = _jitted(function, static_argnames, _RUNS_ONCE if once else _OWN)
 
     @functools.wraps(plain)
     def call(*args, **kwargs):
-        return (plain if is_traced(args, kwargs) else outermost())(*args, **kwargs)
+        return (outermost() if _is_outermost(args, kwargs) else plain)(*args, **kwargs)
 
     return kept(call, static_argnames, outermost, "once" if once else "")
+
+
+def _is_outermost(*args: Any) -> bool:
+    """Whether what is called with these arguments is compiled at once, as a program of its own."""
+    if isinstance(jnp.zeros(()), Tracer):
+        return False
+    return all(map(_is_evaluated, jax.tree.leaves(args)))
+
+
+def _is_evaluated(x: Any) -> bool:
+    """Whether x is a number, or batches and tangents of numbers; no name for one in a program."""
+    kind = type(x).__name__
+    if kind == "BatchTracer":
+        return _is_evaluated(x.val)
+    if kind == "JVPTracer":
+        return _is_evaluated(x.primal) and _is_evaluated(x.tangent)
+    return not isinstance(x, Tracer)
 
 
 def outermost_jit(function: Callable, static_argnames: str | tuple[str, ...] = ()) -> Callable:

@@ -1,6 +1,5 @@
 """The distinct attractors of a mechanism, found from many starts."""
 
-import functools
 from collections.abc import Sequence
 
 import jax
@@ -9,11 +8,10 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from .._base.parts import number
-from .._base.quick import quick_jit
 from .._mechanism.mechanism import Mechanism
 from .cycle import CycleResult, LimitCycle
 from .excitation import Excitation
-from .limit_cycle import STATIC, checked, posed, refined, solved
+from .limit_cycle import checked, posed, refined, solved
 from .scaled import degrees_of_freedom, hybrid_system
 
 
@@ -41,7 +39,9 @@ def attractors(
         raise ValueError(f"starts must have shape (k, {2 * n}), got {starts.shape}")
     returns, segments, static = checked(mechanism, starts, excitation, rtol, max_returns)
     system, growth = posed(mechanism, excitation)
-    cycles = _from_each(system, growth, starts, returns, segments=segments, **static)
+    cycles = jax.vmap(
+        lambda start: solved(system, growth, start, returns, segments=segments, **static)
+    )(starts)
     distinct: list[LimitCycle] = []
     for i in range(len(starts)):
         cycle = jax.tree.map(lambda x, i=i: x[i], cycles)
@@ -54,15 +54,6 @@ def attractors(
                 continue
         distinct.append(cycle)
     return distinct
-
-
-@functools.partial(quick_jit, static_argnames=STATIC)
-def _from_each(
-    system, growth, starts, returns, *, of_scene: bool, segments: int, rtol: float
-) -> LimitCycle:
-    """The cycles (k,) that starts (k, 2n) end in."""
-    static = {"of_scene": of_scene, "segments": segments, "rtol": rtol}
-    return jax.vmap(lambda start: solved(system, growth, start, returns, **static))(starts)
 
 
 @jax.jit

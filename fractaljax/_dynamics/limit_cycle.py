@@ -161,9 +161,6 @@ def _monodromy(system: HybridSystem, segments: Segments, local: Maps) -> Float[A
     return product
 
 
-STATIC = "of_scene", "segments", "rtol"  # of the cycle's program
-
-
 # Apart from the cycle's program, which another contact law then does not compile again.
 @functools.partial(quick_jit, once=True)
 def posed(mechanism: Mechanism, excitation) -> tuple[HybridSystem, Float[Array, ""]]:
@@ -174,7 +171,7 @@ def posed(mechanism: Mechanism, excitation) -> tuple[HybridSystem, Float[Array, 
     return system, growth / system.omega
 
 
-@functools.partial(quick_jit, static_argnames=STATIC)
+@functools.partial(quick_jit, static_argnames=("of_scene", "segments", "rtol"))
 def solved(
     system: HybridSystem, growth, start, max_returns, *, of_scene: bool, segments: int, rtol: float
 ) -> LimitCycle:
