@@ -50,10 +50,11 @@ def main(argv: list[str] | None = None) -> int:
     ):
         add(commands)
     arguments = parser.parse_args(argv)
-    import jax
-
     # A tenth of a command was a search for garbage among the modules, which stay.
     gc.set_threshold(50_000, 20, 50)
+    import jax
+
+    gc.freeze()
     jax.config.update("jax_enable_x64", True)
     try:
         with keep_compiled(), _terminable():
@@ -75,6 +76,14 @@ def main(argv: list[str] | None = None) -> int:
             raise
         refuse(message)
     return 2
+
+
+def command() -> int:
+    """`main` as a process of its own, which ends without a search for garbage in all it holds."""
+    try:
+        return main()
+    finally:
+        gc.freeze()
 
 
 @contextlib.contextmanager
@@ -108,4 +117,4 @@ def _drop_output() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(command())
