@@ -207,7 +207,8 @@ def test_package_and_loop_evaluate_a_design_alike(task):
 
 def test_searches_on_the_loop_and_on_grids():
     """Where the slip limit meets the bound on G, by hand; no method misses it by more."""
-    task, start = designs.TASKS[0], np.array([0.45, 0.9])
+    # Where SciPy before 1.16 gets there as well: elsewhere its differences may stop it early.
+    task, start = designs.TASKS[0], np.array([0.3, 0.9])
     loop = designs.by_loop(task)
     found, simplex = designs.slsqp(task, loop, None, start), designs.nelder_mead(task, loop, start)
     assert found.answer is not None and simplex.answer is not None
