@@ -54,7 +54,6 @@ def main(argv: list[str] | None = None) -> int:
     gc.set_threshold(50_000, 20, 50)
     import jax
 
-    gc.freeze()
     jax.config.update("jax_enable_x64", True)
     try:
         with keep_compiled(), _terminable():

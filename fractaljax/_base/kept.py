@@ -47,8 +47,12 @@ def keep_in(folder: Path | None) -> None:
 
 def is_traced(*args: Any) -> bool:
     """Whether JAX traces these arguments, or whatever is computed now."""
-    found = any(isinstance(x, Tracer) for x in jax.tree.leaves(args))
-    return found or isinstance(jnp.zeros(()), Tracer)
+    return any(isinstance(x, Tracer) for x in jax.tree.leaves(args)) or is_staged()
+
+
+def is_staged() -> bool:
+    """Whether what is computed now becomes part of a program instead."""
+    return isinstance(jnp.zeros(()), Tracer)
 
 
 def kept(

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 
-from .kept import kept
+from .kept import is_staged, kept
 
 _PASSES = "while-loop-invariant-code-motion,simplify-while-loops"
 # Of XLA on CPU. Its fusion emitters take most of the time, and as much for a small loop as for a
@@ -51,8 +51,7 @@ def quick_jit(
     """`jax.jit`, compiled quickly where it is the outermost program: only there JAX has options.
 
     It is that too where `jax.vmap`, `jax.jvp` or `jax.jacfwd` call it outside of any other program.
-
-    `once` halves that again for a program which runs a few times, or on few numbers.
+    `once` halves the time again for a program which runs a few times, or on few numbers.
     """
     plain, outermost = _jitted(function, static_argnames, _RUNS_ONCE if once else _OWN)
 
@@ -65,9 +64,7 @@ def quick_jit(
 
 def _is_outermost(*args: Any) -> bool:
     """Whether what is called with these arguments is compiled at once, as a program of its own."""
-    if isinstance(jnp.zeros(()), Tracer):
-        return False
-    return all(map(_is_evaluated, jax.tree.leaves(args)))
+    return not is_staged() and all(map(_is_evaluated, jax.tree.leaves(args)))
 
 
 def _is_evaluated(x: Any) -> bool:
