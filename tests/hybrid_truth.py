@@ -27,6 +27,7 @@ FAR = 1e6  # in V and V/omega: a motion beyond it has diverged
 SAME = 1e-10  # a sliding velocity below it is zero where a motion starts
 NODES = (1 + np.cos(np.pi * (np.arange(12) + 0.5) / 12)) / 2
 FIT = np.linalg.inv(chebyshev.chebvander(2 * NODES - 1, 11))
+SLOPE = chebyshev.chebder(np.eye(12))  # of coefficients those of the derivative
 
 LAWS = {
     "coulomb": lambda w, mu: mu + 0 * w,
@@ -133,7 +134,7 @@ class Mechanism:
     @cached_property
     def scaled(self) -> "Mechanism":
         """The same in units of 1/omega, V and V/omega."""
-        s, V = self.omega, self.units[-1]
+        s, V = self.omega, float(self.units[-1])
         given = self.force
         force = None if given is None else lambda t: given(t / s) / (V * s)
         joints = tuple(
@@ -236,6 +237,13 @@ class Field:
                     rows.append(row)
                     by.append(-side * self.multipliers[self.stuck.index(i)])
         self.events, self.rows, self.by = events, np.array(rows), np.array(by)
+        # Acceleration without friction, sliding speeds, and signed loads, in one product.
+        none, signs = np.zeros_like(self.D), self.signs[:, None]
+        free, sliding = self.inverse @ np.hstack([-self.K, -self.C]), np.hstack([none, -self.D])
+        loads = np.hstack([self.slope, none])
+        self.linear = np.vstack([free, signs * sliding, signs * loads])
+        parts = self.inverse @ self.f, self.signs * self.V, self.signs * self.load
+        self.constant, self.by_friction = np.concatenate(parts), self.inverse @ self.D.T
 
     def forces(self, z, t) -> np.ndarray:
         """All but inertia and the multipliers, at states z (..., 2n) and times t (...)."""
@@ -250,7 +258,16 @@ class Field:
         return out
 
     def rates(self, t, z) -> np.ndarray:
-        return np.concatenate([z[self.n :], self.inverse @ self.forces(z, t)])
+        n, slips = self.n, len(self.laws)
+        found = self.constant + self.linear @ z
+        acceleration = found[:n]
+        if self.force is not None:
+            acceleration = acceleration + self.inverse @ self.force(np.asarray(t))
+        if slips:
+            speeds = found[n : n + slips].tolist()
+            mu = [law(w) for law, w in zip(self.laws, speeds, strict=True)]
+            acceleration = acceleration + self.by_friction @ (mu * found[n + slips :])
+        return np.concatenate([z[n:], acceleration])
 
     def values(self, z, t) -> np.ndarray:
         """The guards at states z (..., 2n) and times t (...)."""
@@ -364,21 +381,24 @@ def put(mechanism, z, directions, speeds) -> np.ndarray:
 
 def extrema(c) -> np.ndarray:
     """Extrema inside 0..1 of Chebyshev coefficients; other points may be among them."""
-    slope = chebyshev.chebder(c)
-    slope = chebyshev.chebtrim(slope, 1e-15 * abs(slope).max())
-    found = (1 + chebyshev.chebroots(slope).real) / 2
+    slope = SLOPE @ c
+    counts = np.flatnonzero(abs(slope) > 1e-15 * abs(slope).max())
+    found = (1 + chebyshev.chebroots(slope[: counts.max(initial=0) + 1]).real) / 2
     return np.sort(found[(found > 0) & (found < 1)])
 
 
 def at(tau, c):
-    return chebyshev.chebval(2 * tau - 1, c)
+    """The function with Chebyshev coefficients c (k, ...) at tau, by Clenshaw's recurrence."""
+    x, after, now = 4 * tau - 2, 0.0, 0.0
+    for one in c[:0:-1]:
+        after, now = now, one + x * now - after
+    return c[0] + x / 2 * now - after
 
 
 def falls(c) -> Any:
     """Where in 0..1 the function first falls through zero."""
-    if c[0] > abs(c[1:]).sum():
-        return None
-    for low, high in pairwise([0.0, *extrema(c), 1.0]):
+    places, c = [0.0, *extrema(c).tolist(), 1.0], c.tolist()
+    for low, high in pairwise(places):
         if at(low, c) >= 0 > at(high, c):
             return brentq(at, low, high, (c,), xtol=1e-16)
     return None
@@ -450,8 +470,11 @@ def phases(mechanism, z, rtol, t1=np.inf, maxima=False, t0=0.0) -> Iterator[Phas
         solver = DOP853(field_.rates, t, z, t1, max_step=longest, rtol=rtol, atol=rtol)
         start, t0, steps, pieces, hit = z, t, [], [], None
         while hit is None and solver.status == "running":
-            with np.errstate(over="ignore", invalid="ignore"):
-                failed = solver.step()
+            try:
+                with np.errstate(over="ignore", invalid="ignore"):
+                    failed = solver.step()
+            except OverflowError as error:  # in a friction law
+                raise Diverged from error
             if failed or not abs(solver.y).max() < FAR:
                 raise Diverged
             pieces.append(solver.dense_output())
@@ -463,8 +486,10 @@ def phases(mechanism, z, rtol, t1=np.inf, maxima=False, t0=0.0) -> Iterator[Phas
                 g -= np.where(orders > 0, value, 0) + np.where(orders > 1, slope * h * tau, 0)
                 g /= tau**orders
             c, found = FIT @ g, []
-            for k, event in enumerate(events):
-                late = at(0.0, c[:, k]) < 0
+            reaches_zero = c[0] <= abs(c[1:]).sum(axis=0)
+            late_ones = at(0.0, c) < 0
+            for k in np.flatnonzero(reaches_zero):
+                event, late = events[k], late_ones[k]
                 if late and event[0] != "maximum" and not steps:
                     if value[k] < -1e-7:
                         raise Impossible(f"{event} is past in {mode} at {z}")
@@ -585,22 +610,27 @@ class Cycle:
     flow: Any = None  # scaled monodromy matrix
 
 
-def spread(trip, row) -> tuple[float, float]:
-    """The least and the largest value of row.[1, z] over a trip."""
-    found = []
-    for p in trip:
-        for t, end, used, dense in p.steps:
-            c = FIT @ (row[0] + row[1:] @ dense(t + (end - t) * NODES))
-            share = (used - t) / (end - t)
-            found += list(at(np.array([0.0, *(x for x in extrema(c) if x < share), share]), c))
-    return min(found), max(found)
+def spread(trip, rows) -> np.ndarray:
+    """The least and the largest values (r, 2) of rows.[1, z] (r, 2n + 1) over a trip."""
+    steps = [step for p in trip for step in p.steps]
+    Z = np.array([dense(t + (end - t) * NODES) for t, end, _, dense in steps])
+    C = np.einsum("ij,sjr->isr", FIT, rows[:, 0] + np.swapaxes(Z, 1, 2) @ rows[:, 1:].T)
+    used = np.array([(used - t) / (end - t) for t, end, used, _ in steps])
+    ends = np.concatenate([at(0.0, C), at(used[:, None], C)])
+    found, reach = np.array([ends.min(axis=0), ends.max(axis=0)]), abs(C[1:]).sum(axis=0)
+    beyond = (C[0] - reach < found[0]) | (C[0] + reach > found[1])
+    for k, r in np.argwhere(beyond):
+        places = extrema(C[:, k, r])
+        values = at(places[places < used[k]], C[:, k, r])
+        found[0, r] = values.min(initial=found[0, r])
+        found[1, r] = values.max(initial=found[1, r])
+    return found.T
 
 
 def extremes(mechanism, trip) -> np.ndarray:
     """The least and the largest value of each state, (2n, 2) in SI units, over a scaled trip."""
     size = len(mechanism.units)
-    rows = np.hstack([np.zeros((size, 1)), np.eye(size)])
-    return np.array([spread(trip, row) for row in rows]) * mechanism.units[:, None]
+    return spread(trip, np.eye(size, size + 1, 1)) * mechanism.units[:, None]
 
 
 def largest_first(flow) -> np.ndarray:
@@ -649,7 +679,7 @@ def measure(mechanism, z, T, rtol=1e-12) -> Cycle:
                     slopes = chebyshev.chebder(c, 2)
                     graze += [abs(at(x, c)) for x in inside if at(x, slopes) > 0]
     ends, unit = extremes(mechanism, trip), mechanism.units
-    forces = np.array([spread(trip, core.normal(i)) for i in range(m)])
+    forces = spread(trip, np.array([core.normal(i) for i in range(m)]))
     lifts = np.array([j.lifts for j in core.joints])
     forces = np.where(lifts[:, None], np.maximum(forces, 0), forces)
     flow = monodromy(core, trip, rtol)

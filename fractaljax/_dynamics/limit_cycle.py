@@ -65,6 +65,47 @@ def _lowest(x, count: int) -> tuple[Array, Array]:
     return least.T, k.T
 
 
+def _vertex(given, t):
+    """The minimum of row @ y by the parabola at t, of third order, and a step towards it."""
+    system, y, s, h, row = given
+    value, rate, change = _along(system, y, s, t, row)
+    most = h / 8
+    near = jnp.abs(rate) < change * most
+    newton = jnp.where(near, -rate / jnp.where(near, change, 1), 0)
+    return value + rate * newton / 2, jnp.where(near, newton, -jnp.sign(rate) * most)
+
+
+@jax.custom_jvp
+def _minima(given: tuple, t, exists) -> tuple[Array, Array]:
+    """The minima near the times t, infinite but where one `exists`, and when they are.
+
+    Derivatives are those of the last parabola: with respect to its time a minimum has none.
+    """
+    length = given[3]
+
+    def going(carry):
+        _, change, _, steps = carry
+        return (steps < 6) & jnp.any(exists & (jnp.abs(change) > length / 2**20))
+
+    # The cubic's minimum is near, but where it is nearly an inflection.
+    def step(carry):
+        t, _, _, steps = carry
+        value, change = _vertex(given, t)
+        return jnp.clip(t + change, 0, length), change, value, steps + 1
+
+    far = jnp.full_like(t, jnp.inf)
+    t, _, value, _ = jax.lax.while_loop(going, step, (t, far, far, 0))
+    return jnp.where(exists, value, jnp.inf), t
+
+
+@_minima.defjvp
+def _minima_jvp(primals, tangents):
+    given, t, exists = primals
+    value, t = _minima(given, t, exists)
+    _, change = jax.jvp(lambda given: _vertex(given, t)[0], (given,), (tangents[0],))
+    return (value, t), (jnp.where(exists, change, 0), jnp.zeros_like(t))
+
+
 def extreme_values(system: HybridSystem, segments: Segments, rows) -> Float[Array, "2 r"]:
     """Smallest and largest value along the orbit of linear functions rows @ y, rows (r, 2n)."""
     y, h, s = segments.y, segments.duration, segments.s
@@ -78,33 +119,9 @@ def extreme_values(system: HybridSystem, segments: Segments, rows) -> Float[Arra
     least = jnp.where(inside & (d_1 - d_0 > small / 64), cubic(theta), jnp.inf)
     least, k = (x.ravel() for x in _lowest(least, _MINIMA))
     of_row, length = jnp.arange(len(k)) // _MINIMA, h[k]
-    exists, given = least < jnp.inf, (system, y[:, k], s[:, k], length, rows[of_row].T)
-
-    def refined(given, t):
-        """The minimum by the parabola at t, and a step towards it."""
-        system, y, s, h, row = given
-        value, rate, change = _along(system, y, s, t, row)
-        most = h / 8
-        near = jnp.abs(rate) < change * most
-        newton = jnp.where(near, -rate / jnp.where(near, change, 1), 0)
-        return value + rate * newton / 2, jnp.where(near, newton, -jnp.sign(rate) * most)
-
-    # The cubic's minimum is near, but where it is nearly an inflection. The last parabola, of third
-    # order, carries the derivative.
-    frozen, length, t = jax.lax.stop_gradient((given, length, theta[of_row, k] * length))
-
-    def going(carry):
-        _, change, steps = carry
-        return (steps < 5) & jnp.any(exists & (jnp.abs(change) > length / 1024))
-
-    def step(carry):
-        t, _, steps = carry
-        change = refined(frozen, t)[1]
-        return jnp.clip(t + change, 0, length), change, steps + 1
-
-    t, *_ = jax.lax.while_loop(going, step, (t, length, 0))
-    value = jnp.where(exists, refined(given, t)[0], jnp.inf).reshape(-1, _MINIMA)
-    value = jnp.min(value, axis=1)
+    given = (system, y[:, k], s[:, k], length, rows[of_row].T)
+    value, _ = _minima(given, theta[of_row, k] * length, least < jnp.inf)
+    value = jnp.min(value.reshape(-1, _MINIMA), axis=1)
     # Where one ends a segment both are equal to rounding, and the parabola alone follows it.
     node = jnp.min(g_0, axis=1)
     value = jnp.where(value <= node + small, value, node)

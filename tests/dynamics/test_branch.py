@@ -126,7 +126,7 @@ def assert_truth(problem, quantity, found, i):
     np.testing.assert_allclose(trip[-1].end, z, atol=1e-8 * strength * np.abs(z).max())
     n = len(z) // 2
     rows = np.hstack([np.zeros((n, 1)), np.eye(n, 2 * n)])
-    low, high = np.transpose([hybrid_truth.spread(trip, row) for row in rows])
+    low, high = hybrid_truth.spread(trip, rows).T
     largest = found.amplitude[i].max()
     amplitude = (high - low) * mechanism.units[:n]
     np.testing.assert_allclose(found.amplitude[i], amplitude, atol=1e-8 * strength * largest)

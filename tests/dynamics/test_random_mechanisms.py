@@ -117,9 +117,9 @@ def truth(given, near, flow) -> tuple[np.ndarray, list, np.ndarray]:
     z, T, trip = hybrid_truth.closed(core, z, T, 1e-13, mechanism.map_in_units(flow))
     n, m = len(core.M), len(core.joints)
     rows = np.eye(2 * n + 1)[1:]
-    low, high = np.array([hybrid_truth.spread(trip, row) for row in rows]).T * unit
+    low, high = hybrid_truth.spread(trip, rows).T * unit
     stick, _, opened = hybrid_truth.shares(core, trip) / T
-    loads = [hybrid_truth.spread(trip, core.normal(i)) for i in range(m)]
+    loads = hybrid_truth.spread(trip, np.array([core.normal(i) for i in range(m)]))
     forces = np.maximum(np.ravel(loads), 0) * mechanism.omega * unit[-1]
     row = [[T / mechanism.omega], (high - low)[:n], low[n:], high[n:], stick, opened, forces]
     return np.concatenate(row), [p.mode for p in trip], np.append(z * unit, T / mechanism.omega)
