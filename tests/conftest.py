@@ -66,7 +66,7 @@ def pytest_runtest_setup(item):
     os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "0" if compute else "1"  # of subprocesses
 
 
-most_memory = 3.5e9  # of a worker [bytes]
+most_memory = 5e9  # of a worker [bytes]
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -8,7 +8,7 @@ or 2 (open, both faces of a joint together). Components are the first axis; lane
 """
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -28,6 +28,17 @@ OPEN = 2
 SECTION, NONE, UNUSED = 0, -1, -2
 _SMOOTH = 1e-4  # of the way to the opening: nearer, what a load curve adds is below rounding
 FEW = 4  # degrees of freedom up to which a product is a sum, which compiles into one loop
+
+
+def _traced_once(method: Callable) -> Callable:
+    """A method that a program calls at many places, traced and lowered once for each shape."""
+    jitted = jax.jit(method)
+
+    @functools.wraps(method)
+    def call(self, *arrays):
+        return jitted(self, *arrays)
+
+    return call
 
 
 class Products(eqx.Module):
@@ -304,6 +315,7 @@ class HybridSystem(eqx.Module):
         accelerations = leaf(products.F) - driven + self.times(products.W, forces)
         return loads, w, forces, self.held(accelerations, s == 0), rest
 
+    @_traced_once
     def field(self, y, s) -> Array:
         """dy/dt in contact state s. A sticking face must have w = 0."""
         products = self._at_faces
@@ -339,6 +351,7 @@ class HybridSystem(eqx.Module):
         """
         return y[-1] if self.excited else self.along(y[self.n :])[0]
 
+    @_traced_once
     def guards(self, y, s) -> Array:
         """Functions (k, ...) that are positive while contact state s lasts, and the section.
 

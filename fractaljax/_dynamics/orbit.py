@@ -6,6 +6,7 @@ equations are smooth in states and durations. Newton's method solves them by cha
 maps of all segments.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -53,6 +54,7 @@ def _chain(body: Callable, carry, arrays: tuple, lanes: int, count=None) -> tupl
     return carry, jnp.moveaxis(found, 0, found.ndim - 1 - lanes)
 
 
+@functools.partial(jax.jit, static_argnames="constant")  # traced once for all places of a program
 def corrections(
     local: Maps, segments: Segments, last, gap, guard, constant: int | None = None, count=None
 ):
@@ -221,8 +223,9 @@ def solve_periodic_orbits(
 def accurate_return_jacobian(system: HybridSystem, segments: Segments) -> Float[Array, "2n 2n g"]:
     """The Jacobian of the return map of periodic orbits, as exact as they are."""
     ends, local = maps(system, segments)
-    nothing = jnp.zeros_like(segments.duration)
-    return corrections(local, segments, last_of_phase(segments), 0 * ends, nothing)[2]
+    last, nothing = last_of_phase(segments), jnp.zeros_like(segments.duration)
+    many = jnp.max(jnp.sum(segments.used, axis=0))
+    return corrections(local, segments, last, 0 * ends, nothing, system.constant, many)[2]
 
 
 @jax.custom_jvp

@@ -139,7 +139,6 @@ def test_derivatives():
 
 
 @pytest.mark.slow
-@pytest.mark.optimised
 def test_derivatives_of_three_joints():
     """By default options, in a compiled program."""
     for seed in SEEDS_OF_THREE:
