@@ -6,18 +6,18 @@ ones they join them, and it is solved again. (A. G. Blankenship and J. E. Falk, 
 constrained optimization problems", 1976.)
 """
 
-import concurrent.futures
 import dataclasses
 import functools
-import queue
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .evaluator import Evaluation, Evaluator, OnAverage
+from .functions import Functions, compressed, finite
 from .joint_limits import limits_of_joints, within_joints
-from .problem import UNKNOWN, DesignProblem
+from .lockstep import in_lockstep
+from .problem import DesignProblem
 from .rows import linearise
 from .solvers import Solver
 from .starts import designs_near
@@ -44,67 +44,7 @@ class Found(NamedTuple):
     least_growth: Any = None  # `limit.LeastGrowth`, where the growth rate is too large
 
 
-@dataclasses.dataclass
-class _Functions:
-    """What a solver asks, from one evaluation at each point: minimise f subject to c <= 0.
-
-    Rows (m, 1 + k) have their columns in `aim` minimised at their largest, by a variable of its own
-    (`extra`) where there are several, and those in `limited` met with some slack, so that rounding
-    cannot undo it.
-    """
-
-    rows_at: Callable
-    aim: np.ndarray  # (1 + k,), whether a column is
-    limited: np.ndarray
-    slack: float | np.ndarray  # (1 + k,)
-    scale: float  # of the objective
-    extra: bool
-    seen: list[np.ndarray] = dataclasses.field(default_factory=list)  # where rows were asked for
-    _known: dict[bytes, Any] = dataclasses.field(default_factory=dict)
-
-    def at(self, z):
-        """Rows and their Jacobians at z, which is u (v,) or, with the extra variable, (u, t)."""
-        u = np.clip(z[:-1] if self.extra else z, 0, 1)
-        if u.tobytes() not in self._known:
-            rows, jacobians = _finite(*self.rows_at(u))
-            scale = np.where(np.arange(rows.shape[1]) == 0, self.scale, 1)
-            self._known[u.tobytes()] = rows / scale, jacobians / scale[:, None]
-            self.seen.append(u.copy())
-        return self._known[u.tobytes()]
-
-    def objective(self, z):
-        """Value and gradient."""
-        if self.extra:
-            return z[-1], np.eye(len(z))[-1]
-        rows, jacobians = self.at(z)
-        return rows[0, 0], jacobians[0, 0].copy()  # solvers write into it
-
-    def constraints(self, z):
-        """Residuals and their Jacobian, compressed where they are not of order one."""
-        (rows, jacobians), v = self.at(z), len(z) - self.extra
-        c = (rows + self.slack)[:, self.limited].ravel()
-        c, slopes = _compressed(c, jacobians[:, self.limited].reshape(-1, v))
-        if self.extra:
-            aimed, aim_slopes = rows[:, self.aim].ravel(), jacobians[:, self.aim].reshape(-1, v)
-            c = np.append(c, aimed - z[-1])
-            by_t = np.append(np.zeros(len(slopes)), -np.ones(len(aimed)))
-            slopes = np.column_stack([np.concatenate([slopes, aim_slopes]), by_t])
-        return c, slopes
-
-
-def _finite(rows: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows with numbers in place of those that are none, and slopes with zeros."""
-    rows = np.nan_to_num(rows, nan=UNKNOWN, posinf=UNKNOWN, neginf=-UNKNOWN)
-    return rows, np.nan_to_num(slopes, posinf=0, neginf=0)
-
-
-def _compressed(c: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (k,) and slopes (k, v), by logarithms where they are beyond order one."""
-    size = np.maximum(np.abs(c), 1)
-    return np.where(size > 1, np.sign(c) * (1 + np.log(size)), c), slopes / size[:, None]
-
-
-def _least_violated(functions: _Functions, start: np.ndarray) -> np.ndarray:
+def _least_violated(functions: Functions, start: np.ndarray) -> np.ndarray:
     """A design (v,) near `start` with the least sum of squares of its unmet requirements."""
     from scipy.optimize import least_squares
 
@@ -117,47 +57,6 @@ def _least_violated(functions: _Functions, start: np.ndarray) -> np.ndarray:
 
     more: Any = {"jac": slopes, "bounds": (0, 1), "max_nfev": _RESTORING}
     return least_squares(unmet, np.clip(start, 1e-3, 1 - 1e-3), **more).x
-
-
-def in_lockstep(tasks: Sequence[Callable], answer: Callable[[dict], dict]) -> list:
-    """The results of tasks, each a function of `ask`, run side by side.
-
-    What all of them ask next is answered at once, in this thread: one call of a compiled program
-    costs about as much for many designs as for one. `answer` takes {task: question}, and may leave
-    some to be asked again with those of the tasks that it answers.
-    """
-    asked, replies = queue.SimpleQueue(), [queue.SimpleQueue() for _ in tasks]
-
-    def run(i):
-        def ask(question):
-            asked.put((i, question))
-            reply = replies[i].get()
-            if isinstance(reply, BaseException):
-                raise reply
-            return reply
-
-        try:
-            return tasks[i](ask)
-        finally:
-            asked.put((i, None))
-
-    with concurrent.futures.ThreadPoolExecutor(max(1, len(tasks))) as pool:
-        results = [pool.submit(run, i) for i in range(len(tasks))]
-        questions, due = {}, len(tasks)
-        try:
-            while due:
-                questions |= dict(asked.get() for _ in range(due))
-                questions = {i: questions[i] for i in sorted(questions) if questions[i] is not None}
-                answers = answer(questions) if questions else {}
-                for i, reply in answers.items():
-                    del questions[i]
-                    replies[i].put(reply)
-                due = len(answers)
-        except BaseException as error:  # the others wait for a reply
-            for reply in replies:
-                reply.put(error)
-            raise
-        return [result.result() for result in results]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -410,7 +309,7 @@ class Search:
             def rows_at(u, working=working):
                 return ask((self._linearise, u, working))
 
-            functions = _Functions(rows_at, aim, limited, self.slack, self.scale, extra)
+            functions = Functions(rows_at, aim, limited, self.slack, self.scale, extra)
             if self.solver:
                 end = self._solved(functions, path[-1], how)
             else:
@@ -422,7 +321,7 @@ class Search:
             working = np.concatenate([working, new])
         return np.array(path), merit
 
-    def _solved(self, functions: _Functions, start: np.ndarray, restored: bool) -> np.ndarray:
+    def _solved(self, functions: Functions, start: np.ndarray, restored: bool) -> np.ndarray:
         """Where the solver ends, perhaps from the nearest design that violates all the least."""
         v, bounds = len(start), np.tile([0.0, 1.0], (len(start), 1))
         if restored:
@@ -435,7 +334,7 @@ class Search:
         z = solver(functions.objective, functions.constraints, start, bounds)
         return np.clip(np.asarray(z, float)[:v], 0, 1)
 
-    def _stepped(self, functions: _Functions, start, accuracy: Accuracy, working, ask):
+    def _stepped(self, functions: Functions, start, accuracy: Accuracy, working, ask):
         """Where steps in a trust region end, and what is left there to lower.
 
         The limits of joints are those at the working conditions (m, c).
@@ -456,7 +355,7 @@ class Search:
                 np.zeros(v) if extra else slopes[0, 0],
                 rows[:, aimed].ravel(),
                 slopes[:, aimed].reshape(-1, v),
-                *_compressed(unmet, slopes[:, limited].reshape(-1, v)),
+                *compressed(unmet, slopes[:, limited].reshape(-1, v)),
             )
 
         slack = self.slack.max()
@@ -465,8 +364,8 @@ class Search:
             if not keep:
                 return np.zeros(0), np.zeros((0, v))
             residuals, slopes = ask((self._limits, u, working))
-            residuals, slopes = _finite(residuals, slopes)
-            return _compressed(residuals + slack, slopes)
+            residuals, slopes = finite(residuals, slopes)
+            return compressed(residuals + slack, slopes)
 
         if keep and limits(start)[0].max() > 0:
             start = within_joints(problem, start[None], working)[0]

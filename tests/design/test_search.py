@@ -11,7 +11,9 @@ import pytest
 import fractaljax as fj
 from fractaljax._design import search as searches, starts as starting
 from fractaljax._design.evaluator import averaged, expected_shortfall
-from fractaljax._design.search import Search, _Functions, in_lockstep
+from fractaljax._design.functions import Functions
+from fractaljax._design.lockstep import in_lockstep
+from fractaljax._design.search import Search
 from fractaljax._design.solvers import slsqp
 from fractaljax._design.starts import choose_starts, designs_near, screened_designs
 from tools import reference_scene
@@ -25,7 +27,7 @@ def functions_of(f, c, slack=0.0):
         return np.real(at[:1]), np.imag(at[1:]).T[None] / 1e-30
 
     k = 1 + len(c(np.zeros(2)))
-    return _Functions(rows_at, np.arange(k) == 0, np.arange(k) > 0, slack, 1.0, extra=False)
+    return Functions(rows_at, np.arange(k) == 0, np.arange(k) > 0, slack, 1.0, extra=False)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,69 @@
+"""A design problem as a solver sees it: an objective and constraints with their slopes."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from .problem import UNKNOWN
+
+
+@dataclasses.dataclass
+class Functions:
+    """What a solver asks, from one evaluation at each point: minimise f subject to c <= 0.
+
+    Rows (m, 1 + k) have their columns in `aim` minimised at their largest, by a variable of its own
+    (`extra`) where there are several, and those in `limited` met with some slack, so that rounding
+    cannot undo it.
+    """
+
+    rows_at: Callable
+    aim: np.ndarray  # (1 + k,), whether a column is
+    limited: np.ndarray
+    slack: float | np.ndarray  # (1 + k,)
+    scale: float  # of the objective
+    extra: bool
+    seen: list[np.ndarray] = dataclasses.field(default_factory=list)  # where rows were asked for
+    _known: dict[bytes, Any] = dataclasses.field(default_factory=dict)
+
+    def at(self, z):
+        """Rows and their Jacobians at z, which is u (v,) or, with the extra variable, (u, t)."""
+        u = np.clip(z[:-1] if self.extra else z, 0, 1)
+        if u.tobytes() not in self._known:
+            rows, jacobians = finite(*self.rows_at(u))
+            scale = np.where(np.arange(rows.shape[1]) == 0, self.scale, 1)
+            self._known[u.tobytes()] = rows / scale, jacobians / scale[:, None]
+            self.seen.append(u.copy())
+        return self._known[u.tobytes()]
+
+    def objective(self, z):
+        """Value and gradient."""
+        if self.extra:
+            return z[-1], np.eye(len(z))[-1]
+        rows, jacobians = self.at(z)
+        return rows[0, 0], jacobians[0, 0].copy()  # solvers write into it
+
+    def constraints(self, z):
+        """Residuals and their Jacobian, compressed where they are not of order one."""
+        (rows, jacobians), v = self.at(z), len(z) - self.extra
+        c = (rows + self.slack)[:, self.limited].ravel()
+        c, slopes = compressed(c, jacobians[:, self.limited].reshape(-1, v))
+        if self.extra:
+            aimed, aim_slopes = rows[:, self.aim].ravel(), jacobians[:, self.aim].reshape(-1, v)
+            c = np.append(c, aimed - z[-1])
+            by_t = np.append(np.zeros(len(slopes)), -np.ones(len(aimed)))
+            slopes = np.column_stack([np.concatenate([slopes, aim_slopes]), by_t])
+        return c, slopes
+
+
+def finite(rows: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows with numbers in place of those that are none, and slopes with zeros."""
+    rows = np.nan_to_num(rows, nan=UNKNOWN, posinf=UNKNOWN, neginf=-UNKNOWN)
+    return rows, np.nan_to_num(slopes, posinf=0, neginf=0)
+
+
+def compressed(c: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (k,) and slopes (k, v), by logarithms where they are beyond order one."""
+    size = np.maximum(np.abs(c), 1)
+    return np.where(size > 1, np.sign(c) * (1 + np.log(size)), c), slopes / size[:, None]
