@@ -39,13 +39,13 @@ def admissible(system: HybridSystem, segments: Segments, middle) -> Bool[Array, 
     places = jnp.arange(7) / 6
     inside = jax.vmap(lambda x: _quintic(at, d, x))(places)
     g = guards(inside)
-    cubics = (Cubic.at_thirds(g[:4]), Cubic.at_thirds(g[3:]))
-    lowest = []
-    for k, cubic in enumerate(cubics):
-        theta, _ = cubic.minimum()
-        theta = jnp.take_along_axis(theta, jnp.argmin(cubic(theta), axis=0)[None], axis=0)[0]
-        lowest.append(_quintic(at, d, (k + theta)[None] / 2))
-    g = jnp.concatenate([g, guards(jnp.stack(lowest))])
+    cubics = Cubic.at_thirds(jnp.stack([g[:4], g[3:]], axis=1))
+    theta, _ = cubics.minimum()
+    lowest = jnp.argmin(cubics(theta), axis=1)[:, None]
+    theta = jnp.take_along_axis(theta, lowest, axis=1)
+    half = jnp.arange(2).reshape(2, *(1,) * (theta.ndim - 1))
+    lowest = jax.vmap(lambda x: _quintic(at, d, x))((half + theta) / 2)
+    g = jnp.concatenate([g, guards(lowest)])
     # The quintic is this good in a segment of the default length.
     holds = jnp.all(g > -1e-8 * scale[None], axis=(0, 1)) & (h > -1e-10)
     _, after = system.switch(ends, s, segments.guard)
