@@ -35,7 +35,7 @@ PLAIN, TUNED, ARRAYS = "loop", "tuned loop", "NumPy arrays"
 FORWARD, REVERSE, FORWARD_32 = "forward mode", "reverse mode", "forward mode, float32"
 FULL = {"points": 1_000_000, "at_once": 10_000, "arrays": 20_000, "loop": 2000, "exact": 48}
 FULL |= {"repeats": 9, "batches": tuple(10**k for k in range(7))}
-QUICK = {"points": 10_000, "at_once": 1000, "arrays": 1000, "loop": 200, "exact": 6}
+QUICK = {"points": 2000, "at_once": 1000, "arrays": 500, "loop": 50, "exact": 6}
 QUICK |= {"repeats": 3, "batches": (1000,)}
 Rows = list[dict[str, Any]]
 

@@ -122,7 +122,7 @@ def page(**options) -> str:
         persson += list(zip(touching, np.abs(np.log(theirs.K_n / judge.K_n)), strict=True))
         ratios += [float(t / n) for t, n in zip(source.K_t, source.K_n, strict=True) if n > 0]
         for i, P in enumerate(LOADS):
-            row = [f"{D}" if i == 0 else "", f"{P:.0f}", f"{touching[i]:.2g}"]
+            row = [f"{D}", f"{P:.0f}", f"{touching[i]:.2g}"]
             row += [f"{float(law.K_n[i]):.3g}" for law in (source, revised, theirs, judge)]
             row.append(f"{float(judge.scatter[i]):.0%}")
             row += [number(law.alpha[i]) for law in (source, revised, theirs, judge)]

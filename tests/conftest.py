@@ -18,6 +18,18 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "standard")
 
 
+def pytest_addoption(parser):
+    parser.addoption("--once", action="store_true", help="each test with its first parameters only")
+
+
+@pytest.hookimpl(trylast=True)  # of what `-m` has left
+def pytest_collection_modifyitems(config, items):
+    if config.getoption("once"):
+        first = {item.nodeid.partition("[")[0]: item for item in reversed(items)}
+        config.hook.pytest_deselected(items=[i for i in items if i not in first.values()])
+        items[:] = list(first.values())[::-1]
+
+
 def pytest_configure(config):
     config.addinivalue_line("filterwarnings", "error")
     # An entry of the cache that another worker is still writing is compiled anew.

@@ -8,8 +8,6 @@ import fractaljax as fj
 from fractaljax.__main__ import main
 from tools import ROOT, assert_same_picture
 
-pytestmark = pytest.mark.optimised
-
 README, GUIDE = "README.md", "docs/guide.md"
 
 

@@ -13,8 +13,6 @@ from benchmarks.__main__ import PAGES
 from fractaljax._sweep.blocks import blocks
 from tools import ROOT, quick_benchmark
 
-pytestmark = pytest.mark.optimised
-
 RESULTS = ROOT / "benchmarks" / "results"
 STORED = page.stored(RESULTS)
 
@@ -92,8 +90,8 @@ def first_answers(numbers):
     """Answers of two programs that share no code; times are of the machine."""
     rows = {row["name"]: row for row in numbers["rows"]}
     assert rows["fractaljax stability"]["apart"] < 1e-5  # as it is printed
-    assert rows["fractaljax design"]["apart"] < 1e-5
-    assert rows.get("fractaljax cycle", {"apart": 0})["apart"] < 1e-3  # of the smoothed law
+    for name, apart in (("fractaljax design", 1e-5), ("fractaljax cycle", 1e-3)):  # smoothed law
+        assert name not in rows or rows[name]["apart"] < apart
     assert all(row["cold_s"] > 0 for row in rows.values())
 
 
@@ -186,7 +184,14 @@ def test_committed_index_is_that_of_all_pages():
 # The others take minutes, or their methods have tests: run them by hand before a release.
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", ["contact", "extremes", "first_answers", "growth_rate", "scene_cost"]
+    "name",
+    [
+        "contact",
+        "extremes",
+        "first_answers",
+        "growth_rate",
+        pytest.param("scene_cost", marks=pytest.mark.optimised),  # what XLA makes of a program
+    ],
 )
 def test_quick_run_keeps_the_same_promises(name, tmp_path):
     numbers, _ = quick_benchmark(name, tmp_path)
