@@ -17,29 +17,44 @@ import hybrid_truth
 from fractaljax._dynamics.scaled import degrees_of_freedom
 from mechanisms import PROBLEMS, changed
 from structures import of_problem
-from tools import both_modes
+from tools import both_modes, mostly_slow
 
 TABLE = json.loads((Path(__file__).parents[1] / "reference" / "mechanisms.json").read_text())
 ROWS = {row["name"]: row for row in TABLE["rows"]}
 QUICK = ("papangelo_2017",)
-MARKS = {"four_dof": (pytest.mark.slow, pytest.mark.optimised)}
 # A joint slides forwards (V > 0). Backwards, with a second face along n, it is another joint.
 BACKWARDS = {
     name
     for name, problem in PROBLEMS.items()
     if any(joint["V"] < 0 and joint.get("K_t") for joint in problem["joints"])
 }
-NAMES = [
-    name if name in QUICK else pytest.param(name, marks=MARKS.get(name, pytest.mark.slow))
-    for name in PROBLEMS
-    if name not in BACKWARDS
-]
-DIFFERENTIATED = ("lift_off", "stick_together", "four_dof")
+# Their kinds of joints and motion are in four_dof, eight_dof and test_random_mechanisms.py.
+ALIKE = {"five_dof", "six_dof"}
+NAMES = mostly_slow([name for name in PROBLEMS if name not in BACKWARDS | ALIKE], *QUICK)
+DIFFERENTIATED = ("stick_together", "four_dof")
 
 
 @functools.cache
 def cycle(name):
+    if name in DIFFERENTIATED:
+        return differentiated(name)[-1]
     return fj.limit_cycle(of_problem(PROBLEMS[name]), PROBLEMS[name]["start"], throw=False)
+
+
+@functools.cache
+def differentiated(name):
+    """Derivatives of period, amplitudes and shares in both modes, and the cycle: one program."""
+    problem = PROBLEMS[name]
+
+    def outputs(values):
+        x = of_problem(changed(problem, problem["by"], values))
+        # As many as the search takes by itself outside of a compiled program.
+        found = fj.limit_cycle(x, problem["start"], segments=512, throw=False)
+        shares = found.stick_fraction, found.open_fraction
+        return jnp.concatenate([found.period[None], found.amplitude, *shares]), found
+
+    values = jnp.array([_at(problem, place) for place in problem["by"]])
+    return jax.jit(lambda values: both_modes(outputs, values, has_aux=True)[1:])(values)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -70,25 +85,14 @@ def test_cycle(name):
 @pytest.mark.parametrize("name", DIFFERENTIATED)
 def test_derivatives(name):
     """Of period, amplitudes and shares by the numbers in `by`, forward and reverse."""
-    problem, row = PROBLEMS[name], ROWS[name]
-    places = problem["by"]
-
-    def outputs(values):
-        x = of_problem(changed(problem, places, values))
-        # As many as the search takes by itself outside of a compiled program.
-        found = fj.limit_cycle(x, problem["start"], segments=512, throw=False)
-        shares = found.stick_fraction, found.open_fraction
-        return jnp.concatenate([found.period[None], found.amplitude, *shares])
-
-    values = jnp.array([_at(problem, place) for place in places])
-    expected = [row["derivatives"][place] for place in places]
+    places = PROBLEMS[name]["by"]
+    expected = [ROWS[name]["derivatives"][place] for place in places]
     shown = [
         [of["period"], *of["amplitude"], *of["stick_fraction"], *of["open_fraction"]]
         for of in expected
     ]
     truth, error = np.array(shown).transpose(2, 0, 1)
-    _, *slopes = jax.jit(lambda values: both_modes(outputs, values))(values)
-    for slope in slopes:
+    for slope in differentiated(name)[:2]:
         off = abs(np.asarray(slope).T - truth)
         assert (off < 10 * error + 1e-6 * (abs(truth) + 1e-2)).all(), (places, off)
 
@@ -105,7 +109,7 @@ def _at(problem, place) -> float:
 def test_motion_on_a_torus():
     """Its returns come ever nearer to earlier ones, never after 16: more of them change nothing."""
     joint = {"tangential": [1.0, 0.0], "normal": [0.0, 1.0], "V": 0.545, "P": 0.94, "K_n": 2.805}
-    law = "stribeck", {"mu_s": 0.868, "mu_m": 0.635, "v_m": 1.067}
+    law = "hyperbolic", {"mu_s": 0.868, "delta": 0.23}  # the program of lift_off
     problem = {
         "M": [[0.759, -0.122], [-0.122, 0.738]],
         "C": [[0.052, -0.001], [-0.001, 0.055]],
@@ -118,11 +122,11 @@ def test_motion_on_a_torus():
     assert found.result == fj.CycleResult.not_periodic
     mechanism, returns = hybrid_truth.Mechanism.of(problem), []
     phases = hybrid_truth.phases(mechanism.scaled, start / mechanism.units, 1e-9, maxima=True)
-    while len(returns) < 350:
+    while len(returns) < 250:
         end = next(phases).end
         if abs(end[2]) < 1e-9:  # the velocity along t
             returns.append(end)
-    later = np.array(returns[200:])
+    later = np.array(returns[100:])
     gaps = [np.abs(later[k:] - later[:-k]).max(axis=1).min() for k in range(1, 100)]
     assert min(gaps[:16]) > 0.05 and min(gaps[16:]) < 0.005
 
@@ -130,10 +134,8 @@ def test_motion_on_a_torus():
 @pytest.mark.slow
 def test_rest_with_an_open_joint():
     """A force that pulls the joint open leaves the rest to its damping."""
-    joint = fj.Joint(fj.FixedContact(2.0, 0.5, 1.0), fj.Coulomb(0.4), 0, 1, 1.0, preload=True)
-    K = np.array([[1.0, 0.2], [0.2, 1.0]])
-    pulled = fj.Structure(np.eye(2), 0.2 * np.eye(2), K, [joint], F=[0.0, -3.0])
-    found = fj.limit_cycle(pulled, throw=False)
+    pulled = changed(PROBLEMS["two_maxima"], ["F.0"], [-30.0])
+    found = fj.limit_cycle(of_problem(pulled), pulled["start"], throw=False)
     assert found.result == fj.CycleResult.equilibrium
 
 
