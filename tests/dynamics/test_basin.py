@@ -63,11 +63,12 @@ def belt(starts):
     return fj.basin(of_problem(BELT), *BOX, starts=starts, progress=False)
 
 
-def unlike(starts):
+def unlike(starts, each=1):
+    """How many of each such start are labelled otherwise than by SciPy."""
     found = belt(starts)
-    truth = np.array([comes_to_rest(*start) for start in found.starts])
+    truth = np.array([comes_to_rest(*start) for start in found.starts[::each]])
     assert 0 < truth.mean() < 1
-    return np.sum(truth != (found.labels == found.outcomes.index("equilibrium")))
+    return np.sum(truth != (found.labels[::each] == found.outcomes.index("equilibrium")))
 
 
 def test_belt_comes_to_rest_or_not():
@@ -88,7 +89,7 @@ def test_starts_on_and_beside_the_belt():
     truth = [comes_to_rest(x, V - 1e-9) for x, _ in on_belt]
     np.testing.assert_array_equal(found.labels == 0, truth)
     np.testing.assert_array_equal(found.starts, on_belt)
-    assert unlike(1000) <= 0.005 * 1000
+    assert unlike(1000, 5) <= 0.005 * 200
 
 
 def repeats(mechanism, start):
@@ -110,7 +111,7 @@ def repeats(mechanism, start):
 @pytest.mark.slow
 def test_designed_brake_against_the_independent_solver():
     """Kicks of three V: some end in the coexisting cycle of 24.5 um, at once or never."""
-    found = fj.basin(DESIGNED, radius=3.0, starts=12, seed=3, progress=False)
+    found = fj.basin(DESIGNED, radius=3.0, starts=6, seed=3, progress=False)
     mechanism = hybrid_truth.Mechanism.of(source_form_of(DESIGNED))
     truth = [repeats(mechanism, start) for start in found.starts]
     assert [found.outcomes[label] == "cycle 1" for label in found.labels] == truth
@@ -126,11 +127,11 @@ def test_labels_are_the_cycles_of_the_search():
     """
     scene = reference_scene().replace(K_n=6e8, K_t=3e8)
     found = fj.basin(scene, radius=2.0, starts=64, progress=False)
-    alone = jax.vmap(lambda start: fj.limit_cycle(scene, start, throw=False))(found.starts)
+    alone = [fj.limit_cycle(scene, start, throw=False).period for start in found.starts]
     periods = np.array([np.nan, *(float(c.period) for c in found.cycles), np.nan, np.nan])
     periods = periods[found.labels]
     assert len(found.cycles) >= 2
-    differ = np.flatnonzero(~np.isclose(periods, alone.period, rtol=1e-7, equal_nan=True))
+    differ = np.flatnonzero(~np.isclose(periods, np.array(alone), rtol=1e-7, equal_nan=True))
     assert len(differ) <= 2
     mechanism, tops = hybrid_truth.Mechanism.of(source_form_of(scene)), []
     for i in differ:
