@@ -28,9 +28,7 @@ BACKWARDS = {
     for name, problem in PROBLEMS.items()
     if any(joint["V"] < 0 and joint.get("K_t") for joint in problem["joints"])
 }
-# Their kinds of joints and motion are in four_dof, eight_dof and test_random_mechanisms.py.
-ALIKE = {"five_dof", "six_dof"}
-NAMES = mostly_slow([name for name in PROBLEMS if name not in BACKWARDS | ALIKE], *QUICK)
+NAMES = mostly_slow([name for name in PROBLEMS if name not in BACKWARDS], *QUICK)
 DIFFERENTIATED = ("stick_together", "four_dof")
 
 
