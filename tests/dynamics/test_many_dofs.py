@@ -17,6 +17,7 @@ from fractaljax._dynamics.runge_kutta import stability_polynomial
 from fractaljax._dynamics.scaled import hybrid_system
 from fractaljax._dynamics.segments import flow, tableau
 from structures import monodromy_of, truth_of
+from tools import both_modes
 
 system = jax.jit(hybrid_system)
 field, guards = jax.jit(HybridSystem.field), jax.jit(HybridSystem.guards)
@@ -76,42 +77,41 @@ def programs(system, y, s):
 
 @pytest.mark.slow
 def test_cycles_of_many_degrees_of_freedom():
-    """Period, state, shares and slope beside the independent solver; 300/omega a period."""
+    """Two side by side, with slopes in both modes, beside the independent solver.
+
+    Each takes 300/omega a period.
+    """
     structure = rods(40)
 
     @jax.jit
+    @jax.vmap
     def found(P):
-        cycle = fj.limit_cycle(structure.replace(**{"tip.P": P}), throw=False)
-        flow = monodromy_of(cycle)
-        return cycle.period, cycle.state, cycle.stick_fraction, cycle.result, flow
+        def period(P):
+            cycle = fj.limit_cycle(structure.replace(**{"tip.P": P[0]}), throw=False)
+            return cycle.period[None], (cycle, monodromy_of(cycle))
 
-    period, state, stick, result, flow = found(1.0)
-    assert result == fj.CycleResult.converged
-    assert float(period) * float(hybrid_system(structure).omega) > 300
+        return both_modes(period, P[None], has_aux=True)
 
-    def closed(P):
-        own = truth_of(structure.replace(**{"tip.P": P}))
-        z, T = np.asarray(state) / own.units, float(period) * own.omega
-        return own, *hybrid_truth.closed(own.scaled, z, T, 1e-12, own.map_in_units(flow))
+    P = jnp.array([1.0, 1.1])
+    _, *slopes, (cycles, flows) = found(P)
+    assert (cycles.result == fj.CycleResult.converged).all()
+    omega = float(hybrid_system(structure).omega)
+    assert float(cycles.period.min()) * omega > 300
 
-    own, z, T, trip = closed(1.0)
-    assert T / own.omega == pytest.approx(float(period), rel=1e-9)
-    np.testing.assert_allclose(state, z * own.units, rtol=0, atol=1e-8 * abs(state).max())
-    np.testing.assert_allclose(stick, hybrid_truth.shares(own.scaled, trip)[0] / T, atol=1e-8)
-    assert stick[0] > 0.1 and stick[2] > 0.05
+    for i, forward, reverse in zip(range(2), *slopes, strict=True):
+        cycle = jax.tree.map(lambda leaf, i=i: leaf[i], cycles)
 
-    _, slope = jax.jvp(lambda P: found(P)[0], (1.0,), (1.0,))
-    ends = [T / own.omega for own, _, T, _ in map(closed, (1 - 1e-4, 1 + 1e-4))]
-    assert slope == pytest.approx((ends[1] - ends[0]) / 2e-4, rel=1e-6)
+        def closed(P, cycle=cycle, flow=flows[i]):
+            own = truth_of(structure.replace(**{"tip.P": P}))
+            z, T = np.asarray(cycle.state) / own.units, float(cycle.period) * own.omega
+            return own, *hybrid_truth.closed(own.scaled, z, T, 1e-12, own.map_in_units(flow))
 
-    # Under `jax.vmap` periods and slopes are those of each alone.
-    def period_of(P):
-        return fj.limit_cycle(rods(12).replace(**{"tip.P": P}), throw=False).period
-
-    function, P = jax.value_and_grad(period_of), jnp.array([0.9, 1.1])
-    alone = jax.jit(function)
-    np.testing.assert_allclose(
-        jnp.stack(jax.jit(jax.vmap(function))(P)),
-        jnp.array([alone(each) for each in P]).T,
-        rtol=1e-9,
-    )
+        own, z, T, trip = closed(P[i])
+        assert T / own.omega == pytest.approx(float(cycle.period), rel=1e-9)
+        state, stick = z * own.units, hybrid_truth.shares(own.scaled, trip)[0] / T
+        np.testing.assert_allclose(cycle.state, state, rtol=0, atol=1e-8 * abs(state).max())
+        np.testing.assert_allclose(cycle.stick_fraction, stick, atol=1e-8)
+        assert stick[0] > 0.1 and stick[2] > 0.05
+        ends = [T / own.omega for own, _, T, _ in map(closed, (P[i] - 1e-4, P[i] + 1e-4))]
+        assert forward[0, 0] == pytest.approx((ends[1] - ends[0]) / 2e-4, rel=1e-6)
+        np.testing.assert_allclose(reverse, forward, rtol=1e-9)
