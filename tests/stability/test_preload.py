@@ -60,6 +60,12 @@ def test_eigenvalues_and_normal_forces(name, slope):
     np.testing.assert_allclose(forces, oracle.normal_forces(), rtol=rtol)
 
 
+@jax.jit
+def slopes(x, at):
+    """Of the growth rate with these quantities, in both modes: one program for a kind of joints."""
+    return both_gradients(lambda values: fj.growth_rate(x.replace(**values)), at)
+
+
 @most_slow("scene, load curve")
 def test_gradients(name):
     """By every quantity of every joint, in both modes, against differences in 40 digits."""
@@ -73,8 +79,7 @@ def test_gradients(name):
     wanted = {place: oracle.slope_of(quantity) for quantity, place in places.items()}
     scale = max(abs(wanted[place] * float(at[place])) for place in at)
     assert scale > 0
-    rate = jax.jit(lambda at: both_gradients(lambda v: fj.growth_rate(x.replace(**v)), at))
-    for found in rate(at):
+    for found in slopes(x, at):
         for place, slope in wanted.items():
             rounding = 1e-10 * scale / float(at[place])
             assert float(found[place]) == pytest.approx(slope, rel=1e-8, abs=rounding), place
