@@ -197,9 +197,10 @@ def _differences(function, x, h):
 
 
 @functools.cache
-def belt_cycle(a, ratio, **options):
+def belt_cycle(a, ratio):
+    """With as many segments as the longest needs: one program."""
     return fj.limit_cycle(
-        of_problem(BELT), START, excitation=fj.Excitation([a], ratio * FREE, 0.3), **options
+        of_problem(BELT), START, excitation=fj.Excitation([a], ratio * FREE, 0.3), segments=512
     )
 
 
