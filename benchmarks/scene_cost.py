@@ -104,7 +104,6 @@ ROWS = (
     Row("amplitude with gradient by D, G", 9, by_surface(amplitude), normal),
     Row("worst amplitude of 9 conditions, with gradient", 10, by_surface(worst(amplitude)), normal),
 )
-IN_SECONDS = tuple(row for row in ROWS if "amplitude" not in row.name)  # to compile
 FULL, QUICK = {"repeats": 51, "rows": ROWS}, {"repeats": 5, "rows": ROWS[:4]}
 
 

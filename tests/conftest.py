@@ -25,9 +25,12 @@ def pytest_addoption(parser):
 @pytest.hookimpl(trylast=True)  # of what `-m` has left
 def pytest_collection_modifyitems(config, items):
     if config.getoption("once"):
-        first = {item.nodeid.partition("[")[0]: item for item in reversed(items)}
-        config.hook.pytest_deselected(items=[i for i in items if i not in first.values()])
-        items[:] = list(first.values())[::-1]
+        first, others = {}, []
+        for item in items:
+            if first.setdefault(item.nodeid.partition("[")[0], item) is not item:
+                others.append(item)
+        config.hook.pytest_deselected(items=others)
+        items[:] = first.values()
 
 
 def pytest_configure(config):

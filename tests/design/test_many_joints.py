@@ -123,7 +123,7 @@ def test_limits_of_joints_are_those_of_each_condition(tolerance):
 @pytest.mark.slow
 @pytest.mark.optimised
 def test_a_design_of_many_joints_stays_near():
-    """From an even spread over the bounds alone the nearest that is found is at 0.27."""
+    """Under a range of friction, from a few starts."""
     x = several_joints(4, mu=0.5)
     asked: Any = dict(envelope={"j0.mu": (0.45, 0.6)}, starts=12, progress=False)
     found = fj.design(x, bounds_of(x), **asked)

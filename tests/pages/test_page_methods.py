@@ -278,9 +278,9 @@ def test_operations_are_counted_once_in_loops_and_calls():
 
 @pytest.mark.parametrize("quick", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_the_row_without_a_part_traces_fewer_operations(quick):
-    """What is compiled is counted by the quick run of the page."""
+    """What is compiled of the first rows is counted by the quick run of the page."""
     counts = []
-    for row in scene_cost.IN_SECONDS if quick else scene_cost.ROWS:
+    for row in [row for row in scene_cost.ROWS if not quick or "amplitude" not in row.name]:
         counts.append(scene_cost.operations(scene_cost.traced(row)[0].jaxpr.jaxpr).total())
         assert row.without is None or counts[row.without] < counts[-1]
 
