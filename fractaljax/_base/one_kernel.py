@@ -1,63 +1,180 @@
-"""Loops over small arrays as one kernel of XLA on a CPU.
+"""Functions of few numbers as one kernel of XLA on a CPU.
 
-XLA starts a kernel for each operation, which takes some 40 ns. So a loop over a few numbers takes
-longer for starts than for operations. Loops below a size XLA makes one kernel by itself; where a
-loop also fills a larger array it has to be asked to, by an attribute that other backends ignore.
+XLA compiles a kernel for each group of operations, in some 25 ms, and starts it in some 40 ns,
+however few numbers it has. One kernel of all the operations compiles in half the time and runs
+faster. XLA makes it where an attribute asks for that, which other backends ignore.
 """
 
+import math
+import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+from .kept import is_staged
 
 # Versions of JAX whose XLA was seen to do so. It may refuse what others make of an operation.
 _FIRST, _BEYOND = (0, 9), (0, 11)
-_ATTRIBUTES = {"xla_cpu_small_call": "true", "inlineable": "false"}
+_ATTRIBUTE = "xla_cpu_small_call"
+_ATTRIBUTES = {_ATTRIBUTE: "true", "inlineable": "false"}
 # Operations that XLA compiles itself into any kernel; no library's, no search and no scatter.
 _NAMES = """
-abs acos acosh add add_any and argmax argmin asin asinh atan atan2 atanh broadcast_in_dim cbrt
-ceil clamp concatenate cond convert_element_type copy copy_p cos cosh custom_jvp_call
-custom_vjp_call div dynamic_slice dynamic_update_slice eq erf exp exp2 expand_dims expm1 floor
-ge gt integer_pow iota is_finite jit le log log1p logistic lt max min mul ne neg nextafter not
-or pad pjit pow reduce_and reduce_max reduce_min reduce_or reduce_sum rem reshape rev round
-rsqrt scan select_n sign sin sinh slice split sqrt square squeeze stack stop_gradient sub tan
-tanh transpose while xor
+abs add and atan2 broadcast_in_dim case cbrt ceil clamp compare complex concatenate constant
+convert cosine divide dynamic_slice dynamic_update_slice exponential exponential_minus_one floor
+gather if imag iota is_finite log log_plus_one logistic maximum minimum multiply negate not
+optimization_barrier or pad power real remainder reshape return reverse round_nearest_afz
+round_nearest_even rsqrt select sign sine slice sqrt subtract tan tanh transpose while xor
 """
-_KNOWN = frozenset(_NAMES.split())
-_MOST_REDUCED = 1024  # numbers; more may go to a library
+_CHLO = "acos acosh asin asinh atan atanh cosh erf erfc next_after sinh square tan"
+_KNOWN = frozenset(f"stablehlo.{name}" for name in _NAMES.split())
+_KNOWN |= frozenset(f"chlo.{name}" for name in _CHLO.split()) | {"func.return"}
+_MOVES = {f"stablehlo.{name}" for name in ("concatenate", "convert", "reshape", "slice")}
+_SUMMED = 4095  # floats; more may go to a library
+_FEW, _LARGEST = 2**13, 2**16  # numbers; loops over more are left to several threads
 
 
-def one_kernel(function: Callable, large: Any, *small: Any, wanted: bool = True) -> Any:
-    """function(large, *small), on a CPU one kernel where XLA can make one of its operations.
+def one_kernel(
+    function: Callable, *given: Any, wanted: bool = True, largest: int = _LARGEST
+) -> Any:
+    """function(*given), on a CPU one kernel where it is `wanted` and XLA can make one.
 
-    `large` are arrays of which the function changes a part. All others are small: where they are
-    not, one kernel is not `wanted`.
+    Whether it can is seen in what `jit`, `vmap` and derivatives have made of the function. All
+    arrays that it needs, but constants, are among those given.
     """
-    empty = not all(jnp.size(x) for x in jax.tree.leaves((large, small)))
-    if empty or not wanted or not _available():
-        return function(large, *small)
-    program, out = jax.make_jaxpr(function, return_shape=True)(large, *small)
-    if not all(_is_known(equation) for equation in equations(program.jaxpr)):
-        return function(large, *small)
-    from jax.experimental.xla_metadata import set_xla_metadata  # none of JAX's stable parts
+    possible = is_staged() and _available() and all(jnp.size(x) for x in jax.tree.leaves(given))
+    if not wanted or not possible:
+        return function(*given)
 
     @jax.jit
-    def kernel(consts, large, small):
-        run = jaxpr_as_fun(ClosedJaxpr(program.jaxpr, consts))
+    def kernel(given):
         # An argument that optimisation leaves without a use would stop XLA: each goes out again.
-        used = [jnp.ravel(x)[0].astype(float) for x in jax.tree.leaves((consts, small))]
-        return run(*jax.tree.leaves((large, *small))), jnp.stack(used)
+        used = [x.reshape(-1)[:1].astype(float) for x in jax.tree.leaves(given)]
+        return function(*given), jnp.concatenate(used)
 
-    leaves, used = kernel(program.consts, large, small)
-    leaves[0] = set_xla_metadata(leaves[0], **_ATTRIBUTES)
-    leaves[0], _ = jax.lax.optimization_barrier((leaves[0], used))  # so that JAX keeps these
-    return jax.tree.unflatten(jax.tree.structure(out), leaves)
+    result, used = kernel(jax.tree.map(jnp.asarray, given))
+    # What uses any of the results keeps the arguments that go out.
+    return jax.tree.map(lambda x: _kernel_result.bind(x, used, largest=largest), result)
+
+
+def small_kernel(function: Callable, *given: Any) -> Any:
+    """`one_kernel` of some numbers each for a few scenes: of more, several threads are faster."""
+    return one_kernel(function, *given, largest=_FEW)
 
 
 def _available() -> bool:
-    return _FIRST <= jax.__version_info__ < _BEYOND and jax.default_backend() == "cpu"
+    return _FIRST <= jax.__version_info__ < _BEYOND
+
+
+# A result of the call that is to be one kernel, and what else goes out of that.
+_kernel_result = Primitive("kernel_result")
+_kernel_result.def_impl(lambda x, *used, **_: x)
+_kernel_result.def_abstract_eval(lambda x, *used, **_: x)
+
+
+def _batched(arguments, axes, **parameters):
+    return _kernel_result.bind(*arguments, **parameters), axes[0]
+
+
+def _jvp(primals, tangents, **parameters):
+    dx = tangents[0]
+    if not isinstance(dx, ad.Zero):
+        # Tangents are arguments too.
+        moving = [x for x in tangents[1:] if not isinstance(x, ad.Zero)]
+        dx = _kernel_result.bind(dx, *primals[1:], *moving, **parameters)
+    return _kernel_result.bind(*primals, **parameters), dx
+
+
+def _transposed(cotangent, x, *used, **_):
+    return cotangent, *[None] * len(used)
+
+
+batching.primitive_batchers[_kernel_result] = _batched
+ad.primitive_jvps[_kernel_result] = _jvp
+ad.primitive_transposes[_kernel_result] = _transposed
+
+
+def _lowered(context, x, *used, largest):
+    """On a CPU: the call gets the attributes if it has only operations that allow it."""
+    from jax.experimental.xla_metadata import set_xla_metadata  # none of JAX's stable parts
+
+    call = x.owner
+    if getattr(call, "name", "") != "func.call" or "mhlo.frontend_attributes" in call.attributes:
+        return [x]
+    functions = context.module_context.symbol_table
+    if not _all_go_out(call, functions[_called(call)], used):
+        return [x]
+    possible = _Possible(functions, largest)(call)
+    attributes = _ATTRIBUTES if possible else {_ATTRIBUTE: "false"}
+    marked = mlir.lower_fun(lambda x: set_xla_metadata(x, **attributes), multiple_results=False)
+    return marked(context.replace(avals_in=context.avals_in[:1]), x)
+
+
+mlir.register_lowering(_kernel_result, lambda _, x, *used, **__: [x])
+# Elsewhere the value may be an argument, of which nobody sees where it comes from.
+mlir.register_lowering(_kernel_result, _lowered, platform="cpu", cacheable=False)
+
+
+def _called(call) -> str:
+    return mlir.ir.FlatSymbolRefAttr(call.attributes["callee"]).value
+
+
+def _all_go_out(call, function, used) -> bool:
+    """Whether each argument of a function reaches what is `used` of its results, only moved.
+
+    Not so of a linear part on its own, as reverse mode has it, and of what was not among the given.
+    """
+    body = function.regions[0].blocks[0]
+    *_, end = body
+    left = [end.operands[mlir.ir.OpResult(x).result_number] for x in used if x.owner == call]
+    reached = set()
+    while left:
+        value = left.pop()
+        if isinstance(value.owner, mlir.ir.Block):
+            reached.add(mlir.ir.BlockArgument(value).arg_number)
+        elif value.owner.name in _MOVES:
+            left += value.owner.operands
+    return len(reached) == len(body.arguments)
+
+
+class _Possible:
+    """Whether XLA compiles an operation of StableHLO, and those in it, into any kernel."""
+
+    def __init__(self, functions, largest: int):
+        self.functions, self.largest = functions, largest
+        self.seen: dict[str, bool] = {}
+
+    def __call__(self, operation) -> bool:
+        if operation.name == "func.call":
+            name = _called(operation)
+            if name not in self.seen:
+                self.seen[name] = self.inside(self.functions[name])
+            return self.seen[name]
+        operands, results = (
+            [_shape(x) for x in xs] for xs in (operation.operands, operation.results)
+        )
+        if any(math.prod(shape) > self.largest for shape in results):
+            return False
+        if operation.name == "stablehlo.dot_general":
+            return any(len(shape) == 1 for shape in operands)  # with vectors XLA's own loop
+        if operation.name == "stablehlo.reduce":
+            floats = "xf" in str(operation.operands[0].type)
+            return not floats or math.prod(operands[0]) <= _SUMMED
+        return operation.name in _KNOWN and self.inside(operation)
+
+    def inside(self, operation) -> bool:
+        blocks = (block for region in operation.regions for block in region.blocks)
+        return all(self(x.operation) for block in blocks for x in block)
+
+
+def _shape(value) -> list[int]:
+    """Of a token, or where a length is not known yet, larger than any array."""
+    kind = value.type
+    shape = list(kind.shape) if isinstance(kind, mlir.ir.RankedTensorType) else [-1]
+    return [sys.maxsize if length < 0 else length for length in shape]
 
 
 def equations(jaxpr) -> Iterator[Any]:
@@ -68,10 +185,3 @@ def equations(jaxpr) -> Iterator[Any]:
             inner = getattr(value, "jaxpr", value)
             if hasattr(inner, "eqns"):
                 yield from equations(inner)
-
-
-def _is_known(equation) -> bool:
-    name = equation.primitive.name
-    reduces = name.startswith(("reduce", "arg"))
-    small = not reduces or all(x.aval.size <= _MOST_REDUCED for x in equation.invars)
-    return name in _KNOWN and small

@@ -1,4 +1,4 @@
-"""Loops as one kernel of XLA: the same numbers, whatever optimisation makes of the arguments."""
+"""Functions as one kernel of XLA: the same numbers, whatever optimisation makes of arguments."""
 
 import functools
 
@@ -7,11 +7,25 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import fractaljax as fj
 from fractaljax._base import one_kernel as module
 from fractaljax._base.one_kernel import one_kernel
+from mechanisms import PROBLEMS
+from structures import of_problem
 
 ROWS = jnp.zeros((2, 40))
 STATE, RATES, UNUSED = jnp.array([1.0, 0.5]), {"a": 0.3, "b": 7}, jnp.array([True, False])
+ON_A_CPU = jax.default_backend() == "cpu"
+
+
+@pytest.fixture(autouse=True)
+def optimised():
+    """XLA as users have it: what it makes of an argument without a use is to be seen here."""
+    name = "jax_disable_most_optimizations"
+    before = jax.config.read(name)
+    jax.config.update(name, False)
+    yield
+    jax.config.update(name, before)
 
 
 def filled(rows, y, rates, _, wise=jnp.sin):
@@ -27,25 +41,27 @@ def filled(rows, y, rates, _, wise=jnp.sin):
     return jax.lax.fori_loop(0, rows.shape[1], step, (rows, y))
 
 
-def kernels(function, *arguments) -> int:
+def kernels(function, *given) -> int:
     """How many calls of an optimised program are to be one kernel."""
-    compiled = jax.jit(lambda *given: one_kernel(function, *given)).lower(*arguments).compile()
+    compiled = jax.jit(lambda *x: function(*x)).lower(*given).compile()
     return (compiled.as_text() or "").count('inlineable="false"')
 
 
 GIVEN = ROWS, STATE, RATES, UNUSED
 
 
-def test_the_same_numbers():
-    def inside(*given):
-        return one_kernel(filled, *given)
+def inside(*given, wise=jnp.sin):
+    return one_kernel(functools.partial(filled, wise=wise), *given)
 
+
+def end(function):
+    return lambda y: function(ROWS, y, RATES, UNUSED)[1]
+
+
+def test_the_same_numbers():
     for run in (jax.jit(inside), inside):
         for own, plain in zip(run(*GIVEN), filled(*GIVEN), strict=True):
             np.testing.assert_allclose(own, plain, rtol=1e-13)
-
-    def end(function):
-        return lambda y: function(ROWS, y, RATES, UNUSED)[1]
 
     many = jnp.stack([STATE, 2 * STATE])
     for changed in (jax.vmap, lambda f: jax.vmap(jax.jacfwd(f)), lambda f: jax.vmap(jax.jacrev(f))):
@@ -55,22 +71,84 @@ def test_the_same_numbers():
 
 def test_one_kernel_where_xla_can():
     """Not of an operation of a library, nor by a version that nobody has looked at."""
-    on_a_cpu = jax.default_backend() == "cpu"
-    assert (kernels(filled, *GIVEN) > 0) == on_a_cpu
+    assert (kernels(inside, *GIVEN) > 0) == ON_A_CPU
+    for slope in (jax.jacfwd(end(inside)), jax.value_and_grad(lambda y: end(inside)(y)[0])):
+        assert (kernels(slope, STATE) > 0) == ON_A_CPU
 
     def much(y):
-        return y * jnp.sum(jnp.sin(y[:, None] * jnp.arange(1000.0)[None]))
+        return y * jnp.sum(jnp.sin(y[:, None] * jnp.arange(3000.0)[None]))
 
-    for wise in (jnp.sort, much):
-        assert kernels(functools.partial(filled, wise=wise), *GIVEN) == 0
+    def large(y):
+        return y + jnp.max(jnp.arange(2**17) * y[0].astype(int))
+
+    def told(y):
+        jax.debug.callback(lambda _: None, y, ordered=True)
+        return y
+
+    for wise in (jnp.sort, much, large, told):
+        assert kernels(functools.partial(inside, wise=wise), *GIVEN) == 0
+
+
+def test_many_at_once_are_left_to_several_threads():
+    def few(x):
+        return one_kernel(lambda x: jnp.sin(x) * x, x, largest=8)
+
+    assert (kernels(jax.vmap(few), jnp.ones(8)) > 0) == ON_A_CPU
+    assert kernels(jax.vmap(few), jnp.ones(9)) == 0
+
+
+def test_a_result_without_a_use():
+    """XLA is asked of those that have one; what a kernel is for nothing else is not computed."""
+
+    def both(x):
+        return one_kernel(lambda x: (jnp.sin(x), jnp.cos(x)), x)[1]
+
+    assert (kernels(both, STATE) > 0) == ON_A_CPU
+    assert "sine" not in jax.jit(both).lower(STATE).as_text().replace("cosine", "")
+
+
+def unused(x, a):
+    return x * jnp.sin(x) + jnp.where(jnp.zeros((), bool), a, 0)
+
+
+def sliced(x, a):
+    return jax.lax.dynamic_slice(x * jnp.sin(x), (a.astype(int),), x.shape)
+
+
+@pytest.mark.parametrize("function", [unused, sliced, lambda x, _: x * jnp.sin(x)])
+def test_arguments_without_a_use(function):
+    """XLA would end the process."""
+
+    def run(x):
+        return one_kernel(function, x, jnp.sum(x))
+
+    def along(f):
+        return lambda x: jax.jvp(f, (x,), (2 * x,))
+
+    for changed in (lambda f: f, along, jax.jacfwd, jax.jacrev, jax.hessian):
+        np.testing.assert_allclose(
+            jax.jit(changed(run))(STATE), changed(lambda x: x * jnp.sin(x))(STATE), rtol=1e-13
+        )
 
 
 def test_a_later_version_is_left_alone(monkeypatch):
     monkeypatch.setattr(module, "_BEYOND", module._FIRST)
-    assert kernels(filled, *GIVEN) == 0
+    assert kernels(inside, *GIVEN) == 0
 
 
 @pytest.mark.parametrize("empty", [jnp.zeros(0), ()])
 def test_without_numbers(empty):
     found = one_kernel(lambda rows, y, _: rows + y[:, None], ROWS, STATE, empty)
     np.testing.assert_array_equal(found, ROWS + STATE[:, None])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("mechanism", "left"), [("scene", 0), ("second_face", 1)])
+def test_a_limit_cycle_is_made_of_kernels(mechanism, left):
+    """All that was meant to be one is, but a structure's eigenvalues, which are a library's."""
+    mechanism = fj.brake_scene() if mechanism == "scene" else of_problem(PROBLEMS[mechanism])
+    cycle = jax.jit(lambda x: fj.limit_cycle(x, throw=False))
+    text = cycle.lower(mechanism).as_text()
+    asked, all_calls = text.count('xla_cpu_small_call = "true"'), text.count("call @kernel")
+    assert all_calls > 8
+    assert asked == (all_calls - left if ON_A_CPU else 0)
