@@ -1,5 +1,7 @@
 """Which periodic orbits a motion can settle to: they keep to the friction law and attract."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -31,8 +33,8 @@ def admissible(system: HybridSystem, segments: Segments, middle) -> Bool[Array, 
     """
     y, s, h, ends = segments.y, segments.s, segments.duration, next_start(segments.y)
     at = jnp.stack([y, middle, ends])
-    d = jax.vmap(lambda y: h[None] * system.field(y, s))(at)
-    guards = jax.vmap(lambda y: system.guards(y, s)[1:])  # but the section
+    d = jax.lax.map(lambda y: h[None] * system.field(y, s), at)
+    guards = functools.partial(jax.lax.map, lambda y: system.guards(y, s)[1:])  # but the section
     scale = 1 + jnp.max(jnp.abs(y), axis=(0, 1), keepdims=True)
     # Half a segment each: the cubic through a guard's ends and a point between says where it is
     # lowest. There the guard itself is evaluated.

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array
 
 SMALL = 6  # unknowns up to which elimination is no loop, which runs faster
+_ELIMINATED = 16  # unknowns up to which elimination is no library's
 _SUMMED = 8  # rows up to which products of matrices are sums
 _QUICK = 512  # bytes of an array up to which XLA on a CPU runs a loop's operations one by one
 
@@ -52,8 +53,36 @@ def solve(W, b) -> Array:
         entries = W.reshape(4, *W.shape[2:])
         own, other = entries[::3], entries[1:3]
         return (own[::-1] * b - other * b[::-1]) / (own * own[::-1] - other * other[::-1])
+    if len(b) <= _ELIMINATED:
+        return _by_elimination(W, b)
     W, b = jnp.moveaxis(W, (0, 1), (-2, -1)), jnp.moveaxis(b, 0, -1)
     return jnp.moveaxis(jnp.linalg.solve(W, b[..., None])[..., 0], -1, 0)
+
+
+def _by_elimination(W, b) -> Array:
+    """`solve` in operations that XLA compiles into one loop with others, unlike a library's."""
+    lanes = jnp.broadcast_shapes(W.shape[2:], b.shape[1:])
+    W, b = jnp.broadcast_to(W, (*W.shape[:2], *lanes)), jnp.broadcast_to(b, (len(b), *lanes))
+    numbers = row_numbers(b)
+
+    def step(k, A):
+        # The pivot's row trades places with the first one that is left.
+        column = jax.lax.dynamic_index_in_dim(A, k, 1, keepdims=False)
+        pivot, _ = first_least(jnp.where(numbers < k, 1, -jnp.abs(column)))
+        chosen = (numbers == pivot[None])[:, None]
+        row = jnp.sum(jnp.where(chosen, A, 0), axis=0)
+        A = jnp.where(chosen, jax.lax.dynamic_index_in_dim(A, k, 0), A)
+        return _eliminated(k, A, row)
+
+    def solved(W):
+        return lambda _, b: jax.lax.fori_loop(
+            0, len(b), step, jnp.concatenate([W, b[:, None]], axis=1)
+        )[:, -1]
+
+    def times(x):
+        return jnp.sum(W * x[None], axis=1)
+
+    return jax.lax.custom_linear_solve(times, b, solved(W), solved(jnp.swapaxes(W, 0, 1)))
 
 
 def solve_positive(W, b) -> Array:
@@ -67,12 +96,13 @@ def solve_positive(W, b) -> Array:
     parts = (jnp.broadcast_to(x, (*x.shape[:2], *lanes)) for x in (W, b[:, None]))
     A = jnp.concatenate([*parts], axis=1)
     for k in range(len(b)):
-        A = _eliminated(k, A)
+        A = _eliminated(k, A, A[k])
     return A[:, -1]
 
 
-def _eliminated(k, A) -> Array:
-    row = (A[k] / A[k, k][None])[None]
+def _eliminated(k, A, row) -> Array:
+    """A after the unknown k is eliminated by that row, which becomes its row k."""
+    row = (row / row[k][None])[None]
     return jnp.where(row_numbers(A) == k, row, A - A[:, k, None] * row)
 
 
@@ -80,7 +110,7 @@ def _eliminated(k, A) -> Array:
 def _positive_inverse(W) -> Array:
     eye = jnp.eye(len(W), dtype=W.dtype).reshape(len(W), len(W), *(1,) * (W.ndim - 2))
     A = jnp.concatenate([W, jnp.broadcast_to(eye, W.shape)], axis=1)
-    return jax.lax.fori_loop(0, len(W), _eliminated, A)[:, len(W) :]
+    return jax.lax.fori_loop(0, len(W), lambda k, A: _eliminated(k, A, A[k]), A)[:, len(W) :]
 
 
 @_positive_inverse.defjvp

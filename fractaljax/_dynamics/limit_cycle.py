@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, ScalarLike
 
+from .._base.one_kernel import one_kernel, small_kernel
 from .._base.parts import concrete, number, raise_unless, require_kind, whole
 from .._base.quick import quick_jit
 from .._mechanism.mechanism import Mechanism
@@ -20,11 +21,11 @@ from .cycle import CycleResult, LimitCycle, Orbit
 from .events import Cubic, first_root, rounding
 from .excitation import Excitation, excited_system
 from .hybrid import NONE, OPEN, HybridSystem
-from .lanes import first_least, row_numbers
-from .maps import Maps, maps
+from .lanes import first_least, product, row_numbers
+from .maps import maps
 from .orbit import orbit
 from .scaled import FEW, check_rtol, degrees_of_freedom, scaled_start, start_state
-from .segments import Segments, flow, next_start
+from .segments import Segments, cumulative, flow, next_start
 
 if TYPE_CHECKING:
     from diffrax import AbstractSolver
@@ -109,8 +110,9 @@ def _minima_jvp(primals, tangents):
 def extreme_values(system: HybridSystem, segments: Segments, rows) -> Float[Array, "2 r"]:
     """Smallest and largest value along the orbit of linear functions rows @ y, rows (r, 2n)."""
     y, h, s = segments.y, segments.duration, segments.s
+    nodes = _at_nodes(system, segments, lambda x: system.times(rows, x))
+    g_0, g_1, d_0, d_1 = (jnp.concatenate([x, -x]) for x in nodes)
     rows = jnp.concatenate([rows, -rows])
-    (g_0, g_1), (d_0, d_1) = _at_nodes(system, segments, lambda x: system.times(rows, x))
     # Minima inside of segments, by the cubic through the ends. Of those nearly as low it cannot say
     # which is the lowest, so that a few are refined. A row at rest has none.
     through = jax.lax.stop_gradient((g_0, g_1, d_0, d_1))
@@ -129,18 +131,18 @@ def extreme_values(system: HybridSystem, segments: Segments, rows) -> Float[Arra
     return jnp.stack([low, -high])
 
 
-def _at_nodes(system: HybridSystem, segments: Segments, values: Callable) -> tuple[Array, Array]:
-    """Linear `values` of the states at both ends of segments (2, ..., N), and their slopes."""
-    both = jnp.stack([segments.y, next_start(segments.y)], axis=1)
-    rates = segments.duration[None, None] * system.field(both, segments.s[:, None])
-    g, d = values(both), values(rates)
-    return jnp.moveaxis(g, -2, 0), jnp.moveaxis(d, -2, 0)
+def _at_nodes(system: HybridSystem, segments: Segments, values: Callable) -> list[Array]:
+    """Linear `values` of the states at the starts and the ends of segments, and their slopes."""
+    y, h, s = segments.y, segments.duration, segments.s
+    starts = values(y)
+    slopes = [values(h[None] * system.field(end, s)) for end in (y, next_start(y))]
+    return [starts, jnp.roll(starts, -1, axis=-1), *slopes]
 
 
 def _time_below_zero(system: HybridSystem, segments: Segments, row, offset) -> Float[Array, ""]:
     """How long row @ y + offset is negative in one period."""
     y, h, s = segments.y, segments.duration, segments.s
-    (g_0, g_1), (d_0, d_1) = _at_nodes(system, segments, lambda x: system.times(row[None], x)[0])
+    g_0, g_1, d_0, d_1 = _at_nodes(system, segments, lambda x: system.times(row[None], x)[0])
     g_0, g_1 = g_0 + offset, g_1 + offset
     whole_segments = jnp.sum(jnp.where(g_0 < 0, h, 0))
     # In a segment with crossings: from its start to the first zero, and from the last to its end.
@@ -149,7 +151,8 @@ def _time_below_zero(system: HybridSystem, segments: Segments, row, offset) -> F
     back = [reversed_sign * x for x in (g_1, g_0, -d_1, -d_0)]
     cubics = Cubic.through(*(jnp.stack(x) for x in zip((g_0, g_1, d_0, d_1), back, strict=True)))
     first, last = first_root(cubics)
-    crosses, k = jax.lax.top_k((first <= 1).astype(int), _CROSSINGS)
+    until, number = cumulative(first <= 1), jnp.arange(_CROSSINGS)
+    crosses, k = number < until[-1], jnp.argmax(until[None] > number[:, None], axis=1)
     t = jax.lax.stop_gradient(jnp.concatenate([first[k], 1 - last[k]]))
     twice = jnp.concatenate([k, k])
     t = t * h[twice]
@@ -162,26 +165,35 @@ def _time_below_zero(system: HybridSystem, segments: Segments, row, offset) -> F
     first, last = jnp.split(t, 2)
     # With one crossing the rest of the segment has the other sign, else the time between two.
     crossed = jnp.where(jax.lax.stop_gradient(g_1[k]) < 0, h[k] - first, last - first)
-    return whole_segments + jnp.sum(jnp.where(crosses > 0, sign[k] * crossed, 0))
+    return whole_segments + jnp.sum(jnp.where(crosses, sign[k] * crossed, 0))
 
 
-def _monodromy(system: HybridSystem, segments: Segments, local: Maps) -> Float[Array, "2n 2n"]:
+def _monodromy(system: HybridSystem, segments: Segments) -> Float[Array, "2n 2n"]:
     """The product of all segments' maps, with the jump of the tangent at every switch."""
+    _, local = maps(system, segments)
     ends, s = next_start(segments.y), segments.s
     before, after = system.field(ends, s), system.field(ends, jnp.roll(s, -1, axis=-1))
     switches = segments.used & (segments.guard != NONE)
     speed = jnp.where(switches, jnp.sum(local.c * before, axis=0), 1)
     jump = jnp.where(switches[None], (after - before) / speed[None], 0)
     eye = jnp.eye(len(ends), dtype=ends.dtype)
-    M = jnp.einsum("ijn,njk->nik", eye[:, :, None] + jump[:, None] * local.c[None], local.A)
-    product, _ = jax.lax.scan(lambda product, M: (M @ product, None), eye, M)
-    return product
+
+    def chain(so_far, segment):
+        A, jump, c = segment
+        so_far = product(A, so_far)
+        return so_far + jump[:, None] * jnp.sum(c[:, None] * so_far, axis=0)[None], None
+
+    return jax.lax.scan(chain, eye, (local.A, jump.T, local.c.T))[0]
 
 
 # Apart from the cycle's program, which another contact law then does not compile again.
 @functools.partial(quick_jit, once=True)
 def posed(mechanism: Mechanism, excitation) -> tuple[HybridSystem, Float[Array, ""]]:
     """The scaled system, and its growth rate at the equilibrium."""
+    return small_kernel(_posed, mechanism, excitation)
+
+
+def _posed(mechanism: Mechanism, excitation) -> tuple[HybridSystem, Float[Array, ""]]:
     system = excited_system(mechanism, excitation)
     # An excited motion does not end in equilibrium.
     growth = jnp.ones_like(system.omega) if system.excited else growth_rate(mechanism)
@@ -205,13 +217,12 @@ def solved(
     y, duration = orbit(system, found.segments)
     closed = Segments(y, duration, found.segments.s, found.segments.guard)
     period = jnp.sum(duration)
-    _, local = maps(system, closed)
     error = found.error
     status = CycleResult.exhausted
     for outcome, result in enumerate(_RESULTS):
         status = CycleResult.where(found.status == outcome, result, status)
     exists = found.status == search.CONVERGED
-    monodromy = _monodromy(system, closed, local)
+    monodromy = one_kernel(_monodromy, system, closed)
     rounding_of_growth = 1e3 * jnp.finfo(y.dtype).eps
     unstable = exists & (found.growth > 100 * error + rounding_of_growth)
     status = CycleResult.where(unstable, CycleResult.unstable, status)
@@ -227,7 +238,7 @@ def solved(
     rows = jnp.concatenate([system.L[tangential], jnp.zeros_like(system.L[tangential])], axis=1)
     own = system.own(jnp.eye(2 * system.n, dtype=rows.dtype))
     everything = jnp.concatenate([own, rows])
-    low, high = extreme_values(system, closed, everything)
+    low, high = one_kernel(extreme_values, system, closed, everything)
     offset = system.P[tangential][None]
     linear = jnp.zeros((len(system.P), 2), rows.dtype)
     linear = linear.at[tangential].set((jnp.stack([low, high])[:, 2 * n :] + offset).T)
@@ -244,7 +255,7 @@ def solved(
     pulls = [
         jnp.zeros_like(period)
         if opens or not faces[1:]
-        else _time_below_zero(system, closed, row, shift) / period
+        else one_kernel(_time_below_zero, system, closed, row, shift) / period
         for row, shift, faces, opens in zip(
             rows, offset[0], system.faces, system.opens, strict=True
         )

@@ -15,6 +15,7 @@ from .runge_kutta import runge_kutta, stability_polynomial
 from .segments import Segments, chosen_guard, next_start, tableau
 
 _POWERS = 4  # of a matrix in a polynomial of it
+_SIDE_BY_SIDE = 4  # tangents
 _FEW = 512  # segments of all lanes that are taken at once
 _TOGETHER, _LEAST = 128, 8  # of more, how many of all lanes, and of each at least, at a time
 
@@ -90,7 +91,7 @@ def _maps(system: HybridSystem, segments: Segments) -> tuple[Array, Array, Array
     def field(columns):
         # The state and its tangents side by side: one array, one compiled loop a stage.
         along, slope = jax.linearize(lambda y: system.field(y, s), columns[:, 0])
-        tangents = jax.vmap(slope, in_axes=1, out_axes=1)(columns[:, 1:])
+        tangents = _of_each(slope, columns[:, 1:])
         return jnp.concatenate([along[:, None], tangents], axis=1)
 
     columns = jnp.concatenate([y[:, None], _identity(y)], axis=1)
@@ -108,7 +109,7 @@ def _polynomial_maps(system: HybridSystem, segments: Segments, ends):
     b = system.field(ends, s)
     state = (y + ends) / 2 + h[None] / 12 * (system.field(y, s) - b)  # its mean in time
     _, slope = jax.linearize(lambda y: system.field(y, s), state)
-    mean = jax.vmap(slope, in_axes=1, out_axes=1)(_identity(y)) * h[None, None]
+    mean = _of_each(slope, _identity(y)) * h[None, None]
     eye, mean = (jnp.moveaxis(x, 2, 0) for x in (_identity(y), mean))
     powers, times = [eye, mean], jax.vmap(functools.partial(product, written_out=True))
     for _ in range(_POWERS - 1):
@@ -120,6 +121,17 @@ def _polynomial_maps(system: HybridSystem, segments: Segments, ends):
         own = sum(c * power for c, power in zip(block, powers, strict=False))
         A = own if A is None else times(A, powers[-1]) + own
     return ends, A, b
+
+
+def _of_each(slope: Callable, tangents) -> Array:
+    """The slope along each of tangents (2n, k, ...).
+
+    Together, or one by one where their sums are of a size that XLA would leave to a library, so
+    that what they are a part of could not be one kernel.
+    """
+    if len(tangents) <= _SIDE_BY_SIDE or tangents[0, 0].size > _FEW:
+        return jax.vmap(slope, in_axes=1, out_axes=1)(tangents)
+    return jnp.moveaxis(jax.lax.map(slope, jnp.moveaxis(tangents, 1, 0)), 0, 1)
 
 
 def _identity(y) -> Array:

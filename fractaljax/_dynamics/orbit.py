@@ -13,6 +13,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from .._base.one_kernel import one_kernel
@@ -36,7 +37,7 @@ def _chain(body: Callable, carry, arrays: tuple, lanes: int, count=None) -> tupl
         carry, found = jax.lax.scan(body, carry, tuple(front))
         return carry, jnp.moveaxis(found, 0, found.ndim - 1 - lanes)
 
-    def run(_, carry, front, count):
+    def run(carry, front, count):
         def at(k):
             return tuple(jax.lax.dynamic_index_in_dim(x, k, keepdims=False) for x in front)
 
@@ -49,8 +50,7 @@ def _chain(body: Callable, carry, arrays: tuple, lanes: int, count=None) -> tupl
         blank = jnp.zeros((len(front[0]), *one.shape), one.dtype)
         return jax.lax.fori_loop(0, count, step, (carry, blank))
 
-    given = (), carry, tuple(front), count
-    carry, found = one_kernel(run, *given, wanted=carry.size <= _SMALL)
+    carry, found = one_kernel(run, carry, tuple(front), count, wanted=carry.size <= _SMALL)
     return carry, jnp.moveaxis(found, 0, found.ndim - 1 - lanes)
 
 
@@ -82,15 +82,15 @@ def corrections(
         return W + W[:, -1:] * off[None], off[:-1]
 
     b = jnp.where(used[None], local.b, 0)
-    columns = jnp.eye(n + 2, dtype=gap.dtype).reshape(n + 2, n + 2, *(1,) * lanes)
+    columns = np.eye(n + 2, dtype=gap.dtype).reshape(n + 2, n + 2, *(1,) * lanes)
     shifts, durations = columns[n], columns[n + 1]
-    eye = jnp.eye(n, n + 2, dtype=gap.dtype).reshape(n, n + 2, *(1,) * lanes)
+    eye = np.eye(n, n + 2, dtype=gap.dtype).reshape(n, n + 2, *(1,) * lanes)
     W = jnp.broadcast_to(eye, (n, n + 2, *gap.shape[2:]))
     W, dt = _chain(through, W, (local.A, gap, b, local.c, guard, ends), lanes, count)
     jacobian, shift = W[:, :n], W[:, n]
     # Without segments the equations would be singular.
     jacobian = jnp.where(jnp.any(ends, axis=0)[None, None], jacobian, 0)
-    matrix = eye[:, :n] - jacobian
+    matrix = jnp.asarray(eye[:, :n]) - jacobian
     if constant is not None:
         matrix = matrix.at[constant].set(jnp.broadcast_to(eye[constant, :n], shift.shape))
         shift = shift.at[constant].set(0)
@@ -243,19 +243,24 @@ def _orbit_jvp(primals, tangents):
     y, duration = orbit(system, segments)
     s, guard = segments.s, segments.guard
 
-    def equations(system):
-        end = next_start(y)
-        return flow(system, y, duration, s), chosen_guard(system, end, s, guard)
+    def moved(system, tangent, y, duration, s, guard):
+        def equations(system):
+            end = next_start(y)
+            return flow(system, y, duration, s), chosen_guard(system, end, s, guard)
 
-    _, (gap, off) = jax.jvp(equations, (system,), (tangents[0],))
-    _, local = maps(system, Segments(y, duration, s, guard))
+        return jax.jvp(equations, (system,), (tangent,))[1]
 
-    last = last_of_phase(segments)
+    def solved(gap, off, local, segments):
+        last = last_of_phase(segments)
 
-    def solution(gap, off):
-        return corrections(local, segments, last, gap, off, system.constant)[:2]
+        def solution(gap, off):
+            return corrections(local, segments, last, gap, off, system.constant)[:2]
 
-    # Linear, hence its own derivative. Older versions of JAX transpose a scan only as a jvp.
-    nothing = jax.tree.map(jnp.zeros_like, (gap, off))
-    _, (dy, dt) = jax.jvp(solution, nothing, (gap, off))
-    return (y, duration), (dy, dt)
+        # Linear, hence its own derivative. Older versions of JAX transpose a scan only as a jvp.
+        nothing = jax.tree.map(jnp.zeros_like, (gap, off))
+        return jax.jvp(solution, nothing, (gap, off))[1]
+
+    gap, off = one_kernel(moved, system, tangents[0], y, duration, s, guard)
+    segments = Segments(y, duration, s, guard)
+    _, local = one_kernel(maps, system, segments)
+    return (y, duration), one_kernel(solved, gap, off, local, segments)

@@ -15,8 +15,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
+from .._base.one_kernel import one_kernel
 from .acceptance import HARDLY, admissible, growth_of, has_shorter_period
 from .hybrid import OPEN, UNUSED, HybridSystem
 from .orbit import PeriodicOrbit, solve_periodic_orbits
@@ -106,42 +107,47 @@ def _solved(system, record, lane, wanted, given: _Candidates, *, length, options
         found, _, tries = carry
         return (tries == 0) | ((tries < _MESHES) & jnp.any(unsettled(found)))
 
+    def mesh(system, record, lane, given, orbit, h, of_run):
+        # The orbit's phases have other lengths and weights than those of the run.
+        steps = Stretch(record, lane, Steps.along(system, orbit, h), of_run)
+        first = jnp.where(of_run, given.first, 0)
+        last = jnp.where(of_run, given.last, jnp.sum(orbit.used, axis=0))
+        return cut(system, steps, first, last, h, length)
+
     def solve(carry):
         found, h, tries = carry
         of_run = tries == 0
-        # The orbit's phases have other lengths and weights than those of the run.
-        steps = Stretch(record, lane, Steps.along(system, found.segments, h), of_run)
-        first = jnp.where(of_run, given.first, 0)
-        last = jnp.where(of_run, given.last, jnp.sum(found.segments.used, axis=0))
-        segments = cut(system, steps, first, last, h, length)
+        segments = one_kernel(mesh, system, record, lane, given, found.segments, h, of_run)
         own = wanted & (of_run | unsettled(found))
         reach = options.reach * scale
-        new = solve_periodic_orbits(system, segments, own, reach, given.rtol)
+        new = one_kernel(solve_periodic_orbits, system, segments, own, reach, given.rtol)
         # The method is of order 8; where the motion is not as smooth, halves do.
         known = new.error > 0  # a number
         finer = 0.9 * (given.rtol / jnp.where(known, new.error, 1)) ** 0.125
         finer = jnp.where(known, finer, 0.8)
         return new.where(own, found), h * jnp.clip(finer, 0.5, 0.8), tries + 1
 
+    def judged(system, found, given, wanted, scale):
+        orbit, n = found.segments, system.n
+        near = jnp.max(jnp.abs(orbit.y[:, 0] - given.y), axis=0) < 0.2 * scale
+        moves = jnp.max(jnp.abs(orbit.y[n:]), axis=(0, 1)) > 1e-4
+        growth = growth_of(system, found)
+        ok = wanted & found.converged & near & moves & (growth < HARDLY)
+        ok = ok & admissible(system, orbit, found.middle)
+        ok = ok & ~has_shorter_period(orbit, given.returns)
+        return jnp.stack([found.error, growth]), ok
+
     nothing = PeriodicOrbit.none(_no_segments(given.y, len(record.s), length))
     found, *_ = jax.lax.while_loop(going, solve, (nothing, given.h, 0))
-    orbit, n = found.segments, system.n
-    near = jnp.max(jnp.abs(orbit.y[:, 0] - given.y), axis=0) < 0.2 * scale
-    moves = jnp.max(jnp.abs(orbit.y[n:]), axis=(0, 1)) > 1e-4
-    growth = growth_of(system, found)
-    ok = wanted & found.converged & near & moves & (growth < HARDLY)
-    ok = ok & admissible(system, orbit, found.middle)
-    return orbit, jnp.stack([found.error, growth]), ok & ~has_shorter_period(orbit, given.returns)
+    return found.segments, *one_kernel(judged, system, found, given, wanted, scale)
 
 
 class _Progress(eqx.Module):
-    """What the search knows of B lanes besides their record."""
+    """What the search knows of B lanes besides their record and the orbits that were found."""
 
     status: Int[Array, " B"]
-    orbit: Segments
     period_returns: Int[Array, " B"]
-    error: Float[Array, "2 B"]  # of that orbit, and its growth in a period
-    distance: Float[Array, " B"]  # of the run from that orbit
+    distance: Float[Array, " B"]  # of the run from the orbit
     approach: Int[Array, " B"]  # rounds in which it fell
     widest: Float[Array, "2 B"]  # gap between returns, in the last two quarters of the run
     tried: Float[Array, " B"]  # gap at the last attempt
@@ -149,6 +155,28 @@ class _Progress(eqx.Module):
     idle: Int[Array, " B"]  # rounds without a return
     size: Float[Array, " B"]  # distance from the equilibrium at the last return
     calm: Int[Array, " B"]  # rounds with a return in which it did not grow
+
+
+class _Assessment(eqx.Module):
+    """What a round of steps tells of B lanes, and the orbits that it suggests."""
+
+    progress: _Progress  # if no orbit is found now
+    over: Int[Array, " B"]  # the status then
+    ok: Bool[Array, " B"]  # the motion approaches the orbit found before
+    ready: Bool[Array, " B"]  # to be solved
+    gap: Float[Array, " B"]  # between the returns that nearly repeat
+    given: _Candidates
+    seen: Float[Array, "2n k B"]  # states at the last returns
+    exists: Bool[Array, "k B"]
+    scale: Float[Array, " B"]
+    y: Float[Array, "2n B"]  # where the run goes on
+    extrapolates: Bool[Array, " B"]
+
+
+def _distance(seen, exists, orbit: Segments) -> Float[Array, " B"]:
+    """How far the nearest return is from the orbit's first state."""
+    gap = jnp.max(jnp.abs(seen - orbit.y[:, :1]), axis=0)
+    return jnp.min(jnp.where(exists, gap, jnp.inf), axis=0)
 
 
 def _passed(system: HybridSystem, rounds, returns, options: SearchOptions):
@@ -160,6 +188,7 @@ def _assess(
     system,
     record: Record,
     known: _Progress,
+    orbit: Segments,
     rounds,
     equilibrium,
     growth,
@@ -169,8 +198,8 @@ def _assess(
     *,
     options: SearchOptions,
     length: int,
-):
-    """All lanes after a round: the record, perhaps extrapolated, and what is known of them."""
+) -> _Assessment:
+    """All lanes after a round, before any orbit is solved for."""
     lane = jnp.arange(len(known.status))
     at, exists = record.returns(options.longest + 1)
     seen = record.after(at)
@@ -221,12 +250,8 @@ def _assess(
     apart = jnp.where(exists[1:], apart, jnp.inf)
     closest = jnp.min(apart, axis=0)
 
-    def distance_from(orbit):
-        gap = jnp.max(jnp.abs(seen - orbit.y[:, :1]), axis=0)
-        return jnp.min(jnp.where(exists, gap, jnp.inf), axis=0)
-
     # An earlier orbit is accepted once the motion has approached it in several rounds.
-    now = distance_from(known.orbit)
+    now = _distance(seen, exists, orbit)
     closer = active & (now < known.distance) & (known.distance < jnp.inf)
     approach = jnp.where(closer, known.approach + 1, 0)
     distance = jnp.where(closer, now, jnp.inf)
@@ -266,26 +291,6 @@ def _assess(
         rtol=rtol,
     )
 
-    def solved():
-        return _in_groups(
-            system,
-            record,
-            ready,
-            gap,
-            given,
-            known.orbit,
-            known.error,
-            options=options,
-            length=length,
-        )
-
-    # XLA moves what does not change out of a loop, to where it is done even if the loop is not.
-    none = known.orbit, known.error, jnp.zeros_like(ready)
-    orbit, error, found = jax.lax.cond(jnp.any(ready), solved, lambda: none)
-    now = distance_from(orbit)
-    # This near, the multipliers decide whether it attracts.
-    ok = ok | (found & (now < options.accepted * scale))
-    distance = jnp.where(found & ~ok, now, distance)
     # The widest gaps of the third and the last quarter say whether it settles.
     quarter = jnp.stack([returns < 0.75 * max_returns, returns >= 0.75 * max_returns])
     wider = jnp.maximum(known.widest, (closest / scale)[None])
@@ -307,10 +312,9 @@ def _assess(
     short = short | (ended & ~exists[options.longest // 4])
     too_long = (record.count == record.length) & short
     over = jnp.where(too_long, TOO_LONG, over)
-    status = jnp.where(status == RUNNING, jnp.where(ok, CONVERGED, over), status)
     progress = _Progress(
         status=status,
-        period_returns=jnp.where(found, period_returns, known.period_returns),
+        period_returns=period_returns,
         distance=distance,
         approach=approach,
         widest=widest,
@@ -319,15 +323,36 @@ def _assess(
         idle=idle,
         size=jnp.where(idle > 0, known.size, away[0]),
         calm=calm,
-        orbit=known.orbit,
-        error=known.error,
     )
-    progress = jax.tree.map(
-        lambda new, old: old if new is old else jnp.where(active, new, old), progress, known
+    return _Assessment(
+        progress=progress,
+        over=over,
+        ok=ok,
+        ready=ready,
+        gap=gap,
+        given=given,
+        seen=seen,
+        exists=exists,
+        scale=scale,
+        y=y_on,
+        extrapolates=extrapolates,
     )
-    # Where an orbit was found its lane was active.
-    progress = eqx.tree_at(lambda known: (known.orbit, known.error), progress, (orbit, error))
-    return record.moved(y_on, extrapolates), progress
+
+
+def _concluded(told: _Assessment, known: _Progress, orbit: Segments, found, accepted) -> _Progress:
+    """What is known of all lanes after orbits were `found` of some, which all were running."""
+    now = _distance(told.seen, told.exists, orbit)
+    # This near, the multipliers decide whether it attracts.
+    ok = told.ok | (found & (now < accepted * told.scale))
+    new = told.progress
+    status = jnp.where(new.status == RUNNING, jnp.where(ok, CONVERGED, told.over), new.status)
+    returns = jnp.where(found, new.period_returns, known.period_returns)
+    distance = jnp.where(found & ~ok, now, new.distance)
+    new = eqx.tree_at(
+        lambda x: (x.status, x.period_returns, x.distance), new, (status, returns, distance)
+    )
+    active = known.status == RUNNING
+    return jax.tree.map(lambda new, old: jnp.where(active, new, old), new, known)
 
 
 def _in_groups(system, record, ready, gap, given, orbit, error, *, options, length):
@@ -356,6 +381,11 @@ def _in_groups(system, record, ready, gap, given, orbit, error, *, options, leng
             length=length,
             options=options,
         )
+        if lanes == 1:
+            orbit, error = jax.tree.map(
+                lambda new, old: jnp.where(ok, new, old), (new, new_error), (orbit, error)
+            )
+            return orbit, error, ok, start + size
         lane = jnp.where(ok, lane, lanes)  # beyond the last one nothing is written
         orbit = Segments(
             *(
@@ -383,9 +413,7 @@ def _find(
     zero = jnp.zeros(lanes, start.dtype)
     known = _Progress(
         status=none + RUNNING,
-        orbit=_no_segments(start, len(record.s), length),
         period_returns=none,
-        error=jnp.stack([zero, zero]),
         distance=far,
         approach=none,
         widest=jnp.stack([zero, zero]),
@@ -396,34 +424,44 @@ def _find(
         calm=none,
     )
 
+    orbit, error = _no_segments(start, len(record.s), length), jnp.stack([zero, zero])
+    assess = functools.partial(_assess, options=options, length=length)
+
     def running(carry):
         return jnp.any(carry[1].status == RUNNING)
 
     def body(carry):
-        record, known, rounds = carry
+        record, known, orbit, error, rounds = carry
         # A run that takes long to settle may be near the boundary of two basins.
         passed = _passed(system, rounds, jnp.max(known.returns), options)
         finer = sum(passed >= after for after in options.finer_after)
         h_run = (options.step / 2.0**finer).astype(start.dtype)
         record = record.advance(system, h_run, options.round_steps)
-        record, known = _assess(
-            system,
-            record,
-            known,
-            rounds,
-            equilibrium,
-            growth,
-            max_returns,
-            h,
-            rtol,
-            options=options,
-            length=length,
-        )
-        return record, known, rounds + 1
+        limits = equilibrium, growth, max_returns, h, rtol
+        told = one_kernel(assess, system, record, known, orbit, rounds, *limits)
 
-    _, known, _ = jax.lax.while_loop(running, body, (record, known, 0))
-    error, growth = known.error
-    return Attractor(known.orbit, known.status, known.period_returns, error, growth, known.returns)
+        def solved():
+            return _in_groups(
+                system,
+                record,
+                told.ready,
+                told.gap,
+                told.given,
+                orbit,
+                error,
+                options=options,
+                length=length,
+            )
+
+        # XLA moves what does not change out of a loop, to where it is done even if the loop is not.
+        none = orbit, error, jnp.zeros_like(told.ready)
+        orbit, error, found = jax.lax.cond(jnp.any(told.ready), solved, lambda: none)
+        known = one_kernel(_concluded, told, known, orbit, found, options.accepted)
+        return record.moved(told.y, told.extrapolates), known, orbit, error, rounds + 1
+
+    _, known, orbit, error, _ = jax.lax.while_loop(running, body, (record, known, orbit, error, 0))
+    error, growth = error
+    return Attractor(orbit, known.status, known.period_returns, error, growth, known.returns)
 
 
 def find(

@@ -13,7 +13,7 @@ from .hybrid import NONE, UNUSED, HybridSystem
 from .lanes import row_numbers
 from .runge_kutta import runge_kutta
 
-_BLOCK = 32  # of sums
+_BLOCK = 8  # of sums; XLA leaves larger ones to a library
 
 
 class Segments(eqx.Module):

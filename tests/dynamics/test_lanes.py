@@ -12,7 +12,7 @@ def lanes_last(x):
     return jnp.moveaxis(x, 0, -1)
 
 
-# Written out up to six unknowns, by an inverse beyond.
+# Written out up to six unknowns and by an inverse beyond, or by elimination up to sixteen.
 @pytest.mark.parametrize("n", [1, 2, 3, 6, 7, 18])
 @pytest.mark.parametrize("method", [solve, solve_positive])
 def test_solution_and_its_derivatives(method, n):
@@ -38,6 +38,17 @@ def test_solution_and_its_derivatives(method, n):
     found, wanted = (jax.jit(lambda f=f: everything(f))() for f in (ours, theirs))
     for x, y in zip(found, wanted, strict=True):
         np.testing.assert_allclose(x, y, rtol=0, atol=1e-13 * max(1, abs(y).max()))
+
+
+@pytest.mark.parametrize("n", [3, 4, 16])
+def test_pivots(n):
+    """Of matrices whose diagonal vanishes, and whose largest entries are in another row each."""
+    rng = np.random.default_rng(n)
+    W, b = np.eye(n) + rng.uniform(-0.3, 0.3, (4, n, n)) / n, rng.standard_normal((4, n))
+    W = np.stack([w[rng.permutation(n)] for w in W]) * (1 - np.eye(n))
+    found = jax.jit(solve)(lanes_last(W), lanes_last(b)).T
+    wanted = np.linalg.solve(W, b[..., None])[..., 0]
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12 * abs(wanted).max())
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 6, 7])
