@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._base.one_kernel import small_kernel
 from .._base.parts import brief, concrete, flag, nan_where
 from .._base.quick import command_jit
 from .._base.singular import positive_sqrt, safe_divide
@@ -143,6 +144,10 @@ def _factor_of_structure(structure, friction_slope):
 
 @functools.partial(command_jit, static_argnames="friction_slope")
 def _of_scene(scene: Scene, friction_slope: bool) -> Float[Array, ""]:
+    return small_kernel(lambda scene: _closed(scene, friction_slope), scene)
+
+
+def _closed(scene, friction_slope):
     sloping = friction_slope and scene.friction.velocity_dependent
     if scene.contact.depends_on_friction or sloping or scene.follows_load_curve:
         factor, _ = _first_factor(scene, friction_slope)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
+from .._base.one_kernel import small_kernel
 from .._base.parts import Record
 from .._base.quick import command_jit
 from .._mechanism.mechanism import Mechanism
@@ -162,7 +163,9 @@ def _growth_rate(scene, friction_slope):
     if isinstance(scene, Structure):
         attached = assembled(scene, friction_slope)
         return rightmost(attached.matrices[:3], scene.band, scene.coarse).real
-    return quartic.rightmost_root(linearised(scene, friction_slope)).real
+    return small_kernel(
+        lambda scene: quartic.rightmost_root(linearised(scene, friction_slope)).real, scene
+    )
 
 
 def stability(scene: Mechanism, friction_slope: bool = True) -> Stability:
@@ -170,6 +173,14 @@ def stability(scene: Mechanism, friction_slope: bool = True) -> Stability:
     found = _stability(scene, friction_slope)
     require_equilibrium(scene, friction_slope, found.growth_rate)
     return found
+
+
+def _of_scene(scene, friction_slope):
+    joint = pressed(scene)
+    lin, forces = linearised_at(scene, joint, friction_slope), normal_force(scene, joint)
+    s, mobility = quartic.roots(lin), sliding_friction(scene) / scene.oscillator.m
+    x = _displacements(lin, s, mobility, joint.K_n, joint.K_t)
+    return s, x, quartic.resolutions(lin, s), margin_of(lin), forces
 
 
 @functools.partial(command_jit, static_argnames="friction_slope", once=True)
@@ -182,12 +193,8 @@ def _stability(scene, friction_slope):
         counted = in_band(s, scene.band)
         margin, names = least_damping_ratio(among(s, scene.band)), scene.names
     else:
-        joint = pressed(scene)
-        lin, forces = linearised_at(scene, joint, friction_slope), normal_force(scene, joint)
-        s, mobility = quartic.roots(lin), sliding_friction(scene) / scene.oscillator.m
-        x = _displacements(lin, s, mobility, joint.K_n, joint.K_t)
-        error, margin, names = quartic.resolutions(lin, s), margin_of(lin), ("x1", "x2")
-        counted = jnp.ones(s.shape, bool)
+        s, x, error, margin, forces = small_kernel(lambda x: _of_scene(x, friction_slope), scene)
+        counted, names = jnp.ones(s.shape, bool), ("x1", "x2")
     largest = jnp.abs(jax.lax.stop_gradient(x)).argmax(axis=1)
     return Stability(
         eigenvalues=s,
