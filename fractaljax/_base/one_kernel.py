@@ -21,6 +21,7 @@ from .kept import is_staged
 _FIRST, _BEYOND = (0, 9), (0, 11)
 _ATTRIBUTE = "xla_cpu_small_call"
 _ATTRIBUTES = {_ATTRIBUTE: "true", "inlineable": "false"}
+_ATTRIBUTES_OF = "mhlo.frontend_attributes"
 # Operations that XLA compiles itself into any kernel; no library's, no search and no scatter.
 _NAMES = """
 abs add and atan2 broadcast_in_dim case cbrt ceil clamp compare complex concatenate constant
@@ -38,12 +39,17 @@ _FEW, _LARGEST = 2**13, 2**16  # numbers; loops over more are left to several th
 
 
 def one_kernel(
-    function: Callable, *given: Any, wanted: bool = True, largest: int = _LARGEST
+    function: Callable,
+    *given: Any,
+    wanted: bool = True,
+    largest: int = _LARGEST,
+    changed: int = 0,
 ) -> Any:
     """function(*given), on a CPU one kernel where it is `wanted` and XLA can make one.
 
     Whether it can is seen in what `jit`, `vmap` and derivatives have made of the function. All
-    arrays that it needs, but constants, are among those given.
+    arrays that it needs, but constants, are among those given. Of the first `changed` arrays it
+    returns each, changed in a part: these are not copied. There is no kernel of its derivatives.
     """
     possible = is_staged() and _available() and all(jnp.size(x) for x in jax.tree.leaves(given))
     if not wanted or not possible:
@@ -52,12 +58,14 @@ def one_kernel(
     @jax.jit
     def kernel(given):
         # An argument that optimisation leaves without a use would stop XLA: each goes out again.
-        used = [x.reshape(-1)[:1].astype(float) for x in jax.tree.leaves(given)]
+        leaves = jax.tree.leaves(given)[changed:]
+        used = [x.reshape(-1)[:1].astype(float) for x in leaves]
         return function(*given), jnp.concatenate(used)
 
     result, used = kernel(jax.tree.map(jnp.asarray, given))
     # What uses any of the results keeps the arguments that go out.
-    return jax.tree.map(lambda x: _kernel_result.bind(x, used, largest=largest), result)
+    stated = {"largest": largest, "changed": changed}
+    return jax.tree.map(lambda x: _kernel_result.bind(x, used, **stated), result)
 
 
 def small_kernel(function: Callable, *given: Any) -> Any:
@@ -66,7 +74,7 @@ def small_kernel(function: Callable, *given: Any) -> Any:
 
 
 def _available() -> bool:
-    return _FIRST <= jax.__version_info__ < _BEYOND
+    return _FIRST <= jax.__version_info__ < _BEYOND and jax.default_backend() == "cpu"
 
 
 # A result of the call that is to be one kernel, and what else goes out of that.
@@ -80,7 +88,9 @@ def _batched(arguments, axes, **parameters):
 
 
 def _jvp(primals, tangents, **parameters):
-    dx = tangents[0]
+    x, dx = primals[0], tangents[0]
+    if parameters["changed"]:
+        return x, dx
     if not isinstance(dx, ad.Zero):
         # Tangents are arguments too.
         moving = [x for x in tangents[1:] if not isinstance(x, ad.Zero)]
@@ -97,20 +107,19 @@ ad.primitive_jvps[_kernel_result] = _jvp
 ad.primitive_transposes[_kernel_result] = _transposed
 
 
-def _lowered(context, x, *used, largest):
+def _lowered(context, x, *used, largest, changed):
     """On a CPU: the call gets the attributes if it has only operations that allow it."""
-    from jax.experimental.xla_metadata import set_xla_metadata  # none of JAX's stable parts
-
     call = x.owner
-    if getattr(call, "name", "") != "func.call" or "mhlo.frontend_attributes" in call.attributes:
+    if getattr(call, "name", "") != "func.call" or _ATTRIBUTES_OF in call.attributes:
         return [x]
     functions = context.module_context.symbol_table
-    if not _all_go_out(call, functions[_called(call)], used):
+    if not _all_go_out(call, functions[_called(call)], used, changed):
         return [x]
     possible = _Possible(functions, largest)(call)
     attributes = _ATTRIBUTES if possible else {_ATTRIBUTE: "false"}
-    marked = mlir.lower_fun(lambda x: set_xla_metadata(x, **attributes), multiple_results=False)
-    return marked(context.replace(avals_in=context.avals_in[:1]), x)
+    attributes = {name: mlir.ir.StringAttr.get(value) for name, value in attributes.items()}
+    call.attributes[_ATTRIBUTES_OF] = mlir.ir.DictAttr.get(attributes)
+    return [x]
 
 
 mlir.register_lowering(_kernel_result, lambda _, x, *used, **__: [x])
@@ -122,15 +131,15 @@ def _called(call) -> str:
     return mlir.ir.FlatSymbolRefAttr(call.attributes["callee"]).value
 
 
-def _all_go_out(call, function, used) -> bool:
-    """Whether each argument of a function reaches what is `used` of its results, only moved.
+def _all_go_out(call, function, used, changed: int) -> bool:
+    """Whether each argument, but those changed, reaches what is `used` of its results, only moved.
 
     Not so of a linear part on its own, as reverse mode has it, and of what was not among the given.
     """
     body = function.regions[0].blocks[0]
     *_, end = body
     left = [end.operands[mlir.ir.OpResult(x).result_number] for x in used if x.owner == call]
-    reached = set()
+    reached = set(range(changed))
     while left:
         value = left.pop()
         if isinstance(value.owner, mlir.ir.Block):
@@ -153,16 +162,14 @@ class _Possible:
             if name not in self.seen:
                 self.seen[name] = self.inside(self.functions[name])
             return self.seen[name]
-        operands, results = (
-            [_shape(x) for x in xs] for xs in (operation.operands, operation.results)
-        )
-        if any(math.prod(shape) > self.largest for shape in results):
+        if any(math.prod(_shape(x)) > self.largest for x in operation.results):
             return False
         if operation.name == "stablehlo.dot_general":
-            return any(len(shape) == 1 for shape in operands)  # with vectors XLA's own loop
+            # With vectors XLA's own loop.
+            return any(len(_shape(x)) == 1 for x in operation.operands)
         if operation.name == "stablehlo.reduce":
-            floats = "xf" in str(operation.operands[0].type)
-            return not floats or math.prod(operands[0]) <= _SUMMED
+            summed = operation.operands[0]
+            return "xf" not in str(summed.type) or math.prod(_shape(summed)) <= _SUMMED
         return operation.name in _KNOWN and self.inside(operation)
 
     def inside(self, operation) -> bool:

@@ -142,7 +142,7 @@ class Record(Steps):
         motion = self.y, self.s, self.guard, self.sums, self.reach, some
         given = self.steps, motion, self.oldest, system, h
         small = lanes == 1 and system.n <= FEW
-        (y, s, guard, sums, reach, _), steps = one_kernel(run, *given, wanted=small)
+        (y, s, guard, sums, reach, _), steps = one_kernel(run, *given, wanted=small, changed=1)
         known = jnp.minimum(self.count + count, self.length)
         oldest = (self.oldest + count) % self.length
         return Record(steps, oldest, y, s, guard, sums, reach, known)

@@ -127,7 +127,7 @@ def _solved(system, record, lane, wanted, given: _Candidates, *, length, options
         finer = jnp.where(known, finer, 0.8)
         return new.where(own, found), h * jnp.clip(finer, 0.5, 0.8), tries + 1
 
-    def judged(system, found, given, wanted, scale):
+    def evaluated(system, found, given, wanted, scale):
         orbit, n = found.segments, system.n
         near = jnp.max(jnp.abs(orbit.y[:, 0] - given.y), axis=0) < 0.2 * scale
         moves = jnp.max(jnp.abs(orbit.y[n:]), axis=(0, 1)) > 1e-4
@@ -139,7 +139,7 @@ def _solved(system, record, lane, wanted, given: _Candidates, *, length, options
 
     nothing = PeriodicOrbit.none(_no_segments(given.y, len(record.s), length))
     found, *_ = jax.lax.while_loop(going, solve, (nothing, given.h, 0))
-    return found.segments, *one_kernel(judged, system, found, given, wanted, scale)
+    return found.segments, *one_kernel(evaluated, system, found, given, wanted, scale)
 
 
 class _Progress(eqx.Module):
@@ -381,11 +381,6 @@ def _in_groups(system, record, ready, gap, given, orbit, error, *, options, leng
             length=length,
             options=options,
         )
-        if lanes == 1:
-            orbit, error = jax.tree.map(
-                lambda new, old: jnp.where(ok, new, old), (new, new_error), (orbit, error)
-            )
-            return orbit, error, ok, start + size
         lane = jnp.where(ok, lane, lanes)  # beyond the last one nothing is written
         orbit = Segments(
             *(

@@ -144,10 +144,10 @@ def _factor_of_structure(structure, friction_slope):
 
 @functools.partial(command_jit, static_argnames="friction_slope")
 def _of_scene(scene: Scene, friction_slope: bool) -> Float[Array, ""]:
-    return small_kernel(lambda scene: _closed(scene, friction_slope), scene)
+    return small_kernel(lambda scene: _critical_of_scene(scene, friction_slope), scene)
 
 
-def _closed(scene, friction_slope):
+def _critical_of_scene(scene: Scene, friction_slope: bool) -> Float[Array, ""]:
     sloping = friction_slope and scene.friction.velocity_dependent
     if scene.contact.depends_on_friction or sloping or scene.follows_load_curve:
         factor, _ = _first_factor(scene, friction_slope)

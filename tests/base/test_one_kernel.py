@@ -1,6 +1,7 @@
 """Functions as one kernel of XLA: the same numbers, whatever optimisation makes of arguments."""
 
 import functools
+import re
 
 import jax
 import jax.numpy as jnp
@@ -21,11 +22,7 @@ ON_A_CPU = jax.default_backend() == "cpu"
 @pytest.fixture(autouse=True)
 def optimised():
     """XLA as users have it: what it makes of an argument without a use is to be seen here."""
-    name = "jax_disable_most_optimizations"
-    before = jax.config.read(name)
-    jax.config.update(name, False)
-    yield
-    jax.config.update(name, before)
+    jax.config.update("jax_disable_most_optimizations", False)  # the next test sets its own
 
 
 def filled(rows, y, rates, _, wise=jnp.sin):
@@ -105,6 +102,32 @@ def test_a_result_without_a_use():
 
     assert (kernels(both, STATE) > 0) == ON_A_CPU
     assert "sine" not in jax.jit(both).lower(STATE).as_text().replace("cosine", "")
+
+
+def test_what_is_changed_in_a_part_is_not_copied():
+    """In a loop around the kernel, as that of a run, which takes less time than a copy."""
+
+    def run(rows, y, changed):
+        def body(_, carry):
+            return one_kernel(filled, *carry, RATES, UNUSED, changed=changed)
+
+        return jax.lax.fori_loop(0, 5, body, (rows, y))
+
+    def copies(changed):
+        compiled = jax.jit(lambda *given: run(*given, changed)).lower(ROWS, STATE).compile()
+        return len(re.findall(r"f64\[2,40\]\S* copy\(", compiled.as_text() or ""))
+
+    if ON_A_CPU:
+        assert copies(0) == copies(1) + 2
+    assert (kernels(lambda *given: run(*given, 1), ROWS, STATE) > 0) == ON_A_CPU
+    np.testing.assert_allclose(run(ROWS, STATE, 1)[0], run(ROWS, STATE, 0)[0], rtol=1e-13)
+
+    def ending(y, changed):
+        return one_kernel(filled, ROWS, y, RATES, UNUSED, changed=changed)[1]
+
+    for slope in (jax.jacfwd, jax.jacrev):
+        changed, plain = (jax.jit(slope(ending), static_argnums=1)(STATE, n) for n in (1, 0))
+        np.testing.assert_allclose(changed, plain, rtol=1e-13)
 
 
 def unused(x, a):
