@@ -116,8 +116,9 @@ def _lowered(context, x, *used, largest, changed):
     if not _all_go_out(call, functions[_called(call)], used, changed):
         return [x]
     possible = _Possible(functions, largest)(call)
-    attributes = _ATTRIBUTES if possible else {_ATTRIBUTE: "false"}
-    attributes = {name: mlir.ir.StringAttr.get(value) for name, value in attributes.items()}
+    texts = _ATTRIBUTES if possible else {_ATTRIBUTE: "false"}
+    attributes: dict[str, mlir.ir.Attribute]
+    attributes = {name: mlir.ir.StringAttr.get(text) for name, text in texts.items()}
     call.attributes[_ATTRIBUTES_OF] = mlir.ir.DictAttr.get(attributes)
     return [x]
 

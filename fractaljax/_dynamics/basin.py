@@ -22,13 +22,13 @@ from .._base.parts import Record, concrete, flag, whole
 from .._base.quick import quick_jit
 from .._base.table import table
 from .._mechanism.mechanism import Mechanism
+from .assessment import SearchOptions
 from .cycle import CycleResult, LimitCycle
 from .events import step
 from .excitation import Excitation, compiled_system
 from .hybrid import NONE, SECTION, HybridSystem
 from .limit_cycle import limit_cycle
 from .scaled import check_rtol, degrees_of_freedom
-from .search import SearchOptions
 from .segments import next_start
 from .starts import starts_of
 

@@ -17,6 +17,7 @@ from .._mechanism.quantities import joints_of
 from .._mechanism.scene import Scene
 from .._stability.stability import growth_rate
 from . import search
+from .assessment import CONVERGED
 from .cycle import CycleResult, LimitCycle, Orbit
 from .events import Cubic, first_root, rounding
 from .excitation import Excitation, excited_system
@@ -221,7 +222,7 @@ def solved(
     status = CycleResult.exhausted
     for outcome, result in enumerate(_RESULTS):
         status = CycleResult.where(found.status == outcome, result, status)
-    exists = found.status == search.CONVERGED
+    exists = found.status == CONVERGED
     monodromy = one_kernel(_monodromy, system, closed)
     rounding_of_growth = 1e3 * jnp.finfo(y.dtype).eps
     unstable = exists & (found.growth > 100 * error + rounding_of_growth)

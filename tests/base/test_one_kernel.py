@@ -114,12 +114,12 @@ def test_what_is_changed_in_a_part_is_not_copied():
         return jax.lax.fori_loop(0, 5, body, (rows, y))
 
     def copies(changed):
-        compiled = jax.jit(lambda *given: run(*given, changed)).lower(ROWS, STATE).compile()
+        compiled = jax.jit(lambda rows, y: run(rows, y, changed)).lower(ROWS, STATE).compile()
         return len(re.findall(r"f64\[2,40\]\S* copy\(", compiled.as_text() or ""))
 
     if ON_A_CPU:
         assert copies(0) == copies(1) + 2
-    assert (kernels(lambda *given: run(*given, 1), ROWS, STATE) > 0) == ON_A_CPU
+    assert (kernels(lambda rows, y: run(rows, y, 1), ROWS, STATE) > 0) == ON_A_CPU
     np.testing.assert_allclose(run(ROWS, STATE, 1)[0], run(ROWS, STATE, 0)[0], rtol=1e-13)
 
     def ending(y, changed):
