@@ -62,6 +62,7 @@ def equation_38(v, mu_s=mpf(0.4), mu_m=mpf(0.25), v_m=mpf(0.5)):  # noqa: B008
     return mu_s - 3 * (mu_s - mu_m) / (2 * v_m) * v + (mu_s - mu_m) / (2 * v_m**3) * v**3
 
 
+@pytest.mark.slow
 def test_slope_in_both_precisions_and_nan_under_jit():
     """Against differences in 60 digits of Eq. 38; even in the velocity; its minimum; a constant."""
     with mp.workdps(60):
@@ -225,6 +226,7 @@ def test_a_law_in_other_words_has_the_same_answers(name):
     np.testing.assert_allclose([found.high, found.drop, found.reach], sums, rtol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", [replaced, substituted])
 def test_mu_of_a_users_law_is_set_by_scaling_it(place):
     scene = QUESTIONS["fractal"].replace(friction=CUBIC)

@@ -232,6 +232,7 @@ def test_table_agrees_with_the_older_one():
     assert source_form(**PLAIN).items() <= PROBLEMS["source_form"].items()
 
 
+@pytest.mark.slow
 def test_monodromy_is_the_difference_of_the_flow():
     mechanism = Mechanism.of(PAIR).scaled
     z, h = np.array([0.5, 0.0, -1.8, 0.0, 0.38, 0.0]) / Mechanism.of(PAIR).units, 1e-5

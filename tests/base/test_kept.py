@@ -45,6 +45,7 @@ def forget(monkeypatch):
     jax.clear_caches()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jit", [quick.quick_jit, quick.command_jit])
 def test_a_program_is_loaded_without_a_trace(folder, monkeypatch, jit):
     program, traces = counted(jit)
@@ -57,6 +58,7 @@ def test_a_program_is_loaded_without_a_trace(folder, monkeypatch, jit):
     np.testing.assert_array_equal(again["value"], first["value"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "other",
     [

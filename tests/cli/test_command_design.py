@@ -84,6 +84,7 @@ def test_a_tolerance_comes_from_the_file_of_an_identification():
     assert _tolerance(["D=0.01", "lnG=0.1"]) == {"D": 0.01, "ln G": 0.1}
 
 
+@pytest.mark.slow
 def test_infeasible_designs_and_damaged_tolerances(capsys):
     """Exit status 1; table and file say that it is not a solution. Other files stay."""
     Path("old").mkdir()

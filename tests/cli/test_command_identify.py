@@ -61,6 +61,7 @@ def test_identify_a_profile(capsys):
     assert "# surface identified from mine.csv" in comments and "standard error" in comments
 
 
+@pytest.mark.slow
 def test_identify_a_map_for_a_scene(capsys):
     """An instrument's file, a band, limits and a scene of the user's own."""
     z = gaussian_map(np.random.default_rng(0), D, (64, 48))

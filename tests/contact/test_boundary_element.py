@@ -244,6 +244,7 @@ def mixed(x):
     )
 
 
+@pytest.mark.slow
 def test_derivatives_of_pressure_gap_and_stiffness():
     """While no point joins or leaves they are linear in heights and load."""
     x = np.append(ROUGH.ravel() / UNITS[0], np.ones(3))

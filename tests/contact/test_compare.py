@@ -27,6 +27,7 @@ def compared():
     return fj.compare_laws(SURFACE, MATERIAL, LOADS, **SIZES, laws=given, **asked)
 
 
+@pytest.mark.slow
 def test_every_law_is_as_by_itself_and_over_the_seeds(compared):
     names = ["fractal", "asperity", "Persson", "measured", "boundary elements"]
     assert list(compared.curves) == names
@@ -66,6 +67,7 @@ def test_every_law_is_as_by_itself_and_over_the_seeds(compared):
     assert found.K_t is None
 
 
+@pytest.mark.slow
 def test_table_and_picture(compared):
     lines = repr(compared).splitlines()
     assert len(lines) == 1 + 3 * 5

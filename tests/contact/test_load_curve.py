@@ -42,6 +42,7 @@ def _slopes(law, u):
     return jax.vmap(jax.grad(law.load))(u)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("alpha", [0.0, 1 / 3, 0.5, 0.9])
 def test_powers(alpha):
     """N = P (1 + (1 - alpha) e)^(1/(1 - alpha)): a constant spring, Hertz, and nearly exponential.
@@ -97,6 +98,7 @@ def test_table(law):
     np.testing.assert_allclose(found[1], wanted[1], rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_measured_table_and_laws_without_a_curve():
     """A table whose K_n has kinks at its loads; on one of them, between and beyond."""
     for load in (1200.0, 700.0, 20.0, 9000.0):
@@ -118,6 +120,7 @@ def test_measured_table_and_laws_without_a_curve():
         assert not fj.Scene(law, scene.friction, scene.oscillator, True).follows_load_curve
 
 
+@pytest.mark.slow
 def test_derivatives():
     """By D, ln G, P, area and u in both modes, against differences of the load."""
 

@@ -265,6 +265,7 @@ def brake() -> fj.Scene:
     return fj.brake_scene().replace(contact=contact(2.4, 1.342e-10, 1907.3))
 
 
+@pytest.mark.slow
 def test_scene_takes_the_law():
     scene = brake()
     fixed = scene.replace(contact=fj.FixedContact(*map(float, fj.stiffness(scene))))

@@ -26,6 +26,7 @@ def signs(residuals, slack=1e-9):
     return residuals.max(axis=1) > slack
 
 
+@pytest.mark.slow
 def test_residuals_have_the_signs_of_growth_rates():
     """Of all damping: light, equal, heavy, negative; with real eigenvalues too."""
     rng = np.random.default_rng(0)
@@ -72,6 +73,7 @@ def test_residuals_have_the_signs_of_growth_rates():
     np.testing.assert_array_equal(signs(residuals)[clear], (above > 0)[clear])
 
 
+@pytest.mark.slow
 def test_residuals_are_smooth_through_coalescence():
     """T = r^2 + (W' - sqrt(W'^2 - p^2 + m^2))/2, W' = W - c^2/4, r = target + c/2, at p = 0.1."""
     c, target, p = 0.02, -0.005, 0.1
@@ -111,6 +113,7 @@ def test_nearest_design_on_the_wall(c):
     assert len(best.history["objective"]) < 40
 
 
+@pytest.mark.slow
 def test_nearest_scene_on_the_wall():
     """Equal decay rates of both modes: the growth rate is flat up to the wall."""
     scene, rate = fj.brake_scene(), 1.0

@@ -161,10 +161,11 @@ def test_starts_outside_the_elastic_regime(scene, surface):
     assert math.sqrt(best.value) <= 1.01 * nearest_on_grid(start)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("request_", "violated"),
     [
-        pytest.param({"target": -100.0}, ("growth_rate <= target",), marks=pytest.mark.slow),
+        ({"target": -100.0}, ("growth_rate <= target",)),
         ({"K_n_min": 1e14}, ("K_n >= K_n_min",)),
         ({"bounds": {"D": (2.39, 2.41), "G": (1.3e-10, 1.4e-10)}}, ("growth_rate <= target",)),
     ],
@@ -285,6 +286,7 @@ def enveloped(scene):
     return fj.design(scene, envelope=RANGES, progress=False)
 
 
+@pytest.mark.slow
 def test_envelope_holds_everywhere(best, enveloped):
     """At thousands of conditions drawn, and at the corners; the worst one is named."""
     plain, best = best, enveloped
@@ -416,6 +418,7 @@ def test_constraints_are_named_when_active(scene):
     assert rough.name in best.violated
 
 
+@pytest.mark.slow
 def test_unchanged_under_conditions_and_samples_measured_together(scene, enveloped):
     """A surface that holds over the envelope is its own design, with its worst condition."""
     again = fj.design(enveloped.scene, K_n_min=enveloped.K_n_min, envelope=RANGES, progress=False)

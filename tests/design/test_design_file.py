@@ -16,6 +16,8 @@ from fractaljax._base.versions import version_text, versions
 from fractaljax._design.design_file import read_design
 from structures import fractal_joints
 
+# All of it from one design.
+pytestmark = pytest.mark.slow
 SMALL: dict[str, Any] = dict(starts=4, lattice=8, progress=False)
 
 
@@ -38,7 +40,6 @@ def robust():
     )
 
 
-@pytest.mark.slow
 def test_file_repeats_the_run(robust, tmp_path):
     """Scene, options and functions come back; result, history and file are the same to a bit."""
     robust.save(tmp_path / "run.toml")
@@ -81,7 +82,6 @@ def test_file_holds_all_of_it_also_from_other_versions(robust, tmp_path):
     read_design(path, {"coarse": coarse})
 
 
-@pytest.mark.slow
 def test_functions_of_the_package_are_found_again(tmp_path):
     """An objective by its place in this package; a risk with its number."""
     best = fj.design(
@@ -97,7 +97,6 @@ def test_functions_of_the_package_are_found_again(tmp_path):
     assert options["envelope"] == fj.Envelope({"V": (0.1, 0.2)})
 
 
-@pytest.mark.slow
 def test_a_structure_has_files_beside_it(tmp_path):
     """Its design runs again to the last bit."""
     structure = fractal_joints()
@@ -120,7 +119,6 @@ def test_a_structure_has_files_beside_it(tmp_path):
     )
 
 
-@pytest.mark.slow
 def test_single_precision_stays_single(tmp_path):
     """The scene is read in the precision it had."""
     single = jax.tree.map(lambda x: x.astype(jnp.float32), fj.brake_scene())

@@ -40,6 +40,7 @@ def test_the_least_growth_rate_is_where_four_modes_meet(target):
         assert float(best.scene.parameters[name]) == pytest.approx(0.75, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_the_nearest_design_and_one_that_cannot_be_met():
     """p, q, r >= 0.6 and p + q + r <= 2.4, from (0.1, 0.2, 0.3): p = q = r = 0.6."""
     x = one_damper(p=0.1, q=0.2, r=0.3)
@@ -85,6 +86,7 @@ def test_starts_far_from_the_requirements_are_led_to_them():
     assert best.failed_starts == 0 and best.violated == ()
 
 
+@pytest.mark.slow
 def test_what_holds_the_least_growth_rate():
     """At p = q = r = 0.75 all four modes, each with a weight of 1/4 as none leads; by hand."""
     x = one_damper(p=0.1, q=0.2, r=0.3)

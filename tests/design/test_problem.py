@@ -96,6 +96,7 @@ def test_requirements_are_those_of_the_contacts_that_a_design_moves():
     assert stated(fixed, {"K_t/K_n": (0.1, 0.6), "mu": (0.1, 0.5)}).residual_names == only
 
 
+@pytest.mark.slow
 def test_scaled_variables_and_the_default_target():
     bounds = {"D": (2.3, 2.8), "P": (500.0, 8000.0), "mu_s": (0.3, 0.5)}
     problem = stated(bounds=bounds)

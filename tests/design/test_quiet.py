@@ -134,6 +134,7 @@ def test_kicks_in_an_ellipsoid(monkeypatch):
     assert 1 <= found * 0.9 / smallest_kick(1.5) < 1.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("within", "axes"), [([1.5, 2.0], [1.5, 2.0]), (2.0, [1.5, 1.5])])
 def test_kicks_are_the_starts_of_a_basin(within, axes):
     """The least that fails is measured in the semi-axes, or in units of V/omega and V."""

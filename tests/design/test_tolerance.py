@@ -110,6 +110,7 @@ class Identified:
     D_standard_error, ln_G_standard_error, covariance = 0.006, 0.09, CORRELATED
 
 
+@pytest.mark.slow
 def test_a_correlation_counts_in_the_probability_of_squeal():
     """Of a surface on the quiet side; as independent they gave many times too much."""
     scene = fj.brake_scene().replace(D=2.43, G=1.234e-10)

@@ -29,6 +29,7 @@ def growth(scene):
     return float(fj.growth_rate(scene))
 
 
+@pytest.mark.slow
 def test_every_question_and_what_it_rests_on(found):
     as_is, loaded, revised, law, ratio, scatter = found.questions
     assert float(as_is.found) == pytest.approx(growth(DESIGNED), rel=1e-5) and as_is.quiet
@@ -84,6 +85,7 @@ def test_quiet_in_all():
     ]
 
 
+@pytest.mark.slow
 def test_a_slope_that_no_damping_meets_is_incurable():
     """The sum of the growth rates is minus the trace of the damping matrix, for any stiffness."""
     scene = fj.Scene(DESIGNED.contact, DESIGNED.friction, DESIGNED.oscillator, preload=True)
@@ -159,6 +161,7 @@ test_refuses_what_is_no_list_of_laws = refusals(
 )
 
 
+@pytest.mark.slow
 def test_suggestions_are_the_nearest_that_reach_the_target():
     bounds = {"xi_1": (0.001, 0.5), "xi_2": (0.007, 0.5), "P": (19.0, 19000.0)}
     found = fj.suggest(BRAKE, bounds, target=-1.0)

@@ -71,6 +71,7 @@ def unlike(starts, each=1):
     return np.sum(truth != (found.labels[::each] == found.outcomes.index("equilibrium")))
 
 
+@pytest.mark.slow
 def test_belt_comes_to_rest_or_not():
     found = belt(96)
     assert found.outcomes == ("equilibrium", "cycle 1", "diverges", "undecided")
@@ -159,6 +160,7 @@ def test_excited_belt():
     assert found.shares["equilibrium"] == 0
 
 
+@pytest.mark.slow
 def test_starts_in_a_box_a_section_a_ball_and_an_ellipsoid():
     found = belt(96)
     low, high = np.array(BOX)
@@ -217,6 +219,7 @@ def test_long_transients_come_to_rest():
         assert (np.diff(sizes) < 0).all()
 
 
+@pytest.mark.slow
 def test_shares_their_table_and_what_is_undecided_or_refused():
     found = belt(96)
     count = np.sum(found.labels == 0)

@@ -39,6 +39,7 @@ def branch(name, quantity, low, high):
     return fj.continue_cycle(of_problem(PROBLEMS[name]), quantity, (low, high), cycle(name))
 
 
+@pytest.mark.slow
 def test_belt():
     """Grazing and Hopf point."""
     (at,), (hopf,) = belt().grazings, belt().hopf
@@ -53,6 +54,7 @@ def test_belt():
     assert belt().amplitude[-1] == 0 and "grazing at V = 1.8366" in repr(belt())
 
 
+@pytest.mark.slow
 def test_repelling_cycles():
     """Of the belt's slip cycles: each closes, and a deviation grows by its multiplier."""
     found = belt()
@@ -102,6 +104,7 @@ def test_derivatives_of_the_belt():
     np.testing.assert_allclose(backward, forward, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_picture(tmp_path):
     """The committed one, with its words, and a degree of freedom that there is not."""
     load_script(DOCS / "make_branch.py").draw(tmp_path / "branch.png", belt())

@@ -70,6 +70,7 @@ def agree(problem, start, amplitude, frequency, phase, found):
     assert found.states.shape[1] == len(start) and float(found.times[0]) == T0
 
 
+@pytest.mark.slow
 def test_motion():
     """Stick and slip from t0 on; the phase counts from the time 0."""
     arguments = [0.7], 0.17, 0.3
@@ -90,6 +91,7 @@ def test_motion_and_orbit_with_lift_off():
     same(LIFT, found, forced_cycle(forced(LIFT, *arguments), found.state, 1 / LIFT_FREE, settle=30))
 
 
+@pytest.mark.slow
 def test_linear_motion():
     """Without switches: the particular solution and a free decay from the start at t0."""
     a, f, phase = [0.3], 0.22, [0.8]
@@ -108,6 +110,7 @@ def test_linear_motion():
     np.testing.assert_allclose(found.at(TIMES), truth, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_saveat():
     """Only these times, and the same states."""
     given = fj.Excitation([0.7], 0.17, 0.3)

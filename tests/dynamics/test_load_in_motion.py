@@ -138,6 +138,7 @@ def truth(name):
     return Truth().run(STARTS[name][0], 2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STARTS)
 def test_motion(name):
     """Every switch and the end, in slip, stick and flight."""

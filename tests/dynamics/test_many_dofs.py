@@ -28,6 +28,7 @@ def system_of(n):
     return system(rods(n))
 
 
+@pytest.mark.slow
 def test_largest_rate_and_the_factor_of_a_step():
     """Within a per cent; damping makes some modes faster than their frequency."""
     system = system_of(40)

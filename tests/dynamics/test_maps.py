@@ -31,6 +31,7 @@ def problem(n: int):
 
 
 # Products are written out up to eight rows.
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [2, 4, 6])
 def test_coarse_maps_of_an_affine_field_are_exact(n):
     system, segments = problem(n)

@@ -307,6 +307,7 @@ def test_many_starts():
         np.testing.assert_array_equal(found.contact_states[k, :n], alone.contact_states)
 
 
+@pytest.mark.slow
 def test_ends():
     """max_steps used up, or no bound: told or raised; what was reached is part of the motion."""
     m, start = random_case(1)
@@ -372,6 +373,7 @@ def differences():
     return np.array(columns).T
 
 
+@pytest.mark.slow
 def test_derivatives():
     """By `BY` in both modes, of the end and of every switch, through all of them."""
     kinds = {s[1:] for s in switches(run(PLAIN, VALUES[3:7], VALUES[7]))}

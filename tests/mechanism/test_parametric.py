@@ -60,6 +60,7 @@ def test_matrices_are_their_sums(form):
     assert "Omega=2.0" in repr(x)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", FORMS)
 def test_growth_rate_and_its_derivatives(form):
     x = parametric(form)
@@ -80,6 +81,7 @@ def test_growth_rate_and_its_derivatives(form):
     np.testing.assert_allclose(many(x, places), each, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_parameters_in_sweeps_masses_and_refusals():
     x = parametric("texts")
     found = fj.sweep(fj.growth_rate, x, Omega=[1.0, 2.0], kr=[0.5, 1.5], progress=False)

@@ -207,6 +207,7 @@ def inside(check):
     return True
 
 
+@pytest.mark.slow
 def test_a_grid_is_inside_where_every_point_is(monkeypatch):
     """Random axes against the whole grid at once; of some the corners alone are inside."""
     monkeypatch.setattr(quantities, "_CHECKED_AT_ONCE", 7)

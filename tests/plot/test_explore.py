@@ -312,6 +312,7 @@ def test_what_moves_moves_and_nothing_is_cut_off(tmp_path):
             assert complaints(browser) == []
 
 
+@pytest.mark.slow
 def test_widget_says_what_python_says():
     """A slider moved changes the numbers and the pictures; the button finds the limit cycle."""
     pytest.importorskip("ipywidgets")

@@ -164,6 +164,7 @@ def test_deformed_mesh():
     np.testing.assert_allclose(shown.collections[-1].get_array(), expected, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_solid_and_bars():
     """A solid is drawn in space; without a mesh there is a bar for each degree of freedom."""
     ax = plot.complex_mode(np.arange(24) * 1j, phase=np.pi / 2, **SOLID)
@@ -183,6 +184,7 @@ def test_solid_and_bars():
     assert [tick.get_text() for tick in ticks] == ["x1", "x2"]
 
 
+@pytest.mark.slow
 def test_travelling_wave_travels():
     """exp(i (omega t - k x)): in a quarter of a period crests move by a quarter of a wave."""
     moving = plot.animate_mode(SHAPE, frames=8, **STRIP)

@@ -25,6 +25,7 @@ def moved(cycle, share, samples=256):
     return x[round(share * samples) % samples] - x.mean(axis=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at", [0.0, 0.25, 0.5])
 def test_places_marks_and_lanes(at):
     structure, cycle = belt_cycle()
@@ -63,6 +64,7 @@ def test_contact_states_are_those_of_the_switches():
         assert names[last[-1].after] == state
 
 
+@pytest.mark.slow
 def test_motion_as_files(tmp_path):
     structure, cycle = belt_cycle()
     path = tmp_path / "squeal.html"

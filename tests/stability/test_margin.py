@@ -225,6 +225,7 @@ SINGULAR = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", POINTS)
 def test_derivatives(name):
     """Both modes and the second by g against differences in 40 digits, at coalescence too."""
@@ -245,6 +246,7 @@ def test_derivatives(name):
     np.testing.assert_allclose(hessian[4, 4], float((up - 2 * at + down) / h**2), rtol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SINGULAR)
 def test_derivatives_are_finite_where_there_are_none(name):
     point = jnp.asarray(SINGULAR[name])

@@ -37,7 +37,9 @@ CONSTANT = [
 ]
 
 
-EACH = [pytest.param(x, True, marks=slow if x == "load curves" else ()) for x in PROBLEMS]
+QUICK = {"scene", "lever arms"}
+EACH = [pytest.param(x, True, marks=() if x in QUICK else slow) for x in PROBLEMS]
+SCENES = [x for x in PROBLEMS if x.startswith("scene")]
 
 
 @pytest.mark.parametrize(("name", "slope"), [*EACH, *CONSTANT])
@@ -66,7 +68,8 @@ def slopes(x, at):
     return both_gradients(lambda values: fj.growth_rate(x.replace(**values)), at)
 
 
-@most_slow("scene, load curve")
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PROBLEMS)
 def test_gradients(name):
     """By every quantity of every joint, in both modes, against differences in 40 digits."""
     x, oracle = problem(name)
@@ -95,7 +98,7 @@ def test_vmapped_is_looped(name):
     assert len(set(np.round(np.asarray(many), 6))) == 3  # the load counts
 
 
-@pytest.mark.parametrize("name", [name for name in PROBLEMS if name.startswith("scene")])
+@pytest.mark.parametrize("name", mostly_slow(SCENES, "scene"))
 def test_a_scene_is_its_structure(name):
     scene, _ = problem(name)
     same = fj.Structure.from_scene(scene)
@@ -209,6 +212,7 @@ def lifted():
     return scene.replace(F=5000.0), structure.replace(P=1.0, F=-np.abs(PULL) * LEVER)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", [0, 1])
 def test_an_open_joint_has_no_number(which):
     """NaN everywhere, and the force that says why; the tables say it in a line."""
@@ -227,6 +231,7 @@ def test_an_open_joint_has_no_number(which):
     assert np.isfinite(answers(closed)[1]) and "normal force [N]" in table(closed)
 
 
+@pytest.mark.slow
 def test_where_a_joint_opens():
     """The load at which it is 0 is found from the forces; the numbers end there."""
     scene = lifted()[0]
@@ -267,6 +272,7 @@ def test_a_free_body_has_no_pressed_equilibrium():
         structure_table(free)
 
 
+@pytest.mark.slow
 def test_float32_and_no_normal_force_without_preload():
     for name in ("scene", "three kinds"):
         x, _ = problem(name)

@@ -92,6 +92,7 @@ def in_band(s) -> Any:
     return (s.imag > BAND[0]) & (s.imag < BAND[1]) & (abs(s.real) < 0.3 * abs(s))
 
 
+@pytest.mark.slow
 def test_eigenvalues_derivatives_and_errors(problem):
     full, reduced, over = problem
     assert reduced.n < 0.9 * full.n and reduced.reduction.error <= 1e-8
@@ -113,6 +114,7 @@ def test_eigenvalues_derivatives_and_errors(problem):
             assert abs(slopes[name] - slope) * abs(values[name]) < 1e-8 * BAND[1], name
 
 
+@pytest.mark.slow
 def test_joints_and_equilibrium_are_kept():
     full = full_structure("two joints")
     reduced = fj.reduce(full, {}, BAND)
@@ -149,6 +151,7 @@ def chain(count: int):
     )
 
 
+@pytest.mark.slow
 def test_a_large_sparse_chain_against_its_closed_form():
     count = 2500
     full = chain(count)

@@ -15,7 +15,6 @@ from fractaljax._stability import reduction
 from fractaljax._stability.quadratic import solve
 from fractaljax._stability.rightmost import _refined, rightmost
 from structures import state_matrix
-from tools import mostly_slow
 
 N, BAND = 24, (0.0, 8.5)
 
@@ -92,6 +91,7 @@ def test_the_rightmost_of_rough_modes_is_refined_to_rounding(seed, off):
     assert abs(y @ ((2 * s * M + C) @ x) - 1) < 1e-12
 
 
+@pytest.mark.slow
 def test_a_mode_just_beyond_the_band_nan_and_a_batch():
     matrices = problem()
     s = modes_of(*matrices)[0]
@@ -129,6 +129,7 @@ def none_in_the_band(matrices):
     return (M, C, 400 * K), coarse_space(matrices)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spoilt", [rough_beyond_its_tolerance, every_mode_twice, none_in_the_band])
 def test_all_modes_decide_where_rough_ones_do_not(spoilt):
     matrices, coarse = spoilt(problem())
@@ -166,7 +167,8 @@ DERIVATIVES = {
 }
 
 
-@pytest.mark.parametrize("orders", mostly_slow(DERIVATIVES, "first and third"))
+@pytest.mark.slow
+@pytest.mark.parametrize("orders", DERIVATIVES)
 def test_derivatives_of_every_order_are_those_of_all_modes(orders):
     program = jax.jit(lambda t: [DERIVATIVES[orders](f)(t) for f in along_a_line()])
     for found, wanted in zip(*program(0.01), strict=True):

@@ -117,6 +117,7 @@ def test_contributions_sum_to_the_growth_rate(name, friction_slope):
         np.testing.assert_allclose(shares.sum(axis=1), 1, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_belt_and_falling_friction_by_hand():
     """Of two degrees of freedom: friction gives mu (K_n + K_t) Im(x1* x2)/(2 omega m |x|^2)."""
     m, K_n, K_t, mu = 2.0, 3e5, 1e5, 0.6

@@ -129,6 +129,7 @@ def through_contact(x):
     return both_gradients(lambda x: fj.growth_rate(changed(x)), x)
 
 
+@pytest.mark.slow
 def test_gradients_through_the_contact_law():
     """d lambda = lambda_K dK + lambda_x dx, with lambda_K exact and dK by differences."""
     stiffness = jax.jit(lambda x: jnp.stack(fj.stiffness(changed(x))))

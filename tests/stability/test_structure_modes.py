@@ -102,6 +102,7 @@ def test_the_assembled_matrices_are_the_jacobians_of_the_joints_forces(friction_
         np.testing.assert_allclose(X, exact, rtol=0, atol=1e-13 * np.abs(exact).max())
 
 
+@pytest.mark.slow
 def test_growth_rate_and_its_derivatives():
     """By every quantity of each joint and by entries of the matrices, in both modes."""
     exact = float(eigenvalue_near(numbers_of(STRUCTURE), True, critical()).real)
@@ -227,6 +228,7 @@ def test_no_common_mode_of_a_joint_and_far_beyond_critical_damping():
     assert fj.growth_rate(structure) == pytest.approx(-1e-6, abs=1e-15 * 2e6)
 
 
+@pytest.mark.slow
 def test_a_clamped_beam_and_modes_of_a_band():
     """omega = (beta L)^2 sqrt(E I/(rho A)), and damping (alpha + beta omega^2)/2."""
     M, K = beam(50)
@@ -317,6 +319,7 @@ def test_a_free_mass_and_rigid_body_modes():
     np.testing.assert_allclose(near, 0, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_zero_damping_and_no_force_or_support():
     M, _, K = matrices(6)
     joint = fj.Joint(fj.FixedContact(3e6, 1e6), fj.Coulomb(1e-4), 0, 1)

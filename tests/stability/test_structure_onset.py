@@ -85,6 +85,7 @@ def exact(*numbers):
     return min(mu for mu in roots if mp.im(mu) == 0 and mu > 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in PAIRS if name not in WITHOUT])
 def test_closed_forms(name):
     """Flutter with and without damping and static divergence, and all derivatives."""
@@ -110,6 +111,7 @@ def test_closed_forms(name):
             assert slope[i] == pytest.approx(wanted, abs=accuracy * scale), number
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WITHOUT)
 def test_without_a_number(name):
     """0, infinite or NaN as for a scene, with a derivative of 0."""

@@ -173,6 +173,7 @@ UNEQUAL = {  # a coalescence that is missed, a crossing of friction, and much of
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", UNEQUAL)
 def test_brute_force(name):
     """Unequal damping leaves one continuation, which small steps find as well."""

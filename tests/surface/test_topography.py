@@ -196,6 +196,7 @@ def assert_slopes(exact, at, slopes, curvatures):
                 assert float(curvatures[i]) == pytest.approx(float(curvature), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_periodic_derivatives():
     """By D, ln G and L in both modes, the second by D, against differences in long digits."""
     cycles = np.asarray(random_phases(KEY, 5, 3))
@@ -238,6 +239,7 @@ def measure(x):
     return jnp.vdot(WEIGHTS, topography(surface, x[3], SIDE, key=KEY, L_s=1.3e-3 / 5, M=3))
 
 
+@pytest.mark.slow
 def test_derivatives():
     """By D, G, gamma and L in both modes against differences in 30 digits; the second by gamma."""
     cycles = np.asarray(random_phases(KEY, 1 + int(math.log(5) / math.log(AT[2])), 3))
