@@ -26,7 +26,6 @@ def signs(residuals, slack=1e-9):
     return residuals.max(axis=1) > slack
 
 
-@pytest.mark.slow
 def test_residuals_have_the_signs_of_growth_rates():
     """Of all damping: light, equal, heavy, negative; with real eigenvalues too."""
     rng = np.random.default_rng(0)

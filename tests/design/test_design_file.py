@@ -16,8 +16,6 @@ from fractaljax._base.versions import version_text, versions
 from fractaljax._design.design_file import read_design
 from structures import fractal_joints
 
-# All of it from one design.
-pytestmark = pytest.mark.slow
 SMALL: dict[str, Any] = dict(starts=4, lattice=8, progress=False)
 
 
@@ -40,6 +38,7 @@ def robust():
     )
 
 
+@pytest.mark.slow
 def test_file_repeats_the_run(robust, tmp_path):
     """Scene, options and functions come back; result, history and file are the same to a bit."""
     robust.save(tmp_path / "run.toml")
@@ -52,6 +51,7 @@ def test_file_repeats_the_run(robust, tmp_path):
         np.testing.assert_array_equal(again.history[name], column)
 
 
+@pytest.mark.slow
 def test_file_holds_all_of_it_also_from_other_versions(robust, tmp_path):
     """As plain TOML: versions, both scenes, what was found."""
     robust.save(tmp_path / "run.toml")
@@ -82,6 +82,7 @@ def test_file_holds_all_of_it_also_from_other_versions(robust, tmp_path):
     read_design(path, {"coarse": coarse})
 
 
+@pytest.mark.slow
 def test_functions_of_the_package_are_found_again(tmp_path):
     """An objective by its place in this package; a risk with its number."""
     best = fj.design(
@@ -97,6 +98,7 @@ def test_functions_of_the_package_are_found_again(tmp_path):
     assert options["envelope"] == fj.Envelope({"V": (0.1, 0.2)})
 
 
+@pytest.mark.slow
 def test_a_structure_has_files_beside_it(tmp_path):
     """Its design runs again to the last bit."""
     structure = fractal_joints()
@@ -119,6 +121,7 @@ def test_a_structure_has_files_beside_it(tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_single_precision_stays_single(tmp_path):
     """The scene is read in the precision it had."""
     single = jax.tree.map(lambda x: x.astype(jnp.float32), fj.brake_scene())
@@ -185,6 +188,7 @@ RIGHT = [  # of the wrong ones, what an option or a key may be after all
 ]
 
 
+@pytest.mark.slow
 def test_wrong_kinds_are_refused_before_the_search(robust, tmp_path, monkeypatch):
     """Every key of a file, and every option in it, with a value of the wrong type or sign."""
     monkeypatch.setattr("fractaljax._design.design.choose_starts", None)

@@ -86,7 +86,6 @@ def test_starts_far_from_the_requirements_are_led_to_them():
     assert best.failed_starts == 0 and best.violated == ()
 
 
-@pytest.mark.slow
 def test_what_holds_the_least_growth_rate():
     """At p = q = r = 0.75 all four modes, each with a weight of 1/4 as none leads; by hand."""
     x = one_damper(p=0.1, q=0.2, r=0.3)

@@ -71,7 +71,6 @@ def unlike(starts, each=1):
     return np.sum(truth != (found.labels[::each] == found.outcomes.index("equilibrium")))
 
 
-@pytest.mark.slow
 def test_belt_comes_to_rest_or_not():
     found = belt(96)
     assert found.outcomes == ("equilibrium", "cycle 1", "diverges", "undecided")

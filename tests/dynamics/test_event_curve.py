@@ -31,7 +31,6 @@ def grazing():
     return fj.continue_event(BELT, belt().grazings[0], "mu_s", (0.6, 2.0))
 
 
-@pytest.mark.slow
 def test_grazing_of_the_belt():
     """On the phase plane's, from edge to edge, with the stable cycles at lower speeds."""
     assert bool(belt().start == fj.BranchEnd.hopf) and bool(belt().end == fj.BranchEnd.window)

@@ -52,7 +52,6 @@ def test_the_higher_of_two_nearly_equal_maxima():
     np.testing.assert_allclose(by_eps, np.sign(eps), rtol=0, atol=1e-7)
 
 
-@pytest.mark.slow
 def test_a_maximum_that_is_nearly_an_inflection():
     """cos t + a cos(2t + b), of which the motion passes the maximum before a switch ends it.
 

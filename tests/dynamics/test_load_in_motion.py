@@ -138,7 +138,6 @@ def truth(name):
     return Truth().run(STARTS[name][0], 2e-3)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", STARTS)
 def test_motion(name):
     """Every switch and the end, in slip, stick and flight."""

@@ -62,7 +62,6 @@ def cycle(name, eps) -> fj.LimitCycle:
     return fj.limit_cycle(of_problem(problem), problem["start"], **options)
 
 
-@pytest.mark.slow
 def test_motion_under_a_force():
     """From t0 on, at given times: stick, slip and the phase of the force, by Tsit5."""
     problem, eps = PROBLEMS["papangelo_2017"], 0.03

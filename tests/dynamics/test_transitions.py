@@ -5,7 +5,6 @@ Faces are coupled through inertia: a switch of one changes the forces on those t
 
 import jax
 import numpy as np
-import pytest
 
 import hybrid_truth
 from fractaljax._dynamics.hybrid import OPEN
@@ -64,7 +63,6 @@ def case(seed):
     return np.concatenate([x, u]), tuple(int(s) for s in mode), event, guard
 
 
-@pytest.mark.slow
 def test_transitions():
     """Of 3000 events; in two of three the switch releases a face that stuck."""
     system = jax.jit(hybrid_system)(of_problem(PROBLEM))

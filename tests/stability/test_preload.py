@@ -37,8 +37,7 @@ CONSTANT = [
 ]
 
 
-QUICK = {"scene", "lever arms"}
-EACH = [pytest.param(x, True, marks=() if x in QUICK else slow) for x in PROBLEMS]
+EACH = [pytest.param(x, True, marks=() if x in ("scene", "lever arms") else slow) for x in PROBLEMS]
 SCENES = [x for x in PROBLEMS if x.startswith("scene")]
 
 
