@@ -150,6 +150,8 @@ class HybridSystem(eqx.Module):
         if len(x) > 2 * FEW and not own:
             return jnp.tensordot(matrix, x, 1)
         matrix = self._leaf(matrix, x.ndim - 1)
+        if len(x) == 2:  # written out: many lanes run a fifth faster than with XLA's reduction
+            return matrix[:, 0] * x[:1] + matrix[:, 1] * x[1:]
         return jnp.sum(matrix * x[None], axis=1)
 
     def along(self, x) -> Array:
