@@ -116,6 +116,8 @@ def _lowered(context, x, *used, largest, changed):
     if not _all_go_out(call, functions[_called(call)], used, changed):
         return [x]
     possible = _Possible(functions, largest)(call)
+    if possible:
+        _hide_constants(call)
     texts = _ATTRIBUTES if possible else {_ATTRIBUTE: "false"}
     attributes: dict[str, mlir.ir.Attribute]
     attributes = {name: mlir.ir.StringAttr.get(text) for name, text in texts.items()}
@@ -126,6 +128,20 @@ def _lowered(context, x, *used, largest, changed):
 mlir.register_lowering(_kernel_result, lambda _, x, *used, **__: [x])
 # Elsewhere the value may be an argument, of which nobody sees where it comes from.
 mlir.register_lowering(_kernel_result, _lowered, platform="cpu", cacheable=False)
+
+
+def _hide_constants(call) -> None:
+    """XLA puts what it knows of an argument into the kernel, which leaves that without a use."""
+    given = [*call.operands]
+    barrier = mlir.ir.Operation.create(
+        "stablehlo.optimization_barrier",
+        results=[x.type for x in given],
+        operands=given,
+        loc=call.location,
+        ip=mlir.ir.InsertionPoint(call),
+    )
+    for i, hidden in enumerate(barrier.results):
+        call.operands[i] = hidden
 
 
 def _called(call) -> str:

@@ -3,6 +3,7 @@
 import functools
 import re
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -152,6 +153,22 @@ def test_arguments_without_a_use(function):
         np.testing.assert_allclose(
             jax.jit(changed(run))(STATE), changed(lambda x: x * jnp.sin(x))(STATE), rtol=1e-13
         )
+
+
+@pytest.mark.slow
+@pytest.mark.optimised
+def test_what_is_known_when_it_compiles():
+    """XLA moves constants into a kernel, whose arguments are without a use then: it ended so."""
+    problem = PROBLEMS["released"]
+    structure, start = of_problem(problem), jnp.asarray(problem["start"])
+
+    def everything(x):
+        changed = eqx.tree_at(lambda s: s.K, structure, structure.K * x)
+        cycle = fj.limit_cycle(changed, start, segments=64, throw=False)
+        return [x for x in jax.tree.leaves(cycle) if eqx.is_inexact_array(x)]
+
+    for own, apart in zip(jax.jit(everything)(1.0), everything(1.0), strict=True):
+        np.testing.assert_allclose(own, apart, rtol=1e-9, atol=1e-12)
 
 
 def test_a_later_version_is_left_alone(monkeypatch):
