@@ -131,7 +131,7 @@ mlir.register_lowering(_kernel_result, _lowered, platform="cpu", cacheable=False
 
 
 def _hide_constants(call) -> None:
-    """XLA puts what it knows of an argument into the kernel, which leaves that without a use."""
+    """Put the arguments behind a barrier. Those XLA knows would lose their use in the kernel."""
     given = [*call.operands]
     barrier = mlir.ir.Operation.create(
         "stablehlo.optimization_barrier",

@@ -156,9 +156,8 @@ def test_arguments_without_a_use(function):
 
 
 @pytest.mark.slow
-@pytest.mark.optimised
 def test_what_is_known_when_it_compiles():
-    """XLA moves constants into a kernel, whose arguments are without a use then: it ended so."""
+    """XLA would put constants into the kernel, whose arguments lack a use then: it would end."""
     problem = PROBLEMS["released"]
     structure, start = of_problem(problem), jnp.asarray(problem["start"])
 
