@@ -16,11 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
+from .._base.linear_kernel import linear_kernel
 from .._base.one_kernel import one_kernel
 from .hybrid import NONE, HybridSystem
 from .lanes import product, solve
 from .maps import Maps, axis_of, coarse_maps, in_blocks, maps, segments_together
-from .segments import Segments, chosen_guard, flow, last_of_phase, next_start
+from .segments import Segments, chosen_guard, flow, next_start
 
 _ITERATIONS = 20
 _SMALL = 80  # numbers of a matrix, of all lanes, up to which a chain is one kernel
@@ -56,15 +57,14 @@ def _chain(body: Callable, carry, arrays: tuple, lanes: int, count=None) -> tupl
 
 @functools.partial(jax.jit, static_argnames="constant")  # traced once for all places of a program
 def corrections(
-    local: Maps, segments: Segments, last, gap, guard, constant: int | None = None, count=None
+    local: Maps, segments: Segments, gap, guard, constant: int | None = None, count=None
 ):
     """Changes of states and durations that close the gaps and bring the guards to zero.
 
     They solve dy_next = A dy + b dt + gap on every segment of the chain, with the same dt in a
-    phase, which ends with the segment `last`, and c dy_next = -guard at its end. Of the first state
-    the component `constant`, which repeats whatever it is, does not change. Returns them and the
-    product of all maps (2n, 2n), the Jacobian of the return map. No segment from `count` on is
-    used.
+    phase, and c dy_next = -guard at its end. Of the first state the component `constant`, which
+    repeats whatever it is, does not change. Returns them and the product of all maps (2n, 2n), the
+    Jacobian of the return map. No segment from `count` on is used.
     """
     n, used, lanes = len(gap), segments.used, segments.duration.ndim - 1
     ends = used & (segments.guard != NONE)
@@ -96,7 +96,15 @@ def corrections(
         shift = shift.at[constant].set(0)
     first = solve(matrix, shift)
     dt = jnp.sum(dt[:n] * first[:, None], axis=0) + dt[n]
-    dt = jnp.where(used, jnp.take_along_axis(dt, last, axis=0), 0)
+
+    def backwards(after, segment):
+        dt, last = segment
+        after = jnp.where(last, dt, after)
+        return after, after
+
+    # A gather would become a scatter in reverse mode.
+    _, dt = jax.lax.scan(backwards, jnp.zeros_like(dt[0]), (dt, ends), reverse=True)
+    dt = jnp.where(used, dt, 0)
 
     def along(dy, segment):
         A, added = segment
@@ -146,7 +154,7 @@ def solve_periodic_orbits(
     duration = jnp.where(wanted[None], segments.duration, 0)
     if system.excited:
         y = y.at[:, :1].set(system.with_excitation(system.own(y[:, :1]), 0.0))
-    start, last = y[:, 0], last_of_phase(segments)
+    start = y[:, 0]
     many = jnp.max(jnp.sum(used & wanted[None], axis=0))
     eps, big = jnp.finfo(y.dtype).eps, jnp.finfo(y.dtype).max
     size = 1 + jnp.max(jnp.abs(y), axis=(0, 1))
@@ -191,7 +199,7 @@ def solve_periodic_orbits(
         target = next_start(y)
         off = chosen_guard(system, target, s, guard)
         dy, dt, jacobian = corrections(
-            local, found.segments, last, ends - target, off, system.constant, many
+            local, found.segments, ends - target, off, system.constant, many
         )
         largest, longest = jnp.max(jnp.abs(dy), axis=(0, 1)), jnp.max(jnp.abs(dt), axis=0)
         error = jnp.maximum(
@@ -223,9 +231,9 @@ def solve_periodic_orbits(
 def accurate_return_jacobian(system: HybridSystem, segments: Segments) -> Float[Array, "2n 2n g"]:
     """The Jacobian of the return map of periodic orbits, as exact as they are."""
     ends, local = maps(system, segments)
-    last, nothing = last_of_phase(segments), jnp.zeros_like(segments.duration)
+    nothing = jnp.zeros_like(segments.duration)
     many = jnp.max(jnp.sum(segments.used, axis=0))
-    return corrections(local, segments, last, 0 * ends, nothing, system.constant, many)[2]
+    return corrections(local, segments, 0 * ends, nothing, system.constant, many)[2]
 
 
 @jax.custom_jvp
@@ -241,26 +249,20 @@ def orbit(system: HybridSystem, segments: Segments) -> tuple[Array, Array]:
 def _orbit_jvp(primals, tangents):
     system, segments = primals
     y, duration = orbit(system, segments)
-    s, guard = segments.s, segments.guard
+    given = system, Segments(y, duration, segments.s, segments.guard)
+    return (y, duration), linear_kernel(_moved, given, tangents[0])
 
-    def moved(system, tangent, y, duration, s, guard):
-        def equations(system):
-            end = next_start(y)
-            return flow(system, y, duration, s), chosen_guard(system, end, s, guard)
 
-        return jax.jvp(equations, (system,), (tangent,))[1]
+def _moved(given: tuple[HybridSystem, Segments], tangent: HybridSystem) -> tuple[Array, Array]:
+    """Changes of an orbit's states and durations where its system changes."""
+    system, segments = given
 
-    def solved(gap, off, local, segments):
-        last = last_of_phase(segments)
+    def equations(system):
+        end = next_start(segments.y)
+        ends = flow(system, segments.y, segments.duration, segments.s)
+        return ends, chosen_guard(system, end, segments.s, segments.guard)
 
-        def solution(gap, off):
-            return corrections(local, segments, last, gap, off, system.constant)[:2]
+    gap, off = jax.jvp(equations, (system,), (tangent,))[1]
+    _, local = maps(system, segments)
 
-        # Linear, hence its own derivative. Older versions of JAX transpose a scan only as a jvp.
-        nothing = jax.tree.map(jnp.zeros_like, (gap, off))
-        return jax.jvp(solution, nothing, (gap, off))[1]
-
-    gap, off = one_kernel(moved, system, tangents[0], y, duration, s, guard)
-    segments = Segments(y, duration, s, guard)
-    _, local = one_kernel(maps, system, segments)
-    return (y, duration), one_kernel(solved, gap, off, local, segments)
+    return corrections(local, segments, gap, off, system.constant)[:2]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .hybrid import NONE, UNUSED, HybridSystem
+from .hybrid import UNUSED, HybridSystem
 from .lanes import row_numbers
 from .runge_kutta import runge_kutta
 
@@ -75,15 +75,6 @@ def cumulative(x) -> Array:
     inside = cumulative(x.reshape(*x.shape[:-1], k // _BLOCK, _BLOCK))
     before = cumulative(inside[..., -1]) - inside[..., -1]
     return (inside + before[..., None]).reshape(x.shape)
-
-
-def last_of_phase(segments: Segments) -> Int[Array, "N ..."]:
-    """For each segment the last one of its phase."""
-    ends = (segments.used & (segments.guard != NONE)).T
-    ended = cumulative(ends)
-    phase = ended - ends
-    last = jnp.sum(ended[..., None, :] <= phase[..., None], axis=-1)
-    return jnp.minimum(last, ends.shape[-1] - 1).T
 
 
 def mean_square(system: HybridSystem, segments: Segments) -> Float[Array, " 2n"]:
