@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from .._contact.load_curve import LoadTable, loaded_equilibrium
 from .._friction import Friction
-from .lanes import SMALL, first_least, row_numbers, rows, solve, solve_positive
+from .lanes import SMALL, first_least, product, row_numbers, rows, solve, solve_positive
 
 OPEN = 2
 # Guards, by number: the section of the Poincare map, two for each face, one for each joint that
@@ -528,7 +528,7 @@ class HybridSystem(eqx.Module):
         mu = self._each(lambda law, V: law.mu(self.speed * V), self.V)
         K = jnp.diag(self.K) if self.K.ndim == 1 else self.K
         B = jnp.eye(self.n, dtype=K.dtype) if self.B is None else self.B
-        coupled = K - (B * mu[None]) @ self.L
+        coupled = K - product(B * mu[None], self.L)
         x = solve(coupled, self.F + B @ (mu * self.P))
         joints = zip(self.faces, self.curves, strict=True)
         curved = [(faces, curve) for faces, curve in joints if curve is not None]

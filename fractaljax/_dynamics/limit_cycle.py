@@ -205,8 +205,12 @@ def _posed(mechanism: Mechanism, excitation) -> tuple[HybridSystem, Float[Array,
 def solved(
     system: HybridSystem, growth, start, max_returns, *, of_scene: bool, segments: int, rtol: float
 ) -> LimitCycle:
-    frozen, equilibrium, growth = jax.lax.stop_gradient((system, system.equilibrium(), growth))
-    y = scaled_start(system, start)
+    frozen, growth = jax.lax.stop_gradient((system, growth))
+
+    def states(system, start):
+        return system.equilibrium(), scaled_start(system, start)
+
+    equilibrium, y = one_kernel(states, frozen, start)
     h = 0.25 if system.fastest is None else 0.2  # a finer mesh would take a second solution
     h = jnp.asarray(h * (rtol / 1e-9) ** 0.125, y.dtype)
     max_returns = max_returns.astype(y.dtype)

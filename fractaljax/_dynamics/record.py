@@ -102,7 +102,7 @@ class Record(Steps):
     @classmethod
     def begin(cls, system: HybridSystem, y, length: int) -> "Record":
         """Of runs from y, with room for so many steps."""
-        s, lanes = system.contact_state(y), y.shape[1]
+        s, lanes = one_kernel(type(system).contact_state, system, y), y.shape[1]
         steps = jnp.zeros((len(y) + len(s) + len(_ROWS), length, lanes), y.dtype)
         none = jnp.zeros(lanes, int)
         sums = jnp.zeros_like(steps[TIME:, 0])

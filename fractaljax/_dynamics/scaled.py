@@ -208,9 +208,9 @@ def scaled_start(system: HybridSystem, start: Array | None) -> Float[Array, " 2n
     It is V/omega along the tangential direction of the first joint. An excitation begins at t = 0.
     """
     if start is None:
-        y = system.equilibrium()
         away = system.section_direction
-        y = system.own(y.at[: system.n].add(away / jnp.sum(away**2)))
+        away = jnp.concatenate([away / jnp.sum(away**2), jnp.zeros_like(away)])
+        y = system.own(system.equilibrium() + away)
     else:
         y = start / system.units
     return jax.lax.stop_gradient(system.with_excitation(y, 0.0))

@@ -70,18 +70,21 @@ def _solved(system, record, lane, wanted, given: Candidates, *, length, options)
         last = jnp.where(of_run, given.last, jnp.sum(orbit.used, axis=0))
         return cut(system, steps, first, last, h, length)
 
+    def solved(system, segments, own, reach, rtol, found, h):
+        new = solve_periodic_orbits(system, segments, own, reach, rtol)
+        # The method is of order 8; where the motion is not as smooth, halves do.
+        known = new.error > 0  # a number
+        finer = 0.9 * (rtol / jnp.where(known, new.error, 1)) ** 0.125
+        finer = jnp.where(known, finer, 0.8)
+        return new.where(own, found), h * jnp.clip(finer, 0.5, 0.8)
+
     def solve(carry):
         found, h, tries = carry
         of_run = tries == 0
         segments = one_kernel(mesh, system, record, lane, given, found.segments, h, of_run)
         own = wanted & (of_run | unsettled(found))
-        reach = options.reach * scale
-        new = one_kernel(solve_periodic_orbits, system, segments, own, reach, given.rtol)
-        # The method is of order 8; where the motion is not as smooth, halves do.
-        known = new.error > 0  # a number
-        finer = 0.9 * (given.rtol / jnp.where(known, new.error, 1)) ** 0.125
-        finer = jnp.where(known, finer, 0.8)
-        return new.where(own, found), h * jnp.clip(finer, 0.5, 0.8), tries + 1
+        limits = options.reach * scale, given.rtol
+        return *one_kernel(solved, system, segments, own, *limits, found, h), tries + 1
 
     def evaluated(system, found, given, wanted, scale):
         orbit, n = found.segments, system.n
@@ -102,8 +105,23 @@ def _in_groups(system, record, ready, gap, given, orbit, error, *, options, leng
     """The orbits of all lanes, new where found; those that are ready are solved in groups."""
     lanes = len(ready)
     size = min(lanes, options.group)
+
+    def solved(lane, wanted, given):
+        # The systems of several lanes, each for all of its segments.
+        batched = system.omega.ndim > 0
+        own = jax.tree.map(lambda x: x[..., None, lane], system) if batched else system
+        return _solved(own, record, lane, wanted, given, length=length, options=options)
+
+    if size == lanes:
+        *new, ok = solved(jnp.arange(lanes), ready, given)
+
+        def chosen(new, old):
+            return jnp.where(ok.reshape((1,) * (new.ndim - 1) + (-1,)), new, old)
+
+        return *jax.tree.map(chosen, tuple(new), (orbit, error)), ok
+
     # Similar ones together, so that few wait for others.
-    order = jnp.argsort(jnp.where(ready, gap, jnp.inf)) if lanes > 1 else jnp.zeros(1, int)
+    order = jnp.argsort(jnp.where(ready, gap, jnp.inf))
     order = jnp.pad(order, (0, -lanes % size), constant_values=lanes)
 
     def going(carry):
@@ -114,28 +132,13 @@ def _in_groups(system, record, ready, gap, given, orbit, error, *, options, leng
         lane = jax.lax.dynamic_slice(order, (start,), (size,))
         own = jnp.minimum(lane, lanes - 1)
         wanted = ready[own] & (lane < lanes)
-        batched = system.omega.ndim > 0
-        new, new_error, ok = _solved(
-            jax.tree.map(lambda x: x[..., None, own], system) if batched else system,
-            record,
-            own,
-            wanted,
-            jax.tree.map(lambda x: x[..., own], given),
-            length=length,
-            options=options,
-        )
+        *new, ok = solved(own, wanted, jax.tree.map(lambda x: x[..., own], given))
         lane = jnp.where(ok, lane, lanes)  # beyond the last one nothing is written
-        orbit = Segments(
-            *(
-                old.at[..., lane].set(x, mode="drop")
-                for old, x in zip(
-                    (orbit.y, orbit.duration, orbit.s, orbit.guard),
-                    (new.y, new.duration, new.s, new.guard),
-                    strict=True,
-                )
-            )
-        )
-        error = error.at[:, lane].set(new_error, mode="drop")
+
+        def written(new, old):
+            return old.at[..., lane].set(new, mode="drop")
+
+        orbit, error = jax.tree.map(written, tuple(new), (orbit, error))
         return orbit, error, found.at[lane].set(True, mode="drop"), start + size
 
     carry = orbit, error, jnp.zeros(lanes, bool), 0
