@@ -61,7 +61,7 @@ def _jvp(primals, tangents, *, jaxpr: ClosedJaxpr, linear: int):
     found = _bound(jaxpr, linear, primals)
     moving = [i for i, x in enumerate(tangents) if not isinstance(x, ad.Zero)]
     own = len(primals) - linear
-    if moving and moving[0] >= own:  # linear in all that moves
+    if moving[0] >= own:  # linear in all that moves
         vector = [ad.instantiate_zeros(x) for x in tangents[own:]]
         return found, _bound(jaxpr, linear, [*primals[:own], *vector])
 

@@ -1,11 +1,12 @@
 """Rows and small systems of equations of many lanes at once: components first, lanes last."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
 SMALL = 6  # unknowns up to which elimination is no loop, which runs faster
 _ELIMINATED = 16  # unknowns up to which elimination is no library's
@@ -117,6 +118,15 @@ def _positive_inverse(W) -> Array:
 def _positive_inverse_jvp(primals, tangents):
     inverse = _positive_inverse(*primals)
     return inverse, -product(inverse, product(tangents[0], inverse))
+
+
+def chosen(lanes: Bool[Array, " g"], new: Any, old: Any) -> Any:
+    """The arrays of `new` in these lanes, in others those of `old`."""
+
+    def where(new, old):
+        return jnp.where(lanes.reshape((1,) * (new.ndim - 1) + (-1,)), new, old)
+
+    return jax.tree.map(where, new, old)
 
 
 def product(A, B, *, written_out: bool = False) -> Array:

@@ -19,7 +19,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from .._base.linear_kernel import linear_kernel
 from .._base.one_kernel import one_kernel
 from .hybrid import NONE, HybridSystem
-from .lanes import product, solve
+from .lanes import chosen, product, solve
 from .maps import Maps, axis_of, coarse_maps, in_blocks, maps, segments_together
 from .segments import Segments, chosen_guard, flow, next_start
 
@@ -133,11 +133,7 @@ class PeriodicOrbit(eqx.Module):
 
     def where(self, lanes: Bool[Array, " g"], other: "PeriodicOrbit") -> "PeriodicOrbit":
         """Itself in these lanes, in others the other."""
-
-        def chosen(new, old):
-            return jnp.where(lanes.reshape((1,) * (new.ndim - 1) + (-1,)), new, old)
-
-        return jax.tree.map(chosen, self, other)
+        return chosen(lanes, self, other)
 
 
 def solve_periodic_orbits(
@@ -264,5 +260,4 @@ def _moved(given: tuple[HybridSystem, Segments], tangent: HybridSystem) -> tuple
 
     gap, off = jax.jvp(equations, (system,), (tangent,))[1]
     _, local = maps(system, segments)
-
     return corrections(local, segments, gap, off, system.constant)[:2]

@@ -19,6 +19,7 @@ from .._base.one_kernel import one_kernel
 from .acceptance import HARDLY, admissible, growth_of, has_shorter_period
 from .assessment import RUNNING, Candidates, Progress, SearchOptions, assess, concluded, passed
 from .hybrid import UNUSED, HybridSystem
+from .lanes import chosen
 from .orbit import PeriodicOrbit, solve_periodic_orbits
 from .record import Record, Steps, Stretch, cut
 from .segments import Segments
@@ -114,11 +115,7 @@ def _in_groups(system, record, ready, gap, given, orbit, error, *, options, leng
 
     if size == lanes:
         *new, ok = solved(jnp.arange(lanes), ready, given)
-
-        def chosen(new, old):
-            return jnp.where(ok.reshape((1,) * (new.ndim - 1) + (-1,)), new, old)
-
-        return *jax.tree.map(chosen, tuple(new), (orbit, error)), ok
+        return *chosen(ok, tuple(new), (orbit, error)), ok
 
     # Similar ones together, so that few wait for others.
     order = jnp.argsort(jnp.where(ready, gap, jnp.inf))
