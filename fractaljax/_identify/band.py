@@ -23,6 +23,7 @@ _LEAST_END = 0.8  # of the Nyquist frequency: waves that end further down are a 
 _MANY = 5  # bins, of which a part of one more can be spared
 _FINE = 1.1  # ratio of a bin at the very top
 _NOTHING = 0.3  # of the law in it: the surface's waves end below the Nyquist frequency
+_ROUGH = 1e-4  # tolerance of laws that are compared
 _UNKNOWN = 1e6  # standard deviation of a flat share of which nothing is known
 
 
@@ -105,21 +106,21 @@ def noise_model(spectrum: Spectrum, band: tuple[float, float], ratio: float) -> 
     """Noise, aliasing, or neither: from a band up to the Nyquist frequency or the given limit."""
     profile = spectrum.kind == "profile"
 
-    def laws(scatter):
-        cases = [(False, 0.3), (False, _UNKNOWN), *([(True, 0.1)] if profile else [])]
-        return [
-            fit(spectrum, band, ratio, aliased=aliased, flat_deviation=deviation, scatter=scatter)
-            for aliased, deviation in cases
-        ]
-
-    plain, noisy, *rest = laws(min(law.scatter for law in laws(None)))
+    law_of = functools.partial(fit, spectrum, band, tol=_ROUGH)
+    cases = [(False, 0.3), (False, _UNKNOWN), *([(True, 0.1)] if profile else [])]
+    laws = [law_of(ratio, aliased=aliased, flat_deviation=of) for aliased, of in cases]
+    least = min(law.scatter for law in laws)
+    plain, noisy, *rest = [
+        law_of(ratio, aliased=aliased, flat_deviation=of, scatter=least, start=law)
+        for (aliased, of), law in zip(cases, laws, strict=True)
+    ]
     aliased = rest[0] if rest else plain
     gain = plain.deviance - aliased.deviance
     if min(plain.deviance, aliased.deviance) - noisy.deviance > _BEND and noisy.flat > 0:
         crossing = spectrum.nyquist * (2 * noisy.flat) ** (-1 / (noisy.p + (not profile)))
         floor = noisy.flat * math.exp(noisy.log_A)
         return NoiseModel(floor=floor, crossing=crossing, flat_deviation=_UNKNOWN)
-    fine = fit(spectrum, band, _FINE, flat_deviation=0.1)
+    fine = law_of(_FINE, flat_deviation=0.1)
     seen = np.flatnonzero(fine.ratio >= _NOTHING)
     if profile and band[1] == spectrum.nyquist and seen.size and seen[-1] < fine.f.size - 1:
         # Finer waves are missing wherever the profile crosses them. The last discrete wave stands
@@ -142,43 +143,42 @@ def missing_share(p: float) -> float:
     return 2 / (math.pi * p) * math.exp(-log_mean_cosine_power(p))
 
 
-def _plateau(f, p, corner):
-    """A law that is level below its corner."""
-    return (1 + (corner / f) ** 2) ** (-p / 2)
+def _plateau(f, corner):
+    """A law that is level below its corner: (1 + (corner/f)^2)^(-p/2)."""
+    return np.zeros_like(f), -np.log1p((corner / f) ** 2) / 2
 
 
-def _roll_off(f, _, corner):
+def _roll_off(f, corner):
     """A Gaussian filter, which halves amplitudes at its cut-off."""
-    return np.maximum(4.0 ** -((f / corner) ** 2), 1e-6)
+    return np.maximum(-((f / corner) ** 2) * math.log(4), math.log(1e-6)), np.zeros_like(f)
 
 
 def _bend(spectrum, band, ratio, noise):
     """The plateau or roll-off that lowers the deviance most, and its frequency [1/m], or None."""
     low, high = band
-    straight = noise.fit(spectrum, band, ratio)
+    law_of = functools.partial(noise.fit, spectrum, band, ratio, tol=_ROUGH)
+    straight = law_of()
     best, found = _BEND, (None, 0.0)
     for kind, corners in (
         (_roll_off, np.geomspace(4 * low, 1.5 * high, _CORNERS)),
         (_plateau, np.geomspace(1.2 * low, high / 4, _CORNERS)),
     ):
         if straight.scatter < _POOR:
-            gains = [_gain(straight, kind(straight.f, straight.p, c)) for c in corners]
+            gains = [_gain(straight, *kind(straight.f, c)) for c in corners]
             corners = corners[[int(np.argmax(gains))]]
-        bent = [
-            (noise.fit(spectrum, band, ratio, factor=functools.partial(kind, corner=c)), c)
-            for c in corners
-        ]
+        bent = [(law_of(factor=functools.partial(kind, corner=c)), c) for c in corners]
         law, corner = min(bent, key=lambda pair: (pair[0].scatter, pair[0].deviance))
-        gain = noise.fit(spectrum, band, ratio, scatter=law.scatter).deviance - law.deviance
+        plain = law_of(scatter=law.scatter, start=straight)
+        gain = plain.deviance - law.deviance
         if gain > best:
             best, found = gain, (kind, float(corner))
     return found
 
 
-def _gain(law: PowerLaw, factor):
+def _gain(law: PowerLaw, constant, by_p):
     """Fall of the deviance, to first order, if the law had this factor."""
     weight = 1 / (law.error**2 - law.scatter)
-    change = np.log(np.maximum(factor, 1e-300))
+    change = constant + by_p * law.p
     normal = law.slope.T @ (weight[:, None] * law.slope) + 1e-9 * np.eye(3)
     change = change - law.slope @ np.linalg.solve(normal, law.slope.T @ (weight * change))
     along = np.sum(weight * change * (law.ratio - 1))

@@ -20,6 +20,8 @@ FLAT_DEVIATION = (
 _SPREAD = 0.15  # the flat share's own variance, relative to that of its prior
 _SCATTER_ROUNDS = 4
 _STEPS = 20
+_TERMS = 40  # of aliased waves: the last is beyond rounding up to Nyquist, p up to 8
+_STEP = 1e-6  # of differences by p
 
 
 class PowerLaw(Record):
@@ -68,13 +70,25 @@ def _level(u, kind):
 
 
 def shape(u: np.ndarray, p: float, aliased: bool) -> np.ndarray:
-    """u^-p, u = f/f_N; aliased: sum over all integers j of |u + 2j|^-p."""
+    """u^-p, u = f/f_N up to 1; aliased: sum over all integers j of |u + 2j|^-p."""
+    return u**-p + (_aliased(p) @ _even_powers(u) if aliased else 0.0)
+
+
+def _even_powers(u: np.ndarray) -> np.ndarray:
+    """Of u/2, (terms, u)."""
+    return (u / 2) ** np.arange(0, 2 * _TERMS, 2)[:, None]
+
+
+def _aliased(p: float) -> np.ndarray:
+    """Their coefficients in the sum over all j but 0 of |u + 2j|^-p.
+
+    (1 + x)^-p + (1 - x)^-p = 2 sum over even k of p(p+1)...(p+k-1)/k! x^k, at x = u/(2j).
+    """
     from scipy.special import zeta
 
-    if not aliased:
-        return u**-p
-    s = max(p, 1.02)  # the sum diverges at 1
-    return u**-p + 2**-p * (zeta(s, 1 + u / 2) + zeta(s, 1 - u / 2))
+    s, k = max(p, 1.02), np.arange(2 * _TERMS)  # the sum diverges at 1
+    binomial = np.cumprod(np.append(1.0, (s + k) / (k + 1)))[: 2 * _TERMS : 2]
+    return 2 ** (1 - p) * binomial * zeta(s + k[::2])
 
 
 def bin_edges(band: tuple[float, float], ratio: float) -> np.ndarray:
@@ -106,7 +120,7 @@ class Bins:
         self.variance = np.add.reduceat(self.weight**2 / count, self.start) / self.total**2
 
     def __call__(self, values):
-        return np.add.reduceat(self.weight * values, self.start) / self.total
+        return np.add.reduceat(self.weight * values, self.start, axis=-1) / self.total
 
 
 def fit(
@@ -119,6 +133,8 @@ def fit(
     flat_deviation: float = FLAT_DEVIATION,
     scatter: float | None = None,
     factor: Callable | None = None,
+    start: PowerLaw | None = None,
+    tol: float = 1e-6,
 ) -> PowerLaw:
     """The power law of a spectrum over a band [1/m], in bins of `ratio`.
 
@@ -126,26 +142,41 @@ def fit(
     of either sign, with a normal prior of `flat_mean` and `flat_deviation` in units of the law at
     Nyquist. (Aliased power is flat in the band, and so is the lack of waves that a profile should
     cross at an angle.) A given `scatter` is not estimated: deviances of laws that share it compare.
-    A `factor(f, p)` multiplies the law.
+    A `factor(f)` gives a and b of exp(a + b p), which multiplies the law. Steps begin at the law
+    `start` and end with one of ln A, p and the flat share below `tol`.
     """
     bins = Bins(spectrum, band, ratio)
-    u = bins.f / spectrum.nyquist
-    level = _level(u, spectrum.kind)
+    u, widths = bins.f / spectrum.nyquist, bins.spread / bins.f**2
+    log_u, level = np.log(u), _level(u, spectrum.kind)
+    waves = _even_powers(u) if aliased else None
+    constant, by_p = (None, None) if factor is None else factor(bins.f)
 
     def law(p):
+        """Relative to A, and its derivative by p."""
+        value = np.exp(-p * log_u)
+        slope = -log_u * value
+        if waves is not None:
+            sums = _aliased(p), _aliased(p + _STEP)
+            at, change = np.array([sums[0], (sums[1] - sums[0]) / _STEP]) @ waves
+            value, slope = value + at, slope + change
         # A window smears by half its mean square width times the relative second derivative.
-        curve = p * (p + 1) if spectrum.kind == "profile" else (p + 1) ** 2
-        smeared = shape(u, p, aliased) * (1 + curve / 2 * bins.spread / bins.f**2)
-        return smeared if factor is None else smeared * factor(bins.f, p)
+        profile = spectrum.kind == "profile"
+        curve, bend = (p * (p + 1), 2 * p + 1) if profile else ((p + 1) ** 2, 2 * p + 2)
+        smeared = 1 + curve / 2 * widths
+        value, slope = value * smeared, slope * smeared + bend / 2 * widths * value
+        if factor is not None:
+            share = np.exp(constant + by_p * p)
+            value, slope = share * value, share * (slope + by_p * value)
+        return value, slope
 
     def relative(at):
         """Measured over fitted power, and the slope of ln(fit), of each bin."""
         log_A, p, flat = at
-        only = law(p)
-        whole = only + flat * level
-        grown = (law(p + 1e-6) - only) / 1e-6
-        ratios = bins(bins.power / np.exp(log_A) / whole)
-        return ratios, np.stack([np.ones_like(ratios), bins(grown / whole), bins(level / whole)], 1)
+        only, grown = law(p)
+        ratios, *slopes = bins(
+            np.array([bins.power / np.exp(log_A), grown, level]) / (only + flat * level)
+        )
+        return ratios, np.stack([np.ones_like(ratios), *slopes], axis=1)
 
     mean = np.array([0.0, 0.0, flat_mean])
     prior = np.diag([0.0, 0.0, 1 / flat_deviation**2])
@@ -159,14 +190,17 @@ def fit(
             step = np.linalg.solve(weighted @ slope + prior, score)
             step *= min(1.0, 0.7 / np.abs(step[:2]).max())
             at = at + step
-            at[1] = np.clip(at[1], 0.05, 8.0)
+            at[1] = min(max(at[1], 0.05), 8.0)
             if at[2] < 0:  # the sum stays positive
-                at[2] = max(at[2], -0.8 * (law(at[1]) / level).min())
-            if np.abs(step).max() < 1e-6:
+                at[2] = max(at[2], -0.8 * (law(at[1])[0] / level).min())
+            if np.abs(step).max() < tol:
                 break
         return at, *relative(at)
 
-    at = np.array([np.log(bins(bins.power / law(2.0)).mean()), 2.0, flat_mean])
+    if start is None:
+        at = np.array([np.log(bins(bins.power / law(2.0)[0]).mean()), 2.0, flat_mean])
+    else:
+        at = np.array([start.log_A, start.p, start.flat])
     estimated, ratios, slope = scatter or 0.0, *relative(at)
     for _ in range(_SCATTER_ROUNDS):
         at, ratios, slope = solve(at, bins.variance + estimated)

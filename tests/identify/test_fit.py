@@ -4,8 +4,9 @@ import math
 
 import numpy as np
 import pytest
+from scipy.special import zeta
 
-from fractaljax._identify.fit import bin_edges, curvature, fit, shape
+from fractaljax._identify.fit import Bins, bin_edges, curvature, fit, shape
 from fractaljax._identify.spectrum import Spectrum
 
 NYQUIST, BAND, RATIO = 5e5, (5e3, 2.5e5), 1.5
@@ -22,32 +23,51 @@ def law(p, aliased=False):
     return 1e-20 * shape(F / NYQUIST, p, aliased)
 
 
+def plateau(f):
+    """Below 2e4 1/m, as constant and slope by p of its logarithm."""
+    return np.zeros_like(f), -np.log1p((2e4 / f) ** 2) / 2
+
+
+def damped(f):
+    return -np.log1p(f / 1e5), 0.0
+
+
 SPREAD = 4e6  # 1/m^2: a window smears a law by half its second derivative times its width
-EXACT = [  # (power, p, flat, kind, spread, options)
-    (law(1.1), 1.1, 0, "profile", 0, {}),
-    (law(2.9), 2.9, 0, "profile", 0, {}),
-    (law(1.1), 1.1, 0, "map", 0, {}),
-    (law(2.9), 2.9, 0, "map", 0, {}),
-    (law(1.8, aliased=True), 1.8, 0, "profile", 0, {"aliased": True}),
-    (law(2.5) * (1 + 2.5 * 3.5 / 2 * SPREAD / F**2), 2.5, 0, "profile", SPREAD, {}),
-    (law(2.5) * (1 + 3.5**2 / 2 * SPREAD / F**2), 2.5, 0, "map", SPREAD, {}),
-    (law(2.4) + 3e-20, 2.4, 3.0, "profile", 0, {"flat_deviation": 1e6}),
-    (law(2.4) + 3e-20 * F / NYQUIST, 2.4, 3.0, "map", 0, {"flat_deviation": 1e6}),
-    (law(2.0) - 3e-21, 2.0, -0.3, "profile", 0, {"flat_mean": -0.3}),
-    (law(2.0) / (1 + F / 1e5), 2.0, 0, "profile", 0, {"factor": lambda f, p: 1 / (1 + f / 1e5)}),
+
+
+def aliased_law(p):
+    return law(p, aliased=True)
+
+
+EXACT = [  # (power by p, p, flat, kind, spread, options)
+    (law, 1.1, 0, "profile", 0, {}),
+    (law, 2.9, 0, "profile", 0, {}),
+    (law, 1.1, 0, "map", 0, {}),
+    (law, 2.9, 0, "map", 0, {}),
+    (aliased_law, 1.8, 0, "profile", 0, {"aliased": True}),
+    (lambda p: law(p) * (1 + p * (p + 1) / 2 * SPREAD / F**2), 2.5, 0, "profile", SPREAD, {}),
+    (lambda p: law(p) * (1 + (p + 1) ** 2 / 2 * SPREAD / F**2), 2.5, 0, "map", SPREAD, {}),
+    (lambda p: law(p) + 3e-20, 2.4, 3.0, "profile", 0, {"flat_deviation": 1e6}),
+    (lambda p: law(p) + 3e-20 * F / NYQUIST, 2.4, 3.0, "map", 0, {"flat_deviation": 1e6}),
+    (lambda p: law(p) - 3e-21, 2.0, -0.3, "profile", 0, {"flat_mean": -0.3}),
+    (lambda p: law(p) * np.exp(plateau(F)[1] * p), 2.2, 0, "profile", 0, {"factor": plateau}),
+    (lambda p: law(p) / (1 + F / 1e5), 2.0, 0, "profile", 0, {"factor": damped}),
 ]
 
 
 @pytest.mark.parametrize(("power", "p", "flat", "kind", "spread", "options"), EXACT)
 def test_an_exact_law_is_found_exactly(power, p, flat, kind, spread, options):
-    """With its floor, its aliased waves and the smearing by a window."""
-    found = fit(spectrum(power, kind, spread), BAND, RATIO, **options)
+    """With its floor, its aliased waves and the smearing by a window; and its slope by p."""
+    exact, h = spectrum(power(p), kind, spread), 1e-5
+    found = fit(exact, BAND, RATIO, **options)
     assert found.p == pytest.approx(p, abs=1e-5)
     assert found.log_A == pytest.approx(math.log(1e-20), abs=1e-4)
     assert found.flat == pytest.approx(flat, abs=1e-4) and found.scatter == 0
     if not spread and "factor" not in options:
-        np.testing.assert_allclose(found(F), power, rtol=1e-3)
+        np.testing.assert_allclose(found(F), power(p), rtol=1e-3)
     np.testing.assert_allclose(found.power, found(found.f), rtol=1e-4)
+    bins, slope = Bins(exact, BAND, RATIO), (power(p + h) - power(p - h)) / (2 * h * power(p))
+    np.testing.assert_allclose(found.slope[:, 1], bins(slope[np.isin(F, bins.f)]), rtol=1e-4)
 
 
 def test_aliasing_is_the_sum_over_all_bands():
@@ -58,6 +78,21 @@ def test_aliasing_is_the_sum_over_all_bands():
     j = np.arange(1, 200_001)[:, None]
     direct = u**-2.6 + ((u + 2 * j) ** -2.6 + (2 * j - u) ** -2.6).sum(axis=0)
     np.testing.assert_allclose(shape(u, 2.6, True), direct, rtol=1e-8)
+    u = np.linspace(0.005, 1, 200)
+    for p in (1.02, 1.7, 2.9, 4.5, 8.0):
+        exact = u**-p + 2**-p * (zeta(p, 1 + u / 2) + zeta(p, 1 - u / 2))
+        np.testing.assert_allclose(shape(u, p, True), exact, rtol=1e-13)
+
+
+@pytest.mark.parametrize("aliased", [False, True])
+def test_the_first_law_changes_the_time_only(aliased):
+    """Steps from another spectrum's law end where those from the usual first law do."""
+    rng = np.random.default_rng(3)
+    drawn = [spectrum(law(p, aliased) * rng.exponential(size=F.size)) for p in (1.4, 2.6)]
+    other, usual = (fit(one, BAND, RATIO, aliased=aliased) for one in drawn)
+    found = fit(drawn[1], BAND, RATIO, aliased=aliased, scatter=usual.scatter, start=other)
+    for name in ("log_A", "p", "flat"):
+        assert getattr(found, name) == pytest.approx(getattr(usual, name), abs=1e-5)
 
 
 def test_errors_and_a_bend_are_measured():
