@@ -66,6 +66,12 @@ def pytest_configure(config):
     gc.set_threshold(50_000, 20, 50)
 
 
+def pytest_sessionfinish():
+    """pytest collects garbage five times at the end, of which once is enough."""
+    gc.collect()
+    gc.freeze()
+
+
 def optimised() -> bool:
     return not jax.config.read("jax_disable_most_optimizations")
 
@@ -81,7 +87,7 @@ def pytest_runtest_setup(item):
     os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "0" if compute else "1"  # of subprocesses
 
 
-most_memory = 5e9  # of a worker [bytes]
+most_memory = 7e9  # of a worker [bytes]
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -76,8 +76,8 @@ def test_what_is_invalid_is_nan(name):
     """Never a number that one could believe; the same program gives numbers for what is valid."""
     program = (PROGRAMS | SYSTEMS)[name]
     compiled = jax.jit(program.function)
-    good, bad = (compiled(jnp.asarray(x, float)) for x in (program.value, program.invalid))
-    moved = compiled(jnp.asarray(program.value * (1 + 1e-6)))
+    values = program.value, program.value * (1 + 1e-6), program.invalid
+    good, moved, bad = (compiled(jnp.asarray(x, float)) for x in values)
     leaves = [[np.asarray(x) for x in jax.tree.leaves(tree)] for tree in (good, moved, bad)]
     depending = 0
     for one, other, refused in zip(*leaves, strict=True):

@@ -13,8 +13,6 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_outp
 
 from tools import ROOT, load_script
 
-pytestmark = pytest.mark.optimised
-
 FOLDER = ROOT / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 LIMIT = 600  # s: against one that hangs; what they take is in notebooks/README.md

@@ -81,6 +81,7 @@ def brake():
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_squeal_of_nine_joints():
     """From the default start, through 600 periods of growth; two of the joints lift off."""
     reduced = brake()
