@@ -1,5 +1,6 @@
 """What a GPU would run: it lowers for CUDA, and nowhere calls back to the host."""
 
+import functools
 import inspect
 import re
 from typing import Any
@@ -52,11 +53,16 @@ def called(jitted: Any, *arguments: Any) -> set[str]:
     return {name for name in found if not name.startswith("mhlo.")}  # operations of XLA's own
 
 
+@functools.cache
+def jitted(name):
+    """Traced once for all tests."""
+    return jax.jit((PROGRAMS | SYSTEMS)[name].function)
+
+
 @pytest.mark.parametrize("name", [slowly(name) for name in PROGRAMS])
 def test_public_programs_lower_for_cuda(name):
     """In float64, without a callback; only eigenvalues of structures are found on the host."""
-    program = PROGRAMS[name]
-    found = called(jax.jit(program.function), jnp.asarray(program.value))
+    found = called(jitted(name), jnp.asarray(PROGRAMS[name].value, float))
     assert found - {EIG} <= ON_DEVICE
     assert EIG not in found or "structure" in name or "batch" in name
 
@@ -74,8 +80,7 @@ SEARCHED = [name for name in PROGRAMS if name not in (*SYSTEMS, "limit_cycle, ba
 @pytest.mark.parametrize("name", [*SEARCHED, *SYSTEMS])
 def test_what_is_invalid_is_nan(name):
     """Never a number that one could believe; the same program gives numbers for what is valid."""
-    program = (PROGRAMS | SYSTEMS)[name]
-    compiled = jax.jit(program.function)
+    program, compiled = (PROGRAMS | SYSTEMS)[name], jitted(name)
     values = program.value, program.value * (1 + 1e-6), program.invalid
     good, moved, bad = (compiled(jnp.asarray(x, float)) for x in values)
     leaves = [[np.asarray(x) for x in jax.tree.leaves(tree)] for tree in (good, moved, bad)]

@@ -1,6 +1,5 @@
 """What several test files share: scenes, a limit cycle, runs of the command."""
 
-import contextlib
 import functools
 import importlib.util
 import json
@@ -75,18 +74,6 @@ def both_gradients(function, x) -> list[Any]:
     row, unravel = ravel_pytree(x)
     _, *slopes = both_modes(lambda row: function(unravel(row)), row)
     return [unravel(slope) for slope in slopes]
-
-
-@contextlib.contextmanager
-def with_optimisation():
-    """Within it XLA optimises what is compiled, in a test that is not marked so as a whole."""
-    name = "jax_disable_most_optimizations"
-    was = jax.config.read(name)
-    jax.config.update(name, False)
-    try:
-        yield
-    finally:
-        jax.config.update(name, was)
 
 
 def labels(ax) -> list[str]:

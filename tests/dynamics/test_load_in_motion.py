@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 
 import fractaljax as fj
 from fractaljax._dynamics.scaled import hybrid_system
-from tools import both_modes, with_optimisation
+from tools import both_modes
 
 P, K_N, MU = 3000.0, 2.0e8, 0.4
 COUPLING = 1.7e7  # of the two directions [N/m]
@@ -292,7 +292,6 @@ def test_regularised_law_basin_and_branch():
     x_there = x.replace(P=float(branch.parameter[inside]))
     again = fj.limit_cycle(x_there, cycle().state)
     np.testing.assert_allclose(branch.period[inside], again.period, rtol=1e-6)
-    with with_optimisation():  # half the time
-        basin = fj.basin(x, starts=16, radius=0.5)
+    basin = fj.basin(x, starts=16, radius=0.5)
     assert set(basin.outcomes) >= {"cycle 1"}
     assert basin.cycles[0].period == pytest.approx(float(cycle().period), rel=1e-6)
