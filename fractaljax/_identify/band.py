@@ -144,13 +144,13 @@ def missing_share(p: float) -> float:
 
 
 def _plateau(f, corner):
-    """A law that is level below its corner: (1 + (corner/f)^2)^(-p/2)."""
-    return np.zeros_like(f), -np.log1p((corner / f) ** 2) / 2
+    """A factor of `fit`, of a law that is level below its corner: (1 + (corner/f)^2)^(-p/2)."""
+    return 0.0, -np.log1p((corner / f) ** 2) / 2
 
 
 def _roll_off(f, corner):
-    """A Gaussian filter, which halves amplitudes at its cut-off."""
-    return np.maximum(-((f / corner) ** 2) * math.log(4), math.log(1e-6)), np.zeros_like(f)
+    """A factor of `fit`, of a Gaussian filter, which halves amplitudes at its cut-off."""
+    return np.maximum(-((f / corner) ** 2) * math.log(4), math.log(1e-6)), 0.0
 
 
 def _bend(spectrum, band, ratio, noise):
@@ -176,7 +176,7 @@ def _bend(spectrum, band, ratio, noise):
 
 
 def _gain(law: PowerLaw, constant, by_p):
-    """Fall of the deviance, to first order, if the law had this factor."""
+    """Fall of the deviance, to first order, if the law had the factor exp(constant + by_p p)."""
     weight = 1 / (law.error**2 - law.scatter)
     change = constant + by_p * law.p
     normal = law.slope.T @ (weight[:, None] * law.slope) + 1e-9 * np.eye(3)

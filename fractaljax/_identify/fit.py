@@ -71,16 +71,28 @@ def _level(u, kind):
 
 def shape(u: np.ndarray, p: float, aliased: bool) -> np.ndarray:
     """u^-p, u = f/f_N up to 1; aliased: sum over all integers j of |u + 2j|^-p."""
-    return u**-p + (_aliased(p) @ _even_powers(u) if aliased else 0.0)
+    return shape_by_p(u, aliased)(p)[0]
 
 
-def _even_powers(u: np.ndarray) -> np.ndarray:
-    """Of u/2, (terms, u)."""
-    return (u / 2) ** np.arange(0, 2 * _TERMS, 2)[:, None]
+def shape_by_p(u: np.ndarray, aliased: bool) -> Callable[[float], tuple[np.ndarray, np.ndarray]]:
+    """What gives `shape` and its derivative by p: the rest is computed once."""
+    log_u = np.log(u)
+    even_powers = (u / 2) ** np.arange(0, 2 * _TERMS, 2)[:, None] if aliased else None
+
+    def at(p):
+        value = np.exp(-p * log_u)
+        slope = -log_u * value
+        if even_powers is not None:
+            sums = _aliased(p), _aliased(p + _STEP)
+            others, change = np.array([sums[0], (sums[1] - sums[0]) / _STEP]) @ even_powers
+            value, slope = value + others, slope + change
+        return value, slope
+
+    return at
 
 
 def _aliased(p: float) -> np.ndarray:
-    """Their coefficients in the sum over all j but 0 of |u + 2j|^-p.
+    """Coefficients of even powers of u/2 in the sum over all j but 0 of |u + 2j|^-p.
 
     (1 + x)^-p + (1 - x)^-p = 2 sum over even k of p(p+1)...(p+k-1)/k! x^k, at x = u/(2j).
     """
@@ -147,20 +159,14 @@ def fit(
     """
     bins = Bins(spectrum, band, ratio)
     u, widths = bins.f / spectrum.nyquist, bins.spread / bins.f**2
-    log_u, level = np.log(u), _level(u, spectrum.kind)
-    waves = _even_powers(u) if aliased else None
-    constant, by_p = (None, None) if factor is None else factor(bins.f)
+    profile, level = spectrum.kind == "profile", _level(u, spectrum.kind)
+    only_shape = shape_by_p(u, aliased)
+    constant, by_p = (0.0, 0.0) if factor is None else factor(bins.f)
 
     def law(p):
         """Relative to A, and its derivative by p."""
-        value = np.exp(-p * log_u)
-        slope = -log_u * value
-        if waves is not None:
-            sums = _aliased(p), _aliased(p + _STEP)
-            at, change = np.array([sums[0], (sums[1] - sums[0]) / _STEP]) @ waves
-            value, slope = value + at, slope + change
+        value, slope = only_shape(p)
         # A window smears by half its mean square width times the relative second derivative.
-        profile = spectrum.kind == "profile"
         curve, bend = (p * (p + 1), 2 * p + 1) if profile else ((p + 1) ** 2, 2 * p + 2)
         smeared = 1 + curve / 2 * widths
         value, slope = value * smeared, slope * smeared + bend / 2 * widths * value

@@ -25,7 +25,7 @@ def law(p, aliased=False):
 
 def plateau(f):
     """Below 2e4 1/m, as constant and slope by p of its logarithm."""
-    return np.zeros_like(f), -np.log1p((2e4 / f) ** 2) / 2
+    return 0.0, -np.log1p((2e4 / f) ** 2) / 2
 
 
 def damped(f):
