@@ -1,9 +1,9 @@
 """The periodic orbit of a known itinerary, by multiple shooting over short segments.
 
-A segment keeps one contact state. Those of one phase, from one switch to the next, share its
-duration equally, and the phase ends where its guard vanishes. So no event is searched for, and the
-equations are smooth in states and durations. Newton's method solves them by chaining the affine
-maps of all segments.
+A segment keeps one contact state. Those of one phase, from one switch to the next, have fixed
+shares of its duration, and the phase ends where its guard vanishes. So no event is searched for,
+and the equations are smooth in states and durations. Newton's method solves them by chaining the
+affine maps of all segments.
 """
 
 import functools
@@ -25,6 +25,7 @@ from .segments import Segments, chosen_guard, flow, next_start
 
 _ITERATIONS = 20
 _SMALL = 80  # numbers of a matrix, of all lanes, up to which a chain is one kernel
+_SHORTEST = 1e-12  # duration, in scaled time, that a segment counts with at least
 _HOPELESS = 8  # iterations after which steps must be small, relative to the orbit
 
 
@@ -61,10 +62,10 @@ def corrections(
 ):
     """Changes of states and durations that close the gaps and bring the guards to zero.
 
-    They solve dy_next = A dy + b dt + gap on every segment of the chain, with the same dt in a
-    phase, and c dy_next = -guard at its end. Of the first state the component `constant`, which
-    repeats whatever it is, does not change. Returns them and the product of all maps (2n, 2n), the
-    Jacobian of the return map. No segment from `count` on is used.
+    They solve dy_next = A dy + b dt + gap on every segment of the chain, with the same dt/duration
+    in a phase, and c dy_next = -guard at its end. Of the first state the component `constant`,
+    which repeats whatever it is, does not change. Returns them and the product of all maps
+    (2n, 2n), the Jacobian of the return map. No segment from `count` on is used.
     """
     n, used, lanes = len(gap), segments.used, segments.duration.ndim - 1
     ends = used & (segments.guard != NONE)
@@ -73,7 +74,7 @@ def corrections(
         """The affine map from the first state to this end, and what the phase's dt adds.
 
         The columns of W are the derivatives by the first state, the shift, and those by the
-        dt of the phase so far, which is known at its end: r dy_first + d.
+        dt/duration of the phase so far, which is known at its end: r dy_first + d.
         """
         A, gap, b, c, guard, last = segment
         W = product(A, W) + shifts[None] * gap[:, None] + durations[None] * b[:, None]
@@ -81,7 +82,9 @@ def corrections(
         off = jnp.where(last[None], off / jnp.where(last, -off[-1], 1)[None], 0)
         return W + W[:, -1:] * off[None], off[:-1]
 
-    b = jnp.where(used[None], local.b, 0)
+    # With one dt for all, the shortest would turn negative where a phase becomes a little shorter.
+    share = jnp.maximum(jnp.abs(segments.duration), _SHORTEST)
+    b = jnp.where(used[None], local.b * share[None], 0)
     columns = np.eye(n + 2, dtype=gap.dtype).reshape(n + 2, n + 2, *(1,) * lanes)
     shifts, durations = columns[n], columns[n + 1]
     eye = np.eye(n, n + 2, dtype=gap.dtype).reshape(n, n + 2, *(1,) * lanes)
@@ -104,7 +107,7 @@ def corrections(
 
     # A gather would become a scatter in reverse mode.
     _, dt = jax.lax.scan(backwards, jnp.zeros_like(dt[0]), (dt, ends), reverse=True)
-    dt = jnp.where(used, dt, 0)
+    dt = jnp.where(used, dt * share, 0)
 
     def along(dy, segment):
         A, added = segment

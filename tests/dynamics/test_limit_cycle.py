@@ -1,5 +1,6 @@
 """Limit cycles: the exact law against 40 digits and against an independent event-driven solver."""
 
+import dataclasses
 import functools
 import json
 from pathlib import Path
@@ -15,7 +16,9 @@ from fractaljax._base.parts import substitute
 from fractaljax._dynamics import search
 from fractaljax._dynamics.acceptance import growth_of
 from fractaljax._dynamics.cycle import repels
-from fractaljax._dynamics.orbit import PeriodicOrbit
+from fractaljax._dynamics.hybrid import NONE
+from fractaljax._dynamics.orbit import PeriodicOrbit, solve_periodic_orbits
+from fractaljax._dynamics.segments import flow
 from mechanisms import PLAIN, source_form
 from tools import both_modes, motionless_scene, reference_cycle, reference_scene, refusals, scene_of
 
@@ -175,6 +178,22 @@ def test_orbit_that_repels():
     lane = PeriodicOrbit(segments, jnp.array([True]), rough, jnp.zeros(1), segments.y)
     (growth,) = growth_of(cycle._system, lane)
     np.testing.assert_allclose(growth, np.log(expected[-1]), rtol=1e-4)
+
+
+def test_segments_keep_their_shares_of_a_phase():
+    """Phases are too long, and one segment is far shorter than the change: it stays positive."""
+    cycle = reference_cycle()
+    system, known = cycle._system, jax.tree.map(lambda x: x[..., None], cycle._orbit.segments)
+    k = int(np.flatnonzero(np.asarray(known.guard) == NONE)[0])  # the next one goes on from it
+    h = known.duration.at[k : k + 2, 0].set(known.duration[k : k + 2].sum() * jnp.array([1e-5, 1]))
+    y = known.y.at[:, k + 1].set(flow(system, known.y[:, k], h[k], known.s[:, k]))
+    given = dataclasses.replace(known, y=y, duration=1.01 * h)
+    found = jax.jit(solve_periodic_orbits)(system, given, jnp.array([True]), jnp.ones(1), 1e-9)
+    durations = found.segments.duration[known.used]
+    assert found.converged and float(durations.min()) > 0
+    assert float(durations.sum()) == pytest.approx(float(known.duration.sum()), rel=1e-8)
+    shares = durations[k : k + 2] / given.duration[k : k + 2, 0]
+    assert shares[0] == pytest.approx(float(shares[1]), rel=1e-12)
 
 
 def test_orbit():
