@@ -90,6 +90,7 @@ def test_verdicts_follow_from_the_numbers():
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_contact_laws_of_two_surfaces_and_what_is_said_of_all(monkeypatch):
     """The largest and the smallest share in contact, as found now; the claims, from the table."""
     made = script("contact_laws")

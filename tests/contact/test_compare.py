@@ -102,6 +102,7 @@ def test_full_contact_is_infinitely_stiff():
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 @pytest.mark.parametrize("D, waves", [(2.1, 16), (2.1, 64), (2.5, 16), (2.9, 64)])
 def test_persson_s_law_is_near_boundary_elements(D, waves):
     """Within 35 % below half contact, within a factor of 2 to nearly full; area and roughness."""
@@ -135,6 +136,7 @@ def random_phases(seed, D, sides, waves, n):
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 @pytest.mark.parametrize("D", [2.1, 2.55, 2.9])
 def test_persson_s_law_is_near_boundary_elements_on_surfaces_of_another_program(D):
     """Three loads on two areas, mean over seeds: 35 % below half contact, a factor of 2 beyond."""

@@ -287,11 +287,11 @@ def test_regularised_law_basin_and_branch():
     np.testing.assert_allclose(found.open_fraction, cycle().open_fraction, rtol=2e-2)
     # Both take the curve: the same cycle from all around it, and over the load.
     x = coupled()
-    branch = fj.continue_cycle(x, "P", (2950.0, 3050.0), start=cycle())
+    branch = fj.continue_cycle(x, "P", (2980.0, 3020.0), start=cycle())
     inside = np.argmin(abs(branch.parameter - 3000.0))
     x_there = x.replace(P=float(branch.parameter[inside]))
     again = fj.limit_cycle(x_there, cycle().state)
     np.testing.assert_allclose(branch.period[inside], again.period, rtol=1e-6)
-    basin = fj.basin(x, starts=16, radius=0.5)
+    basin = fj.basin(x, starts=4, radius=0.5)
     assert set(basin.outcomes) >= {"cycle 1"}
     assert basin.cycles[0].period == pytest.approx(float(cycle().period), rel=1e-6)

@@ -205,7 +205,7 @@ def test_coarse_steps_of_a_brake_are_those_of_fine_ones():
 def test_brake_by_brute_force():
     structure, values = brake(), np.linspace(0.02, 0.6, 4)
     found = track(structure, "mu", values)
-    assert_same_tracks(found, brute_force(structure, "mu", values, 250), 1e-8)
+    assert_same_tracks(found, brute_force(structure, "mu", values, 100), 1e-8)
 
 
 def test_modes_leave_and_enter_a_band():
