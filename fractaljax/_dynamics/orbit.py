@@ -62,34 +62,34 @@ def corrections(
 ):
     """Changes of states and durations that close the gaps and bring the guards to zero.
 
-    They solve dy_next = A dy + b dt + gap on every segment of the chain, with the same dt/duration
-    in a phase, and c dy_next = -guard at its end. Of the first state the component `constant`,
-    which repeats whatever it is, does not change. Returns them and the product of all maps
-    (2n, 2n), the Jacobian of the return map. No segment from `count` on is used.
+    They solve dy_next = A dy + b dt + gap on every segment of the chain, with the same stretch
+    dt/duration in a phase, and c dy_next = -guard at its end. Of the first state the component
+    `constant`, which repeats whatever it is, does not change. Returns them and the product of all
+    maps (2n, 2n), the Jacobian of the return map. No segment from `count` on is used.
     """
     n, used, lanes = len(gap), segments.used, segments.duration.ndim - 1
     ends = used & (segments.guard != NONE)
 
     def through(W, segment):
-        """The affine map from the first state to this end, and what the phase's dt adds.
+        """The affine map from the first state to this end, and what the phase's stretch adds.
 
         The columns of W are the derivatives by the first state, the shift, and those by the
-        dt/duration of the phase so far, which is known at its end: r dy_first + d.
+        stretch of the phase so far, which is known at its end: r dy_first + d.
         """
         A, gap, b, c, guard, last = segment
-        W = product(A, W) + shifts[None] * gap[:, None] + durations[None] * b[:, None]
+        W = product(A, W) + shifts[None] * gap[:, None] + stretches[None] * b[:, None]
         off = jnp.sum(c[:, None] * W, axis=0) + shifts * guard[None]
         off = jnp.where(last[None], off / jnp.where(last, -off[-1], 1)[None], 0)
         return W + W[:, -1:] * off[None], off[:-1]
 
-    # With one dt for all, the shortest would turn negative where a phase becomes a little shorter.
-    share = jnp.maximum(jnp.abs(segments.duration), _SHORTEST)
-    b = jnp.where(used[None], local.b * share[None], 0)
+    # With one dt for all, short segments of a phase that becomes shorter would be negative.
+    duration = jnp.maximum(jnp.abs(segments.duration), _SHORTEST)
+    b = jnp.where(used[None], local.b * duration[None], 0)
     columns = np.eye(n + 2, dtype=gap.dtype).reshape(n + 2, n + 2, *(1,) * lanes)
-    shifts, durations = columns[n], columns[n + 1]
+    shifts, stretches = columns[n], columns[n + 1]
     eye = np.eye(n, n + 2, dtype=gap.dtype).reshape(n, n + 2, *(1,) * lanes)
     W = jnp.broadcast_to(eye, (n, n + 2, *gap.shape[2:]))
-    W, dt = _chain(through, W, (local.A, gap, b, local.c, guard, ends), lanes, count)
+    W, stretch = _chain(through, W, (local.A, gap, b, local.c, guard, ends), lanes, count)
     jacobian, shift = W[:, :n], W[:, n]
     # Without segments the equations would be singular.
     jacobian = jnp.where(jnp.any(ends, axis=0)[None, None], jacobian, 0)
@@ -98,16 +98,17 @@ def corrections(
         matrix = matrix.at[constant].set(jnp.broadcast_to(eye[constant, :n], shift.shape))
         shift = shift.at[constant].set(0)
     first = solve(matrix, shift)
-    dt = jnp.sum(dt[:n] * first[:, None], axis=0) + dt[n]
+    stretch = jnp.sum(stretch[:n] * first[:, None], axis=0) + stretch[n]
 
     def backwards(after, segment):
-        dt, last = segment
-        after = jnp.where(last, dt, after)
+        stretch, last = segment
+        after = jnp.where(last, stretch, after)
         return after, after
 
     # A gather would become a scatter in reverse mode.
-    _, dt = jax.lax.scan(backwards, jnp.zeros_like(dt[0]), (dt, ends), reverse=True)
-    dt = jnp.where(used, dt * share, 0)
+    none = jnp.zeros_like(stretch[0])
+    _, stretch = jax.lax.scan(backwards, none, (stretch, ends), reverse=True)
+    dt = jnp.where(used, stretch * duration, 0)
 
     def along(dy, segment):
         A, added = segment
