@@ -125,8 +125,7 @@ def answer() -> None:
 
 def devices(count: int) -> dict[str, str]:
     """An environment in which JAX sees so many virtual devices on the processor."""
-    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={count}"
-    return {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
+    return {"JAX_NUM_CPU_DEVICES": str(count), "JAX_PLATFORMS": "cpu"}
 
 
 # The machine

@@ -8,7 +8,6 @@ import sys
 import threading
 
 from ._cli.commands import add_cycle, add_scene, add_stability
-from ._cli.compiled import keep_compiled
 from ._cli.contact import add_contact
 from ._cli.design import add_design
 from ._cli.explore import add_explore
@@ -54,9 +53,11 @@ def main(argv: list[str] | None = None) -> int:
     gc.set_threshold(50_000, 20, 50)
     import jax
 
+    from ._base.programs import kept_programs
+
     jax.config.update("jax_enable_x64", True)
     try:
-        with keep_compiled(), _terminable():
+        with kept_programs(), _terminable():
             status = arguments.run(arguments)
         if sys.stdout is not None:  # None where it was closed from the start
             sys.stdout.flush()

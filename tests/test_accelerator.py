@@ -112,7 +112,7 @@ DRIVERS = {
     "sweep": (batches, ["_batch"], lambda: fj.sweep(fj.growth_rate, BRAKE, None, False, D=[2.4])),
     "design": (
         rows,
-        ["_linearise_light"],
+        ["linearised"],
         lambda: fj.design(BRAKE, {"D": (2.39, 2.41)}, starts=1, progress=False),
     ),
     "basin": (basin, ["_first", "_run"], lambda: fj.basin(BRAKE, **KICKS)),

@@ -1,5 +1,6 @@
 """What several test files share: scenes, a limit cycle, runs of the command."""
 
+import contextlib
 import functools
 import importlib.util
 import json
@@ -7,6 +8,7 @@ import re
 import subprocess
 import sys
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +21,7 @@ from jax.flatten_util import ravel_pytree
 
 import fractaljax as fj
 from fractaljax.__main__ import main
-from fractaljax._base import kept
-from fractaljax._base.one_kernel import equations
+from fractaljax._base import programs
 from mechanisms import PLAIN
 
 ROOT = Path(__file__).parents[1]
@@ -109,11 +110,11 @@ def assert_same_picture(drawn: Path, name: str) -> None:
 def run_command(capsys, *arguments) -> tuple[Any, str, str]:
     """Exit status, standard output and standard error of one call of the command.
 
-    Its programs are those of the other tests. A process of its own keeps them whole, on disk
-    (tests/base/test_kept.py): here they would be compiled once more for that.
+    Its programs are those of the other tests. A process of its own keeps them on disk
+    (tests/base/test_programs.py): here they would be compiled once more for that.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(kept, "keep_in", lambda _: None)
+        patch.setattr(programs, "kept_programs", contextlib.nullcontext)
         try:
             status = main([str(argument) for argument in arguments])
         except SystemExit as stop:
@@ -127,6 +128,16 @@ def refused_command(capsys, *arguments) -> str:
     assert (status, out) == (2, ""), arguments
     assert err.startswith("fractaljax: ") and err.count("\n") == 1, arguments
     return err.removeprefix("fractaljax: ").rstrip()
+
+
+def equations(jaxpr) -> Iterator[Any]:
+    """All equations of a jaxpr, those of loops and calls included."""
+    for equation in jaxpr.eqns:
+        yield equation
+        for value in jax.tree.leaves(tuple(equation.params.values())):
+            inner = getattr(value, "jaxpr", value)
+            if hasattr(inner, "eqns"):
+                yield from equations(inner)
 
 
 def primitives(jaxpr) -> Counter[str]:

@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, ScalarLike
 
-from .._base.one_kernel import small_kernel
 from .._base.parts import Numbers, number, ordered, quantity, require_kind, require_scalar, scalar
 from .._base.singular import boxcox, exp_or_inf, positive_cbrt
 from .._surface.surface import Surface
@@ -155,9 +154,6 @@ class FractalContact(Contact):
         )
 
     def _solve(self, mu_s, mu_m) -> _Solved:
-        return small_kernel(FractalContact._balance, self, mu_s, mu_m)
-
-    def _balance(self, mu_s, mu_m) -> _Solved:
         D, P, material = self.surface.D, self.P, self.material
         k_mu = friction_correction(mu_m)
         beta = critical_pressure_ratio(material, k_mu)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._base.batches import in_batches
-from .._base.quick import quick_jit
+from .._base.programs import exported_jit
 from .._mechanism.structure import ParametricStructure
 from .._stability.linearise import assembled
 from .._stability.quadratic import solve
@@ -43,7 +43,7 @@ def in_few_modes(problem: DesignProblem, us: np.ndarray) -> DesignProblem | None
     return dataclasses.replace(problem, x=ParametricStructure(**projected(x, V, V)))
 
 
-@quick_jit
+@exported_jit
 def _growing(problem: DesignProblem, us):
     """Right and left vectors (n, dofs, k) of the modes that grow most, and the diagonals of M."""
 

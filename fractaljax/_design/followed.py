@@ -12,10 +12,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._base.quick import quick_jit
+from .._base.programs import exported_jit
 from .._dynamics.acceptance import HARDLY, admissible, growth_of
 from .._dynamics.cycle import CycleResult
-from .._dynamics.limit_cycle import extreme_values, limit_cycle
+from .._dynamics.extremes import extreme_values
+from .._dynamics.limit_cycle import limit_cycle
 from .._dynamics.orbit import orbit, solve_periodic_orbits
 from .._dynamics.scaled import check_rtol, hybrid_system
 from .._dynamics.segments import Segments, mean_square
@@ -146,7 +147,7 @@ def _mechanism(problem, u):
     return problem.moved(jnp.asarray(u, problem.low.dtype), problem.own_condition)
 
 
-@quick_jit
+@exported_jit
 def _followed(problem, u, segments: Segments):
     """The orbit of the design u near those segments, what is measured of it, and by u."""
     rtol = check_rtol(None, u.dtype)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._base.quick import quick_jit
+from .._base.programs import exported_jit
 from .._base.ranges import low_discrepancy
 from .._stability.linearise import assembled
 from .._stability.quadratic import leading
@@ -30,7 +30,7 @@ def modes_to_keep(problem: DesignProblem) -> int:
     return min(int(growing.sum(axis=2).max()) + 2, modes)
 
 
-@quick_jit
+@exported_jit
 def _rates(problem: DesignProblem, us, conditions):
     """The largest growth rates (n, laws, modes), NaN where there is no steady sliding."""
 

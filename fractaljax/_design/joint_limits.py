@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._base.batches import in_batches
-from .._base.quick import outermost_jit
+from .._base.programs import exported_jit
 from .._mechanism.quantities import joints_of
 from .joints import states_of
 from .problem import UNKNOWN, DesignProblem
@@ -69,7 +69,7 @@ def within_joints(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray
     return us
 
 
-@functools.partial(outermost_jit, static_argnames="structure")
+@functools.partial(exported_jit, static_argnames="structure")
 def _limits_of_joints(leaves, us, conditions, structure):
     problem: DesignProblem = jax.tree.unflatten(structure, leaves)
 

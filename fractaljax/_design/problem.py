@@ -22,7 +22,6 @@ from .._mechanism.quantities import (
     substituted,
     value_of,
 )
-from .._mechanism.scene import Scene
 from .._stability.linearise import assembled
 from .._stability.quadratic import leading
 from .._stability.stability import growth_rate
@@ -187,12 +186,6 @@ class DesignProblem(eqx.Module):
     def robust(self) -> bool:
         """Whether there is an envelope or a tolerance."""
         return bool(self.conditions) or self.scatter is not None
-
-    @property
-    def light(self) -> bool:
-        """Whether a row takes less time than its call: the source's law, and nothing besides."""
-        more = self.robust or self.modes or self.laws or self.constraints or self.objective
-        return isinstance(self.x, Scene) and self.x.contact.fractal and not more
 
     @property
     def least_growth(self) -> bool:

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from .._base.batches import in_batches
-from .._base.quick import quick_jit
+from .._base.programs import exported_jit
 from .problem import DesignProblem
 
 BATCH = 32  # designs, each at one condition, evaluated at once
@@ -20,8 +20,7 @@ def linearise(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray):
 
     Each design is at a condition (n, c).
     """
-    program = _linearise_light if problem.light else _linearise
-    rows, jacobians, numbers = rows_in_batches(program, problem, us, conditions)
+    rows, jacobians, numbers = rows_in_batches(linearised, problem, us, conditions)
     rows, jacobians = rows.astype(float), jacobians.astype(float)
     if problem.cycles is not None:
         problem.cycles.fill(problem, us, rows, jacobians)
@@ -58,6 +57,7 @@ def rows_in_batches(program, problem, us, conditions):
     return in_batches(functools.partial(program, problem), batch, *pairs)
 
 
+@exported_jit
 def linearised(problem: DesignProblem, us, conditions):
     """What `linearise` compiles."""
 
@@ -72,9 +72,6 @@ def linearised(problem: DesignProblem, us, conditions):
     return jax.vmap(one)(us, conditions)
 
 
-_linearise, _linearise_light = quick_jit(linearised), quick_jit(linearised, once=True)
-
-
-@quick_jit
+@exported_jit
 def evaluated(problem: DesignProblem, us, conditions):
     return jax.vmap(lambda u, condition: problem.at(u, condition)[0])(us, conditions)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._base.parts import Record, brief, flag, require_kind, require_scalar, scalar, substitute
-from .._base.quick import quick_jit
+from .._base.programs import exported_jit
 from .._base.table import table
 from .._contact.asperity import AsperityContact
 from .._contact.contact import Contact
@@ -217,7 +217,7 @@ class _Found(NamedTuple):
     trace: Array  # the sum of the growth rates, which no stiffness changes
 
 
-@functools.partial(quick_jit, static_argnames="friction_slope", once=True)
+@functools.partial(exported_jit, static_argnames="friction_slope")
 def _growth_rates(asked: tuple[Mechanism, ...], friction_slope: bool) -> _Found:
     """Growth rates of m mechanisms, and of the first over K_t/K_n, in one program.
 

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float, Int
 
 from .._base.parts import Record, concrete, flag, whole
-from .._base.quick import quick_jit
+from .._base.programs import exported_jit
 from .._base.table import table
 from .._mechanism.mechanism import Mechanism
 from .assessment import SearchOptions
@@ -113,7 +113,7 @@ class _Lanes(Record):
     label: Int[Array, " k"]
 
 
-@functools.partial(quick_jit, once=True)
+@exported_jit
 def _linearised(system: HybridSystem) -> tuple[Array, Array, Array, Array]:
     """The equilibrium (2n,), the field's Jacobian there, the normal forces and their Jacobian."""
     y, slip = system.equilibrium(), jnp.ones(len(system.P), system.P.dtype)

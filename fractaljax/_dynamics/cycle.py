@@ -1,6 +1,7 @@
 """A limit cycle: its numbers, its orbit, its spectrum and its switches."""
 
 import functools
+from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
@@ -10,10 +11,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._base.parts import Record, concrete
-from .._base.quick import command_jit
-from .hybrid import OPEN, UNUSED, HybridSystem
-from .lanes import log_spectral_radius
-from .segments import Segments, flow, mean_square
+from .._base.programs import exported_jit
+from .extremes import extreme_values, time_below_zero
+from .hybrid import NONE, OPEN, UNUSED, HybridSystem
+from .lanes import log_spectral_radius, product
+from .maps import maps
+from .segments import Segments, flow, mean_square, next_start
 
 SQUARINGS = 40  # of a monodromy matrix
 _SAMPLES = 1024  # of a smooth orbit, for a mean
@@ -71,8 +74,23 @@ class Switch(Record):
     after: str
 
 
+class Ranges(eqx.Module):
+    """Smallest and largest values over a period."""
+
+    states: Float[Array, "2 2n"]  # [m, m/s]
+    normal_force: Float[Array, "m 2"]  # [N]
+
+
+class Fractions(eqx.Module):
+    """Shares of a period."""
+
+    stick: Float[Array, " f"]  # of each direction of friction
+    open: Float[Array, " m"]
+    tension: Float[Array, " m"]
+
+
 class Orbit(eqx.Module):
-    """The motion along the segments of a periodic orbit."""
+    """The motion along the segments of a periodic orbit, and what follows from it when asked."""
 
     segments: Segments
 
@@ -86,43 +104,164 @@ class Orbit(eqx.Module):
         """Contact states from scaled times (n,) on."""
         return self.segments.s[:, self._segment(times)]
 
+    def ranges(self, system: HybridSystem) -> Ranges:
+        """Extremes of displacements, velocities and normal forces."""
+        n = system.n - system.excited
+        rows, offset = _normal_rows(system)
+        own = system.own(jnp.eye(2 * system.n, dtype=rows.dtype))
+        values = extreme_values(system, self.segments, jnp.concatenate([own, rows]))
+        linear = jnp.zeros((len(system.P), 2), rows.dtype)
+        linear = linear.at[_tangential(system)].set((values[:, 2 * n :] + offset[None]).T)
+        # A load curve rises, so that its extremes are where those of the approach are.
+        forces = system.normal_forces(linear) * system.force_unit
+        opens = np.array(system.opens)[:, None]
+        forces = jnp.where(opens, jnp.maximum(forces, 0), forces)
+        return Ranges(values[:, : 2 * n] * system.units[None], forces)
+
+    def fractions(self, system: HybridSystem) -> Fractions:
+        """Shares of sticking, of being open, and of pulling."""
+        s, duration = self.segments.s, self.segments.duration
+        period = jnp.sum(duration)
+
+        def share(state):
+            return jnp.sum(jnp.where(s == state, duration[None], 0), axis=1) / period
+
+        rows, offset = _normal_rows(system)
+        pulls = [
+            jnp.zeros_like(period)
+            if opens or not faces[1:]
+            else time_below_zero(system, self.segments, row, shift) / period
+            for row, shift, faces, opens in zip(
+                rows, offset, system.faces, system.opens, strict=True
+            )
+        ]
+        return Fractions(share(0), share(OPEN)[_tangential(system)], jnp.stack(pulls))
+
+    def monodromy(self, system: HybridSystem) -> Float[Array, "2n 2n"]:
+        """The product of all segments' maps, with the jump of the tangent at every switch."""
+        segments = self.segments
+        _, local = maps(system, segments)
+        ends, s = next_start(segments.y), segments.s
+        before, after = system.field(ends, s), system.field(ends, jnp.roll(s, -1, axis=-1))
+        switches = segments.used & (segments.guard != NONE)
+        speed = jnp.where(switches, jnp.sum(local.c * before, axis=0), 1)
+        jump = jnp.where(switches[None], (after - before) / speed[None], 0)
+        eye = jnp.eye(len(ends), dtype=ends.dtype)
+
+        def chain(so_far, segment):
+            A, jump, c = segment
+            so_far = product(A, so_far)
+            return so_far + jump[:, None] * jnp.sum(c[:, None] * so_far, axis=0)[None], None
+
+        monodromy = jax.lax.scan(chain, eye, (local.A, jump.T, local.c.T))[0]
+        return system.own(system.own(monodromy).T).T
+
     def _segment(self, times) -> Int[Array, " n"]:
         ends = jax.lax.stop_gradient(jnp.cumsum(self.segments.duration))
         k = jnp.searchsorted(ends, jax.lax.stop_gradient(times), side="right")
         return jnp.minimum(k, len(ends) - 1)
 
 
+def _tangential(system: HybridSystem) -> np.ndarray:
+    """The tangential face of each joint."""
+    return np.array([faces[0] for faces in system.faces])
+
+
+def _normal_rows(system: HybridSystem) -> tuple[Float[Array, "m 2n"], Float[Array, " m"]]:
+    """The loads of the tangential faces, which are the joints' normal forces: row @ y + offset."""
+    L = system.L[_tangential(system)]
+    return jnp.concatenate([L, jnp.zeros_like(L)], axis=1), system.P[_tangential(system)]
+
+
 class LimitCycle(Record):
-    """A limit cycle, as `limit_cycle` returns it. NaN throughout where there is none."""
+    """A limit cycle, as `limit_cycle` returns it. NaN throughout where there is none.
+
+    Fields are what the search finds. Everything else is computed from the orbit when it is asked
+    for, so that a program which asks for the period alone compiles no more than that.
+    """
 
     period: Float[Array, ""]  # [s]
-    amplitude: Float[Array, " n"]  # peak to peak of each degree of freedom [m]
-    velocity_min: Float[Array, " n"]  # of dx/dt [m/s]
-    velocity_max: Float[Array, " n"]  # [m/s]
-    stick_fraction: Float[Array, " m"]  # of the period in stick (regularised: abs(v) < eps)
-    open_fraction: Float[Array, " m"]  # of the period open, one value a joint
-    tension_fraction: Float[Array, "..."]  # of the period with K_n n.x < 0: the contact pulls
-    normal_force: Float[Array, "m 2"]  # smallest and largest of each joint [N]
     # [x, v] [m, m/s] on the cycle, at the section: a maximum of t.x, or the time 0 of an excitation
     state: Float[Array, " 2n"]
     error: Float[Array, ""]  # estimated relative error of period and states
     returns: Int[Array, ""]  # of the Poincare map in one period
     regularisation_error: Float[Array, ""]  # largest relative difference from the exact law
     result: CycleResult
-    _monodromy: Float[Array, "2n 2n"] = eqx.field(repr=False)
+    of_scene: bool = eqx.field(static=True, repr=False)  # fractions are of directions, not joints
     _system: HybridSystem = eqx.field(repr=False)
     _orbit: Any = eqx.field(repr=False)  # Orbit, or regularised.SmoothOrbit
+
+    def _shown(self) -> Iterator[str]:
+        yield from super()._shown()
+        if concrete(self.period) is not None:
+            for name in ("amplitude", "velocity_min", "velocity_max", "normal_force"):
+                yield f"{name}={np.asarray(getattr(self, name))!r}"
+            for name in ("stick_fraction", "open_fraction", "tension_fraction"):
+                yield f"{name}={np.asarray(getattr(self, name))!r}"
+
+    @property
+    def amplitude(self) -> Float[Array, " n"]:
+        """Peak to peak of each degree of freedom [m]."""
+        states = self._ranges.states
+        low, high = jnp.split(states[..., : states.shape[-1] // 2], 2, axis=-2)
+        return (high - low)[..., 0, :]
+
+    @property
+    def velocity_min(self) -> Float[Array, " n"]:
+        """The least dx/dt of each degree of freedom [m/s]."""
+        states = self._ranges.states
+        return states[..., 0, states.shape[-1] // 2 :]
+
+    @property
+    def velocity_max(self) -> Float[Array, " n"]:
+        """The largest dx/dt of each degree of freedom [m/s]."""
+        states = self._ranges.states
+        return states[..., 1, states.shape[-1] // 2 :]
+
+    @property
+    def normal_force(self) -> Float[Array, "m 2"]:
+        """The smallest and the largest normal force of each joint [N]."""
+        return self._ranges.normal_force
+
+    @property
+    def stick_fraction(self) -> Float[Array, " m"]:
+        """The share of the period in stick: of a scene's two directions, or of each joint.
+
+        Of a regularised cycle, the share with abs(v) < eps.
+        """
+        stick = self._fractions.stick
+        return stick if self.of_scene else stick[..., _tangential(self._system)]
+
+    @property
+    def open_fraction(self) -> Float[Array, " m"]:
+        """The share of the period in which each joint is open."""
+        return self._fractions.open
+
+    @property
+    def tension_fraction(self) -> Float[Array, "..."]:
+        """The share of the period with K_n n.x < 0, in which the contact pulls.
+
+        Of a scene one number (), of a structure one a joint (m,).
+        """
+        tension = self._fractions.tension
+        return tension[..., 0] if self.of_scene else tension
 
     @property
     def multipliers(self) -> Complex[Array, " 2n"]:
         """The Floquet multipliers, largest modulus first; one is 1 where nothing excites."""
-        # Computed only when asked for: eigenvalues have no second derivative in JAX.
         return _multipliers(self._monodromy)
 
     @property
-    def of_scene(self) -> bool:
-        """Whether `stick_fraction` is of the two directions of a scene, not of joints."""
-        return self.stick_fraction.shape[-1] != len(self._system.faces)
+    def _ranges(self) -> Ranges:
+        return _of_orbit(self._orbit, self._system, self.period, "ranges")
+
+    @property
+    def _fractions(self) -> Fractions:
+        return _of_orbit(self._orbit, self._system, self.period, "fractions")
+
+    @property
+    def _monodromy(self) -> Float[Array, "2n 2n"]:
+        return _of_orbit(self._orbit, self._system, self.period, "monodromy")
 
     @property
     def frequency(self) -> Float[Array, ""]:
@@ -138,7 +277,7 @@ class LimitCycle(Record):
             square = jnp.where(jnp.isfinite(self.period), square, jnp.nan)
         else:
             square = jnp.mean(self.orbit(_SAMPLES)[1] ** 2, axis=0)
-        return jnp.sqrt(square[len(self.amplitude) :])
+        return jnp.sqrt(square[len(square) // 2 :])
 
     @property
     def velocity_level(self) -> Float[Array, " n"]:
@@ -157,7 +296,7 @@ class LimitCycle(Record):
 
         The Fourier coefficients of n samples of the orbit, without the mean.
         """
-        return self.harmonics(jnp.eye(len(self.amplitude), dtype=self.amplitude.dtype), n)
+        return self.harmonics(jnp.eye(len(self.state) // 2, dtype=self.state.dtype), n)
 
     def harmonics(self, rows, n: int = 512) -> tuple[Float[Array, " n/2"], Float[Array, "n/2 k"]]:
         """As `spectrum`, of the displacements rows @ x, rows (k, dofs)."""
@@ -198,14 +337,28 @@ class LimitCycle(Record):
         return found
 
 
-@command_jit
+@functools.partial(exported_jit, static_argnames="what")
+def _of_orbit(orbit, system: HybridSystem, period, what: str) -> Any:
+    """What a method of an orbit says: of one cycle, or of each of a batch; NaN without a cycle."""
+
+    def of_one(orbit, system, period):
+        exists = jnp.isfinite(period)
+        values = getattr(orbit, what)(system)
+        return jax.tree.map(lambda x: jnp.where(exists, x, jnp.nan), values)
+
+    for _ in range(period.ndim):
+        of_one = jax.vmap(of_one)
+    return of_one(orbit, system, period)
+
+
+@exported_jit
 def _multipliers(monodromy):
     values = jnp.linalg.eigvals(monodromy)
     order = jnp.argsort(-jnp.abs(jax.lax.stop_gradient(values)), axis=-1)
     return jnp.take_along_axis(values, order, axis=-1)
 
 
-@functools.partial(command_jit, static_argnames="n", once=True)
+@functools.partial(exported_jit, static_argnames="n")
 def _harmonics(orbit, system: HybridSystem, period, rows, n: int):
     _, states = _sampled(orbit, system, period, n=n)
     x = states[:, : states.shape[1] // 2] @ jnp.asarray(rows, states.dtype).T
@@ -214,7 +367,7 @@ def _harmonics(orbit, system: HybridSystem, period, rows, n: int):
     return harmonics / period, lines[1 : n // 2 + 1]
 
 
-@functools.partial(command_jit, static_argnames="n", once=True)
+@functools.partial(exported_jit, static_argnames="n")
 def _sampled(orbit, system: HybridSystem, period, n: int):
     share = jnp.arange(n) / n
     y = orbit.at(system, share * period * system.omega)

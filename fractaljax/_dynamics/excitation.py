@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, ScalarLike
 
 from .._base.parts import Numbers, Record, number, require_kind
-from .._base.quick import quick_jit
+from .._base.programs import exported_jit
 from .._mechanism.joint import Dof
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.structure import Structure
@@ -150,4 +150,4 @@ def excited_system(mechanism: Any, excitation: Excitation | None) -> HybridSyste
 
 
 # Outside of a program: its some hundred operations, one by one, would be compiled one by one.
-compiled_system = quick_jit(excited_system, once=True)
+compiled_system = exported_jit(excited_system)

@@ -4,7 +4,6 @@ Within one itinerary the equations of `shooting.py` are smooth, and `_continuati
 their solutions. `itinerary_change.py` takes the branch from one itinerary to the next.
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -12,7 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .._base.quick import quick_jit
+from .._base.programs import exported_jit
 from .._continuation import cubic
 from .._mechanism.mechanism import Mechanism
 from .hybrid import OPEN, SECTION, HybridSystem
@@ -40,7 +39,7 @@ class BranchEnd(eqx.Enumeration):
     long = "after the largest number of points"
 
 
-@functools.partial(quick_jit, once=True)
+@exported_jit
 def _system(window, x: Mechanism, q) -> HybridSystem:
     return window.system(x, q)
 

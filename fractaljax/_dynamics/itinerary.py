@@ -1,13 +1,12 @@
 """The equations of `shooting.py` for NumPy: itineraries, meshes and solutions on the host."""
 
-import functools
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._base.quick import quick_jit
+from .._base.programs import exported_jit
 from .._continuation import Continuation
 from .._mechanism.mechanism import Mechanism
 from .cycle import LimitCycle
@@ -57,7 +56,7 @@ class Solution(NamedTuple):
         return np.concatenate([[0], np.cumsum(self.u[k : k + len(self.phases)])])
 
 
-@functools.partial(quick_jit, once=True)
+@exported_jit
 def _along(system: HybridSystem, y):
     """t.x of each face (f, k) in states (2n, k)."""
     return system.along(y[: system.n])

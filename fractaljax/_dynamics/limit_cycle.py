@@ -1,17 +1,15 @@
 """The stick-slip limit cycle: amplitude, frequency and share of sticking, with gradients."""
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float, ScalarLike
 
-from .._base.one_kernel import one_kernel, small_kernel
 from .._base.parts import concrete, number, raise_unless, require_kind, whole
-from .._base.quick import quick_jit
+from .._base.programs import exported_jit
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import joints_of
 from .._mechanism.scene import Scene
@@ -19,22 +17,17 @@ from .._stability.stability import growth_rate
 from . import search
 from .assessment import CONVERGED
 from .cycle import CycleResult, LimitCycle, Orbit
-from .events import Cubic, first_root, rounding
 from .excitation import Excitation, excited_system
-from .hybrid import NONE, OPEN, HybridSystem
-from .lanes import first_least, product, row_numbers
-from .maps import maps
+from .hybrid import HybridSystem
 from .orbit import orbit
 from .scaled import FEW, check_rtol, degrees_of_freedom, scaled_start, start_state
-from .segments import Segments, cumulative, flow, next_start
+from .segments import Segments
 
 if TYPE_CHECKING:
     from diffrax import AbstractSolver
 
 _SEGMENTS = 64  # one return takes some 35 at rtol 1e-9
 _MOST_SEGMENTS = 4096
-_CROSSINGS = 16  # segments in which x2 may change sign
-_MINIMA = 4  # nearly equal ones of a displacement or a velocity
 
 # In the order of the numbers in `search`.
 _RESULTS = (
@@ -48,169 +41,22 @@ _RESULTS = (
 )
 
 
-def _along(system: HybridSystem, y, s, t, row):
-    """row @ y and its first two derivatives by time, each lane at its own time t."""
-    y = flow(system, y, t, s)
-    rate = system.field(y, s)
-    _, change = jax.jvp(lambda y: system.field(y, s), (y,), (rate,))
-    return tuple(jnp.sum(row * x, axis=0) for x in (y, rate, change))
-
-
-def _lowest(x, count: int) -> tuple[Array, Array]:
-    """The lowest values (r, count) in the rows of x (r, k), and where: quicker than sorting."""
-
-    def without(x, _):
-        k, least = first_least(x)
-        return jnp.where(row_numbers(x) == k[None], jnp.inf, x), (least, k)
-
-    _, (least, k) = jax.lax.scan(without, x.T, length=count)
-    return least.T, k.T
-
-
-def _vertex(given, t):
-    """The minimum of row @ y by the parabola at t, of third order, and a step towards it."""
-    system, y, s, h, row = given
-    value, rate, change = _along(system, y, s, t, row)
-    most = h / 8
-    near = jnp.abs(rate) < change * most
-    newton = jnp.where(near, -rate / jnp.where(near, change, 1), 0)
-    return value + rate * newton / 2, jnp.where(near, newton, -jnp.sign(rate) * most)
-
-
-@jax.custom_jvp
-def _minima(given: tuple, t, exists) -> tuple[Array, Array]:
-    """The minima near the times t, infinite but where one `exists`, and when they are.
-
-    Derivatives are those of the last parabola: with respect to its time a minimum has none.
-    """
-    length = given[3]
-
-    def going(carry):
-        _, change, _, steps = carry
-        return (steps < 6) & jnp.any(exists & (jnp.abs(change) > length / 2**20))
-
-    # The cubic's minimum is near, but where it is nearly an inflection.
-    def step(carry):
-        t, _, _, steps = carry
-        value, change = _vertex(given, t)
-        return jnp.clip(t + change, 0, length), change, value, steps + 1
-
-    far = jnp.full_like(t, jnp.inf)
-    t, _, value, _ = jax.lax.while_loop(going, step, (t, far, far, 0))
-    return jnp.where(exists, value, jnp.inf), t
-
-
-@_minima.defjvp
-def _minima_jvp(primals, tangents):
-    given, t, exists = primals
-    value, t = _minima(given, t, exists)
-    _, change = jax.jvp(lambda given: _vertex(given, t)[0], (given,), (tangents[0],))
-    return (value, t), (jnp.where(exists, change, 0), jnp.zeros_like(t))
-
-
-def extreme_values(system: HybridSystem, segments: Segments, rows) -> Float[Array, "2 r"]:
-    """Smallest and largest value along the orbit of linear functions rows @ y, rows (r, 2n)."""
-    y, h, s = segments.y, segments.duration, segments.s
-    nodes = _at_nodes(system, segments, lambda x: system.times(rows, x))
-    g_0, g_1, d_0, d_1 = (jnp.concatenate([x, -x]) for x in nodes)
-    rows = jnp.concatenate([rows, -rows])
-    # Minima inside of segments, by the cubic through the ends. Of those nearly as low it cannot say
-    # which is the lowest, so that a few are refined. A row at rest has none.
-    through = jax.lax.stop_gradient((g_0, g_1, d_0, d_1))
-    cubic, small = Cubic.through(*through), jnp.max(rounding(y))
-    theta, inside = cubic.minimum()
-    least = jnp.where(inside & (d_1 - d_0 > small / 64), cubic(theta), jnp.inf)
-    least, k = (x.ravel() for x in _lowest(least, _MINIMA))
-    of_row, length = jnp.arange(len(k)) // _MINIMA, h[k]
-    given = (system, y[:, k], s[:, k], length, rows[of_row].T)
-    value, _ = _minima(given, theta[of_row, k] * length, least < jnp.inf)
-    value = jnp.min(value.reshape(-1, _MINIMA), axis=1)
-    # Where one ends a segment both are equal to rounding, and the parabola alone follows it.
-    node = jnp.min(g_0, axis=1)
-    value = jnp.where(value <= node + small, value, node)
-    low, high = jnp.split(value, 2)
-    return jnp.stack([low, -high])
-
-
-def _at_nodes(system: HybridSystem, segments: Segments, values: Callable) -> list[Array]:
-    """Linear `values` of the states at the starts and the ends of segments, and their slopes."""
-    y, h, s = segments.y, segments.duration, segments.s
-    starts = values(y)
-    slopes = [values(h[None] * system.field(end, s)) for end in (y, next_start(y))]
-    return [starts, jnp.roll(starts, -1, axis=-1), *slopes]
-
-
-def _time_below_zero(system: HybridSystem, segments: Segments, row, offset) -> Float[Array, ""]:
-    """How long row @ y + offset is negative in one period."""
-    y, h, s = segments.y, segments.duration, segments.s
-    g_0, g_1, d_0, d_1 = _at_nodes(system, segments, lambda x: system.times(row[None], x)[0])
-    g_0, g_1 = g_0 + offset, g_1 + offset
-    whole_segments = jnp.sum(jnp.where(g_0 < 0, h, 0))
-    # In a segment with crossings: from its start to the first zero, and from the last to its end.
-    sign, reversed_sign = jnp.where(g_0 < 0, -1, 1), jnp.where(g_0 * g_1 < 0, -1, 1)
-    g_0, g_1, d_0, d_1 = (sign * x for x in (g_0, g_1, d_0, d_1))
-    back = [reversed_sign * x for x in (g_1, g_0, -d_1, -d_0)]
-    cubics = Cubic.through(*(jnp.stack(x) for x in zip((g_0, g_1, d_0, d_1), back, strict=True)))
-    first, last = first_root(cubics)
-    until, number = cumulative(first <= 1), jnp.arange(_CROSSINGS)
-    crosses, k = number < until[-1], jnp.argmax(until[None] > number[:, None], axis=1)
-    t = jax.lax.stop_gradient(jnp.concatenate([first[k], 1 - last[k]]))
-    twice = jnp.concatenate([k, k])
-    t = t * h[twice]
-    lanes = jnp.broadcast_to(row[:, None], (len(row), len(t)))
-    value, rate, change = _along(system, y[:, twice], s[:, twice], t, lanes)
-    # One step of third order from the cubic's root, which carries the derivative as well.
-    rate = jnp.where(rate == 0, 1, rate)
-    newton = (value + offset) / rate
-    t = t - newton * (1 + newton * change / (2 * rate))
-    first, last = jnp.split(t, 2)
-    # With one crossing the rest of the segment has the other sign, else the time between two.
-    crossed = jnp.where(jax.lax.stop_gradient(g_1[k]) < 0, h[k] - first, last - first)
-    return whole_segments + jnp.sum(jnp.where(crosses, sign[k] * crossed, 0))
-
-
-def _monodromy(system: HybridSystem, segments: Segments) -> Float[Array, "2n 2n"]:
-    """The product of all segments' maps, with the jump of the tangent at every switch."""
-    _, local = maps(system, segments)
-    ends, s = next_start(segments.y), segments.s
-    before, after = system.field(ends, s), system.field(ends, jnp.roll(s, -1, axis=-1))
-    switches = segments.used & (segments.guard != NONE)
-    speed = jnp.where(switches, jnp.sum(local.c * before, axis=0), 1)
-    jump = jnp.where(switches[None], (after - before) / speed[None], 0)
-    eye = jnp.eye(len(ends), dtype=ends.dtype)
-
-    def chain(so_far, segment):
-        A, jump, c = segment
-        so_far = product(A, so_far)
-        return so_far + jump[:, None] * jnp.sum(c[:, None] * so_far, axis=0)[None], None
-
-    return jax.lax.scan(chain, eye, (local.A, jump.T, local.c.T))[0]
-
-
 # Apart from the cycle's program, which another contact law then does not compile again.
-@functools.partial(quick_jit, once=True)
+@exported_jit
 def posed(mechanism: Mechanism, excitation) -> tuple[HybridSystem, Float[Array, ""]]:
     """The scaled system, and its growth rate at the equilibrium."""
-    return small_kernel(_posed, mechanism, excitation)
-
-
-def _posed(mechanism: Mechanism, excitation) -> tuple[HybridSystem, Float[Array, ""]]:
     system = excited_system(mechanism, excitation)
     # An excited motion does not end in equilibrium.
     growth = jnp.ones_like(system.omega) if system.excited else growth_rate(mechanism)
     return system, growth / system.omega
 
 
-@functools.partial(quick_jit, static_argnames=("of_scene", "segments", "rtol"))
+@functools.partial(exported_jit, static_argnames=("of_scene", "segments", "rtol"))
 def solved(
     system: HybridSystem, growth, start, max_returns, *, of_scene: bool, segments: int, rtol: float
 ) -> LimitCycle:
     frozen, growth = jax.lax.stop_gradient((system, growth))
-
-    def states(system, start):
-        return system.equilibrium(), scaled_start(system, start)
-
-    equilibrium, y = one_kernel(states, frozen, start)
+    equilibrium, y = frozen.equilibrium(), scaled_start(frozen, start)
     h = 0.25 if system.fastest is None else 0.2  # a finer mesh would take a second solution
     h = jnp.asarray(h * (rtol / 1e-9) ** 0.125, y.dtype)
     max_returns = max_returns.astype(y.dtype)
@@ -227,7 +73,6 @@ def solved(
     for outcome, result in enumerate(_RESULTS):
         status = CycleResult.where(found.status == outcome, result, status)
     exists = found.status == CONVERGED
-    monodromy = one_kernel(_monodromy, system, closed)
     rounding_of_growth = 1e3 * jnp.finfo(y.dtype).eps
     unstable = exists & (found.growth > 100 * error + rounding_of_growth)
     status = CycleResult.where(unstable, CycleResult.unstable, status)
@@ -236,50 +81,14 @@ def solved(
     def only(value):
         return jnp.where(exists, value, jnp.nan)
 
-    period = only(period)
-    n, scale = system.n - system.excited, system.units
-    # The loads of the tangential faces are the normal forces of the joints.
-    tangential = np.array([faces[0] for faces in system.faces])
-    rows = jnp.concatenate([system.L[tangential], jnp.zeros_like(system.L[tangential])], axis=1)
-    own = system.own(jnp.eye(2 * system.n, dtype=rows.dtype))
-    everything = jnp.concatenate([own, rows])
-    low, high = one_kernel(extreme_values, system, closed, everything)
-    offset = system.P[tangential][None]
-    linear = jnp.zeros((len(system.P), 2), rows.dtype)
-    linear = linear.at[tangential].set((jnp.stack([low, high])[:, 2 * n :] + offset).T)
-    # A load curve rises, so that its extremes are where those of the approach are.
-    forces = system.normal_forces(linear).T * system.force_unit
-    forces = jnp.where(np.array(system.opens)[None], jnp.maximum(forces, 0), forces)
-    low, high = low[: 2 * n] * scale, high[: 2 * n] * scale
-
-    def share(of):
-        return jnp.sum(jnp.where(of, duration[None], 0), axis=1) / period
-
-    # A scene says it of both directions, a structure of each joint.
-    shown = slice(None) if of_scene else tangential
-    pulls = [
-        jnp.zeros_like(period)
-        if opens or not faces[1:]
-        else one_kernel(_time_below_zero, system, closed, row, shift) / period
-        for row, shift, faces, opens in zip(
-            rows, offset[0], system.faces, system.opens, strict=True
-        )
-    ]
     return LimitCycle(
-        period=period / system.omega,
-        amplitude=only((high - low)[:n]),
-        velocity_min=only(low[n:]),
-        velocity_max=only(high[n:]),
-        stick_fraction=only(share(closed.s == 0))[shown],
-        open_fraction=only(share(closed.s == OPEN))[tangential],
-        tension_fraction=only(pulls[0] if of_scene else jnp.stack(pulls)),
-        normal_force=only(forces.T),
-        state=only(system.own(y[:, 0]) * scale),
+        period=only(period) / system.omega,
+        state=only(system.own(y[:, 0]) * system.units),
         error=only(error),
         returns=found.period_returns,
         regularisation_error=only(jnp.zeros_like(error)),
         result=status,
-        _monodromy=only(system.own(system.own(monodromy).T).T),
+        of_scene=of_scene,
         _system=system,
         _orbit=Orbit(closed),
     )

@@ -16,15 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from .._base.linear_kernel import linear_kernel
-from .._base.one_kernel import one_kernel
 from .hybrid import NONE, HybridSystem
 from .lanes import chosen, product, solve
 from .maps import Maps, axis_of, coarse_maps, in_blocks, maps, segments_together
 from .segments import Segments, chosen_guard, flow, next_start
 
 _ITERATIONS = 20
-_SMALL = 80  # numbers of a matrix, of all lanes, up to which a chain is one kernel
 _SHORTEST = 1e-12  # duration, in scaled time, that a segment counts with at least
 _HOPELESS = 8  # iterations after which steps must be small, relative to the orbit
 
@@ -39,20 +36,17 @@ def _chain(body: Callable, carry, arrays: tuple, lanes: int, count=None) -> tupl
         carry, found = jax.lax.scan(body, carry, tuple(front))
         return carry, jnp.moveaxis(found, 0, found.ndim - 1 - lanes)
 
-    def run(carry, front, count):
-        def at(k):
-            return tuple(jax.lax.dynamic_index_in_dim(x, k, keepdims=False) for x in front)
+    def at(k):
+        return tuple(jax.lax.dynamic_index_in_dim(x, k, keepdims=False) for x in front)
 
-        def step(k, so_far):
-            carry, found = so_far
-            carry, one = body(carry, at(k))
-            return carry, jax.lax.dynamic_update_index_in_dim(found, one, k, 0)
+    def step(k, so_far):
+        carry, found = so_far
+        carry, one = body(carry, at(k))
+        return carry, jax.lax.dynamic_update_index_in_dim(found, one, k, 0)
 
-        one = jax.eval_shape(body, carry, at(0))[1]
-        blank = jnp.zeros((len(front[0]), *one.shape), one.dtype)
-        return jax.lax.fori_loop(0, count, step, (carry, blank))
-
-    carry, found = one_kernel(run, carry, tuple(front), count, wanted=carry.size <= _SMALL)
+    one = jax.eval_shape(body, carry, at(0))[1]
+    blank = jnp.zeros((len(front[0]), *one.shape), one.dtype)
+    carry, found = jax.lax.fori_loop(0, count, step, (carry, blank))
     return carry, jnp.moveaxis(found, 0, found.ndim - 1 - lanes)
 
 
@@ -250,7 +244,7 @@ def _orbit_jvp(primals, tangents):
     system, segments = primals
     y, duration = orbit(system, segments)
     given = system, Segments(y, duration, segments.s, segments.guard)
-    return (y, duration), linear_kernel(_moved, given, tangents[0])
+    return (y, duration), _moved(given, tangents[0])
 
 
 def _moved(given: tuple[HybridSystem, Segments], tangent: HybridSystem) -> tuple[Array, Array]:
@@ -264,4 +258,9 @@ def _moved(given: tuple[HybridSystem, Segments], tangent: HybridSystem) -> tuple
 
     gap, off = jax.jvp(equations, (system,), (tangent,))[1]
     _, local = maps(system, segments)
-    return corrections(local, segments, gap, off, system.constant)[:2]
+
+    def solution(gap, off):
+        return corrections(local, segments, gap, off, system.constant)[:2]
+
+    # Linear, hence its own derivative: without the constant parts that no scan can transpose.
+    return jax.jvp(solution, (jnp.zeros_like(gap), jnp.zeros_like(off)), (gap, off))[1]

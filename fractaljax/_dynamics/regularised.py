@@ -16,8 +16,7 @@ import optimistix
 from jaxtyping import Array, Float
 
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.structure import Structure
-from .cycle import CycleResult, LimitCycle, repels
+from .cycle import CycleResult, Fractions, LimitCycle, Ranges, repels
 from .events import Cubic
 from .excitation import excited_system
 from .hybrid import HybridSystem
@@ -57,13 +56,28 @@ def nodes(solution) -> tuple[Float[Array, " n"], Float[Array, "n 2n"]]:
 
 
 class SmoothOrbit(eqx.Module):
-    """The motion over one period, as diffrax's dense solution."""
+    """The motion over one period, as diffrax's dense solution, and its numbers."""
 
     solution: Any
+    _ranges: Ranges
+    _fractions: Fractions
+    _monodromy: Float[Array, "2n 2n"]
 
     def at(self, system: HybridSystem, times) -> Float[Array, "2n n"]:
         """Scaled states at scaled times (n,) within one period."""
         return jax.vmap(self.solution.evaluate, out_axes=1)(times)
+
+    def ranges(self, system: HybridSystem) -> Ranges:
+        """Extremes of displacements, velocities and normal forces."""
+        return self._ranges
+
+    def fractions(self, system: HybridSystem) -> Fractions:
+        """Shares of sticking, of being open, and of pulling."""
+        return self._fractions
+
+    def monodromy(self, system: HybridSystem) -> Float[Array, "2n 2n"]:
+        """The derivative of the state after a period by the state before it."""
+        return self._monodromy
 
 
 def _settle(system: HybridSystem, eps, y, solver, rtol, max_steps):
@@ -185,14 +199,14 @@ def regularised_cycle(
     solution = solve(system, eps, y, period, rtol=rtol, saveat=DENSE, **options)
     times, states = nodes(solution)
     rates = jax.vmap(lambda y: field(0.0, y, (system, eps)))(states)
-    low, high = system.own(extremes(times, states, rates).T).T * system.units[None]
-    n, structure = system.n, isinstance(mechanism, Structure)
-    shown = np.array([faces[0] for faces in system.faces]) if structure else np.arange(2)
+    ranges = system.own(extremes(times, states, rates).T).T * system.units[None]
+    n = system.n
     w = jax.vmap(lambda y: system.sliding(y[n:]))(states)
     change = -jax.vmap(lambda rate: system.along(rate[n:]))(rates)
     width = eps / system.speed
     stuck = [
-        share_below_zero(times, w[:, i] ** 2 - width**2, 2 * w[:, i] * change[:, i]) for i in shown
+        share_below_zero(times, w[:, i] ** 2 - width**2, 2 * w[:, i] * change[:, i])
+        for i in range(w.shape[1])
     ]
     moving = (states[:, :n].T,), (rates[:, :n].T,)
     pairs = zip(*jax.jvp(system.closures, *moving), strict=True)
@@ -207,7 +221,8 @@ def regularised_cycle(
         return solve(system, eps, y, period, rtol=rtol / 10, **options).ys[0]
 
     monodromy = jax.jacfwd(end)(y)
-    numbers = jnp.stack([period / system.omega, *(high - low)[: len(low) // 2]])
+    amplitude = (ranges[1] - ranges[0])[: ranges.shape[1] // 2]
+    numbers = jnp.stack([period / system.omega, *amplitude])
     difference = jnp.abs(numbers / jnp.stack([exact.period, *exact.amplitude]) - 1)
     difference = jax.lax.stop_gradient(jnp.max(difference))
     error = jnp.asarray(error, y.dtype)
@@ -227,19 +242,17 @@ def regularised_cycle(
 
     return LimitCycle(
         period=only(numbers[0]),
-        amplitude=only(numbers[1:]),
-        velocity_min=only(low[len(low) // 2 :]),
-        velocity_max=only(high[len(low) // 2 :]),
-        stick_fraction=only(jnp.stack(stuck)),
-        open_fraction=only(jnp.where(opens, below, 0)),
-        tension_fraction=only(jnp.where(opens, 0, below)[() if structure else 0]),
-        normal_force=only(forces),
         state=only(system.own(y) * system.units),
         error=only(error),
         returns=returns,
         regularisation_error=only(difference),
         result=status,
-        _monodromy=only(system.own(system.own(monodromy).T).T),
+        of_scene=exact.of_scene,
         _system=system,
-        _orbit=SmoothOrbit(solution),
+        _orbit=SmoothOrbit(
+            solution,
+            Ranges(ranges, forces),
+            Fractions(jnp.stack(stuck), jnp.where(opens, below, 0), jnp.where(opens, 0, below)),
+            system.own(system.own(monodromy).T).T,
+        ),
     )

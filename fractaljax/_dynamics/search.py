@@ -15,13 +15,12 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Float, Int
 
-from .._base.one_kernel import one_kernel
 from .acceptance import HARDLY, admissible, growth_of, has_shorter_period
 from .assessment import RUNNING, Candidates, Progress, SearchOptions, assess, concluded, passed
 from .hybrid import UNUSED, HybridSystem
 from .lanes import chosen
 from .orbit import PeriodicOrbit, solve_periodic_orbits
-from .record import Record, Steps, Stretch, cut
+from .record import Record, cut
 from .segments import Segments
 
 _OPTIONS = SearchOptions()
@@ -64,42 +63,27 @@ def _solved(system, record, lane, wanted, given: Candidates, *, length, options)
         found, _, tries = carry
         return (tries == 0) | ((tries < _MESHES) & jnp.any(unsettled(found)))
 
-    def mesh(system, record, lane, given, orbit, h, of_run):
-        # The orbit's phases have other lengths and weights than those of the run.
-        steps = Stretch(record, lane, Steps.along(system, orbit, h), of_run)
-        first = jnp.where(of_run, given.first, 0)
-        last = jnp.where(of_run, given.last, jnp.sum(orbit.used, axis=0))
-        return cut(system, steps, first, last, h, length)
-
-    def solved(system, segments, own, reach, rtol, found, h):
-        new = solve_periodic_orbits(system, segments, own, reach, rtol)
-        # The method is of order 8; where the motion is not as smooth, halves do.
-        known = new.error > 0  # a number
-        finer = 0.9 * (rtol / jnp.where(known, new.error, 1)) ** 0.125
-        finer = jnp.where(known, finer, 0.8)
-        return new.where(own, found), h * jnp.clip(finer, 0.5, 0.8)
-
     def solve(carry):
         found, h, tries = carry
-        of_run = tries == 0
-        segments = one_kernel(mesh, system, record, lane, given, found.segments, h, of_run)
-        own = wanted & (of_run | unsettled(found))
-        limits = options.reach * scale, given.rtol
-        return *one_kernel(solved, system, segments, own, *limits, found, h), tries + 1
-
-    def evaluated(system, found, given, wanted, scale):
-        orbit, n = found.segments, system.n
-        near = jnp.max(jnp.abs(orbit.y[:, 0] - given.y), axis=0) < 0.2 * scale
-        moves = jnp.max(jnp.abs(orbit.y[n:]), axis=(0, 1)) > 1e-4
-        growth = growth_of(system, found)
-        ok = wanted & found.converged & near & moves & (growth < HARDLY)
-        ok = ok & admissible(system, orbit, found.middle)
-        ok = ok & ~has_shorter_period(orbit, given.returns)
-        return jnp.stack([found.error, growth]), ok
+        segments = cut(system, record, lane, given.first, given.last, h, length)
+        own = wanted & ((tries == 0) | unsettled(found))
+        new = solve_periodic_orbits(system, segments, own, options.reach * scale, given.rtol)
+        # The method is of order 8; where the motion is not as smooth, halves do.
+        known = new.error > 0  # a number
+        finer = 0.9 * (given.rtol / jnp.where(known, new.error, 1)) ** 0.125
+        finer = jnp.where(known, finer, 0.8)
+        return new.where(own, found), h * jnp.clip(finer, 0.5, 0.8), tries + 1
 
     nothing = PeriodicOrbit.none(_no_segments(given.y, len(record.s), length))
     found, *_ = jax.lax.while_loop(going, solve, (nothing, given.h, 0))
-    return found.segments, *one_kernel(evaluated, system, found, given, wanted, scale)
+    orbit, n = found.segments, system.n
+    near = jnp.max(jnp.abs(orbit.y[:, 0] - given.y), axis=0) < 0.2 * scale
+    moves = jnp.max(jnp.abs(orbit.y[n:]), axis=(0, 1)) > 1e-4
+    growth = growth_of(system, found)
+    ok = wanted & found.converged & near & moves & (growth < HARDLY)
+    ok = ok & admissible(system, orbit, found.middle)
+    ok = ok & ~has_shorter_period(orbit, given.returns)
+    return orbit, jnp.stack([found.error, growth]), ok
 
 
 def _in_groups(system, record, ready, gap, given, orbit, error, *, options, length):
@@ -176,7 +160,7 @@ def _find(
         h_run = (options.step / 2.0**finer).astype(start.dtype)
         record = record.advance(system, h_run, options.round_steps)
         limits = equilibrium, growth, max_returns, h, rtol
-        told = one_kernel(look, system, record, known, orbit, rounds, *limits)
+        told = look(system, record, known, orbit, error[0] <= rtol, rounds, *limits)
 
         def solved():
             return _in_groups(
@@ -194,7 +178,7 @@ def _find(
         # XLA moves what does not change out of a loop, to where it is done even if the loop is not.
         none = orbit, error, jnp.zeros_like(told.ready)
         orbit, error, found = jax.lax.cond(jnp.any(told.ready), solved, lambda: none)
-        known = one_kernel(concluded, told, known, orbit, found, options.accepted)
+        known = concluded(told, known, orbit, error[0] <= rtol, found, options)
         return record.moved(told.y, told.extrapolates), known, orbit, error, rounds + 1
 
     _, known, orbit, error, _ = jax.lax.while_loop(running, body, (record, known, orbit, error, 0))

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._base.quick import quick_jit
+from .._base.programs import exported_jit
 from .._mechanism.mechanism import Mechanism
 from .hybrid import HybridSystem
 from .shooting import durations, equations, reduced_guard, return_jacobian
@@ -35,7 +35,7 @@ def _event_jvp(kind, primals, tangents):
     return event_value(kind, x, event), _change(kind, x, event, tangents[0])
 
 
-@functools.partial(quick_jit, static_argnames="kind", once=True)
+@functools.partial(exported_jit, static_argnames="kind")
 def _change(kind, x, event, x_dot):
     window, u = event[0], event[-2]
     _, slope = jax.jvp(window.value, (u[-1],), (jnp.ones_like(u[-1]),))

@@ -14,13 +14,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .._base.quick import outermost_jit
+from .._base.programs import exported_jit
 from .._base.ranges import is_logarithmic
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import substituted
 from .events import Cubic
+from .extremes import extreme_values
 from .hybrid import NONE, UNUSED, HybridSystem
-from .limit_cycle import extreme_values
 from .runge_kutta import runge_kutta
 from .scaled import hybrid_system
 from .segments import Segments, chosen_guard, flow, next_start, tableau
@@ -136,7 +136,7 @@ def equations(x: Mechanism, window: Window, chain: Chain, lifted: Lifted, u):
     return residual, jacobian, Lifted(u, y + d, D), jnp.max(jnp.abs(d))
 
 
-condensed = outermost_jit(equations)
+condensed = exported_jit(equations)
 
 
 def return_jacobian(jacobian, k: int, xp: Any = jnp) -> Any:
@@ -280,7 +280,7 @@ def descended(
     return jax.lax.scan(vertex, theta, jnp.array(spacings, theta.dtype))[0]
 
 
-@functools.partial(outermost_jit, static_argnames="places")
+@functools.partial(exported_jit, static_argnames="places")
 def resampled(x, window: Window, chain: Chain, lifted: Lifted, u, times, *, places: int):
     """States (2n, places) at times since the start of the orbit, and the rate of friction."""
     system = window.system(x, u[-1])
@@ -292,7 +292,7 @@ def resampled(x, window: Window, chain: Chain, lifted: Lifted, u, times, *, plac
     return y, system.stiffness(y, chain.s[:, k], 1 / 4)
 
 
-@outermost_jit
+@exported_jit
 def measured(x, window: Window, chain: Chain, lifted: Lifted, u):
     """Least, largest and section's states (3, 2n) in SI units, 1/omega, and the error."""
     system = window.system(x, u[-1])

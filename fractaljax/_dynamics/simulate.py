@@ -26,7 +26,7 @@ from .._base.parts import (
     scalar,
     whole,
 )
-from .._base.quick import quick_jit
+from .._base.programs import exported_jit
 from .._mechanism.mechanism import Mechanism
 from .exact_step import step_to_switch
 from .excitation import Excitation, excited_system
@@ -347,7 +347,7 @@ def simulate(
     return raise_unless(SimulationResult.reached, trajectory) if throw else trajectory
 
 
-@functools.partial(quick_jit, once=True)
+@exported_jit
 def _scaled(mechanism, excitation, start, t0, t1):
     """The system, its state at t0, t0 itself, and the duration in scaled time."""
     system = excited_system(mechanism, excitation)

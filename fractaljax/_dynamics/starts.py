@@ -1,6 +1,5 @@
 """Where the starts of a basin lie: in a box, in a ball or an ellipsoid, or as they are given."""
 
-import functools
 from typing import Any
 
 import jax.numpy as jnp
@@ -8,13 +7,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.parts import number, scalar, whole
-from .._base.quick import quick_jit
+from .._base.programs import exported_jit
 from .hybrid import HybridSystem
 
 _MOST_STARTS = 1_000_000
 
 
-@functools.partial(quick_jit, once=True)
+@exported_jit
 def _centre(system: HybridSystem) -> tuple[Array, Array]:
     """The equilibrium without an excitation (2n,), and the units (2n,)."""
     return system.own(system.equilibrium()), system.units

@@ -25,7 +25,7 @@ from .._base.parts import (
     require_scalar,
     scalar,
 )
-from .._base.quick import quick_jit
+from .._base.programs import exported_jit
 from .._base.toml import naming, read_toml
 from .joint import Direction, Dof, Joint, stored_direction
 from .matrices import (
@@ -366,7 +366,7 @@ class ParametricStructure(Structure):
                 raise ValueError(f"the parameter {name} has the name of another quantity")
 
 
-@quick_jit
+@exported_jit
 def _of_oscillator(oscillator: Oscillator):
     """M, C, K and F of the mass on a belt."""
     m, f = oscillator.m, oscillator.F / jnp.sqrt(2.0)

@@ -16,9 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._base.one_kernel import small_kernel
 from .._base.parts import brief, concrete, flag, nan_where
-from .._base.quick import command_jit
+from .._base.programs import exported_jit
 from .._base.singular import positive_sqrt, safe_divide
 from .._contact.contact import MU_M_MAX
 from .._mechanism.oscillator import (
@@ -135,19 +134,15 @@ def _coefficient(structure: Structure, name: str | None) -> Array:
 _sliding = jax.jit(Joint.coefficient)
 
 
-@functools.partial(command_jit, static_argnames="friction_slope")
+@functools.partial(exported_jit, static_argnames="friction_slope")
 def _factor_of_structure(structure, friction_slope):
     # Beyond a static divergence there is an equilibrium again: it is looked for before.
     least = assembled(with_friction_times(structure, 1e-3), friction_slope)
     return _first_factor(structure, friction_slope)[0] + 0 * least.C[0, 0]
 
 
-@functools.partial(command_jit, static_argnames="friction_slope")
+@functools.partial(exported_jit, static_argnames="friction_slope")
 def _of_scene(scene: Scene, friction_slope: bool) -> Float[Array, ""]:
-    return small_kernel(lambda scene: _critical_of_scene(scene, friction_slope), scene)
-
-
-def _critical_of_scene(scene: Scene, friction_slope: bool) -> Float[Array, ""]:
     sloping = friction_slope and scene.friction.velocity_dependent
     if scene.contact.depends_on_friction or sloping or scene.follows_load_curve:
         factor, _ = _first_factor(scene, friction_slope)

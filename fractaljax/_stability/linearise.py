@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from .._base.lapack import solve
 from .._base.parts import concrete, flag
-from .._base.quick import quick_jit
+from .._base.programs import exported_jit
 from .._contact.load_curve import LoadCurve, loaded_equilibrium
 from .._mechanism.oscillator import Linearised, linearise, static_normal_force
 from .._mechanism.quantities import sliding_friction
@@ -250,7 +250,7 @@ def assembled(structure: Structure, friction_slope: bool, refuse: bool = True) -
 
 
 # One program: operation by operation the first call would compile sixty.
-_assembled = quick_jit(assembled, ("friction_slope", "refuse"), once=True)
+_assembled = exported_jit(assembled, ("friction_slope", "refuse"))
 
 
 def _with_joint(K, K_n, K_t, mu, t, n) -> Array:

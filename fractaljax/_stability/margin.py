@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float, ScalarLike
 
-from .._base.one_kernel import small_kernel
 from .._base.singular import positive_sqrt
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.oscillator import Linearised, dimensionless
@@ -56,9 +55,7 @@ def _margin(scene, shift, friction_slope):
     if isinstance(scene, Structure):
         s = solve(*assembled(scene, friction_slope).matrices).s
         return least_damping_ratio(among(s - shift, scene.band))
-    return small_kernel(
-        lambda scene, shift: margin_of(linearised(scene, friction_slope), shift), scene, shift
-    )
+    return margin_of(linearised(scene, friction_slope), shift)
 
 
 def damping_ratios(s: Complex[Array, " k"]) -> Float[Array, " k"]:

@@ -13,9 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
-from .._base.one_kernel import small_kernel
 from .._base.parts import Record
-from .._base.quick import command_jit
+from .._base.programs import exported_jit
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.oscillator import Linearised
 from .._mechanism.quantities import sliding_friction
@@ -158,14 +157,12 @@ def growth_rate(scene: Mechanism, friction_slope: bool = True) -> Float[Array, "
     return found
 
 
-@functools.partial(command_jit, static_argnames="friction_slope", once=True)
+@functools.partial(exported_jit, static_argnames="friction_slope")
 def _growth_rate(scene, friction_slope):
     if isinstance(scene, Structure):
         attached = assembled(scene, friction_slope)
         return rightmost(attached.matrices[:3], scene.band, scene.coarse).real
-    return small_kernel(
-        lambda scene: quartic.rightmost_root(linearised(scene, friction_slope)).real, scene
-    )
+    return quartic.rightmost_root(linearised(scene, friction_slope)).real
 
 
 def stability(scene: Mechanism, friction_slope: bool = True) -> Stability:
@@ -183,7 +180,7 @@ def _of_scene(scene, friction_slope):
     return s, x, quartic.resolutions(lin, s), margin_of(lin), forces
 
 
-@functools.partial(command_jit, static_argnames="friction_slope", once=True)
+@functools.partial(exported_jit, static_argnames="friction_slope")
 def _stability(scene, friction_slope):
     if isinstance(scene, Structure):
         attached = assembled(scene, friction_slope)
@@ -193,7 +190,7 @@ def _stability(scene, friction_slope):
         counted = in_band(s, scene.band)
         margin, names = least_damping_ratio(among(s, scene.band)), scene.names
     else:
-        s, x, error, margin, forces = small_kernel(lambda x: _of_scene(x, friction_slope), scene)
+        s, x, error, margin, forces = _of_scene(scene, friction_slope)
         counted, names = jnp.ones(s.shape, bool), ("x1", "x2")
     largest = jnp.abs(jax.lax.stop_gradient(x)).argmax(axis=1)
     return Stability(

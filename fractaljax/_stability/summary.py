@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._base.quick import quick_jit
+from .._base.programs import exported_jit
 from .._base.table import table
 from .._contact.contact import Regime
 from .._mechanism.quantities import sliding_friction
@@ -39,7 +39,7 @@ class _Critical(NamedTuple):
     normal_force: Array | None
 
 
-@functools.partial(quick_jit, static_argnames="friction_slope", once=True)
+@functools.partial(exported_jit, static_argnames="friction_slope")
 def _critical(scene: Scene, friction_slope: bool, wavelengths):
     """Critical mode, stiffness, contact state, and the roughness over wavelengths unless None."""
     joint = pressed(scene)
@@ -50,7 +50,7 @@ def _critical(scene: Scene, friction_slope: bool, wavelengths):
     return mode, stiffness(scene), _contact_state(scene), rough
 
 
-@functools.partial(quick_jit, static_argnames="friction_slope", once=True)
+@functools.partial(exported_jit, static_argnames="friction_slope")
 def _numbers(scene: Scene, friction_slope: bool):
     """Stability, stiffness, contact state and friction."""
     friction = sliding_friction(scene)
@@ -138,7 +138,7 @@ def verdict(modes: Stability) -> dict[str, str]:
     return {"growth rate [1/s]": f"{growth:+.6g}  ({verdict})"}
 
 
-@functools.partial(quick_jit, once=True)
+@exported_jit
 def _friction(law, speed):
     return law.mu(speed), law.mu_s
 

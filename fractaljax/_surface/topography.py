@@ -26,7 +26,7 @@ from .._base.parts import (
     scalar,
     whole,
 )
-from .._base.quick import command_jit
+from .._base.programs import exported_jit
 from .surface import Surface, frequency_count
 
 _BLOCK = 256  # waves in one product of matrices
@@ -134,7 +134,7 @@ def _known(name: str, value: jax.Array) -> np.ndarray:
     return values
 
 
-@functools.partial(command_jit, static_argnames="n")
+@functools.partial(exported_jit, static_argnames="n")
 def _sum(surface, L, key, directions, coarse, fine, lengths, n):
     """Eq. 13 on the grid (n, n), with phases by `key`; coarse and fine (2, n_max + 1, M).
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from .._base.quick import command_jit
+from .._base.programs import exported_jit
 from .blocks import Blocks
 from .program import Program
 
@@ -48,7 +48,7 @@ def mesh_of(devices: Sequence[Any] | None) -> Mesh:
     return Mesh(np.array(chosen), (_POINTS,))
 
 
-@functools.partial(command_jit, static_argnames=("point", "mesh"))
+@functools.partial(exported_jit, static_argnames=("point", "mesh"))
 def _batch(point: Program, mesh: Mesh, scene, axes, places) -> list[jax.Array]:
     """The program `point` at the points that lie at `places` (batch,) on each of the axes."""
 

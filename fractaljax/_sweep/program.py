@@ -19,11 +19,11 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 from jaxtyping import ArrayLike, PyTree
 
+from .._base.programs import TRACED_UNDER
 from .._mechanism.quantities import substituted
 from .._mechanism.scene import Scene
 
 _SETTINGS = ("jax_enable_x64", "jax_threefry_partitionable", "jax_default_matmul_precision")
-_TRACED_UNDER = (*_SETTINGS, "jax_default_prng_impl", "jax_numpy_dtype_promotion")
 # Other parameters of these operations change no value: shardings, derivative rules, names.
 _MEANT = {
     "jit": ("jaxpr", "compiler_options_kvs"),
@@ -109,7 +109,7 @@ class Program:
 
 def settings() -> dict[str, Any]:
     """The settings of JAX under which this thread traces programs."""
-    return {name: getattr(jax.config, name) for name in _TRACED_UNDER}
+    return {name: getattr(jax.config, name) for name in TRACED_UNDER}
 
 
 @contextlib.contextmanager
@@ -159,6 +159,9 @@ class Digest:
             return "tree", self._plain(x.node_data(), name), self._plain(x.children(), name)
         if isinstance(x, (jax.sharding.Sharding, jax.sharding.AbstractMesh)):
             return "sharding"  # where numbers are, not which
+        text = repr(x)
+        if type(x).__module__.startswith("jax.") and not any(w in text for w in (" at 0x", "...")):
+            return type(x).__qualname__, text  # of JAX, and wholly said by its text
         self.outside.append((name, x))
         return type(x).__qualname__
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from .._base.files import write_whole
 from .._base.parts import require_kind, require_scalar, whole
-from .._base.quick import outermost_jit
+from .._base.programs import exported_jit
 from .._contact.contact import Regime
 from .._dynamics.cycle import CycleResult
 from .._dynamics.limit_cycle import limit_cycle
@@ -359,7 +359,7 @@ def _cycles(scene, axes: Sequence[Axis], progress: bool) -> dict[str, Any]:
     }
 
 
-@functools.partial(outermost_jit, static_argnames="names")
+@functools.partial(exported_jit, static_argnames="names")
 def _batch_of_cycles(scene, names, nodes):
     """Result, the numbers of `_CYCLE` and orbits (samples, [x1, v1]) of a batch of nodes."""
 

@@ -107,15 +107,15 @@ class _Program:
             return [tuple(values)]
         if kind in ("real", "imag"):
             return [values[0][kind == "imag"]]
-        if kind == "kernel_result":  # says how XLA is to compile it
-            return values[:1]
-        if kind not in (*_ELEMENTWISE, *_MOVES, "iota", "reduce_sum"):
+        if kind not in (*_ELEMENTWISE, *_MOVES, "iota", "reduce_sum", "unstack"):
             raise _refusal(eqn)
         if any(isinstance(value, tuple) for value in values):
             raise ValueError(f"no JavaScript for the operation {kind} of complex numbers")
         arrays = [np.asarray(value, object) for value in values]
         if kind in _MOVES:
             return [_plain(_moved(eqn, arrays))]
+        if kind == "unstack":
+            return [_plain(part) for part in np.moveaxis(arrays[0], params["axis"], 0)]
         if kind == "iota":
             return [_literal(eqn.primitive.bind(**params))]
         if kind == "reduce_sum":

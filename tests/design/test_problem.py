@@ -9,7 +9,7 @@ import pytest
 
 import fractaljax as fj
 from fractaljax._design.constraints import NormalStiffness
-from fractaljax._design.rows import _linearise, describe, linearised
+from fractaljax._design.rows import describe, linearised
 from fractaljax._design.statement import DEFAULT_BOUNDS, state_problem
 from fractaljax._design.tolerance import Tolerance
 from structures import fractal_joints
@@ -123,7 +123,7 @@ def test_residuals_inform_on_both_sides_of_regime_boundaries():
     area, slip, growth = 1, 2, 3
     plastic = problem.scaled(fj.brake_scene().replace(D=2.2, G=1e-9))
     us = np.array([plastic, [0.75, 0.25]])
-    _, jacobians, _ = _linearise(problem, us, np.zeros((2, 0)))
+    _, jacobians, _ = linearised(problem, us, np.zeros((2, 0)))
     assert jnp.all(jacobians[0, growth] == 0) and jnp.all(jnp.abs(jacobians[0, area]) > 1)
     assert jnp.all(jnp.abs(jacobians[1, slip]) > 1)
     for u, jacobian in zip(us, jacobians, strict=True):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
+from fractaljax._dynamics.extremes import extreme_values
 from fractaljax._dynamics.hybrid import NONE, SECTION, UNUSED
-from fractaljax._dynamics.limit_cycle import extreme_values
 from fractaljax._dynamics.scaled import hybrid_system
 from fractaljax._dynamics.segments import Segments
 
