@@ -13,10 +13,9 @@ from ._cli.design import add_design
 from ._cli.explore import add_explore
 from ._cli.identify import add_identify
 from ._cli.map import add_map
-from ._cli.parsing import Parser, reason, refuse
+from ._cli.parsing import Parser, Version, reason, refuse
 from ._cli.reduce import add_reduce
 from ._cli.validate import add_validate
-from ._version import __version__
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -31,7 +30,7 @@ def main(argv: list[str] | None = None) -> int:
         epilog="Without a scene file a command takes the reference brake; `fractaljax scene > "
         "brake.toml` writes it as a file to change. `fractaljax COMMAND --help` lists the options.",
     )
-    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    parser.add_argument("--version", action=Version, nargs=0, help="show the version and exit")
     commands = parser.add_subparsers(
         dest="command", required=True, metavar="COMMAND", parser_class=Parser
     )

@@ -1,6 +1,7 @@
 """Strict numerics for every test: 64 bits, no silent broadcasting, warnings are errors."""
 
 import gc
+import itertools
 import os
 import sys
 import warnings
@@ -51,6 +52,12 @@ def pytest_configure(config):
     gc.set_threshold(50_000, 20, 50)
 
 
+def pytest_report_header():
+    from fractaljax._base.versions import untested_jax
+
+    return untested_jax() or f"JAX {jax.__version__}"
+
+
 def pytest_sessionfinish():
     """pytest collects garbage five times at the end, of which once is enough."""
     gc.collect()
@@ -70,6 +77,8 @@ def pytest_runtest_setup(item):
 
 
 most_memory = 7e9  # of a worker [bytes]
+MOST_MAPPINGS = 40_000  # of its memory: Linux ends a process beyond 65,530
+_tests = itertools.count()
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -83,6 +92,21 @@ def bounded_memory():
     if memory() > most_memory:
         jax.clear_caches()
         most_memory = memory() + 1e9
+
+
+@pytest.fixture(autouse=True)
+def bounded_mappings():
+    yield
+    if next(_tests) % 8 == 0 and mappings() > MOST_MAPPINGS:
+        jax.clear_caches()
+
+
+def mappings() -> int:
+    """The mappings of memory of this process: each compiled program has some."""
+    try:
+        return Path("/proc/self/maps").read_bytes().count(b"\n")
+    except OSError:  # not Linux
+        return 0
 
 
 def memory() -> float:

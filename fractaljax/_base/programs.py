@@ -38,6 +38,7 @@ TRACED_UNDER = (
 _TRUSTED = "fractaljax", "equinox"  # packages whose classes a kept program may hold
 _MOST_BYTES = 300_000_000  # of all files in the folder; those not used for longest go
 _CACHE = "jax_compilation_cache_dir"
+_CHECKSUMS = "checksums.json"
 
 _folder: Path | None = None
 _programs: dict[Any, Callable] = {}
@@ -71,7 +72,7 @@ def exported_jit(function: Callable, static_argnames: str | tuple[str, ...] = ()
     static = (static_argnames,) if isinstance(static_argnames, str) else static_argnames
     signature = inspect.signature(function)
 
-    @functools.wraps(function)
+    @functools.wraps(jitted)
     def call(*args, **kwargs):
         traced = any(isinstance(x, Tracer) for x in jax.tree.leaves((args, kwargs)))
         if _folder is None or traced or jax.device_count() > 1:
@@ -239,6 +240,7 @@ def kept_programs() -> Iterator[None]:
         if all(_is_private(x) and os.access(x, os.W_OK | os.X_OK) for x in (folder, programs)):
             _folder = programs
             if chosen is None:
+                _drop_damaged(folder)
                 jax.config.update(_CACHE, str(folder))
                 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
             if first and sys.stderr is not None and sys.stderr.isatty():
@@ -248,7 +250,11 @@ def kept_programs() -> Iterator[None]:
     finally:
         if _folder is not None:
             with contextlib.suppress(OSError):
-                _make_room(_folder.parent if chosen is None else _folder)
+                if chosen is None:
+                    _make_room(_folder.parent)
+                    _write_checksums(_folder.parent)
+                else:
+                    _make_room(_folder)
         _folder = None
 
 
@@ -268,6 +274,28 @@ def _cache_folder() -> Path:
     else:
         base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(base) / "fractaljax" / "compiled"
+
+
+def _checksums(folder: Path) -> dict[str, str]:
+    """Checksums of what JAX keeps in the folder: it has none of its own."""
+    entries = (x for x in folder.iterdir() if x.name.endswith("-cache"))
+    return {x.name: hashlib.sha256(x.read_bytes()).hexdigest() for x in entries}
+
+
+def _write_checksums(folder: Path) -> None:
+    content = json.dumps(_checksums(folder), indent=0)
+    write_whole(folder / _CHECKSUMS, content.encode(), durable=False)
+
+
+def _drop_damaged(folder: Path) -> None:
+    """Remove the executables that are not as a command left them: they could end the process."""
+    try:
+        expected = json.loads((folder / _CHECKSUMS).read_text())
+    except (OSError, ValueError):
+        expected = {}
+    for name, checksum in _checksums(folder).items():
+        if expected.get(name) != checksum:
+            (folder / name).unlink(missing_ok=True)
 
 
 def _make_room(folder: Path) -> None:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import jax
 
-from .._version import __version__
+from .._version import NEWEST_TESTED_JAX, __version__
 
 
 def versions() -> dict[str, str]:
@@ -23,3 +23,11 @@ def versions_differ(found: Mapping[str, str]) -> str | None:
         f"{name} {found[name]}" for name, own in versions().items() if found.get(name, own) != own
     ]
     return f"written by {', '.join(others)}, read by {version_text()}" if others else None
+
+
+def untested_jax() -> str | None:
+    """A note where JAX is newer than the newest with which this version was tested."""
+    if jax.__version_info__[:2] <= NEWEST_TESTED_JAX:
+        return None
+    newest = ".".join(map(str, NEWEST_TESTED_JAX))
+    return f"JAX {jax.__version__} is newer than {newest}, the newest that was tested"

@@ -9,6 +9,20 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from .._version import __version__
+
+
+class Version(argparse.Action):
+    """Print the version, and a note where JAX is newer than what was tested, and exit."""
+
+    def __call__(self, parser, namespace, values, option_string=None):
+        print(f"{parser.prog} {__version__}")
+        from .._base.versions import untested_jax
+
+        if note := untested_jax():
+            print(f"{parser.prog}: {note}", file=sys.stderr)
+        parser.exit()
+
 
 class _Once(argparse.Action):
     """Stores a value, and refuses a second one."""

@@ -10,11 +10,10 @@ from .cycle import SQUARINGS
 from .events import Cubic
 from .hybrid import SECTION, HybridSystem
 from .lanes import log_spectral_radius
-from .orbit import PeriodicOrbit, accurate_return_jacobian
+from .orbit import PeriodicOrbit, return_jacobian
 from .segments import Segments, cumulative, next_start
 
 HARDLY = 1e-3  # growth in a period up to which an orbit that repels is kept
-_FEW_SQUARINGS, _UNSURE = 13, 1e-2  # of coarse Jacobians, and growth that they do not tell from 0
 
 
 def _quintic(y, d, x):
@@ -56,15 +55,19 @@ def admissible(system: HybridSystem, segments: Segments, middle) -> Bool[Array, 
 
 
 def growth_of(system: HybridSystem, orbit: PeriodicOrbit) -> Float[Array, " g"]:
-    """ln of the largest Floquet multiplier, but the one of the motion itself, in modulus."""
-    growth = log_spectral_radius(orbit.return_jacobian, _FEW_SQUARINGS)
-    unsure = orbit.converged & (jnp.abs(growth) < _UNSURE)
+    """ln of the largest Floquet multiplier, but the one of the motion itself, in modulus.
+
+    The multipliers of an excitation, which are 1, are none of the mechanism's. Without an orbit it
+    is not a number.
+    """
+    nothing = jnp.full_like(orbit.error, jnp.nan)
 
     def exactly():
-        jacobian = accurate_return_jacobian(system, orbit.segments)
-        return jnp.where(unsure, log_spectral_radius(jacobian, SQUARINGS), growth)
+        jacobian = return_jacobian(system, orbit.segments)
+        jacobian = jnp.swapaxes(system.own(jnp.swapaxes(system.own(jacobian), 0, 1)), 0, 1)
+        return jnp.where(orbit.converged, log_spectral_radius(jacobian, SQUARINGS), nothing)
 
-    return jax.lax.cond(jnp.any(unsure), exactly, lambda: growth)
+    return jax.lax.cond(jnp.any(orbit.converged), exactly, lambda: nothing)
 
 
 def has_shorter_period(orbit: Segments, returns) -> Bool[Array, " g"]:

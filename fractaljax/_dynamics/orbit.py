@@ -117,7 +117,6 @@ class PeriodicOrbit(eqx.Module):
 
     segments: Segments
     converged: Bool[Array, " g"]
-    return_jacobian: Float[Array, "2n 2n g"]
     error: Float[Array, " g"]  # of period and states, relative, estimated by halving the steps
     middle: Float[Array, "2n N g"]  # states halfway through the segments
 
@@ -126,8 +125,7 @@ class PeriodicOrbit(eqx.Module):
         """None yet; of the shapes that belong to those segments."""
         y = segments.y
         zero = jnp.zeros_like(y[0, 0])
-        jacobian = jnp.zeros((len(y), len(y), *zero.shape), y.dtype)
-        return cls(segments, zero > 0, jacobian, zero + jnp.inf, jnp.zeros_like(y))
+        return cls(segments, zero > 0, zero + jnp.inf, jnp.zeros_like(y))
 
     def where(self, lanes: Bool[Array, " g"], other: "PeriodicOrbit") -> "PeriodicOrbit":
         """Itself in these lanes, in others the other."""
@@ -192,9 +190,7 @@ def solve_periodic_orbits(
         ends, middle = in_blocks(flows, lambda none: (none.y, none.y), together, found.segments)
         target = next_start(y)
         off = chosen_guard(system, target, s, guard)
-        dy, dt, jacobian = corrections(
-            local, found.segments, ends - target, off, system.constant, many
-        )
+        dy, dt, _ = corrections(local, found.segments, ends - target, off, system.constant, many)
         largest, longest = jnp.max(jnp.abs(dy), axis=(0, 1)), jnp.max(jnp.abs(dt), axis=0)
         error = jnp.maximum(
             jnp.abs(jnp.sum(dt, axis=0)) / jnp.sum(h, axis=0),
@@ -213,7 +209,7 @@ def solve_periodic_orbits(
         y = jnp.where(used[None], y, y[:, :1])
         h = jnp.where(moves[None], h + share * dt, h)
         middle = jnp.where(used[None], middle, y)
-        found = PeriodicOrbit(Segments(y, h, s, guard), converged, jacobian, error, middle)
+        found = PeriodicOrbit(Segments(y, h, s, guard), converged, error, middle)
         change, before = jnp.where(going, jnp.stack([new, change]), jnp.stack([change, before]))
         return found, local, change, before, jnp.where(ends_here, _ITERATIONS, count) + 1
 
@@ -222,7 +218,7 @@ def solve_periodic_orbits(
     return found
 
 
-def accurate_return_jacobian(system: HybridSystem, segments: Segments) -> Float[Array, "2n 2n g"]:
+def return_jacobian(system: HybridSystem, segments: Segments) -> Float[Array, "2n 2n g"]:
     """The Jacobian of the return map of periodic orbits, as exact as they are."""
     ends, local = maps(system, segments)
     nothing = jnp.zeros_like(segments.duration)

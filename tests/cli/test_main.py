@@ -47,6 +47,15 @@ def test_stability_scene_and_version(capsys, tmp_path):
     assert run(capsys, "--version") == (0, f"fractaljax {fj.__version__}\n", "")
 
 
+def test_a_jax_newer_than_tested_is_a_note(capsys, monkeypatch):
+    monkeypatch.setattr("jax.__version_info__", (0, 13, 1))
+    monkeypatch.setattr("jax.__version__", "0.13.1")
+    status, out, err = run(capsys, "--version")
+    assert (status, out) == (0, f"fractaljax {fj.__version__}\n")
+    assert err.startswith("fractaljax: JAX 0.13.1 is newer than 0.12, the newest that was tested")
+    assert run(capsys, "scene")[2] == ""  # elsewhere there is none
+
+
 def assert_same_orbit(rows, cycle):
     """Up to rounding: the command compiles the same program with other options of XLA."""
     wanted = np.column_stack(cycle.orbit(512))

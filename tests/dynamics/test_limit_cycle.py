@@ -20,7 +20,15 @@ from fractaljax._dynamics.hybrid import NONE
 from fractaljax._dynamics.orbit import PeriodicOrbit, solve_periodic_orbits
 from fractaljax._dynamics.segments import flow
 from mechanisms import PLAIN, source_form
-from tools import both_modes, motionless_scene, reference_cycle, reference_scene, refusals, scene_of
+from tools import (
+    both_modes,
+    motionless_scene,
+    primitives,
+    reference_cycle,
+    reference_scene,
+    refusals,
+    scene_of,
+)
 
 ROWS = json.loads((Path(__file__).parents[1] / "reference" / "cycle.json").read_text())["rows"]
 CYCLES = [row for row in ROWS if row["kind"] == "cycle"]
@@ -172,10 +180,9 @@ def test_orbit_that_repels():
     assert expected[-1] > 1.0001 and np.isfinite(cycle.amplitude).all()
     with pytest.raises(RuntimeError, match="but it repels"):
         fj.limit_cycle(scene)
-    # So near to 1 its growth is not taken from the derivatives of Newton's method.
+    # Its growth is that of its exact derivatives, not of those that Newton's method has.
     segments = jax.tree.map(lambda x: x[..., None], cycle._orbit.segments)
-    rough = 1.0005 * jnp.eye(4)[..., None]
-    lane = PeriodicOrbit(segments, jnp.array([True]), rough, jnp.zeros(1), segments.y)
+    lane = PeriodicOrbit(segments, jnp.array([True]), jnp.zeros(1), segments.y)
     (growth,) = growth_of(cycle._system, lane)
     np.testing.assert_allclose(growth, np.log(expected[-1]), rtol=1e-4)
 
@@ -248,6 +255,35 @@ def test_mass_on_a_belt_under_constant_load(slow):
     assert float(x_leave) == pytest.approx(limit, rel=1e-9)
     stuck = float(cycle.stick_fraction[0] * cycle.period)
     assert stuck == pytest.approx(float(x_leave - x_enter) / 0.02, rel=1e-7)
+
+
+NUMBERS = ("amplitude", "velocity_min", "velocity_max", "normal_force")
+NUMBERS += ("stick_fraction", "open_fraction", "tension_fraction", "multipliers")
+
+
+def test_what_nobody_asks_for_is_not_in_the_program():
+    """A period has neither extremes nor multipliers; each number of a cycle has its own part."""
+
+    def count(name):
+        found = jax.make_jaxpr(lambda scene: getattr(fj.limit_cycle(scene), name))
+        return sum(primitives(found(reference_scene())).values())
+
+    least = count("period")
+    assert count("state") < 1.01 * least
+    assert all(count(name) > 1.02 * least for name in NUMBERS)
+
+
+def test_numbers_of_a_batch_are_those_of_its_cycles():
+    """One scene squeals, one is quiet: there everything is not a number."""
+    scenes = [reference_scene(), motionless_scene(), reference_scene().replace(V=0.2)]
+    cycles = [fj.limit_cycle(scene, throw=False) for scene in scenes]
+    batch = jax.tree.map(lambda *x: jnp.stack(x), *cycles)
+    for name in NUMBERS:
+        found, each = getattr(batch, name), [getattr(cycle, name) for cycle in cycles]
+        np.testing.assert_allclose(found, np.stack(each), rtol=1e-12, atol=1e-15)
+        assert np.isfinite(each[0]).all() and np.isnan(each[1]).all()
+    shown = repr(batch)
+    assert all(f"{name}=array(" in shown for name in NUMBERS[:-1])
 
 
 def blocks(largest):
