@@ -134,7 +134,8 @@ def unoptimised() -> dict[str, list[float]]:
     run = subprocess.run(
         [sys.executable, __file__],
         env=os.environ
-        | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1", "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT}/tests"},
+        | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1", "JAX_ENABLE_X64": "1"}
+        | {"PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}"},
         capture_output=True,
         text=True,
     )
@@ -154,5 +155,4 @@ def test_optimisation_changes_no_number(name):
 
 
 if __name__ == "__main__":
-    jax.config.update("jax_enable_x64", True)
     print(json.dumps({name: numbers(name) for name in CALLS}))

@@ -32,7 +32,7 @@ def admissible(system: HybridSystem, segments: Segments, middle) -> Bool[Array, 
     """
     y, s, h, ends = segments.y, segments.s, segments.duration, next_start(segments.y)
     at = jnp.stack([y, middle, ends])
-    # One by one: of all at once XLA would leave sums to a library, and this would be no kernel.
+    # One by one, which compiles and runs sooner than all at once.
     d = jax.lax.map(lambda y: h[None] * system.field(y, s), at)
     guards = functools.partial(jax.lax.map, lambda y: system.guards(y, s)[1:])  # but the section
     scale = 1 + jnp.max(jnp.abs(y), axis=(0, 1), keepdims=True)

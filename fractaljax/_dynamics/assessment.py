@@ -34,7 +34,6 @@ class SearchOptions:
     own_scale: float = 4.0  # most that gaps are relative to, in distances from the equilibrium
     patient: int = 4  # rounds in which that is asked of them
     accepted: float = 0.03  # distance from the orbit at which its multipliers decide, relative
-    settled: float = 1e-4  # gap between returns whose phases are as long as the orbit's, relative
     reach: float = 0.5  # distance from the run beyond which Newton's method gives up, relative
     group: int = 16  # orbits that are solved together, of those that many searches have at a time
     approaches: int = 3  # rounds in which the motion approaches an orbit that is not yet near
@@ -90,7 +89,6 @@ class Assessment(eqx.Module):
     seen: Float[Array, "2n k B"]  # states at the last returns
     exists: Bool[Array, "k B"]
     scale: Float[Array, " B"]
-    settled: Bool[Array, " B"]  # the motion repeats
     y: Float[Array, "2n B"]  # where the run goes on
     extrapolates: Bool[Array, " B"]
 
@@ -111,7 +109,6 @@ def assess(
     record: Record,
     known: Progress,
     orbit: Segments,
-    accurate: Bool[Array, " B"],
     rounds,
     equilibrium,
     growth,
@@ -178,16 +175,12 @@ def assess(
     closer = active & (now < known.distance) & (known.distance < jnp.inf)
     approach = jnp.where(closer, known.approach + 1, 0)
     distance = jnp.where(closer, now, jnp.inf)
-    # Segments are those of the run. Until that has settled, its phases may have other lengths than
-    # the orbit's, which some of them are then too long for.
-    accurate = accurate | (closest < options.settled * scale)
-    ok = (approach >= options.approaches) & accurate
+    ok = approach >= options.approaches
     # Alternately an orbit of one return and the one that the motion seems to repeat.
     repeated = 1 + jnp.argmax(apart <= 2 * closest[None] + 1e-6, axis=0)
     period_returns = jnp.where(rounds % 2 == 0, 1, repeated)
     gap = jnp.where(period_returns == 1, apart[0], closest)
-    ready = active & (status == RUNNING) & ~(closer & accurate) & ~extrapolates
-    ready = ready & (gap < options.near * scale)
+    ready = active & (status == RUNNING) & ~closer & ~extrapolates & (gap < options.near * scale)
     # Without switches an affine motion has no orbit; nor has another that leaves the equilibrium
     # at the linear rate.
     first = jnp.take_along_axis(at, period_returns[None], axis=0)[0]
@@ -261,20 +254,16 @@ def assess(
         seen=seen,
         exists=exists,
         scale=scale,
-        settled=closest < options.settled * scale,
         y=y_on,
         extrapolates=extrapolates,
     )
 
 
-def concluded(
-    told: Assessment, known: Progress, orbit: Segments, accurate, found, options: SearchOptions
-) -> Progress:
+def concluded(told: Assessment, known: Progress, orbit: Segments, found, accepted) -> Progress:
     """What is known of all lanes after orbits were `found` of some, which all were running."""
     now = _distance(told.seen, told.exists, orbit)
     # This near, the multipliers decide whether it attracts.
-    near = (now < options.accepted * told.scale) & (accurate | told.settled)
-    ok = told.ok | (found & near)
+    ok = told.ok | (found & (now < accepted * told.scale))
     new = told.progress
     status = jnp.where(new.status == RUNNING, jnp.where(ok, CONVERGED, told.over), new.status)
     returns = jnp.where(found, new.period_returns, known.period_returns)

@@ -15,7 +15,6 @@ from .runge_kutta import runge_kutta, stability_polynomial
 from .segments import Segments, chosen_guard, next_start, tableau
 
 _POWERS = 4  # of a matrix in a polynomial of it
-_SIDE_BY_SIDE = 4  # tangents
 _FEW = 512  # segments of all lanes that are taken at once
 _TOGETHER, _LEAST = 128, 8  # of more, how many of all lanes, and of each at least, at a time
 
@@ -124,14 +123,8 @@ def _polynomial_maps(system: HybridSystem, segments: Segments, ends):
 
 
 def _of_each(slope: Callable, tangents) -> Array:
-    """The slope along each of tangents (2n, k, ...).
-
-    Together, or one by one where their sums are of a size that XLA would leave to a library, so
-    that what they are a part of could not be one kernel.
-    """
-    if len(tangents) <= _SIDE_BY_SIDE or tangents[0, 0].size > _FEW:
-        return jax.vmap(slope, in_axes=1, out_axes=1)(tangents)
-    return jnp.moveaxis(jax.lax.map(slope, jnp.moveaxis(tangents, 1, 0)), 0, 1)
+    """The slope along each of tangents (2n, k, ...)."""
+    return jax.vmap(slope, in_axes=1, out_axes=1)(tangents)
 
 
 def _identity(y) -> Array:

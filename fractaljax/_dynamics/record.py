@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .events import step
+from .events import MOST, step
 from .hybrid import NONE, SECTION, UNUSED, HybridSystem
 from .lanes import together
 from .segments import Segments, cumulative, flow
@@ -34,20 +34,63 @@ def first_reached(reaches: Callable[[Array], Array], shape: tuple[int, ...], cou
     return jax.lax.fori_loop(0, (count - 1).bit_length(), halve, bounds)[0]
 
 
+class Steps(eqx.Module):
+    """Steps of motions in B lanes, numbered from the oldest, in a ring."""
+
+    steps: Float[Array, "2n+f+5 length B"]  # state and contact state before, and `_ROWS`
+    oldest: Int[Array, ""]  # place of the oldest
+
+    @classmethod
+    def along(cls, system: HybridSystem, segments: Segments, h) -> "Steps":
+        """The segments of orbits as steps 1, 2, ...; of step 0 all is zero.
+
+        Of a system whose steps follow the motion the weight is by the errors, and h on average.
+        """
+        used = segments.used
+        time = jnp.where(used, segments.duration, 0)
+        ended = used & (segments.guard != NONE), used & (segments.guard == SECTION)
+        if system.fastest is None:
+            weight = step_weight(system, segments.y, segments.s) * time
+        else:
+            _, error = flow(system, segments.y, time, segments.s, error=True)
+            weight = jnp.max(jnp.abs(error), axis=0) ** 0.125
+            weight = jnp.where(used, weight, 0)
+            mean = jnp.sum(weight, axis=0) / jnp.sum(used, axis=0)
+            mean = jnp.where(mean > 0, mean, 1)
+            weight = h[None] * jnp.maximum(weight / mean[None], 0.1)
+            weight = jnp.where(used, jnp.maximum(weight, time * system.fastest / MOST), 0)
+        sums = [time, weight]
+        sums = jnp.stack([*sums, *(x.astype(time.dtype) for x in ended)])
+        sums = jnp.swapaxes(cumulative(jnp.swapaxes(sums, 1, 2)), 1, 2)
+        guard = segments.guard[None].astype(time.dtype)
+        steps = jnp.concatenate([segments.y, segments.s, guard, sums])
+        return cls(jnp.pad(steps, ((0, 0), (1, 0), (0, 0))), jnp.asarray(0))
+
+    @property
+    def length(self) -> int:
+        """How many steps it holds."""
+        return self.steps.shape[1]
+
+    def row(self, row, number, lane) -> Array:
+        """A row of the steps of those numbers in those lanes, or of `slice` several."""
+        place = jax.lax.rem(self.oldest + number + self.length, self.length)
+        row = row if isinstance(row, slice) else row % len(self.steps)
+        kept = self.steps.at[row, place, lane]
+        return kept.get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+
 def step_weight(system: HybridSystem, y, s, least=1) -> Array:
     """By how much shorter than elsewhere segments should be, where friction is stiff (...)."""
     return jnp.maximum(least, 2 * system.stiffness(y, s, 1 / 4))
 
 
-class Record(eqx.Module):
-    """The last steps of coarse runs in B lanes, numbered from the oldest, in a ring.
+class Record(Steps):
+    """The last steps of coarse runs in B lanes, numbered from the oldest.
 
     What changes the array anywhere but in the loop that steps would copy it, which takes longer
     than the steps.
     """
 
-    steps: Float[Array, "2n+f+5 length B"]  # state and contact state before, and `_ROWS`
-    oldest: Int[Array, ""]  # place of the oldest
     y: Float[Array, "2n B"]  # state after the last step
     s: Float[Array, "f B"]
     guard: Int[Array, " B"]  # that ended it
@@ -64,18 +107,6 @@ class Record(eqx.Module):
         sums = jnp.zeros_like(steps[TIME:, 0])
         reach = None if system.fastest is None else jnp.zeros_like(y[0]) + 0.1 / system.fastest
         return cls(steps, none[0], y, s, none + NONE, sums, reach, none)
-
-    @property
-    def length(self) -> int:
-        """How many steps it holds."""
-        return self.steps.shape[1]
-
-    def row(self, row, number, lane) -> Array:
-        """A row of the steps of those numbers in those lanes, or of `slice` several."""
-        place = jax.lax.rem(self.oldest + number + self.length, self.length)
-        row = row if isinstance(row, slice) else row % len(self.steps)
-        kept = self.steps.at[row, place, lane]
-        return kept.get(mode="promise_in_bounds", wrap_negative_indices=False)
 
     def past(self, row, number, lane) -> Array:
         """A row of sums as of now, which are zero after the last step."""
@@ -134,6 +165,28 @@ class Record(eqx.Module):
         return jnp.where((number == self.length - 1)[None], self.y[:, None], following)
 
 
+class Stretch(eqx.Module):
+    """Steps of g lanes: of their coarse runs, or of orbits that were found near these."""
+
+    run: Record
+    lane: Int[Array, " g"]  # of the run
+    orbit: Steps
+    of_run: Bool[Array, ""]
+
+    @property
+    def length(self) -> int:
+        """How many steps it holds at most."""
+        return self.run.length
+
+    def row(self, row, number) -> Array:
+        """A row of the steps of those numbers (g, k), or of `slice` several."""
+        # Both are looked up: what is done with a row compiles once, not once for each.
+        of_run = self.run.row(row, number, self.lane[:, None])
+        number = jnp.minimum(number, self.orbit.length - 1)
+        of_orbit = self.orbit.row(row, number, jnp.arange(len(number))[:, None])
+        return jnp.where(self.of_run, of_run, of_orbit)
+
+
 class Phases(eqx.Module):
     """Phases of motions in g lanes: steps of one contact state, from one return to another."""
 
@@ -143,31 +196,29 @@ class Phases(eqx.Module):
     weight: Float[Array, "g p"]
 
     @classmethod
-    def between(cls, record: Record, lane, first, last, most: int) -> "Phases":
-        """At most so many of lanes (g,), from after step `first` (g,) to step `last` (g,)."""
-        lane, first, last = lane[:, None], first[:, None], last[:, None]
+    def between(cls, steps: Stretch, first, last, most: int) -> "Phases":
+        """At most so many, from after step `first` (g,) to step `last` (g,)."""
+        first, last = first[:, None], last[:, None]
         p = jnp.arange(most)[None]
-        before = record.row(ENDED, first, lane)
-        exists = p < record.row(ENDED, last, lane) - before
+        before = steps.row(ENDED, first)
+        exists = p < steps.row(ENDED, last) - before
         ends = first_reached(
-            lambda number: record.row(ENDED, number, lane) > before + p,
-            exists.shape,
-            record.length,
+            lambda number: steps.row(ENDED, number) > before + p, exists.shape, steps.length
         )
         ends = jnp.where(exists, ends, first)
         starts = jnp.concatenate([first, ends[:, :-1]], axis=1)
-        weight = record.row(WEIGHT, ends, lane) - record.row(WEIGHT, starts, lane)
+        weight = steps.row(WEIGHT, ends) - steps.row(WEIGHT, starts)
         return cls(exists, starts + 1, ends, jnp.where(exists, weight, 0))
 
 
-def cut(system: HybridSystem, record: Record, lane, first, last, h, length: int) -> Segments:
-    """The steps of lanes (g,) after `first` (g,) up to `last` (g,) in at most `length` segments.
+def cut(system: HybridSystem, steps: Stretch, first, last, h, length: int) -> Segments:
+    """The steps after `first` (g,) up to `last` (g,) in at most `length` segments.
 
     Those of a phase have equal weight, at most h (g,) where so few suffice. Unused ones have no
     duration.
     """
-    n, lane_of = 2 * system.n, lane[:, None]
-    phases = Phases.between(record, lane, first, last, min(length, _PHASES))
+    n = 2 * system.n
+    phases = Phases.between(steps, first, last, min(length, _PHASES))
     # How many segments each phase has.
     free = jnp.maximum(length - jnp.sum(phases.exists, axis=-1), 1)
     h = jnp.maximum(h, jnp.sum(phases.weight, axis=-1) / free)[:, None]
@@ -183,20 +234,20 @@ def cut(system: HybridSystem, record: Record, lane, first, last, h, length: int)
     )
     place = number[None] - before
     # The step in which each segment starts, and the time since then.
-    begin = record.row(WEIGHT, low - 1, lane_of)
+    begin = steps.row(WEIGHT, low - 1)
     share = place.astype(h.dtype) / jnp.maximum(count, 1).astype(h.dtype)
     weight = begin + _take(phases.weight, phase) * share
-    at = first_reached(lambda k: record.row(WEIGHT, k, lane_of) > weight, low.shape, record.length)
+    at = first_reached(lambda number: steps.row(WEIGHT, number) > weight, low.shape, steps.length)
     at = jnp.clip(at, low, high)
     both = slice(TIME, ENDED)
-    time, begin = record.row(both, at - 1, lane_of)
-    duration, own = record.row(both, at, lane_of) - jnp.stack([time, begin])
+    time, begin = steps.row(both, at - 1)
+    duration, own = steps.row(both, at) - jnp.stack([time, begin])
     after = jnp.clip((weight - begin) / jnp.where(own > 0, own, 1), 0, 1) * duration
-    end = record.row(TIME, last[:, None], lane_of)
+    end = steps.row(TIME, last[:, None])
     duration = jnp.diff(jnp.where(used, time + after, end), axis=-1, append=end)
-    guard = record.row(GUARD, high, lane_of).astype(int)
+    guard = steps.row(GUARD, high).astype(int)
     guard = jnp.where(used, jnp.where(place + 1 == count, guard, NONE), UNUSED)
-    states = record.row(slice(GUARD), at, lane_of)
+    states = steps.row(slice(GUARD), at)
     # An unused segment stays in the last contact state, at the first state.
     final = _take(states, jnp.maximum(until[:, -1:] - 1, 0)[None])
     states = jnp.where(used[None], states, final)

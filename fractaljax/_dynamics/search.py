@@ -20,7 +20,7 @@ from .assessment import RUNNING, Candidates, Progress, SearchOptions, assess, co
 from .hybrid import UNUSED, HybridSystem
 from .lanes import chosen
 from .orbit import PeriodicOrbit, solve_periodic_orbits
-from .record import Record, cut
+from .record import Record, Steps, Stretch, cut
 from .segments import Segments
 
 _OPTIONS = SearchOptions()
@@ -63,10 +63,18 @@ def _solved(system, record, lane, wanted, given: Candidates, *, length, options)
         found, _, tries = carry
         return (tries == 0) | ((tries < _MESHES) & jnp.any(unsettled(found)))
 
+    def mesh(orbit, h, of_run):
+        # The orbit's phases have other lengths and weights than those of the run.
+        steps = Stretch(record, lane, Steps.along(system, orbit, h), of_run)
+        first = jnp.where(of_run, given.first, 0)
+        last = jnp.where(of_run, given.last, jnp.sum(orbit.used, axis=0))
+        return cut(system, steps, first, last, h, length)
+
     def solve(carry):
         found, h, tries = carry
-        segments = cut(system, record, lane, given.first, given.last, h, length)
-        own = wanted & ((tries == 0) | unsettled(found))
+        of_run = tries == 0
+        segments = mesh(found.segments, h, of_run)
+        own = wanted & (of_run | unsettled(found))
         new = solve_periodic_orbits(system, segments, own, options.reach * scale, given.rtol)
         # The method is of order 8; where the motion is not as smooth, halves do.
         known = new.error > 0  # a number
@@ -160,7 +168,7 @@ def _find(
         h_run = (options.step / 2.0**finer).astype(start.dtype)
         record = record.advance(system, h_run, options.round_steps)
         limits = equilibrium, growth, max_returns, h, rtol
-        told = look(system, record, known, orbit, error[0] <= rtol, rounds, *limits)
+        told = look(system, record, known, orbit, rounds, *limits)
 
         def solved():
             return _in_groups(
@@ -178,7 +186,7 @@ def _find(
         # XLA moves what does not change out of a loop, to where it is done even if the loop is not.
         none = orbit, error, jnp.zeros_like(told.ready)
         orbit, error, found = jax.lax.cond(jnp.any(told.ready), solved, lambda: none)
-        known = concluded(told, known, orbit, error[0] <= rtol, found, options)
+        known = concluded(told, known, orbit, found, options.accepted)
         return record.moved(told.y, told.extrapolates), known, orbit, error, rounds + 1
 
     _, known, orbit, error, _ = jax.lax.while_loop(running, body, (record, known, orbit, error, 0))

@@ -305,8 +305,9 @@ class _Field:
         lost = np.isnan(tests)
         if not self.entered:
             # Beyond a static divergence the force has the other sign: it passed through infinity.
-            # On it rounding decides.
-            lost |= lifted & (tests >= 0)
+            # There the test is at most 0, which it is where the mode nearest to the one that grows
+            # is undamped. On it rounding decides.
+            lost |= lifted & (tests > 0)
             self.entered = True
         if lost.any():
             place = zip(self.plane.names, self.quantities(us[lost][0]), strict=True)
