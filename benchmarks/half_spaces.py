@@ -97,7 +97,7 @@ def residual(pressure: np.ndarray, heights: np.ndarray, dx: float, E: float) -> 
     x, y = (2 * np.pi * np.fft.fftfreq(n, dx) for n in heights.shape)
     q = np.hypot(x[:, None], y)
     compliance = np.divide(2 / E, q, out=np.zeros_like(q), where=q > 0)
-    gap = np.fft.ifft2(compliance * np.fft.fft2(pressure)).real - heights
+    gap = np.real(np.fft.ifft2(compliance * np.fft.fft2(pressure))) - heights
     touches = pressure > 0
     gap -= gap[touches].mean()
     return float(max(np.abs(gap[touches]).max(), -gap.min()) / heights.std())

@@ -223,7 +223,7 @@ def tuned_loop(b: Numbers) -> Callable[[float, float], tuple[float, float, str]]
 def arrays(b: Numbers) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """D and G (n,) to growth rates (n,) [1/s], with no loop over points."""
     at, matrices = joint(b, ARRAYS, by_newton), state_matrices(b)
-    return lambda D, G: np.linalg.eigvals(matrices(*at(D, G)[1:3])).real.max(axis=1)
+    return lambda D, G: np.real(np.linalg.eigvals(matrices(*at(D, G)[1:3]))).max(axis=1)
 
 
 # Values and differences

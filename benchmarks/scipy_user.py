@@ -63,7 +63,7 @@ def growth_rate(D: float, G: float) -> float:
     x = np.linalg.solve(K, np.array([F, -F]) / math.sqrt(2))
     c_1, c_2 = 2 * XI_1 * OMEGA_1 + slope * K_n * x[1], 2 * XI_2 * OMEGA_2 - slope * K_t * x[0]
     A = np.block([[np.zeros((2, 2)), np.eye(2)], [-K, -np.diag([c_1, c_2])]])
-    return float(np.linalg.eigvals(A).real.max())
+    return float(np.real(np.linalg.eigvals(A)).max())
 
 
 def stability() -> dict[str, float]:

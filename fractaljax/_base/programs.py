@@ -156,8 +156,8 @@ def _described(x: Any, leaves: list) -> Any:
     if isinstance(x, eqx.Module):
         fields = {f.name: _described(getattr(x, f.name), leaves) for f in dataclasses.fields(x)}
         return {"class": _place(type(x)), "fields": fields}
-    if isinstance(x, tuple) and type(x) is not tuple:  # a named one
-        fields = {name: _described(value, leaves) for name, value in x._asdict().items()}
+    if isinstance(x, tuple) and (names := getattr(x, "_fields", None)):  # a named one
+        fields = {name: _described(getattr(x, name), leaves) for name in names}
         return {"named": _place(type(x)), "fields": fields}
     if isinstance(x, tuple | list | dict):
         pairs = x.items() if isinstance(x, dict) else enumerate(x)

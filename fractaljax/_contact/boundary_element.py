@@ -14,7 +14,7 @@ doi:10.1016/S0043-1648(99)00113-1), preconditioned by |q| (Vollebergt, Appl. Mat
 
 import functools
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -307,7 +307,7 @@ def _conjugate_gradients(right, load, contact, rtol):
     return jax.lax.while_loop(go_on, iterate, state)[0]
 
 
-def _on_contact(right, load, contact, rtol):
+def _on_contact(right, load, contact, rtol) -> Any:
     """(p, g) with S p + g = right in contact and p = right outside, of the sum `load` inside."""
 
     def operator(solution):

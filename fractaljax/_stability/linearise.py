@@ -289,6 +289,7 @@ def _tangents(structure: Structure, F) -> tuple[list[tuple[Array, Array, Array |
     for i, curve, e, n in zip(curved, curves, displaced, normals, strict=True):
         own, K_t, load = found[i]
         force, slope = _on_curve(curve, e)
+        load = jnp.asarray(load)
         tangent = load * (force - slope * e)
         F = F + (load - tangent) * n
         found[i] = own * slope, K_t, tangent

@@ -16,7 +16,12 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
+from jax.extend.core import (
+    ClosedJaxpr,  # pyright: ignore[reportAttributeAccessIssue, reportPrivateImportUsage]
+    Jaxpr,
+    Literal,
+    jaxpr_as_fun,
+)
 from jaxtyping import ArrayLike, PyTree
 
 from .._base.programs import TRACED_UNDER
@@ -92,9 +97,10 @@ class Program:
         if any(name == "custom_vmap_call" for name, _ in digest.outside):
             # For two points the rules of `custom_vmap` are written out. Calls that are left are
             # not mapped, and their rules not used.
+            avals: Any = self._jaxpr.in_avals
             pair = [
                 jax.ShapeDtypeStruct(aval.shape if axis is None else (2, *aval.shape), aval.dtype)
-                for aval, axis in zip(self._jaxpr.in_avals, self._axes, strict=True)
+                for aval, axis in zip(avals, self._axes, strict=True)
             ]
             mapped = jax.vmap(jaxpr_as_fun(self._jaxpr), self._axes)
             digest = Digest(jax.make_jaxpr(mapped)(*pair))

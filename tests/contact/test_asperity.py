@@ -31,7 +31,7 @@ POINTS = [
 ]
 
 
-def contact(D, G, P, L_s=1e-4, E=E, sigma_y=SIGMA_Y, H=H, **others):
+def contact(D, G, P, L_s: Any = 1e-4, E: Any = E, sigma_y: Any = SIGMA_Y, H: Any = H, **others):
     material = fj.Material(E=E, nu=NU, sigma_y=sigma_y, H=H)
     return fj.AsperityContact(fj.Surface(D, G, GAMMA), material, P, L_s, **others)
 

@@ -167,6 +167,6 @@ def test_damping_ratio_is_that_of_the_state_matrix():
         mu = scene.friction.mu(scene.oscillator.V)
         A = state_matrix(scene.oscillator, mu, scene.contact.K_n, scene.contact.K_t)
         eigenvalues = np.linalg.eigvals(A)
-        expected = (-eigenvalues.real / np.abs(eigenvalues)).min()
+        expected = (-np.real(eigenvalues) / np.abs(eigenvalues)).min()
         found = DampingRatio(0.0, friction_slope=False).measure(scene)
         np.testing.assert_allclose(found, expected, rtol=1e-9)

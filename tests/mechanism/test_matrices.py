@@ -90,9 +90,9 @@ def test_a_mass_matrix_is_symmetric_and_one_in_its_coordinates():
 def damping_ratios(C):
     """Those of the modes in the order of rising frequency, by SciPy, and the frequencies."""
     s = np.linalg.eigvals(state_matrix(M, C, K))
-    s = s[s.imag > 0]
+    s = s[np.imag(s) > 0]
     s = s[np.argsort(abs(s))]
-    return -s.real / abs(s), abs(s)
+    return -np.real(s) / abs(s), abs(s)
 
 
 def test_rayleigh_damping_and_rigid_body_modes():
