@@ -125,6 +125,7 @@ def _write(file: Path, program: Callable, kinds) -> None:
     content = f"{skeleton}\n".encode() + exported.serialize()
     digest = hashlib.sha256(content).hexdigest()
     write_whole(file, f"{digest}\n".encode() + content, durable=False)
+    file.chmod(0o600)
 
 
 def _read(file: Path) -> Callable:
@@ -160,7 +161,9 @@ def _described(x: Any, leaves: list) -> Any:
         fields = {name: _described(getattr(x, name), leaves) for name in names}
         return {"named": _place(type(x)), "fields": fields}
     if isinstance(x, tuple | list | dict):
-        pairs = x.items() if isinstance(x, dict) else enumerate(x)
+        pairs = [*(x.items() if isinstance(x, dict) else enumerate(x))]
+        if not all(isinstance(key, str | int) for key, _ in pairs):
+            raise ValueError("cannot be kept: a key that is no text")
         return {type(x).__name__: [[key, _described(value, leaves)] for key, value in pairs]}
     if isinstance(x, jax.Array | _Leaf):
         leaves.append(x)
@@ -236,7 +239,8 @@ def kept_programs() -> Iterator[None]:
         folder = Path(chosen) if chosen is not None else _cache_folder()
         programs = folder / "programs"
         first = not programs.exists()
-        programs.mkdir(mode=0o700, parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        programs.mkdir(mode=0o700, exist_ok=True)
         if all(_is_private(x) and os.access(x, os.W_OK | os.X_OK) for x in (folder, programs)):
             _folder = programs
             if chosen is None:

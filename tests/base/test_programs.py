@@ -174,14 +174,24 @@ def test_a_folder_that_is_gone_or_full(folder, tmp_path, monkeypatch):
 
 
 def test_private_folder_of_the_user(tmp_path, monkeypatch):
+    monkeypatch.setattr(programs, "_programs", {})
+    monkeypatch.setattr(programs, "_TRUSTED", (*programs._TRUSTED, __name__.partition(".")[0]))
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    shared_with_a_group = os.umask(0o002)
+    try:
+        with programs.kept_programs():
+            assert float(program(2.0)["value"]) == 4
+    finally:
+        os.umask(shared_with_a_group)
     folder = tmp_path / "cache" / "fractaljax" / "compiled"
     with programs.kept_programs():
         assert programs._folder == folder / "programs"
     assert programs._folder is None  # of a process that does more than one command
     assert [getattr(jax.config, name) for name in SETTINGS] == [str(folder), 0]
-    assert stat.S_IMODE(os.stat(folder / "programs").st_mode) == 0o700
+    (kept,) = (folder / "programs").iterdir()
+    for place, mode in ((folder, 0o700), (folder / "programs", 0o700), (kept, 0o600)):
+        assert stat.S_IMODE(place.stat().st_mode) == mode
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))  # one that is set stays
     with programs.kept_programs():
         assert programs._folder == tmp_path / "programs"

@@ -243,6 +243,17 @@ def test_orbit(a, ratio, returns):
     np.testing.assert_allclose(states, again.at(times), rtol=0, atol=1e-8)
 
 
+@pytest.mark.parametrize(("ratio", "mu"), [(0.8, 0.4), (0.6, 0.2), (0.9, 0.6), (1.2, 0.4)])
+def test_an_orbit_attracts_where_its_multipliers_are_below_one(ratio, mu):
+    """An undamped oscillator under dry friction; the excitation's multiplier 1 is none of its."""
+    joint = fj.Joint(fj.FixedContact(1.0, 0.0, P=0.5), fj.Coulomb(mu), [1.0], V=0.1, preload=True)
+    oscillator = fj.Structure([[1.0]], [[0.0]], [[1.0]], [joint])
+    force = fj.Excitation([1.0], ratio / (2 * np.pi))
+    cycle = fj.limit_cycle(oscillator, [2.5, 0.0], excitation=force, throw=False)
+    assert cycle.result == fj.CycleResult.converged
+    assert 0.1 < np.abs(cycle.multipliers).max() < 0.95
+
+
 @SLOW
 def test_linear_orbit():
     """Where nothing switches it is the linear response, also close to resonance."""
