@@ -54,6 +54,9 @@ def coefficient_of(name: str, given: Any, parameters: Parameters) -> Callable | 
         raise ValueError(
             f"{name} needs the parameter {error.args[0]!r}; given are {_listed(parameters)}"
         ) from None
+    except (OverflowError, ZeroDivisionError):
+        shown = f", got {brief(given.text)}" if isinstance(given, Expression) else ""
+        raise ValueError(f"{name} must be a finite number of these parameters{shown}") from None
     value = scalar(name, value)
     return given if seen.read else value
 
@@ -107,7 +110,7 @@ def _parsed(text: str) -> ast.expr:
 def _value(node: Any, p: Parameters) -> Any:
     match node:
         case ast.Constant():
-            return node.value
+            return float(node.value)  # a power of whole numbers has no end
         case ast.Name():
             if node.id in p:
                 return p[node.id]

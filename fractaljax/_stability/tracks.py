@@ -40,6 +40,7 @@ from .quadratic import solve
 _SURE = 0.8  # a MAC from which on two modes are the same
 _HALVINGS = 12  # of a step, at most
 _NEUTRAL = 1e-9  # growth rate, of |s|, that does not count
+_COALESCED = 1e-7  # growth rate, of |s|, that rounding gives to modes that coalesce
 _PART = 0.48  # of a step, its first "half": a round number would meet the places of coalescence
 _INDEPENDENT = 1e4  # condition of shapes below which they are no single one
 _NONE = complex(np.nan, np.nan)
@@ -87,18 +88,20 @@ class ModeTracks(Record):
         return -np.real(self.eigenvalues) / np.abs(self.eigenvalues)
 
     def crossings(self) -> list[ModeCrossing]:
-        """Where growth rates change sign between two of the values, in the order of the values.
+        """Where modes start or cease to grow between two of the values, in the order of the values.
 
-        Each is the root of the growth rate of its own mode, to the rounding of the eigenvalues. A
-        growth rate that is 0 to rounding, as of undamped modes, changes no sign, and two changes
-        between neighbouring values are not seen.
+        Each is the root of the growth rate of its own mode, to the rounding of the eigenvalues. Where
+        the growth rate is 0 to rounding on one side, as of undamped modes, it is where that ends: the
+        frequencies of two modes meet there. Two changes between neighbouring values are not seen.
         """
         from scipy.optimize import brentq
 
         growth = self.growth_rates
         growth = np.where(np.abs(growth) > _NEUTRAL * np.abs(self.eigenvalues), growth, 0)
         at, found = _modes_of(self.x, self.name, self.friction_slope), []
-        for i, k in np.argwhere(growth[:-1] * growth[1:] < 0).tolist():
+        grows, known = growth > 0, np.isfinite(growth)
+        changes = (grows[:-1] != grows[1:]) & known[:-1] & known[1:]
+        for i, k in np.argwhere(changes).tolist():
             begin = at(self.values[i])
             own = int(np.abs(begin.s - self.eigenvalues[i, k]).argmin())
 
@@ -106,8 +109,11 @@ class ModeTracks(Record):
                 return complex(_step(begin, at(value), at, _HALVINGS)[0].s[own])
 
             ends = self.values[i], self.values[i + 1]
-            more: Any = {"xtol": 1e-300, "rtol": 1e-14}
-            value: Any = brentq(lambda value: eigenvalue(value).real, *ends, **more)
+            if growth[i, k] * growth[i + 1, k] < 0:
+                more: Any = {"xtol": 1e-300, "rtol": 1e-14}
+                value: Any = brentq(lambda value: eigenvalue(value).real, *ends, **more)
+            else:
+                value = _bisected(lambda value: _grows(eigenvalue(value)), *ends)
             frequency = abs(eigenvalue(value).imag) / (2 * np.pi)
             starts = (growth[i + 1, k] > 0) == (ends[0] < ends[1])
             found.append(ModeCrossing(k, float(value), frequency, bool(starts)))
@@ -118,6 +124,21 @@ class ModeTracks(Record):
         yield f"modes: {self.eigenvalues.shape[1]}"
         unstable = (self.growth_rates > 0).any(axis=0).sum()
         yield f"with positive growth rate: {unstable}"
+
+
+def _grows(s: complex) -> bool:
+    """True where a mode grows by more than the rounding of eigenvalues that coalesce."""
+    return s.real > _COALESCED * abs(s)
+
+
+def _bisected(test: Callable[[float], bool], low: float, high: float) -> float:
+    """Where a test that differs at the ends changes, to the last digit."""
+    at_low = test(low)
+    while True:
+        middle = low + (high - low) / 2
+        if middle in (low, high):
+            return middle
+        low, high = (middle, high) if test(middle) == at_low else (low, middle)
 
 
 def track_modes(

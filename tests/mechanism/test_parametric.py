@@ -129,6 +129,12 @@ REFUSED = {
     ),
     "coefficient must be a formula": dict(K=[("__import__('os')", K)]),
     "a coefficient must be a formula of parameters": dict(K=[("Omega(", K)]),
+    "the coefficient of K, term 1 must be a finite number of these parameters, got '9": dict(
+        K=[("9**9**9 + Omega", K)]
+    ),
+    "the coefficient of K, term 1 must be a finite number of these parameters, got '1/0'": dict(
+        K=[("1/0", K)]
+    ),
     "the coefficient of K, term 1 must be finite": dict(
         K=[("1/Omega", K)], parameters={"Omega": 0.0}
     ),

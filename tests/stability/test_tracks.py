@@ -271,3 +271,21 @@ test_refusals = refusals(
     lambda x, name, values, slope=True: track(x, name, values, friction_slope=slope),
     kind=(ValueError, TypeError),
 )
+
+
+@pytest.mark.parametrize(("a", "b"), [(2.0, 1.5), (3.0, 7.1), (1e8, 1.3e8)])
+@pytest.mark.parametrize("damping", [0.0, 1e-11])
+def test_undamped_modes_cross_where_their_frequencies_meet(a, b, damping):
+    """[[a, -mu], [mu, b]] has equal eigenvalues at |a - b| = 2 mu, in any order of the values."""
+    exact, scale = abs(a - b) / 2, np.sqrt((a + b) / 2)
+    x = fj.ParametricStructure(
+        np.eye(2),
+        damping * scale * np.eye(2),
+        [(1, [[a, 0.0], [0.0, b]]), ("mu", [[0.0, -1.0], [1.0, 0.0]])],
+        parameters={"mu": 0.1 * exact},
+    )
+    values = np.linspace(0.0, 2.4, 7) * exact
+    for order in (values, values[::-1]):
+        (found,) = fj.track_modes(x, "mu", order).crossings()
+        assert found.value == pytest.approx(exact, rel=1e-11) and found.starts
+        assert found.frequency == pytest.approx(scale / (2 * np.pi), rel=1e-7)
