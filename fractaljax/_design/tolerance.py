@@ -199,16 +199,21 @@ def quantile(values: Float[Array, "n ..."], weights: Float[Array, " n"], level) 
 
 
 class SquealProbability(NamedTuple):
-    """A share of draws, and its standard error, which is not 0 where all or nothing squeals."""
+    """The share of draws that squeal, and its standard error, which is never 0.
+
+    Draws without a sliding equilibrium, whose growth rate is NaN, are neither: they are counted by
+    themselves, so that the probability lies between `value` and `value + undetermined`.
+    """
 
     value: float
     standard_error: float
+    undetermined: float = 0.0  # share of draws without a growth rate
 
 
 @eqx.filter_jit
-def _squeals(x, names, values, friction_slope):
+def _growth_rates(x, names, values, friction_slope):
     def one(row):
-        return growth_rate(substituted(x, dict(zip(names, row, strict=True))), friction_slope) > 0
+        return growth_rate(substituted(x, dict(zip(names, row, strict=True))), friction_slope)
 
     return jax.vmap(one)(values)
 
@@ -223,6 +228,9 @@ def squeal_probability(
     seed: int = 0,
 ) -> SquealProbability:
     """The probability that `x` as machined or identified squeals: growth rate > 0.
+
+    Draws whose growth rate is NaN, as where a preloaded joint has no closed equilibrium, are
+    `undetermined`.
 
     `tolerance` is an `Identification`, a `Tolerance` or a mapping of standard deviations; with an
     `envelope` every draw is at a condition drawn evenly from it. A name without a joint, "D", of a
@@ -249,10 +257,13 @@ def squeal_probability(
     dtype = jax.tree.leaves(x)[0].dtype
     rows = np.stack([np.asarray(column, dtype) for column in values.values()], axis=1)
     batch = max(64, _EIGENVALUES_AT_ONCE // n**2)
-    squeals = in_batches(
-        lambda rows: _squeals(x, tuple(values), rows, friction_slope), min(batch, samples), rows
+    growth = in_batches(
+        lambda rows: _growth_rates(x, tuple(values), rows, friction_slope),
+        min(batch, samples),
+        rows,
     )
-    return proportion(int(squeals.sum()), samples)
+    found = proportion(int((growth > 0).sum()), samples)
+    return found._replace(undetermined=float(np.isnan(growth).mean()))
 
 
 def proportion(hits: int, count: int) -> SquealProbability:

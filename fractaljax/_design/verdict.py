@@ -46,6 +46,12 @@ class Question(NamedTuple):
     name: str  # instead
     found: str  # what was found, in words
     quiet: bool
+    undetermined: bool = False  # it is not quiet because it has no answer
+
+    @property
+    def outcome(self) -> str:
+        """What is printed: quiet, squeals, or that there is no answer."""
+        return "quiet" if self.quiet else "undetermined" if self.undetermined else "squeals"
 
 
 class Verdict(Record):
@@ -69,10 +75,7 @@ class Verdict(Record):
     def __repr__(self) -> str:
         columns: list[dict[str, str]] = [
             {question.name: question.found for question in self.questions},
-            {
-                question.name: "quiet" if question.quiet else "squeals"
-                for question in self.questions
-            },
+            {question.name: question.outcome for question in self.questions},
         ]
         lines = [table(["growth rate [1/s]", ""], columns)]
         if self.incurable:
@@ -131,7 +134,7 @@ def verdict(
     found = _growth_rates(tuple(other for *_, other in asked), friction_slope)
     rates = found.rates.tolist()
     questions = [
-        Question(assumed, name, _as_text(rate), rate < 0)
+        Question(assumed, name, _as_text(rate), rate < 0, not np.isfinite(rate))
         for (assumed, name, _), rate in zip(asked, rates[: len(asked)], strict=True)
     ]
     if (stiff := np.asarray(found.stiff)).any():
@@ -273,8 +276,9 @@ def _of_ratios(ratios: np.ndarray, rates: np.ndarray, own: np.ndarray) -> Questi
     """The worst growth rate between the own K_t/K_n, the fractal law's and Mindlin's."""
     worst = int(np.argmax(rates))
     name = f"K_t/K_n from {ratios[0].min():.3g} to {ratios[-1].max():.3g}"
-    found = f"{rates[worst]:+.6g} at {_extent(ratios[worst])}"
-    return Question(f"K_t/K_n = {_extent(own)}", name, found, bool(rates[worst] < 0))
+    found = f"{_as_text(rates[worst])} at {_extent(ratios[worst])}"
+    quiet, undetermined = bool(rates[worst] < 0), bool(np.isnan(rates[worst]))
+    return Question(f"K_t/K_n = {_extent(own)}", name, found, quiet, undetermined)
 
 
 def _extent(values) -> str:
@@ -289,8 +293,12 @@ def _scattered(x, tolerance, envelope, friction_slope, seed) -> Question:
     names = " and ".join(tolerance.names)
     over = "" if envelope is None else f" over {Envelope.of(envelope)}"
     words = f"squeals with probability {found.value:.3g} +- {found.standard_error:.1g}"
+    if found.undetermined:
+        words += f", has no sliding equilibrium with {found.undetermined:.3g}"
     exact = f"{names} without scatter"
-    return Question(exact, f"{names} scatter{over}", words, found.value < _ACCEPTED)
+    quiet = found.value + found.undetermined < _ACCEPTED
+    undetermined = not quiet and found.value < _ACCEPTED
+    return Question(exact, f"{names} scatter{over}", words, quiet, undetermined)
 
 
 class Suggestion(Record):

@@ -90,9 +90,10 @@ class ModeTracks(Record):
     def crossings(self) -> list[ModeCrossing]:
         """Where modes start or cease to grow between two of the values, in the order of the values.
 
-        Each is the root of the growth rate of its own mode, to the rounding of the eigenvalues. Where
-        the growth rate is 0 to rounding on one side, as of undamped modes, it is where that ends: the
-        frequencies of two modes meet there. Two changes between neighbouring values are not seen.
+        Each is the root of the growth rate of its own mode, to the rounding of the eigenvalues.
+        Where the growth rate is 0 to rounding on one side, as of undamped modes, it is where that
+        ends: the frequencies of two modes meet there. Two changes between neighbouring values are
+        not seen.
         """
         from scipy.optimize import brentq
 

@@ -77,9 +77,9 @@ def test_lattice_proportion_and_what_does_not_scatter():
     np.testing.assert_array_equal(low_discrepancy(55, 2), expected)
     assert Tolerance.of({"ln G": 0.05, "D": 0.0}).names == ("ln G",)
     # The usual one in the middle, one over n at nothing and at all.
-    assert proportion(3000, 10000) == (0.3, pytest.approx(math.sqrt(0.21 / 10000), rel=1e-3))
-    assert proportion(0, 10000) == (0.0, pytest.approx(1e-4, rel=1e-3))
-    assert proportion(10000, 10000) == (1.0, pytest.approx(1e-4, rel=1e-3))
+    assert proportion(3000, 10000)[:2] == (0.3, pytest.approx(math.sqrt(0.21 / 10000), rel=1e-3))
+    assert proportion(0, 10000)[:2] == (0.0, pytest.approx(1e-4, rel=1e-3))
+    assert proportion(10000, 10000)[:2] == (1.0, pytest.approx(1e-4, rel=1e-3))
 
 
 CORRELATED = np.array([[1.0, 0.985 * 15], [0.985 * 15, 15**2]]) * 6e-3**2
@@ -124,6 +124,26 @@ def test_a_correlation_counts_in_the_probability_of_squeal():
     spread = 4 * math.hypot(found.standard_error, math.sqrt(share * (1 - share) / 20000))
     assert found.value == pytest.approx(share, abs=spread)
     assert alone.value > 20 * found.value
+
+
+def test_draws_without_an_equilibrium_are_neither_quiet_nor_squeal():
+    """A force that scatters opens the joint beyond a limit: they are its normal tail."""
+    brake = fj.brake_scene()
+    scene = fj.Scene(brake.contact, brake.friction, brake.oscillator, preload="linear")
+    scene = scene.replace(F=2000.0, xi_1=0.3, xi_2=0.3)
+    rate = jax.jit(lambda F: fj.growth_rate(scene.replace(F=F)))
+    low, high = 2000.0, 4000.0
+    while high - low > 1e-3:
+        middle = (low + high) / 2
+        low, high = (low, middle) if np.isnan(rate(middle)) else (middle, high)
+    found = fj.squeal_probability(scene, {"F": 600.0}, samples=20_000)
+    tail = 0.5 * math.erfc((low - 2000.0) / 600.0 / math.sqrt(2))
+    assert 0.2 < tail < 0.5 and found.value == 0
+    assert found.undetermined == pytest.approx(tail, abs=4 * math.sqrt(tail * (1 - tail) / 20_000))
+    verdict = fj.verdict(scene, tolerance={"F": 600.0}, progress=False)
+    question = next(q for q in verdict.questions if q.name == "F scatter")
+    assert not question.quiet and question.undetermined and not verdict.quiet
+    assert "undetermined" in repr(verdict) and "has no sliding equilibrium with 0." in repr(verdict)
 
 
 @pytest.mark.slow

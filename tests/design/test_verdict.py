@@ -104,7 +104,7 @@ def test_largest_kick_survived():
     law, scatter = [fj.FixedContact(1e7, 5e6)], {"mu": 1e-3}
     found = fj.verdict(scene, laws=law, tolerance=scatter, quiet_within=0.5, progress=False)
     assert found.not_asked == () and repr(found).splitlines()[-1] == "Quiet in all."
-    assert found.questions[-1] == (
+    assert found.questions[-1][:4] == (
         "smaller kicks",
         "kicks within 0.5",
         "comes to rest from 0.5 of 0.5",
