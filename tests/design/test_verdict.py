@@ -111,7 +111,7 @@ def test_largest_kick_survived():
         True,
     )
     squealing = fj.verdict(reference_scene(), quiet_within=0.5, progress=False)
-    assert squealing.questions[-1] == (
+    assert squealing.questions[-1][:4] == (
         "smaller kicks",
         "kicks within 0.5",
         "comes to rest from 0 of 0.5",
