@@ -7,16 +7,6 @@ import signal
 import sys
 import threading
 
-from ._cli.commands import add_cycle, add_scene, add_stability
-from ._cli.contact import add_contact
-from ._cli.design import add_design
-from ._cli.explore import add_explore
-from ._cli.identify import add_identify
-from ._cli.map import add_map
-from ._cli.parsing import Parser, Version, reason, refuse
-from ._cli.reduce import add_reduce
-from ._cli.validate import add_validate
-
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; returns its exit status.
@@ -24,6 +14,16 @@ def main(argv: list[str] | None = None) -> int:
     0, or 1 for an infeasible design, no limit cycle, a surface that is not fractal or a published
     number that is not met, or 2 for bad input, or 128 plus the number of the signal that ended it.
     """
+    from ._cli.commands import add_cycle, add_scene, add_stability
+    from ._cli.contact import add_contact
+    from ._cli.design import add_design
+    from ._cli.explore import add_explore
+    from ._cli.identify import add_identify
+    from ._cli.map import add_map
+    from ._cli.parsing import Parser, Version, reason, refuse
+    from ._cli.reduce import add_reduce
+    from ._cli.validate import add_validate
+
     parser = Parser(
         prog="fractaljax",
         description="From a machined surface to a stable mechanism.",
@@ -55,6 +55,8 @@ def main(argv: list[str] | None = None) -> int:
     from ._base.programs import kept_programs
 
     jax.config.update("jax_enable_x64", True)
+    if signal.getsignal(signal.SIGINT) is _end_at_once:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with kept_programs(), _terminable():
             status = arguments.run(arguments)
@@ -79,10 +81,18 @@ def main(argv: list[str] | None = None) -> int:
 
 def command() -> int:
     """`main` as a process of its own, which ends without a search for garbage in all it holds."""
+    # While modules load, an exception could be taken for an error of theirs.
+    signal.signal(signal.SIGINT, _end_at_once)
     try:
         return main()
     finally:
         gc.freeze()
+
+
+def _end_at_once(*_) -> None:
+    """End an interrupted command before it has begun."""
+    os.write(2, b"fractaljax: interrupted, nothing written\n")
+    os._exit(128 + signal.SIGINT)
 
 
 @contextlib.contextmanager

@@ -280,3 +280,30 @@ def test_module_in_double_precision():
         [sys.executable, "-m", "fractaljax", "stability"], capture_output=True, text=True
     )
     assert (done.returncode, done.stderr) == (0, "") and "+22.0801" in done.stdout
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no signals between processes")
+@pytest.mark.parametrize("after", [0.0, 0.1, 0.3, 0.6])
+def test_an_interrupt_at_any_time_is_one_line(tmp_path, after):
+    """Also while the modules load, in the first second."""
+    script = f"""
+import os, signal, sys, threading
+from fractaljax.__main__ import command
+sys.argv = ["fractaljax", "design", "--quiet", "--out", "out"]
+timer = threading.Timer({after}, os.kill, (os.getpid(), signal.SIGINT))
+set_handler = signal.signal
+
+def first_handler(*arguments):
+    signal.signal = set_handler
+    set_handler(*arguments)
+    timer.start()
+
+signal.signal = first_handler
+sys.exit(command())
+"""
+    run = subprocess.run(
+        [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert (run.returncode, run.stdout) == (130, "")
+    assert run.stderr == "fractaljax: interrupted, nothing written\n"
+    assert not [*tmp_path.iterdir()]
