@@ -20,7 +20,8 @@ def growth_map(result: Sweep, ax: Axes | None = None) -> Axes:
     """Growth rate [1/s] as labelled contours: filled where it squeals, dashed where it does not.
 
     From a sweep of `stability` or of `growth_rate`. Hatched where a fractal contact is not
-    elastic-plastic: there the growth rate is that of another mechanism.
+    elastic-plastic: there the growth rate is that of another mechanism; and, by a hatch of its own,
+    where it is NaN, as where a preloaded joint has no closed equilibrium.
 
     **Raises:** `ValueError` unless the sweep has two axes, each with two values or more.
     """
@@ -38,7 +39,7 @@ def growth_map(result: Sweep, ax: Axes | None = None) -> Axes:
 def frequency_map(result: Sweep, ax: Axes | None = None, *, mode: int = 1) -> Axes:
     """Frequency [kHz] of a mode of a sweep of `stability`, and the stability boundary.
 
-    Mode 1 has the lowest frequency.
+    Mode 1 has the lowest frequency. Hatched as in `growth_map`.
 
     **Raises:** `ValueError` for a mode that there is not, and as `growth_map`.
     """
@@ -48,7 +49,7 @@ def frequency_map(result: Sweep, ax: Axes | None = None, *, mode: int = 1) -> Ax
     _, frequencies = vibration_modes(result)
     if mode not in range(1, frequencies.shape[-1] + 1):
         raise ValueError(f"mode must be from 1 to {frequencies.shape[-1]}, got {mode!r}")
-    frequency = frequencies[..., mode - 1] / 1e3
+    frequency = np.ma.masked_where(_no_number(result), frequencies[..., mode - 1] / 1e3)
     low, high = frequency.min(), frequency.max()
     if low < high:
         _fill(result, ax, frequency, MaxNLocator(10).tick_values(low, high), "YlGnBu")
@@ -81,7 +82,6 @@ def stability_chart(result: Sweep, ax: Axes | None = None) -> Axes:
         ax.set_ylabel("growth rate [1/s]")
         return ax
     ax, growth, handles = _start(result, ax)
-    growth = np.ma.masked_invalid(growth)
     x, y = result.points
     _count(ax, x, y, count.T, ax.transData)
     levels = MaxNLocator(8).tick_values(growth.min(), growth.max())
@@ -115,16 +115,22 @@ def vibration_modes(result: Sweep) -> tuple[np.ndarray, np.ndarray]:
 
 def shade_regimes(ax: Axes, x: np.ndarray, y: np.ndarray, regime: Regime) -> list[Artist]:
     """Hatch where a joint (n, m) is fully plastic or slips as a whole; what the legend shows."""
+    return [
+        handle
+        for words, (member, grey, hatch) in _SHADES.items()
+        for handle in _shade(ax, x, y, np.asarray(regime == member), words, grey, hatch)
+    ]
+
+
+def _shade(ax, x, y, inside, words: str, grey: str, hatch: str) -> list[Artist]:
+    """Hatch where `inside` (n, m) holds, a point and what is half way to its neighbours."""
     from matplotlib.patches import Patch
 
-    handles = []
-    for words, (member, grey, hatch) in _SHADES.items():
-        inside = np.asarray(regime == member)
-        if inside.any():
-            style: dict[str, Any] = {"hatches": [hatch], "colors": [grey]}
-            ax.contourf(x, y, inside.T.astype(float), levels=[0.5, 1.5], **style)
-            handles.append(Patch(facecolor=grey, hatch=hatch, edgecolor="0.3", label=words))
-    return handles
+    if not inside.any():
+        return []
+    style: dict[str, Any] = {"hatches": [hatch], "colors": [grey]}
+    ax.contourf(x, y, inside.T.astype(float), levels=[0.5, 1.5], **style)
+    return [Patch(facecolor=grey, hatch=hatch, edgecolor="0.3", label=words)]
 
 
 def regime_of(scene: Scene) -> Regime:
@@ -133,7 +139,7 @@ def regime_of(scene: Scene) -> Regime:
 
 
 def _start(result, ax):
-    """Axes, the growth rate (n, m), masked where inelastic, and the hatched regimes."""
+    """Axes, the growth rate (n, m), masked where inelastic or NaN, and what is hatched."""
     shape = tuple(map(len, result.points))
     if len(shape) != 2 or min(shape) < 2:
         raise ValueError(f"a map needs two axes of two values or more, got a grid of {shape}")
@@ -141,15 +147,25 @@ def _start(result, ax):
     x, y = result.points
     over_quantity(ax, "x", result.scene, result.names[0], x)
     over_quantity(ax, "y", result.scene, result.names[1], y)
-    growth = np.asarray(getattr(result.values, "growth_rate", result.values))
+    none = _no_number(result)
+    growth = np.ma.masked_where(none, getattr(result.values, "growth_rate", result.values))
+
+    def hatched() -> list[Artist]:
+        return _shade(ax, x, y, none, "no steady sliding", "1.0", "xx")
+
     if not (isinstance(result.scene, Scene) and result.scene.contact.fractal):
-        return ax, growth, []
+        return ax, growth, hatched()
     axes: Any = result.axes
     regime = sweep(regime_of, result.scene, progress=False, **axes).values
     inelastic = np.asarray(regime != Regime.elastic_plastic)
     if not inelastic.all():
         growth = np.ma.masked_where(inelastic, growth)
-    return ax, growth, shade_regimes(ax, x, y, regime)
+    return ax, growth, shade_regimes(ax, x, y, regime) + hatched()
+
+
+def _no_number(result) -> np.ndarray:
+    """Where the growth rate of a sweep is NaN."""
+    return np.isnan(np.asarray(getattr(result.values, "growth_rate", result.values)))
 
 
 def _fill(result, ax, values, levels, name, skip=0):
@@ -192,7 +208,8 @@ def _finish(result, ax, growth, handles, title):
     if growth.min() < 0 < growth.max():
         ax.contour(*result.points, growth.T, [0.0], colors="k", linewidths=2)
         handles = [Line2D([], [], color="k", lw=2, label="stability boundary"), *handles]
-    ax.set_title(title, fontsize="medium", loc="left")
+    rows = -(-len(handles) // 3)
+    ax.set_title(title, fontsize="medium", loc="left", pad=6 if rows < 2 else 6 + 14 * rows)
     if handles:
         place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.99)}
         ax.legend(handles=handles, ncols=3, fontsize="small", frameon=False, **place)

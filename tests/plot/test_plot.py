@@ -15,6 +15,7 @@ import matplotlib.pyplot
 import numpy as np
 import pytest
 from IPython.core.formatters import DisplayFormatter
+from matplotlib.contour import ContourSet
 
 import fractaljax as fj
 from fractaljax.plot.axes import coordinate
@@ -312,6 +313,29 @@ def test_maps_and_lines_show_the_modes():
     np.testing.assert_array_equal(lines[3], real[32].max(axis=-1))
     surfaces = plot.mode_surfaces(modes(), quantity="frequency")
     assert surfaces.get_zlabel() == "frequency [kHz]" and labels(surfaces) == ["mode 1", "mode 2"]
+
+
+@pytest.mark.parametrize("draw", [plot.growth_map, plot.frequency_map])
+def test_all_that_is_a_number_is_drawn(draw):
+    """NaN has its own hatch; everywhere else the map is as it was, but beside it."""
+    whole, names = modes(), ("growth_rate", "eigenvalues")
+    values = [np.array(getattr(whole.values, name)) for name in names]
+    for array in values:
+        array[2, 3] = np.nan
+
+    def changed(x):
+        return [getattr(x.values, name) for name in names]
+
+    lacking = draw(eqx.tree_at(changed, whole, values))
+    words = [text.get_text() for text in lacking.get_legend().get_texts()]
+    assert "no steady sliding" in words
+    (filled,), (own, *_) = (
+        [x for x in ax.collections if isinstance(x, ContourSet) and x.filled and not any(x.hatches)]
+        for ax in (draw(whole), lacking)
+    )
+    np.testing.assert_array_equal(own.levels, filled.levels)
+    areas = [sum(len(path.vertices) for path in x.get_paths()) for x in (own, filled)]
+    assert areas[0] > 0.8 * areas[1]
 
 
 def test_map_without_a_boundary():
