@@ -23,6 +23,7 @@ from .search import Search
 from .statement import state_problem
 
 _STARTS = 6  # of each member of the front
+_RESOLVED = 1e-6  # relative, of the values at the ends of a front
 _POINTS_MAX = 1000
 
 
@@ -120,7 +121,8 @@ def pareto(
     places = np.stack([problem.scaled(end.scene) for end in ends])
     rows = Evaluator(problem).evaluate(places).rows
     (high, low), scale = rows[:, -1].tolist(), float(np.ptp(rows[:, 0])) or 1.0
-    if not high > low:
+    # Ends are found to the solver's tolerance; at either of equal ends both objectives are least.
+    if not high > low or _equal(high, low) or _equal(*rows[:, 0].tolist()):
         raise ValueError(f"the least {names[0]} and the least {names[1]} are one design")
     _, designs = screened(problem, None, made["lattice"])
     known = Evaluator(problem).evaluate(designs)
@@ -159,6 +161,11 @@ def pareto(
         ends=ends,
         failed=points - len(found),
     )
+
+
+def _equal(one: float, other: float) -> bool:
+    """True if two values of an objective differ by no more than its error."""
+    return abs(one - other) <= _RESOLVED * max(abs(one), abs(other))
 
 
 def _beats(other, member) -> bool:

@@ -85,3 +85,15 @@ test_refusals = refusals(
     ),
     plain=True,
 )
+
+
+@pytest.mark.parametrize(
+    "second", [lambda x: 2 * fj.growth_rate(x) + 5.0, lambda x: jnp.exp(fj.growth_rate(x) / 1e4)]
+)
+def test_objectives_without_a_trade_off_are_refused(second):
+    """Both are least at one design, which the solver finds twice to its tolerance."""
+    bounds = {"D": (2.3, 2.8), "G": (1e-11, 1e-9)}
+    with pytest.raises(ValueError, match="first objective and the least second .* are one design"):
+        fj.pareto(
+            fj.brake_scene(), fj.growth_rate, second, bounds=bounds, target=1e5, progress=False
+        )
