@@ -93,7 +93,7 @@ test_refusals = refusals(
 def test_objectives_without_a_trade_off_are_refused(second):
     """Both are least at one design, which the solver finds twice to its tolerance."""
     bounds = {"D": (2.3, 2.8), "G": (1e-11, 1e-9)}
-    with pytest.raises(ValueError, match="first objective and the least second .* are one design"):
+    with pytest.raises(ValueError, match=r"first objective and the least second .* are one design"):
         fj.pareto(
             fj.brake_scene(), fj.growth_rate, second, bounds=bounds, target=1e5, progress=False
         )
