@@ -10,7 +10,12 @@ import fractaljax as fj
 from fractaljax._base.table import table
 from fractaljax._design.summary import comparison_table
 from fractaljax._dynamics.summary import cycle_table
-from fractaljax._stability.summary import friction_remark, scene_rows, stability_table
+from fractaljax._stability.summary import (
+    friction_remark,
+    scene_rows,
+    stability_table,
+    structure_table,
+)
 from tools import motionless_scene, reference_cycle, reference_scene
 
 BRAKE = fj.brake_scene()
@@ -164,3 +169,21 @@ def test_remarks_on_friction_beyond_its_law_and_a_growth_rate_of_zero():
     # Without damping rounding would decide.
     scene = fj.brake_scene().replace(xi_1=0.0, xi_2=0.0, mu_s=0.01, mu_m=0.01)
     assert "+0  (0 to rounding: it neither grows nor dies out)" in stability_table(scene)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said", "promise"),
+    [
+        ({"G": 1.342e-4}, "carries no stiffness: every contact is plastic", False),
+        ({"D": 2.7}, "has no tangential stiffness: it slips as a whole", False),
+        ({"D": 2.436}, "", True),
+    ],
+)
+def test_a_joint_without_stiffness_is_said_first(changes, said, promise):
+    """With units mistaken the brake seems quiet: it is the mechanism without its joint."""
+    scene = fj.brake_scene().replace(**changes)
+    structure = fj.Structure.from_scene(scene)
+    cycle = fj.limit_cycle(scene, throw=False)
+    for text in (stability_table(scene), cycle_table(scene, cycle), structure_table(structure)):
+        assert said in text.splitlines()[0]
+        assert ("stable against small disturbances" in text) == promise

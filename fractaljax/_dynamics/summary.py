@@ -6,7 +6,7 @@ from .._base.table import table
 from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
 from .._stability.stability import stability
-from .._stability.summary import friction_remark, verdict
+from .._stability.summary import friction_remark, stiffness_remark, verdict
 from .cycle import CycleResult, LimitCycle
 
 _MOST = 12  # degrees of freedom of a structure, and multipliers, that are listed
@@ -20,9 +20,11 @@ _CONTACT_STATES = {
 
 def cycle_table(mechanism: Scene | Structure, cycle: LimitCycle) -> str:
     """The result of the search for one limit cycle, its numbers and its switches."""
-    found = {"result": str(CycleResult[cycle.result])} | verdict(stability(mechanism))
+    lacking = stiffness_remark(mechanism) if isinstance(mechanism, Scene) else []
+    found = {"result": str(CycleResult[cycle.result])}
+    found |= verdict(stability(mechanism), without_joint=bool(lacking))
     if not np.isfinite(cycle.period):
-        return table([""], [found])
+        return "\n".join([*lacking, table([""], [found])])
     whole = found | {
         "period [ms]": f"{cycle.period * 1e3:.6g}",
         "frequency [Hz]": f"{cycle.frequency:.6g}",
@@ -59,7 +61,8 @@ def cycle_table(mechanism: Scene | Structure, cycle: LimitCycle) -> str:
     scene = mechanism
     for direction, share in zip(directions, cycle.stick_fraction, strict=True):
         direction["sticks"] = f"{share:.2%} of the period"
-    tables = [table([""], [whole]), table(["x1, along the belt", "x2, normal to it"], directions)]
+    tables = ["\n".join(lacking)] if lacking else []
+    tables += [table([""], [whole]), table(["x1, along the belt", "x2, normal to it"], directions)]
     switches = [] if regularised else cycle.switches()
     if switches:
         tables.append(_switching(switches, cycle.period))

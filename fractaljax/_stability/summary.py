@@ -11,6 +11,7 @@ from jaxtyping import Array
 from .._base.programs import exported_jit
 from .._base.table import table
 from .._contact.contact import Regime
+from .._contact.fixed import FixedContact
 from .._mechanism.quantities import sliding_friction
 from .._mechanism.scene import Scene, stiffness
 from .._mechanism.structure import Joint, Structure
@@ -111,7 +112,8 @@ def stability_table(scene: Scene, friction_slope: bool = True) -> str:
     modes, K, state, friction = _numbers(scene, friction_slope)
     require_computable(scene, friction_slope, modes)
     critical = float(critical_friction(scene, friction_slope))
-    rows = _rows(scene, modes, K, state) | verdict(modes)
+    lacking = stiffness_remark(scene, K)
+    rows = _rows(scene, modes, K, state) | verdict(modes, without_joint=bool(lacking))
     rows |= {
         "margin": f"{modes.margin:+.6g}",
         "friction at V": f"{friction:.6g}",
@@ -121,10 +123,24 @@ def stability_table(scene: Scene, friction_slope: bool = True) -> str:
         f"eigenvalue {i} [1/s]": f"{s.real:+.6g} {s.imag:+.6g}i"
         for i, s in enumerate(modes.eigenvalues.tolist(), start=1)
     }
-    return "\n".join([table([""], [rows]), *friction_remark(scene, scene.oscillator.V)])
+    lines = [*lacking, table([""], [rows]), *friction_remark(scene, scene.oscillator.V)]
+    return "\n".join(lines)
 
 
-def verdict(modes: Stability) -> dict[str, str]:
+def stiffness_remark(part: Scene | Joint, K=None, name: str = "The joint") -> list[str]:
+    """A line if the law of a contact gives it no stiffness, normal or tangential, else none."""
+    if isinstance(part.contact, FixedContact):  # as it was asked for
+        return []
+    K_n, K_t = map(float, stiffness(part) if K is None and isinstance(part, Scene) else K)
+    if K_n == 0:
+        why = "every contact is plastic" if part.contact.fractal else "its law gives none"
+        return [f"{name} carries no stiffness: {why}. What follows is of the mechanism without it."]
+    if K_t == 0:
+        return [f"{name} has no tangential stiffness: it slips as a whole."]
+    return []
+
+
+def verdict(modes: Stability, without_joint: bool = False) -> dict[str, str]:
     """The growth rate of a scene as a row, and what it means."""
     growth, margin = float(modes.growth_rate) + 0.0, float(modes.margin)
     rounding = _ROUNDING * np.abs(np.asarray(modes.eigenvalues)).max()
@@ -135,6 +151,8 @@ def verdict(modes: Stability) -> dict[str, str]:
         verdict = "0 to rounding: it neither grows nor dies out"
         if margin != 0:
             verdict = f"0 to rounding; by its margin {'it squeals' if margin < 0 else _STABLE}"
+    if without_joint and _STABLE in verdict:
+        verdict = "no promise: see above"
     return {"growth rate [1/s]": f"{growth:+.6g}  ({verdict})"}
 
 
@@ -179,10 +197,16 @@ def structure_table(structure: Structure, friction_slope: bool = True) -> str:
     if not np.isfinite(np.asarray(modes.eigenvalues)).all():
         raise ValueError(f"M, C and K have no eigenvalues in the range of {modes.margin.dtype}")
     unstable, unresolved = modes.unstable(), modes.unresolved()
+    lacking = [
+        line
+        for name, joint in zip(structure.joint_names, structure.joints, strict=True)
+        for line in stiffness_remark(joint, joint.stiffness(), f"Joint {name}")
+    ]
+    meaning = _structure_verdict(modes, unstable, unresolved, lacking)
     whole = {
         "degrees of freedom": f"{structure.n}",
         **{name: f"{value:.6g}" for name, value in structure.parameters.items()},
-        "unstable modes": f"{len(unstable)}  ({_structure_verdict(modes, unstable, unresolved)})",
+        "unstable modes": f"{len(unstable)}  ({meaning})",
         "growth rate [1/s]": f"{modes.growth_rate:+.6g}  (to +-{modes.resolution:.1g})",
         "least damping ratio": f"{modes.margin:+.6g}",
     }
@@ -205,7 +229,7 @@ def structure_table(structure: Structure, friction_slope: bool = True) -> str:
         titles = [f"mode {i}" for i in range(1, len(listed) + 1)]
         cells = zip(*(_mode_cells(*item) for item in listed), strict=True)
         tables.append(table(columns, [dict(zip(titles, c, strict=True)) for c in cells]))
-    return "\n\n".join(tables)
+    return "\n\n".join([*["\n".join(lacking)] * bool(lacking), *tables])
 
 
 def _forces(x: Assembled | Stability) -> list[float]:
@@ -218,14 +242,15 @@ def _mode_cells(mode, remark) -> list[str]:
     return [f"{mode.frequency:.6g}", *numbers, f"{mode.largest}", remark]
 
 
-def _structure_verdict(modes, unstable, unresolved) -> str:
+def _structure_verdict(modes, unstable, unresolved, lacking) -> str:
     rigid = np.asarray(modes.resolutions)[np.asarray(modes.eigenvalues) == 0]
     also = [f"{len(unresolved)} unresolved"] if unresolved else []
     if rigid.size:
         also.append(f"{rigid.size} eigenvalues 0 to +-{rigid.max():.1g} 1/s: rigid bodies")
     if unstable:
         return "; ".join(["it squeals", *also])
-    return "; ".join([*also, f"else {_STABLE}" if also else _STABLE])
+    stable = "no promise: see above" if lacking else _STABLE
+    return "; ".join([*also, f"else {stable}" if also else stable])
 
 
 def _joint_rows(joint: Joint) -> dict[str, str]:
