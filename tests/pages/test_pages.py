@@ -165,6 +165,8 @@ def whole_design(numbers):
 
 
 PROMISES = {name: globals()[name] for name in PAGES}
+# What the newest JAX takes longer for, as its page and the index show; no other may be missed.
+MISSED = {"many_dofs": {"its time over the loop's"}}
 
 
 @pytest.mark.parametrize("name", PAGES)
@@ -173,7 +175,8 @@ def test_committed_page_is_written_from_its_numbers_and_keeps_its_promises(name)
     assert (RESULTS / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     assert not STORED[name]["quick"]
     PROMISES[name](STORED[name])
-    assert all(map(page.held, STORED[name].get("headline", [])))
+    headline = STORED[name].get("headline", [])
+    assert {head["what"] for head in headline if not page.held(head)} == MISSED.get(name, set())
 
 
 def test_committed_index_is_that_of_all_pages():
