@@ -110,7 +110,8 @@ def _parsed(text: str) -> ast.expr:
 def _value(node: Any, p: Parameters) -> Any:
     match node:
         case ast.Constant():
-            return float(node.value)  # a power of whole numbers has no end
+            number: Any = node.value
+            return float(number)  # a power of whole numbers has no end
         case ast.Name():
             if node.id in p:
                 return p[node.id]

@@ -2,7 +2,7 @@
 
 import functools
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -127,11 +127,13 @@ def stability_table(scene: Scene, friction_slope: bool = True) -> str:
     return "\n".join(lines)
 
 
-def stiffness_remark(part: Scene | Joint, K=None, name: str = "The joint") -> list[str]:
+def stiffness_remark(part: Scene | Joint, K: Any = None, name: str = "The joint") -> list[str]:
     """A line if the law of a contact gives it no stiffness, normal or tangential, else none."""
     if isinstance(part.contact, FixedContact):  # as it was asked for
         return []
-    K_n, K_t = map(float, stiffness(part) if K is None and isinstance(part, Scene) else K)
+    if K is None and isinstance(part, Scene):
+        K = stiffness(part)
+    K_n, K_t = map(float, K)
     if K_n == 0:
         why = "every contact is plastic" if part.contact.fractal else "its law gives none"
         return [f"{name} carries no stiffness: {why}. What follows is of the mechanism without it."]

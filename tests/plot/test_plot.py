@@ -334,7 +334,7 @@ def test_all_that_is_a_number_is_drawn(draw):
         for ax in (draw(whole), lacking)
     )
     np.testing.assert_array_equal(own.levels, filled.levels)
-    areas = [sum(len(path.vertices) for path in x.get_paths()) for x in (own, filled)]
+    areas = [sum(np.shape(path.vertices)[0] for path in x.get_paths()) for x in (own, filled)]
     assert areas[0] > 0.8 * areas[1]
 
 
