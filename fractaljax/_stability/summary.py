@@ -131,9 +131,8 @@ def stiffness_remark(part: Scene | Joint, K: Any = None, name: str = "The joint"
     """A line if the law of a contact gives it no stiffness, normal or tangential, else none."""
     if isinstance(part.contact, FixedContact):  # as it was asked for
         return []
-    if K is None and isinstance(part, Scene):
-        K = stiffness(part)
-    K_n, K_t = map(float, K)
+    pair: Any = stiffness(part) if K is None and isinstance(part, Scene) else K
+    K_n, K_t = map(float, pair)
     if K_n == 0:
         why = "every contact is plastic" if part.contact.fractal else "its law gives none"
         return [f"{name} carries no stiffness: {why}. What follows is of the mechanism without it."]
