@@ -74,8 +74,8 @@ def exported_jit(function: Callable, static_argnames: str | tuple[str, ...] = ()
 
     @functools.wraps(jitted)
     def call(*args, **kwargs):
-        traced = any(isinstance(x, Tracer) for x in jax.tree.leaves((args, kwargs)))
-        if _folder is None or traced or jax.device_count() > 1:
+        inside = any(isinstance(x, Tracer) for x in jax.tree.leaves((args, kwargs)))
+        if _folder is None or inside or jax.device_count() > 1:
             return jitted(*args, **kwargs)
         arguments = signature.bind(*args, **kwargs).arguments
         fixed = {name: arguments.pop(name) for name in static if name in arguments}
@@ -83,7 +83,8 @@ def exported_jit(function: Callable, static_argnames: str | tuple[str, ...] = ()
         kinds = tuple((x.shape, x.dtype, x.weak_type) for x in map(jax.typeof, leaves))
         key = function, tuple(fixed.items()), tree, kinds
         if key not in _programs:
-            _programs[key] = _find(_folder, key) or functools.partial(_traced, jitted, tree, fixed)
+            traced = functools.partial(_traced, jitted, tree, fixed)
+            _programs[key] = _find(_folder, key, traced) or traced
         return _programs[key](*leaves)
 
     return call
@@ -93,7 +94,7 @@ def _traced(jitted: Callable, tree, fixed: dict[str, Any], *leaves) -> Any:
     return jitted(**jax.tree.unflatten(tree, leaves), **fixed)
 
 
-def _find(folder: Path, key) -> Callable | None:
+def _find(folder: Path, key, program: Callable) -> Callable | None:
     """The program from its file, which is written if there is none; None where it cannot be."""
     function, fixed, tree, kinds = key
     with contextlib.suppress(ValueError):  # a class whose code the file's name would not know
@@ -103,9 +104,8 @@ def _find(folder: Path, key) -> Callable | None:
         file = folder / hashlib.sha256(name.encode()).hexdigest()
         with contextlib.suppress(OSError, ValueError):
             return _read(file)
-        jitted = jax.jit(function, static_argnames=[*dict(fixed)])
         with contextlib.suppress(OSError, NotImplementedError):
-            _write(file, functools.partial(_traced, jitted, tree, dict(fixed)), kinds)
+            _write(file, program, kinds)
             return _read(file)
     return None
 

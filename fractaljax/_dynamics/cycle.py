@@ -194,9 +194,15 @@ class LimitCycle(Record):
     def _shown(self) -> Iterator[str]:
         yield from super()._shown()
         if concrete(self.period) is not None:
-            for name in ("amplitude", "velocity_min", "velocity_max", "normal_force"):
-                yield f"{name}={np.asarray(getattr(self, name))!r}"
-            for name in ("stick_fraction", "open_fraction", "tension_fraction"):
+            for name in (
+                "amplitude",
+                "velocity_min",
+                "velocity_max",
+                "normal_force",
+                "stick_fraction",
+                "open_fraction",
+                "tension_fraction",
+            ):
                 yield f"{name}={np.asarray(getattr(self, name))!r}"
 
     @property
