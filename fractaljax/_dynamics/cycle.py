@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from .._base.parts import Record, concrete, nan_where
+from .._base.parts import Record, concrete
 from .._base.programs import exported_jit
 from .extremes import extreme_values, time_below_zero
 from .hybrid import NONE, OPEN, UNUSED, HybridSystem
@@ -348,7 +348,9 @@ def _of_orbit(orbit, system: HybridSystem, period, what: str) -> Any:
     """What a method of an orbit says: of one cycle, or of each of a batch; NaN without a cycle."""
 
     def of_one(orbit, system, period):
-        return nan_where(~jnp.isfinite(period), getattr(orbit, what)(system))
+        exists, found = jnp.isfinite(period), getattr(orbit, what)(system)
+        # A choice, as of `period`: its derivative without a cycle is 0, which a batch can select.
+        return jax.tree.map(lambda x: jnp.where(exists, x, jnp.nan), found)
 
     for _ in range(period.ndim):
         of_one = jax.vmap(of_one)
