@@ -27,7 +27,7 @@ from ._base.singular import safe_divide
 LAWS: dict[str, type["Friction"]] = {}  # by their names in files
 
 _FASTEST = 100.0  # m/s: a law is followed up to there for its least value
-_SPEEDS = np.concatenate([[0.0], np.geomspace(1e-6, _FASTEST, 161)])
+SPEEDS = np.concatenate([[0.0], np.geomspace(1e-6, _FASTEST, 161)])  # [m/s]
 _BISECTIONS = 60
 
 
@@ -151,7 +151,7 @@ def _dtype(law: Friction) -> Any:
 def _least(law: Friction) -> Numbers:
     """The least value of mu up to 100 m/s, at least 0; differentiable with its place."""
     fixed = jax.tree.map(jax.lax.stop_gradient, law)
-    speeds = jnp.asarray(_SPEEDS, _dtype(law))
+    speeds = jnp.asarray(SPEEDS, _dtype(law))
     place = jnp.argmin(jax.vmap(fixed.mu)(speeds), axis=0)
     ends = speeds[jnp.maximum(place - 1, 0)], speeds[jnp.minimum(place + 1, len(speeds) - 1)]
 

@@ -10,7 +10,7 @@ from .cycle import SQUARINGS
 from .events import Cubic
 from .hybrid import SECTION, HybridSystem
 from .lanes import log_spectral_radius
-from .orbit import PeriodicOrbit, return_jacobian
+from .orbit import PeriodicOrbit
 from .segments import Segments, cumulative, next_start
 
 HARDLY = 1e-3  # growth in a period up to which an orbit that repels is kept
@@ -60,14 +60,9 @@ def growth_of(system: HybridSystem, orbit: PeriodicOrbit) -> Float[Array, " g"]:
     The multipliers of an excitation, which are 1, are none of the mechanism's. Without an orbit it
     is not a number.
     """
-    nothing = jnp.full_like(orbit.error, jnp.nan)
-
-    def exactly():
-        jacobian = return_jacobian(system, orbit.segments)
-        jacobian = jnp.swapaxes(system.own(jnp.swapaxes(system.own(jacobian), 0, 1)), 0, 1)
-        return jnp.where(orbit.converged, log_spectral_radius(jacobian, SQUARINGS), nothing)
-
-    return jax.lax.cond(jnp.any(orbit.converged), exactly, lambda: nothing)
+    own = system.own(jnp.swapaxes(system.own(orbit.jacobian), 0, 1))
+    log = log_spectral_radius(jnp.swapaxes(own, 0, 1), SQUARINGS)
+    return jnp.where(orbit.converged, log, jnp.nan)
 
 
 def has_shorter_period(orbit: Segments, returns) -> Bool[Array, " g"]:

@@ -17,7 +17,7 @@ from .hybrid import OPEN, HybridSystem
 from .record import ENDED, RETURNED, TIME, WEIGHT, Record
 from .segments import Segments
 
-RUNNING, CONVERGED, EQUILIBRIUM, DIVERGED, NOT_PERIODIC, EXHAUSTED, TOO_LONG = range(7)
+RUNNING, CONVERGED, EQUILIBRIUM, DIVERGED, NOT_PERIODIC, EXHAUSTED, TOO_LONG, NOT_FINITE = range(8)
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,6 @@ class SearchOptions:
     small: float = 1e-2  # size below which any decay without switches does
     still: float = 1e-6  # size, or with a joint open rate of change, below which it is at rest
     extrapolated: float = 0.02  # growth in a return, without switches, that is extrapolated
-    divergence: float = 1e6  # size at which a motion diverges: with a small V, many V are ordinary
     nearly: float = 0.02  # gap below which returns nearly repeat, relative
     settles: float = 0.95  # factor by which gaps shrink in a quarter of a run that does
     repeats: float = 1e-6  # gap between returns of a motion that has settled, relative
@@ -111,6 +110,7 @@ def assess(
     orbit: Segments,
     rounds,
     equilibrium,
+    bound,
     growth,
     max_returns,
     h,
@@ -133,8 +133,6 @@ def assess(
     # --- near the equilibrium ---
     away = jnp.sqrt(jnp.sum((seen - equilibrium[:, None]) ** 2, axis=0))
     size = jnp.sqrt(jnp.sum((record.y - equilibrium) ** 2, axis=0)) + tiny
-    largest = jnp.max(jnp.abs(equilibrium), axis=0)
-    diverged = ~(size < options.divergence * (1 + largest))
     # The last three returns without a switch between them.
     smooth = exists[3] & (record.past(ENDED, at[3], lane) == -3)
     log = jnp.log(away[:3] + tiny)
@@ -149,7 +147,10 @@ def assess(
         # With a joint open there is another equilibrium.
         change = jnp.max(jnp.abs(system.field(record.y, record.s)), axis=0)
         decays = decays | (jnp.any(record.s == OPEN, axis=0) & (change < options.still))
-    status = jnp.where(diverged, DIVERGED, jnp.where(decays, EQUILIBRIUM, RUNNING))
+    status = jnp.where(decays, EQUILIBRIUM, RUNNING)
+    largest = jnp.max(jnp.abs(record.y), axis=0)
+    status = jnp.where(largest > bound, DIVERGED, status)
+    status = jnp.where(jnp.isnan(largest), NOT_FINITE, status)
     # Amplitude extrapolation: a slow, steady change without switches skips many returns, but at
     # most half of the change that is left if it slows down geometrically.
     slower = jnp.maximum(jnp.abs(rate_before) - jnp.abs(rate), 1e-300)

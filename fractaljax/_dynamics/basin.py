@@ -22,7 +22,6 @@ from .._base.parts import Record, concrete, flag, whole
 from .._base.programs import exported_jit
 from .._base.table import table
 from .._mechanism.mechanism import Mechanism
-from .assessment import SearchOptions
 from .cycle import CycleResult, LimitCycle
 from .events import step
 from .excitation import Excitation, compiled_system
@@ -45,7 +44,8 @@ _NEAR = 0.02  # and below which few rounds of it are enough
 _FEW, _STAYS = 3, 8  # rounds of approach, or near without approach
 _PATIENCE = 8  # rounds without a label after which a start is searched in full
 _FAILURES = 8  # full searches without an orbit; then all others are left to the coarse run
-_RUNNING, _EQUILIBRIUM, _DIVERGES, _UNDECIDED = -1, -2, -3, -4  # a cycle has its number
+# A cycle has its number.
+_RUNNING, _EQUILIBRIUM, _DIVERGES, _UNDECIDED, _LOST = -1, -2, -3, -4, -5
 
 
 class Basin(Record):
@@ -131,10 +131,11 @@ class _Modes(eqx.Module):
     inverse: Complex[Array, "2n 2n"]
     reach: Float[Array, "g 2n"]  # what each mode takes of the way to every switch
     attracts: Bool[Array, ""]
+    bound: Float[Array, ""]  # beyond which a motion diverges
     free: bool = eqx.field(static=True)  # not excited: only then is there an equilibrium
 
     @classmethod
-    def of(cls, system: HybridSystem) -> "_Modes":
+    def of(cls, system: HybridSystem, starts) -> "_Modes":
         n, (equilibrium, A, closures, normals) = system.n, map(np.asarray, _linearised(system))
         values, vectors = map(np.asarray, np.linalg.eig(A))
         T = np.eye(n) if system.T is None else np.asarray(system.T)
@@ -143,6 +144,7 @@ class _Modes(eqx.Module):
         rows.append(normals[opens] @ vectors[:n] / closures[opens, None])
         inverse, reach = np.linalg.inv(vectors), abs(np.concatenate(rows))
         arrays = equilibrium, values, vectors, inverse, reach, np.real(values).max() < 0
+        arrays = *arrays, system.bound(starts.ravel(), equilibrium)
         return cls(*map(jnp.asarray, arrays), free=not system.excited)
 
     def amplitudes(self, y) -> Array:
@@ -188,7 +190,7 @@ def _advance(system: HybridSystem, modes: _Modes, lanes: _Lanes) -> _Lanes:
 
     def one(_, carry):
         y, s, guard, seen, returns, switches = carry
-        y, s, _, guard, _ = step(system, y, s, guard, h)
+        y, s, _, guard, *_ = step(system, y, s, guard, h)
         returned = guard == SECTION
         seen = jnp.where(returned[None], y, seen)
         return y, s, guard, seen, returns + returned, switches + (guard > 0)
@@ -248,8 +250,7 @@ def _decay(modes: _Modes, lanes: _Lanes):
 def _label(modes: _Modes, lanes: _Lanes, returned, points, owners) -> _Lanes:
     """The lanes after a round, labelled where their end is known."""
     centre = modes.equilibrium[:, None]
-    size = jnp.max(jnp.abs(lanes.y - centre), axis=0)
-    far = ~(size < SearchOptions.divergence * (1 + jnp.max(jnp.abs(modes.equilibrium))))
+    size = jnp.max(jnp.abs(lanes.y), axis=0)
     decays, lanes = _decay(modes, lanes)
     gaps = jnp.max(jnp.abs(lanes.seen[:, None] - points[:, :, None]), axis=0)
     owner = owners[jnp.argmin(gaps, axis=0)]
@@ -271,7 +272,7 @@ def _label(modes: _Modes, lanes: _Lanes, returned, points, owners) -> _Lanes:
         distance=since(distance, lanes.distance),
         approach=since(approach, lanes.approach),
         near=since(near, lanes.near),
-        label=jnp.where(far, _DIVERGES, label),
+        label=jnp.where(size > modes.bound, _DIVERGES, jnp.where(jnp.isnan(size), _LOST, label)),
     )
 
 
@@ -376,9 +377,8 @@ def basin(
     tolerance = check_rtol(rtol, dtype)
     max_returns, progress = whole("max_returns", max_returns, 1), flag("progress", progress)
     given = starts_of(system, n, low, high, starts, whole("seed", seed, 0), radius)
-    modes = _Modes.of(system)
     y = system.with_excitation(jnp.asarray(given.T / np.asarray(system.units)[:, None], dtype), 0.0)
-    lanes = jax.tree.map(np.array, _first(system, y))
+    lanes, modes = jax.tree.map(np.array, _first(system, y)), _Modes.of(system, y)
     options: dict[str, Any] = {"excitation": excitation, "rtol": tolerance, "throw": False}
     known, reasons = _Known(2 * system.n), {}
     search = functools.partial(limit_cycle, mechanism, max_returns=max_returns, **options)
@@ -407,6 +407,9 @@ def _label_all(system, lanes, known, reasons, search, modes, max_returns, progre
                     jax.tree.leaves(lanes), jax.tree.leaves(result), strict=True
                 ):
                     whole_array[..., chunk] = np.asarray(piece)[..., : len(chunk)]
+            lost = np.flatnonzero(lanes.label == _LOST)
+            lanes.label[lost] = _UNDECIDED
+            reasons |= dict.fromkeys(lost.tolist(), CycleResult.not_finite)
             left = lanes.label == _RUNNING
             over = left & ((lanes.returns >= max_returns) | (lanes.rounds >= max_returns))
             lanes.label[over] = _UNDECIDED

@@ -15,7 +15,7 @@ from .._base.programs import exported_jit
 from .extremes import extreme_values, time_below_zero
 from .hybrid import NONE, OPEN, UNUSED, HybridSystem
 from .lanes import log_spectral_radius, product
-from .maps import maps
+from .maps import exact_maps
 from .segments import Segments, flow, mean_square, next_start
 
 SQUARINGS = 40  # of a monodromy matrix
@@ -36,6 +36,9 @@ class CycleResult(eqx.Enumeration):
     unstable = "a limit cycle was found, but it repels: nearby motions leave it"
     equilibrium = "the motion dies out: the sliding equilibrium attracts it"
     diverged = "the motion grows beyond all bounds"
+    not_finite = (
+        "the motion is not a number, as some number of the mechanism or of the start is not"
+    )
     too_long = "a period takes more steps than are kept: ask for more segments"
     not_periodic = "the motion does not repeat within 16 returns (a longer period, or none)"
     too_stiff = (
@@ -140,7 +143,7 @@ class Orbit(eqx.Module):
     def monodromy(self, system: HybridSystem) -> Float[Array, "2n 2n"]:
         """The product of all segments' maps, with the jump of the tangent at every switch."""
         segments = self.segments
-        _, local = maps(system, segments)
+        local = exact_maps(system, segments)
         ends, s = next_start(segments.y), segments.s
         before, after = system.field(ends, s), system.field(ends, jnp.roll(s, -1, axis=-1))
         switches = segments.used & (segments.guard != NONE)

@@ -122,20 +122,18 @@ def step(system: HybridSystem, y, s, last, h, reach=None):
 
     `last` is the guard that ended the step before: a section just crossed is not crossed again.
     Returns the state and contact state after it, its length, the number of the guard that ended it
-    or `NONE`, and the reach of the next step. States inside the step are those of the cubic through
-    its ends.
+    or `NONE`, by how much friction made it shorter, and the reach of the next step. States inside
+    the step are those of the cubic through its ends.
 
     Of a system whose steps follow the motion `reach` (...) is the length that has the error of a
     step h of a harmonic motion with frequency 1.
     """
-    stiff = 2 * system.stiffness(y, s)
     unit, allowed = h if reach is None else h / system.fastest, (0.9 * h) ** 4 / 72
-    if reach is None:
-        h = h / jnp.maximum(1, stiff)
-    else:
-        h = jnp.minimum(jnp.minimum(reach, STABLE * unit), h / jnp.maximum(stiff, 1e-6))
-    step = h[None]
     f_0 = system.field(y, s)
+    usual = jnp.broadcast_to(h, y.shape[1:])
+    longest = usual if reach is None else jnp.minimum(reach, STABLE * unit)
+    h = system.step_length(y, s, f_0, longest, usual)
+    shorter, step = jnp.where(h < longest, usual / h, 0), h[None]
     f_b = system.field(y + step / 2 * f_0, s)
     f_c = system.field(y + step / 2 * f_b, s)
     f_d = system.field(y + step * f_c, s)
@@ -169,7 +167,7 @@ def step(system: HybridSystem, y, s, last, h, reach=None):
         reach = h * jnp.clip((size / jnp.maximum(error, 1e-300)) ** 0.25, 0.2, 2.2)
         reach = jnp.minimum(reach, MOST * unit)
     y_end = system.with_unit_excitation(y_end)
-    return y_end, s_end, jnp.where(hit, theta, 1) * h, guard, reach
+    return y_end, s_end, jnp.where(hit, theta, 1) * h, guard, shorter, reach
 
 
 def guards_and_rates(system: HybridSystem, y, s, h, f) -> tuple[Array, Array]:

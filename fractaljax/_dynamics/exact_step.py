@@ -91,7 +91,7 @@ def _event(system: HybridSystem, y, s, h, g_0, g_1, d_0, d_1):
 
 def _smooth_step(system: HybridSystem, y, s, longest, left, rtol):
     """A step in contact state s, as long as rtol allows: the state it ends in, and its length."""
-    h = jnp.minimum(longest / jnp.maximum(1, 2 * system.stiffness(y, s)), left)
+    h = jnp.minimum(system.step_length(y, s, system.field(y, s), longest, longest), left)
     allowed = rtol * (1 + jnp.max(jnp.abs(y)))
 
     def step(h):

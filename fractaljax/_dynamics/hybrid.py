@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._contact.load_curve import LoadTable, loaded_equilibrium
-from .._friction import Friction
+from .._friction import SPEEDS, Friction
 from .lanes import SMALL, first_least, product, row_numbers, rows, solve, solve_positive
 
 OPEN = 2
@@ -28,6 +28,9 @@ OPEN = 2
 SECTION, NONE, UNUSED = 0, -1, -2
 _SMOOTH = 1e-4  # of the way to the opening: nearer, what a load curve adds is below rounding
 FEW = 4  # degrees of freedom up to which a product is a sum, which compiles into one loop
+_FAR = 1e6  # factor by which a motion grows that diverges: of a small V, many are ordinary
+_HALVINGS = 48  # of the unit of velocity, to where a law can be continued below w = 0
+_TRIALS = 4.0 ** -np.arange(6)  # shares of a step at which the steepness ahead is looked at
 
 
 def _traced_once(method: Callable) -> Callable:
@@ -74,6 +77,31 @@ class HybridSystem(eqx.Module):
     # cent: steps then follow the motion, as far as that allows. None: steps are those of rate 1.
     fastest: Float[Array, ""] | None = None
     products: Products | None = None  # of a structure
+    # How far below w = 0 each face's law is continued, and its steepest slope at any speed. None:
+    # no law depends on the velocity.
+    below: Float[Array, " f"] | None = None
+    steepest: Float[Array, " f"] | None = None
+
+    def with_steps_of_laws(self) -> "HybridSystem":
+        """With what steps need of laws that depend on the velocity.
+
+        Below w = 0 a law goes on while mu is between 0 and 2 mu_s, and is constant beyond: a coarse
+        step may overshoot to there, where the formula of a law may be anything.
+        """
+        if not any(law.velocity_dependent for law in self.laws):
+            return self
+        shares = jnp.asarray(2.0 ** -np.arange(_HALVINGS), self.V.dtype)
+        speeds = jnp.asarray(SPEEDS, self.V.dtype)
+
+        def numbers(law, one):
+            mu = law.mu(-self.speed * shares)
+            inside = ((mu >= 0) & (mu <= 2 * law.mu_s)).astype(shares.dtype)
+            below = jnp.max(jax.lax.cummin(inside, reverse=True) * shares)
+            return one * jnp.stack([below, self.speed * jnp.max(jnp.abs(law.slope(speeds)))])
+
+        one = jnp.ones_like(self.P)
+        below, steepest = jax.lax.stop_gradient(self._each(numbers, one)).T
+        return replace(self, below=below, steepest=self._own(steepest))
 
     def with_products(self) -> "HybridSystem":
         """With them, if its faces have directions of their own; K and C are matrices then."""
@@ -117,8 +145,17 @@ class HybridSystem(eqx.Module):
     @property
     def largest_force(self) -> Array:
         """The largest acceleration by the constant and the harmonic forces."""
-        constant = jnp.max(jnp.abs(self.F))
-        return constant + jnp.max(jnp.abs(self.K[:-1, -1])) if self.excited else constant
+        constant = jnp.max(jnp.abs(self.F), axis=0)
+        if not self.excited:
+            return constant
+        return constant + jnp.max(jnp.abs(self.K[:-1, -1]), axis=0)
+
+    def bound(self, y, equilibrium) -> Array:
+        """The size (...) that a motion from y (2n, ...) passes only where it diverges."""
+        size = 1 + jnp.max(jnp.abs(y), axis=0)
+        size = size + jnp.max(jnp.where(jnp.isfinite(equilibrium), jnp.abs(equilibrium), 0), axis=0)
+        # At resonance an excitation may move far more than its force does at rest.
+        return _FAR * (size + self.largest_force if self.excited else size)
 
     def with_excitation(self, y, t) -> Array:
         """States (2n, ...) of the mechanism at the times t (...), with z = cos(Omega t)."""
@@ -271,14 +308,12 @@ class HybridSystem(eqx.Module):
         return self._by_laws(self.sliding(y[self.n :]), self.loads(y[: self.n]), signs)
 
     def _by_laws(self, w, loads, signs) -> Array:
-        def force(law, w, load, sign):
-            if law.velocity_dependent:
-                # A coarse step may overshoot far beyond w = 0, where a law means nothing.
-                side = jnp.sign(sign)
-                w = side * jnp.maximum(side * w, -1)
-            return law.branch(self.speed * w, sign) * load
-
-        return self._each(force, w, loads, signs)
+        if self.below is not None:
+            side = jnp.sign(signs)
+            w = side * jnp.maximum(side * w, -self._leaf(self.below, w.ndim - 1))
+        return self._each(
+            lambda law, w, load, sign: law.branch(self.speed * w, sign) * load, w, loads, signs
+        )
 
     def _slipping(self, y, s) -> Array:
         """The friction forces of slipping faces (f, ...), 0 elsewhere."""
@@ -382,24 +417,57 @@ class HybridSystem(eqx.Module):
             found.append(jnp.where(opened, -closures, closures))
         return jnp.concatenate(found)
 
-    def stiffness(self, y, s, closing: float = 1 / 16) -> Array:
-        """A rate (...) above which no step should be as long as its inverse, in addition to K's.
+    def crowding(self, y, s) -> Array:
+        """By how much shorter than elsewhere segments should be where load curves bend (...)."""
+        return 2 * self._of_curves(y, s, 1 / 4)
 
-        The largest at which friction alone changes velocities of slipping faces: far from
-        equilibrium it exceeds every other rate. And that of load curves. Zero without both.
-        """
-        of_curves = self._of_curves(y, s, closing)
-        if not any(law.velocity_dependent for law in self.laws):
-            return of_curves
-        w, loads = self.sliding(y[self.n :]), self.loads(y[: self.n])
-        rates = self._each(
-            lambda law, w, load: self.speed * law.slope(self.speed * w) * load, w, loads
+    def _own(self, forces) -> Array:
+        """What each of the forces (f, ...) on the faces accelerates that face by itself."""
+        if self.T is None or self.B is None:
+            return forces
+        return forces * self._leaf(
+            jnp.sum(self.T * jnp.swapaxes(self.B, 0, 1), axis=1), forces.ndim - 1
         )
-        if self.T is not None and self.B is not None:
-            own = jnp.sum(self.T * jnp.swapaxes(self.B, 0, 1), axis=1)
-            rates = rates * self._leaf(own, y.ndim - 1)
-        rates = jnp.where(jnp.abs(s) == 1, jnp.abs(rates), 0)
-        return jnp.maximum(jnp.max(rates, axis=0), of_curves)
+
+    def step_length(self, y, s, rate, longest, allowed) -> Array:
+        """The length (...) of a step, at most `longest`, that is `allowed`/2 at a stiffness of 1.
+
+        `rate` is dy/dt. The stiffness is the largest rate at which load curves change, or at which
+        friction alone changes the velocity of a slipping face, at any velocity that the step can
+        reach: far from equilibrium it exceeds every other rate, and a law may fall within a small
+        part of the way to w = 0.
+        """
+        least = allowed / longest
+        step = allowed / jnp.maximum(least, 2 * self._of_curves(y, s, 1 / 16))
+        if self.below is None or self.steepest is None:
+            return step
+        u, loads = y[self.n :], self.loads(y[: self.n])
+        loads = self._own(jnp.where(jnp.abs(s) == 1, jnp.abs(loads), 0))
+        bound = jnp.max(self._leaf(self.steepest, u.ndim - 1) * loads, axis=0)
+
+        def shortened():
+            w, change = jnp.abs(self.sliding(u)), jnp.abs(self.along(rate[self.n :]))
+            trials = jnp.multiply.outer(jnp.asarray(_TRIALS, y.dtype), longest)
+            # No eigenfrequency exceeds 1, so that accelerations change by about the velocities.
+            bend = (1 + jnp.max(jnp.abs(u), axis=0)) / 2
+            ways = (change[None] + (trials * bend[None])[:, None]) * trials[:, None]
+            speeds = jnp.concatenate([jnp.maximum(w[None] - ways, 0), w[None], w[None] + ways])
+            rates = jax.vmap(lambda w: self._steepness(w, loads))(speeds)
+            slower, here, faster = jnp.split(rates, [len(trials), len(trials) + 1])
+            most = jnp.maximum(here, jnp.maximum(slower, faster))
+            most = jax.lax.cummax(most, reverse=True)
+            steps = jnp.minimum(trials, allowed[None] / jnp.maximum(least[None], 2 * most))
+            return jnp.minimum(step, jnp.max(steps, axis=0))
+
+        return jax.lax.cond(jnp.any(2 * bound * longest > allowed), shortened, lambda: step)
+
+    def _steepness(self, w, loads) -> Array:
+        """The largest rate (...) at which friction at |w| (f, ...) changes that; 0 of no load."""
+
+        def rate(law, w, load):
+            return jnp.abs(self.speed * law.slope(self.speed * w)) * load
+
+        return jnp.max(self._each(rate, w, loads), axis=0)
 
     def _of_curves(self, y, s, closing: float) -> Array:
         """The largest rate (...) at which load curves change; 0 without any.

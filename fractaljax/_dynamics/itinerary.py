@@ -73,11 +73,11 @@ class Family:
         self.segments = 0  # so far: no fewer later, since another number is compiled anew
 
     def sampled(self, orbit: Solution, times, places: int):
-        """States (2n, places) of an orbit at times, and the rates of friction there."""
+        """States (2n, places) of an orbit at times, and by how much segments should be shorter."""
         period = orbit.u[2 * self.n : -1].sum()
         wrapped = jnp.asarray(np.mod(times, period))
         given = orbit.x, self.window, orbit.chain, orbit.lifted, orbit.u
-        return resampled(*given, wrapped, places=places)
+        return resampled(*given, wrapped, self.h, places=places)
 
     def linearised(self, q) -> tuple[np.ndarray, np.ndarray]:
         """The sliding equilibrium (2n,) and the Jacobian (2n, 2n) of the field there."""
@@ -165,12 +165,18 @@ class Shooting:
     def _mesh(self, old, times):
         """The chain of segments, equal in each phase where friction counts, and their starts."""
         starts, lengths = times[:-1], np.diff(times)
-        fine = np.linspace(0, 1, _SAMPLES, endpoint=False)
         span = times[-1] - times[0]
-        _, stiff = self.family.sampled(old, times[0] + fine * span, _SAMPLES)
-        density = np.maximum(1, 2 * np.asarray(stiff))
-        total = np.concatenate([[0.0], np.cumsum(density) * span / _SAMPLES])
         clock = np.linspace(0, span, _SAMPLES + 1)
+        if self.family.template.below is not None:
+            # Where a law falls within a small part of the velocity the old segments are short.
+            phase, begin = np.asarray(old.chain.phase), np.asarray(old.chain.begin)
+            known = old.times[phase] + begin * np.diff(old.times)[phase]
+            known = np.clip(np.mod(known - times[0], old.times[-1]), 0, span)
+            clock = np.sort(np.concatenate([clock, known]))
+        _, density = self.family.sampled(old, times[0] + clock, len(clock))
+        density = np.maximum(1, np.asarray(density))
+        steps = np.maximum(density[1:], density[:-1]) * np.diff(clock)
+        total = np.concatenate([[0.0], np.cumsum(steps)])
         weight = np.interp(times - times[0], clock, total)
         counts = np.maximum(1, np.ceil(np.diff(weight) / self.family.h - 1e-6)).astype(int)
         N = self.family.segments = max(self.family.segments, bucket(counts.sum(), 64))

@@ -38,6 +38,7 @@ _RESULTS = (
     CycleResult.not_periodic,
     CycleResult.exhausted,
     CycleResult.too_long,
+    CycleResult.not_finite,
 )
 
 

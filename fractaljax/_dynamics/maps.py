@@ -27,12 +27,12 @@ class Maps(eqx.Module):
     c: Float[Array, "2n N ..."]  # of the guard by the state it ends in; 0 where none ends it
 
 
-def maps(system: HybridSystem, segments: Segments) -> tuple[Array, Maps]:
-    """The ends of the segments and their derivatives."""
+def exact_maps(system: HybridSystem, segments: Segments) -> Maps:
+    """Derivatives of the segments, as exact as their steps are."""
     # The stages of many degrees of freedom fill the cache: one segment at a time.
     size = len(segments.duration) if system.fastest is None else 1
-    ends, A, b = in_blocks(functools.partial(_maps, system), unmoved, size, segments)
-    return ends, Maps(A, b, _guard_slopes(system, segments))
+    _, A, b = in_blocks(functools.partial(_maps, system), unmoved, size, segments)
+    return Maps(A, b, _guard_slopes(system, segments))
 
 
 def coarse_maps(system: HybridSystem, segments: Segments) -> Maps:

@@ -18,7 +18,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from .hybrid import NONE, HybridSystem
 from .lanes import chosen, product, solve
-from .maps import Maps, axis_of, coarse_maps, in_blocks, maps, segments_together
+from .maps import Maps, axis_of, coarse_maps, exact_maps, in_blocks, segments_together
 from .segments import Segments, chosen_guard, flow, next_start
 
 _ITERATIONS = 20
@@ -119,13 +119,15 @@ class PeriodicOrbit(eqx.Module):
     converged: Bool[Array, " g"]
     error: Float[Array, " g"]  # of period and states, relative, estimated by halving the steps
     middle: Float[Array, "2n N g"]  # states halfway through the segments
+    jacobian: Float[Array, "2n 2n g"]  # of the return map
 
     @classmethod
     def none(cls, segments: Segments) -> "PeriodicOrbit":
         """None yet; of the shapes that belong to those segments."""
         y = segments.y
         zero = jnp.zeros_like(y[0, 0])
-        return cls(segments, zero > 0, zero + jnp.inf, jnp.zeros_like(y))
+        jacobian = jnp.zeros((len(y), *y[:, 0].shape), y.dtype)
+        return cls(segments, zero > 0, zero + jnp.inf, jnp.zeros_like(y), jacobian)
 
     def where(self, lanes: Bool[Array, " g"], other: "PeriodicOrbit") -> "PeriodicOrbit":
         """Itself in these lanes, in others the other."""
@@ -173,11 +175,18 @@ def solve_periodic_orbits(
         # The last iteration is with half the steps: what these change is the error.
         ends_here = ~jnp.any(going) | (count == _ITERATIONS)
         # Near the orbit the maps serve again, while they do well.
-        stale = going & ((change > 1e-3 * size) | (change > before / 8))
-        local = jax.lax.cond(
-            jnp.any(stale) & ~ends_here,
-            lambda: coarse_maps(system, found.segments),
-            lambda: local,
+        slow = change > before / 8
+        stale = going & ((change > 1e-3 * size) | slow)
+        # Where a law bends much within a segment, rough maps converge slowly or not at all.
+        exact = ends_here | jnp.any(going & slow)
+        local = jax.lax.switch(
+            jnp.where(exact, 2, jnp.where(jnp.any(stale), 1, 0)),
+            [
+                lambda: local,
+                lambda: coarse_maps(system, found.segments),
+                # Of an affine field these are exact.
+                lambda: (coarse_maps if system.affine else exact_maps)(system, found.segments),
+            ],
         )
         parts = jnp.where(ends_here, 2, 1)
 
@@ -190,7 +199,9 @@ def solve_periodic_orbits(
         ends, middle = in_blocks(flows, lambda none: (none.y, none.y), together, found.segments)
         target = next_start(y)
         off = chosen_guard(system, target, s, guard)
-        dy, dt, _ = corrections(local, found.segments, ends - target, off, system.constant, many)
+        dy, dt, jacobian = corrections(
+            local, found.segments, ends - target, off, system.constant, many
+        )
         largest, longest = jnp.max(jnp.abs(dy), axis=(0, 1)), jnp.max(jnp.abs(dt), axis=0)
         error = jnp.maximum(
             jnp.abs(jnp.sum(dt, axis=0)) / jnp.sum(h, axis=0),
@@ -209,21 +220,13 @@ def solve_periodic_orbits(
         y = jnp.where(used[None], y, y[:, :1])
         h = jnp.where(moves[None], h + share * dt, h)
         middle = jnp.where(used[None], middle, y)
-        found = PeriodicOrbit(Segments(y, h, s, guard), converged, error, middle)
+        found = PeriodicOrbit(Segments(y, h, s, guard), converged, error, middle, jacobian)
         change, before = jnp.where(going, jnp.stack([new, change]), jnp.stack([change, before]))
         return found, local, change, before, jnp.where(ends_here, _ITERATIONS, count) + 1
 
     none = PeriodicOrbit.none(Segments(y, duration, s, guard))
     found, *_ = jax.lax.while_loop(running, body, (none, nothing, far, far, 0))
     return found
-
-
-def return_jacobian(system: HybridSystem, segments: Segments) -> Float[Array, "2n 2n g"]:
-    """The Jacobian of the return map of periodic orbits, as exact as they are."""
-    ends, local = maps(system, segments)
-    nothing = jnp.zeros_like(segments.duration)
-    many = jnp.max(jnp.sum(segments.used, axis=0))
-    return corrections(local, segments, 0 * ends, nothing, system.constant, many)[2]
 
 
 @jax.custom_jvp
@@ -253,7 +256,7 @@ def _moved(given: tuple[HybridSystem, Segments], tangent: HybridSystem) -> tuple
         return ends, chosen_guard(system, end, segments.s, segments.guard)
 
     gap, off = jax.jvp(equations, (system,), (tangent,))[1]
-    _, local = maps(system, segments)
+    local = exact_maps(system, segments)
 
     def solution(gap, off):
         return corrections(local, segments, gap, off, system.constant)[:2]

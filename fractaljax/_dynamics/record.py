@@ -50,7 +50,9 @@ class Steps(eqx.Module):
         time = jnp.where(used, segments.duration, 0)
         ended = used & (segments.guard != NONE), used & (segments.guard == SECTION)
         if system.fastest is None:
-            weight = step_weight(system, segments.y, segments.s) * time
+            y, s, longest = segments.y, segments.s, jnp.broadcast_to(h[None], time.shape)
+            shortest = system.step_length(y, s, system.field(y, s), longest, longest)
+            weight = jnp.maximum(longest / shortest, system.crowding(y, s)) * time
         else:
             _, error = flow(system, segments.y, time, segments.s, error=True)
             weight = jnp.max(jnp.abs(error), axis=0) ** 0.125
@@ -77,11 +79,6 @@ class Steps(eqx.Module):
         row = row if isinstance(row, slice) else row % len(self.steps)
         kept = self.steps.at[row, place, lane]
         return kept.get(mode="promise_in_bounds", wrap_negative_indices=False)
-
-
-def step_weight(system: HybridSystem, y, s, least=1) -> Array:
-    """By how much shorter than elsewhere segments should be, where friction is stiff (...)."""
-    return jnp.maximum(least, 2 * system.stiffness(y, s, 1 / 4))
 
 
 class Record(Steps):
@@ -120,8 +117,9 @@ class Record(Steps):
 
         def one(k, carry):
             y, s, guard, sums, reach, some = carry
-            y_new, s_new, dt, guard, reach = step(system, y, s, guard, h, reach)
-            weight = step_weight(system, y, s, 1 if reach is None else h / reach) * dt
+            y_new, s_new, dt, guard, shorter, reach = step(system, y, s, guard, h, reach)
+            least = jnp.maximum(1 if reach is None else h / reach, shorter)
+            weight = jnp.maximum(least, system.crowding(y, s)) * dt
             ended = guard != NONE, guard == SECTION
             sums = sums + jnp.stack([dt, weight, *(x.astype(dt.dtype) for x in ended)])
             row = jnp.concatenate([y, s, guard.astype(y.dtype)[None], sums])

@@ -24,7 +24,7 @@ from .record import Record, Steps, Stretch, cut
 from .segments import Segments
 
 _OPTIONS = SearchOptions()
-_MESHES = 4  # on which a candidate is solved, each finer, until it is accurate
+_MESHES = 6  # on which a candidate is solved, each finer, until it is accurate
 
 
 class Attractor(eqx.Module):
@@ -139,6 +139,7 @@ def _find(
 ) -> Attractor:
     lanes = start.shape[1]
     record = Record.begin(system, start, max(32 * length, options.record))
+    bound = system.bound(start, equilibrium)
     none, far = jnp.zeros(lanes, int), jnp.full(lanes, jnp.inf, start.dtype)
     zero = jnp.zeros(lanes, start.dtype)
     known = Progress(
@@ -167,7 +168,7 @@ def _find(
         finer = sum(counted >= after for after in options.finer_after)
         h_run = (options.step / 2.0**finer).astype(start.dtype)
         record = record.advance(system, h_run, options.round_steps)
-        limits = equilibrium, growth, max_returns, h, rtol
+        limits = equilibrium, bound, growth, max_returns, h, rtol
         told = look(system, record, known, orbit, rounds, *limits)
 
         def solved():

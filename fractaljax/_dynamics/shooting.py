@@ -281,15 +281,20 @@ def descended(
 
 
 @functools.partial(exported_jit, static_argnames="places")
-def resampled(x, window: Window, chain: Chain, lifted: Lifted, u, times, *, places: int):
-    """States (2n, places) at times since the start of the orbit, and the rate of friction."""
+def resampled(x, window: Window, chain: Chain, lifted: Lifted, u, times, longest, *, places: int):
+    """States (2n, places) at times since the start of the orbit.
+
+    And by how much shorter than `longest` segments should be there.
+    """
     system = window.system(x, u[-1])
     h = durations(chain, u, system.n)
     ends = jnp.cumsum(h)
     last = jnp.max(jnp.where(chain.share > 0, jnp.arange(len(h)), 0))
     k = jnp.minimum(jnp.searchsorted(ends, times, side="right"), last)
-    y = flow(system, lifted.at(u)[:, k], times - (ends - h)[k], chain.s[:, k])
-    return y, system.stiffness(y, chain.s[:, k], 1 / 4)
+    s, longest = chain.s[:, k], jnp.broadcast_to(longest, k.shape)
+    y = flow(system, lifted.at(u)[:, k], times - (ends - h)[k], s)
+    shortest = system.step_length(y, s, system.field(y, s), longest, longest)
+    return y, jnp.maximum(longest / shortest, system.crowding(y, s))
 
 
 @exported_jit

@@ -44,6 +44,9 @@ class SimulationResult(eqx.Enumeration):
     reached = "the end time was reached"
     out_of_steps = "max_steps were used up before the end time"
     diverged = "the motion grew beyond all bounds"
+    not_finite = (
+        "the motion is not a number, as some number of the mechanism or of the start is not"
+    )
 
 
 class Trajectory(Record):
@@ -147,20 +150,13 @@ class _Steps(eqx.Module):
     result: SimulationResult
 
 
-def _bound(system: HybridSystem, y) -> Array:
-    """The size beyond which a motion from y has diverged."""
-    bound = 1e3 * (1 + jnp.max(jnp.abs(y)))
-    # An excitation may be large beside the belt's velocity, and at resonance.
-    return bound + 1e5 * system.largest_force if system.excited else bound
-
-
 @functools.partial(jax.jit, static_argnames="max_steps")
 def _find_steps(system: HybridSystem, y, end, h, rtol, *, max_steps: int) -> _Steps:
-    limit = _bound(system, y)
+    limit = system.bound(y, system.equilibrium())
 
     def running(carry):
         y, _, t, k, *_ = carry
-        return (t < end) & (k < max_steps) & (jnp.max(jnp.abs(y)) < limit)
+        return (t < end) & (k < max_steps) & (jnp.max(jnp.abs(y)) <= limit)
 
     def body(carry):
         y, s, t, k, duration, states, guards = carry
@@ -174,10 +170,11 @@ def _find_steps(system: HybridSystem, y, end, h, rtol, *, max_steps: int) -> _St
     s = system.contact_state(y)
     empty = jnp.zeros(n, y.dtype), jnp.ones((len(s), n), y.dtype), jnp.full(n, NONE)
     start = y, s, jnp.zeros((), y.dtype), 0, *empty
-    _, s, t, count, duration, states, guards = jax.lax.while_loop(running, body, start)
+    y, s, t, count, duration, states, guards = jax.lax.while_loop(running, body, start)
     result = SimulationResult.where(
-        count >= n, SimulationResult.out_of_steps, SimulationResult.diverged
+        jnp.max(jnp.abs(y)) > limit, SimulationResult.diverged, SimulationResult.not_finite
     )
+    result = SimulationResult.where(count >= n, SimulationResult.out_of_steps, result)
     result = SimulationResult.where(t >= end, SimulationResult.reached, result)
     # Unused steps keep the last contact state.
     states = jnp.where(jnp.arange(n)[None] < count, states, s[:, None])
@@ -263,7 +260,7 @@ def _regularised(
     contact_states = jnp.where(jnp.abs(sliding) < eps, 0, jnp.sign(sliding))
     if any(system.opens):
         contact_states = jnp.where(system.open_faces(states.T).T, OPEN, contact_states)
-    far = jnp.max(jnp.abs(last)) > _bound(system, y)
+    far = jnp.max(jnp.abs(last)) > system.bound(y, system.equilibrium())
     reached = solution.result == RESULTS.successful
     result = SimulationResult.where(
         reached, SimulationResult.reached, SimulationResult.out_of_steps

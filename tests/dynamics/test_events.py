@@ -187,7 +187,7 @@ def test_shallow_dip(depth):
 def _stepped(system, y, h):
     def body(carry, _):
         y, s, last, t = carry
-        y, s_new, dt, guard, _ = step(system, y, s, last, h)
+        y, s_new, dt, guard, *_ = step(system, y, s, last, h)
         return (y, s_new, guard, t + dt), (y, s_new, t + dt, dt, guard)
 
     start = y, system.contact_state(y), jnp.array(NONE), jnp.zeros(())

@@ -21,7 +21,7 @@ field = jax.jit(HybridSystem.field)
 guards = jax.jit(HybridSystem.guards)
 switch = jax.jit(HybridSystem.switch)
 first_state = jax.jit(HybridSystem.contact_state)
-stiffness = jax.jit(HybridSystem.stiffness)
+step_length = jax.jit(HybridSystem.step_length)
 closures = jax.jit(HybridSystem.closures)
 equilibrium = jax.jit(HybridSystem.equilibrium)
 scaled = jax.jit(hybrid_system)
@@ -138,10 +138,10 @@ def test_equilibrium_and_coulomb():
     ends, middle = np.asarray(field(system, y, s)), (y + y[:, ::-1]) / 2
     close(field(system, middle, s), (ends + ends[:, ::-1]) / 2, 1e-14)
     close(ends, field(flat, y, s), 1e-15)
-    equal(stiffness(system, y, s), np.zeros(200))
+    equal(step_length(system, y, s, field(system, y, s), *np.full((2, 200), 0.3)), 0.3)
 
 
-def test_stiffness():
+def test_steps_are_bounded_by_the_slope_of_friction():
     """The larger slope of what friction does to u_i by u_i, in units of omega."""
     for seed in SEEDS:
         x, (omega, factors) = numbers(seed), scale(numbers(seed))
@@ -155,8 +155,75 @@ def test_stiffness():
                 for moved in (y + step, y - step)
             ]
             slopes.append((ends[0] - ends[1]) / 2e-6 / (omega * x["V"]))
-        found = np.asarray(stiffness(scaled(scene_of(x)), y, np.array([[1.0], [-1.0]])))
-        np.testing.assert_allclose(found, abs(np.array(slopes)).max(axis=0), rtol=1e-6, atol=1e-8)
+        system, s, longest = scaled(scene_of(x)), np.array([[1.0], [-1.0]]), np.full(200, 1e-3)
+        s = np.broadcast_to(s, (2, 200))
+        # Of so short a step nothing but the slope here counts.
+        step = step_length(system, y, s, field(system, y, s), longest, 1e-6 * longest)
+        assert (step < longest).all()
+        found = np.maximum(5e-10 / np.asarray(step) - 5e-7, 0)
+        np.testing.assert_allclose(found, abs(np.array(slopes)).max(axis=0), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("v_0", [1.0, 1e-1, 1e-3, 1e-5])
+def test_no_step_reaches_a_slope_too_steep_for_it(v_0):
+    """Whatever w a face has and however that changes: friction that falls within v_0 of V."""
+    V, h = 0.15, 0.3
+    scene = reference_scene().replace(friction=fj.ExponentialStribeck(0.4, 0.25, v_0 * V))
+    system = scaled(scene)
+    rng = np.random.default_rng(5)
+    y, s = states((1, 1))
+    y[2] = 1 - np.geomspace(1e-3 * v_0, 3, 200)
+    rate = np.concatenate([y[2:], rng.normal(size=(2, 200)) * 10 ** rng.uniform(-6, 1, (2, 200))])
+    step = np.asarray(step_length(system, y, s, rate, *np.full((2, 200), h)))
+    assert (0 < step).all() and (step <= h).all()
+    loads = abs(np.asarray(jax.jit(HybridSystem.loads)(system, y[:2])))
+    for face in (0, 1):
+        w = abs(1 - y[2 + face])
+        inside = w - np.linspace(-1, 1, 501)[:, None] * abs(rate[2 + face]) * step
+        slope = 0.15 / v_0 * np.exp(-np.maximum(inside, 0) / v_0) * loads[face]
+        assert (2 * step * slope.max(axis=0) <= h * (1 + 1e-9)).all()
+    # None is shorter than the steepest slope of all asks for.
+    assert (step >= 0.99 * np.minimum(h, h / (2 * 0.15 / v_0 * loads.max(axis=0)))).all()
+
+
+def test_laws_go_on_below_zero_and_are_bounded():
+    """Each by its own formula just below w = 0, and between 0 and 2 mu_s however far below."""
+
+    class Root(fj.Friction):  # without a value below -1e-3 m/s
+        mu_s: jax.Array = fj.quantity("-", "static friction coefficient")
+
+        def mu(self, speed):
+            return self.mu_s * (1.5 - jnp.sqrt(speed + 1e-3) / jnp.sqrt(1e-3) / 2)
+
+    class Cubed(fj.Friction):  # flat at 0, without a bound below
+        mu_s: jax.Array = fj.quantity("-", "static friction coefficient")
+
+        def mu(self, speed):
+            return self.mu_s * jnp.exp(-((speed / 1e-3) ** 3))
+
+    laws = [
+        fj.ExponentialStribeck(0.4, 0.2, 1e-6),
+        fj.ExponentialStribeck(0.4, 0.2, 1e-2, 0.3),
+        fj.HyperbolicStribeck(0.4, 1e4),
+        fj.Stribeck(0.4, 0.1, 1e-3),
+        Root(0.4),
+        Cubed(0.4),
+    ]
+    signs = jnp.ones((2, 1))
+    for law in laws:
+        system = hybrid_system(reference_scene().replace(friction=law))
+        far = [
+            float(system._by_laws(jnp.full((2, 1), w), signs, signs)[0, 0])
+            for w in (-1e-12, -1e-3, -1.0, -1e3)
+        ]
+        assert 0 <= min(far) and max(far) <= 0.8 * (1 + 1e-12), law
+        assert far[2] == far[3]
+        # As smooth as the law.
+        steps = 1e-3 * float(system.below[0]) * jnp.arange(-2, 3)
+        values = [float(system._by_laws(jnp.full((2, 1), w), signs, signs)[0, 0]) for w in steps]
+        known = law.mu(float(system.speed) * steps)
+        np.testing.assert_allclose(values, known, rtol=1e-12)
+        assert float(system.below[0]) > 0
 
 
 def test_derivatives():

@@ -17,7 +17,7 @@ from fractaljax._dynamics import search
 from fractaljax._dynamics.acceptance import growth_of
 from fractaljax._dynamics.cycle import repels
 from fractaljax._dynamics.hybrid import NONE
-from fractaljax._dynamics.orbit import PeriodicOrbit, solve_periodic_orbits
+from fractaljax._dynamics.orbit import solve_periodic_orbits
 from fractaljax._dynamics.segments import flow
 from mechanisms import PLAIN, source_form
 from tools import (
@@ -181,9 +181,9 @@ def test_orbit_that_repels():
     with pytest.raises(RuntimeError, match="but it repels"):
         fj.limit_cycle(scene)
     # Its growth is that of its exact derivatives, not of those that Newton's method has.
-    segments = jax.tree.map(lambda x: x[..., None], cycle._orbit.segments)
-    lane = PeriodicOrbit(segments, jnp.array([True]), jnp.zeros(1), segments.y)
-    (growth,) = growth_of(cycle._system, lane)
+    system, segments = cycle._system, jax.tree.map(lambda x: x[..., None], cycle._orbit.segments)
+    found = jax.jit(solve_periodic_orbits)(system, segments, jnp.array([True]), jnp.ones(1), 1e-9)
+    (growth,) = growth_of(system, found)
     np.testing.assert_allclose(growth, np.log(expected[-1]), rtol=1e-4)
 
 
