@@ -70,8 +70,9 @@ def _stick_as_one(structure: Structure, joint: Joint, other: Joint) -> bool:
 
 def hybrid_system(mechanism: Any) -> HybridSystem:
     """The scaled system of a scene or a structure."""
-    of_kind = _of_structure if isinstance(mechanism, Structure) else _of_scene
-    return of_kind(mechanism).with_steps_of_laws()
+    is_structure = isinstance(mechanism, Structure)
+    system = _of_structure(mechanism) if is_structure else _of_scene(mechanism)
+    return system.with_steps_of_laws()
 
 
 def _of_scene(scene: Scene) -> HybridSystem:
