@@ -18,13 +18,16 @@ from numpy.polynomial import chebyshev
 from .._base.parts import Numbers
 
 _LEAST, _MOST = 1 / 256, 1024.0  # loads over P between which pieces lie; one more begins at 0
-_BELOW, _ABOVE = 4, 8  # pieces on either side of P
+_FAINTEST = 1e-16  # load over P from which on K_n is searched for where it ends to be a power
+_POWER = 0.005  # within which its exponent then is the one at no load
+_BELOW, _ABOVE = 16, 8  # pieces on either side of P
 _STEEPEST = 14.0  # e-folds of load and stiffness above P, beyond which the curve is straight
-_SAMPLES = 32  # of the stiffness, on either side, for the borders of the pieces
+_SAMPLES = 128  # of the stiffness, on either side, for the borders of the pieces
 _DEGREE = 16  # of the series of e in each piece
 _NEWTON = 10  # steps to its inverse
-_ROWS, _POWERS = 512, 7  # of the table
-_FINEST = 1e-4  # of the way to the opening: rows there are no finer
+_POWERS = 7  # of the table
+_ROWS, _FIRST = 32, 128  # of it in each piece, and in the first one
+_FINEST = 1e-4  # of the first piece: rows there are no finer
 _SETTLING = 16  # Newton steps to an equilibrium
 
 
@@ -47,30 +50,29 @@ class LoadCurve(eqx.Module):
     first one, from n = 0, of n^(1/power), in which it is smooth.
     """
 
-    power: Float[Array, ""]  # N/P begins as that power of the distance d = e + opening
+    power: Float[Array, ""]  # N/P begins as that power of the distance e + opening
     logs: Float[Array, " p"]  # ln n where each piece ends
     slopes: Float[Array, "p k"]  # of the approach by the share of the piece, Chebyshev series
     approach: Float[Array, "p k+1"]  # within the piece
-    ends: Float[Array, " p"]  # d where each piece ends
+    ends: Float[Array, " p"]  # e where each piece ends; one of them is 0 itself
     opening: Float[Array, ""]  # the joint opens at e = -opening
     top: Float[Array, ""]  # slope at the end of the last piece, and beyond
 
     def __call__(self, e: Numbers) -> Numbers:
         """N/P at e, of any shape."""
-        d = e.ravel() + self.opening
-        end = self.ends[-1]
-        inside = jnp.clip(d, jnp.finfo(d.dtype).eps ** 2 * end, end)
-        load = jnp.exp(self._log_load(inside)) + self.top * jnp.maximum(d - end, 0)
-        return jnp.where(d <= 0, 0, load).reshape(e.shape)  # NaN stays NaN
+        at, end = e.ravel(), self.ends[-1]
+        load = jnp.exp(self._log_load(jnp.minimum(at, end)))
+        load = load + self.top * jnp.maximum(at - end, 0)
+        return jnp.where(at <= -self.opening, 0, load).reshape(e.shape)  # NaN stays NaN
 
-    def _log_load(self, d) -> Array:
-        """ln n at the distances d (j,), by Newton's method."""
-        piece = jnp.minimum(jnp.searchsorted(self.ends, d), len(self.ends) - 1)
-        start = jnp.where(piece > 0, self.ends[piece - 1], 0)
+    def _log_load(self, e) -> Array:
+        """ln n at e (j,), by Newton's method."""
+        piece = jnp.minimum(jnp.searchsorted(self.ends, e), len(self.ends) - 1)
+        start = jnp.where(piece > 0, self.ends[piece - 1], -self.opening)
         slopes, approach = self.slopes[piece], self.approach[piece]
         width = jnp.sum(approach, axis=1)
-        share = (d - start) / width
-        least = jnp.where(piece > 0, -0.1, jnp.finfo(d.dtype).eps ** 2)
+        least = jnp.where(piece > 0, -0.1, jnp.finfo(e.dtype).eps ** 2)
+        share = jnp.maximum((e - start) / width, least)
 
         def closer(z, _):
             T = _polynomials(2 * z - 1)
@@ -89,66 +91,68 @@ class LoadCurve(eqx.Module):
 
 
 class LoadTable(eqx.Module):
-    """A load curve for motions, which ask for it at every step: rows of polynomials.
+    """A load curve for motions, which ask for it at every step: rows of polynomials of e.
 
-    Row i is for the distances d = e + opening at which q = ln((d + low)/(high - d)) + growth d is
-    from i to i + 1 times `step` above its value at d = 0. Leaves may have further axes, of lanes.
+    Rows follow the load, not the approach, which may change by far more below P than near it.
+    Leaves may have further axes, of lanes.
     """
 
     opening: Float[Array, ""]  # the joint opens at e = -opening
-    spacing: Float[Array, "4"]  # low, high, growth, step
-    table: Float[Array, "k r"]  # the middle of each row, its half width inverted, coefficients
-    last: Float[Array, "3"]  # d, N/P and its slope at the end of the last row
+    table: Float[Array, "k r"]  # start of each row, middle, half width inverted, coefficients
+    last: Float[Array, "3"]  # e, N/P and its slope at the end of the last row
 
     def __call__(self, e: Numbers) -> Numbers:
         """N/P at e, a number for each lane."""
-        d, (end, load, slope) = e + self.opening, self.last
-        inside = jnp.clip(d, 0, end)
-        row = _row_number(jax.lax.stop_gradient(inside), self.spacing).astype(int)
-        row = jnp.clip(row, 0, _ROWS - 1)[None, None]
-        middle, scale, value, *others = jnp.take_along_axis(self.table, row, axis=1)[:, 0]
+        end, load, slope = self.last
+        inside = jnp.clip(e, -self.opening, end)
+        row = self._row(jax.lax.stop_gradient(inside))[None, None]
+        _, middle, scale, value, *others = jnp.take_along_axis(self.table, row, axis=1)[:, 0]
         x = (inside - middle) * scale
         for coefficient in others:
             value = value * x + coefficient
-        value = jnp.where(d < end, jnp.maximum(value, 0), load + slope * (d - end))
-        return jnp.where(d <= 0, 0, value)  # NaN stays NaN
+        value = jnp.where(e < end, jnp.maximum(value, 0), load + slope * (e - end))
+        return jnp.where(e <= -self.opening, 0, value)  # NaN stays NaN
+
+    def _row(self, e) -> Array:
+        """The row of e: its group of rows, and its place in that."""
+        starts = jax.lax.stop_gradient(self.table[0])
+        groups = starts.reshape(-1, _ROWS, *starts.shape[1:])
+        group = jnp.maximum(jnp.sum(groups[:, 0] <= e[None], axis=0) - 1, 0)
+        own = jnp.take_along_axis(groups, group[None, None], axis=0)[0]
+        return group * _ROWS + jnp.maximum(jnp.sum(own <= e[None], axis=0) - 1, 0)
 
 
 @jax.jit
 def tabulated(curve: LoadCurve) -> LoadTable:
-    """The table of a load curve; it departs from it by less than 1e-11 of P or N."""
-    opening, end = jax.lax.stop_gradient((curve.opening, curve.ends[-1]))
-    spacing, at = _spaced(opening, end)
+    """The table of a load curve.
+
+    It departs from it by less than 1e-11 of P or N, or by 1e-9 of P below it where K_n(P) is a
+    million times that of small loads, in full contact.
+    """
+    at = jax.lax.stop_gradient(_borders_of_rows(curve))
     middle, half = (at[1:] + at[:-1]) / 2, (at[1:] - at[:-1]) / 2
-    d = middle[:, None] + half[:, None] * jnp.asarray(_ROW_NODES, at.dtype)[None]
-    load = curve(jnp.append(d.ravel(), end) - curve.opening)
-    powers = jnp.asarray(_TO_POWERS, at.dtype) @ load[:-1].reshape(d.shape).T
-    table = jnp.concatenate([middle[None], 1 / half[None], powers])
-    return LoadTable(curve.opening, spacing, table, jnp.stack([end, load[-1], curve.top]))
+    e = middle[:, None] + half[:, None] * jnp.asarray(_ROW_NODES, at.dtype)[None]
+    load = curve(jnp.append(e.ravel(), at[-1]))
+    powers = jnp.asarray(_TO_POWERS, at.dtype) @ load[:-1].reshape(e.shape).T
+    table = jnp.concatenate([at[None, :-1], middle[None], 1 / half[None], powers])
+    return LoadTable(curve.opening, table, jnp.stack([at[-1], load[-1], curve.top]))
 
 
-def _row_number(d, spacing) -> Array:
-    """The place of a distance among the rows, from 0 on."""
-    low, high, growth, step = spacing
-    return (jnp.log((d + low) / (high - d) * (high / low)) + growth * d) / step
+def _borders_of_rows(curve: LoadCurve) -> Array:
+    """e where the rows of the table meet (r + 1,): equal shares of each piece, in its variable."""
+    dtype = curve.ends.dtype
+    equal = jnp.arange(1, _ROWS + 1, dtype=dtype) / _ROWS
+    # In the first one the load is a power of the share.
+    finer = jnp.geomspace(_FINEST, 1, _FIRST, dtype=dtype)
+    starts = jnp.concatenate([-curve.opening[None], curve.ends[:-1]])
 
+    def inside(start, approach, shares):
+        return start + _polynomials(2 * shares - 1) @ approach
 
-def _spaced(opening, end) -> tuple[Array, Array]:
-    """The spacing of the rows between the distances 0 and `end`, and where they meet (r + 1,)."""
-    low, high, growth = _FINEST * opening, end + 0.001 * (end - opening), 12 / end
-    step = _row_number(end, (low, high, growth, 1)) / _ROWS
-    spacing = jnp.stack([low, high, growth, step])
-    wanted = jnp.arange(_ROWS + 1, dtype=end.dtype)
-
-    def halved(ends, _):
-        low, high = ends
-        middle = (low + high) / 2
-        above = _row_number(middle, spacing) > wanted
-        return (jnp.where(above, low, middle), jnp.where(above, middle, high)), None
-
-    start = jnp.zeros_like(wanted), jnp.full_like(wanted, end)
-    (at, _), _ = jax.lax.scan(halved, start, length=60)
-    return spacing, at.at[0].set(0).at[-1].set(end)
+    first = inside(starts[0], curve.approach[0], finer)
+    others = jax.vmap(inside, (0, 0, None))(starts[1:], curve.approach[1:], equal)
+    others = others.at[:, -1].set(curve.ends[1:])
+    return jnp.concatenate([-curve.opening[None], first[:-1], curve.ends[:1], others.ravel()])
 
 
 def load_curve(
@@ -172,7 +176,7 @@ def load_curve(
         return jnp.log(at / own).reshape(log_n.shape)
 
     if borders is None:
-        logs = jax.lax.stop_gradient(_borders(relative, dtype))
+        logs = jax.lax.stop_gradient(_borders(relative, jnp.asarray(opening_exponent, dtype)))
     else:
         given = jnp.log(jnp.asarray(borders, dtype) / P)
         logs = jnp.sort(jnp.append(given, 0))
@@ -188,8 +192,11 @@ def load_curve(
     slopes = by_share * jnp.exp(log_n - relative(log_n))
     slopes = slopes @ jnp.asarray(_TO_SERIES.T, dtype)
     approach = slopes @ jnp.asarray(_INTEGRAL.T, dtype)
-    ends = jnp.cumsum(jnp.sum(approach, axis=1))
-    opening = jnp.sum(jnp.where(logs <= 0, jnp.diff(ends, prepend=0), 0))
+    widths, below = jnp.sum(approach, axis=1), logs <= 0
+    # From P both ways: where K_n(P) is far above that of small loads, far from it e is large.
+    down = jnp.cumsum(jnp.where(below, widths, 0)[::-1])[::-1]
+    up = jnp.cumsum(jnp.where(below, 0, widths))
+    ends, opening = up - jnp.append(down[1:], 0), down[0]
     return LoadCurve(power, logs, slopes, approach, ends, opening, jnp.exp(relative(logs[-1])))
 
 
@@ -204,14 +211,21 @@ def _polynomials(x) -> Array:
     return found.T
 
 
-def _borders(relative, dtype) -> Array:
-    """ln n at the borders of the pieces: in each of them load and stiffness grow as much."""
+def _borders(relative, exponent) -> Array:
+    """ln n at the borders of the pieces: in each of them load and stiffness grow as much.
+
+    Below the first one K_n is a power of the load, with the exponent that it has at no load.
+    """
+    dtype = exponent.dtype
+    x = jnp.linspace(0, math.log(_FAINTEST), 4 * _SAMPLES, dtype=dtype)
+    other = jnp.abs(jnp.diff(relative(x)) / jnp.diff(x) - exponent) > _POWER
+    last = jnp.min(jnp.where(other, x[1:], 0))
     found = []
-    for end, count in ((_LEAST, _BELOW), (_MOST, _ABOVE)):
-        x = jnp.linspace(0, math.log(end), _SAMPLES, dtype=dtype)
+    for end, count in ((jnp.minimum(last, math.log(_LEAST)), _BELOW), (math.log(_MOST), _ABOVE)):
+        x = jnp.linspace(0, end, _SAMPLES, dtype=dtype)
         grown = jnp.abs(jnp.diff(x)) + jnp.abs(jnp.diff(relative(x)))
         grown = jnp.append(jnp.zeros(1, dtype), jnp.cumsum(grown))
-        most = jnp.minimum(grown[-1], _STEEPEST) if end > 1 else grown[-1]
+        most = grown[-1] if count == _BELOW else jnp.minimum(grown[-1], _STEEPEST)
         found.append(jnp.interp(most * jnp.arange(1, count + 1) / count, grown, x))
     below, above = found
     return jnp.concatenate([below[::-1], jnp.zeros(1, dtype), above])

@@ -85,7 +85,7 @@ def test_persson(D, G, load, area):
 def _table_and_curve(curve, share):
     """Value and slope of the table of a load curve, and of the curve."""
     table = jax.tree.map(lambda leaf: leaf[..., None], tabulated(curve))
-    e = share * jnp.where(share < 0, curve.opening, curve.ends[-1] - curve.opening)
+    e = share * jnp.where(share < 0, curve.opening, curve.ends[-1])
     return [jax.jvp(f, (e,), (jnp.ones_like(e),)) for f in (table, curve)]
 
 
@@ -96,6 +96,43 @@ def test_table(law):
     found, wanted = _table_and_curve(curve, jnp.linspace(-1.2, 1.1, 4001))
     np.testing.assert_allclose(found[0], wanted[0], rtol=1e-11, atol=1e-11)
     np.testing.assert_allclose(found[1], wanted[1], rtol=1e-8, atol=1e-8)
+
+
+@jax.jit
+@jax.vmap
+def _of_persson(D, load):
+    """Curve and table at rest, and beside each other from the opening to far above P."""
+    law = fj.PerssonContact(fj.Surface(D, 1.342e-10), MATERIAL, load, 1e-4, 1e-2, 1e-4)
+    curve = law.load_curve(0.4, 0.3)
+    assert curve is not None
+    table = jax.tree.map(lambda leaf: leaf[..., None], tabulated(curve))
+    share = jnp.geomspace(1e-6, 1, 200)
+    e = jnp.concatenate([jnp.zeros(1), -share * curve.opening, 1.5 * share * curve.ends[-1]])
+    return curve(e), table(e), e / curve.opening
+
+
+def test_nothing_moves_at_rest():
+    """N = P without approach, from the lightest loads to full contact of surfaces of any D."""
+    D, load = np.meshgrid(np.linspace(2.02, 2.98, 9), 10.0 ** np.arange(7))
+    found, tabled, e = map(np.asarray, _of_persson(D.ravel(), load.ravel()))
+    np.testing.assert_array_equal(found[:, 0], 1)
+    np.testing.assert_allclose(tabled[:, 0], 1, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(tabled, found, rtol=1e-9, atol=1e-9)
+    # N never falls with the approach, and is 0 where the joint opens.
+    rising = np.take_along_axis(found, np.argsort(e, axis=1), axis=1)
+    assert (rising[:, 1:] >= rising[:, :-1]).all()
+    assert (found[:, 200] == 0).all()
+
+
+@pytest.mark.parametrize("D", [2.05, 2.5, 2.8, 2.97])
+def test_mass_at_rest_stays(D):
+    """Under a preload, with its own load curve: it once moved by 6.7 P/K_n."""
+    law = fj.PerssonContact(fj.Surface(D, 1.342e-10), MATERIAL, P, 1e-4, 1e-2, 1e-4)
+    joint = fj.Joint(law, fj.Coulomb(1e-9), [1.0, 0.0], [0.0, 1.0], V=0.1, preload=True)
+    structure = fj.Structure(np.eye(2), np.eye(2), 1e4 * np.eye(2), [joint])
+    K_n = float(law.stiffness(0.4, 0.3)[0])
+    motion, size = fj.simulate(structure, np.zeros(4), 100 / np.sqrt(K_n)), P / K_n
+    assert abs(np.asarray(motion.states)[:, 1]).max() < 1e-9 * size
 
 
 @pytest.mark.slow
