@@ -331,7 +331,7 @@ def _branch(follower: Follower, x, name: str, start, end) -> Branch:
         if event.kind == "Hopf":
             beside = event.index - 1 if event.index else 1
             rows["stable"][event.index] = rows["stable"][beside]
-    joints = [faces[0] for faces in follower.family.template.faces]
+    joints = [faces[0] for faces in follower.family.template.joints]
     if not isinstance(x, Scene):
         rows["stick_fraction"] = rows["stick_fraction"][:, joints]
     rows["open_fraction"] = rows["open_fraction"][:, joints]

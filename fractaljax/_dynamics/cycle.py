@@ -113,6 +113,8 @@ class Orbit(eqx.Module):
         rows, offset = _normal_rows(system)
         own = system.own(jnp.eye(2 * system.n, dtype=rows.dtype))
         values = extreme_values(system, self.segments, jnp.concatenate([own, rows]))
+        if not system.joints:
+            return Ranges(values[:, : 2 * n] * system.units[None], jnp.zeros((0, 2), rows.dtype))
         linear = jnp.zeros((len(system.P), 2), rows.dtype)
         linear = linear.at[_tangential(system)].set((values[:, 2 * n :] + offset[None]).T)
         # A load curve rises, so that its extremes are where those of the approach are.
@@ -129,6 +131,8 @@ class Orbit(eqx.Module):
         def share(state):
             return jnp.sum(jnp.where(s == state, duration[None], 0), axis=1) / period
 
+        if not system.joints:
+            return Fractions(*[jnp.zeros(0, period.dtype)] * 3)
         rows, offset = _normal_rows(system)
         pulls = [
             jnp.zeros_like(period)
@@ -167,7 +171,7 @@ class Orbit(eqx.Module):
 
 def _tangential(system: HybridSystem) -> np.ndarray:
     """The tangential face of each joint."""
-    return np.array([faces[0] for faces in system.faces])
+    return np.array([faces[0] for faces in system.joints], int)
 
 
 def _normal_rows(system: HybridSystem) -> tuple[Float[Array, "m 2n"], Float[Array, " m"]]:

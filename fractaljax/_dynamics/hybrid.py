@@ -71,6 +71,7 @@ class HybridSystem(eqx.Module):
     faces: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # of each joint
     sharing: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # the joints of each of the laws
     opens: tuple[bool, ...] = eqx.field(static=True)  # whether a joint can open
+    jointless: bool = eqx.field(static=True, default=False)  # its one face is no joint's
     # Whether the last degree of freedom is the phase of an excitation: excitation.py.
     excited: bool = eqx.field(static=True, default=False)
     # Of many degrees of freedom the largest rate of the mechanism without friction, within a per
@@ -111,6 +112,11 @@ class HybridSystem(eqx.Module):
         seen = [jnp.concatenate([self.L, zero], axis=1), jnp.concatenate([zero, self.T], axis=1)]
         matrix = jnp.concatenate([*seen, self.T @ both, both])
         return replace(self, products=Products(matrix, self.T @ self.B, self.T @ self.F))
+
+    @property
+    def joints(self) -> tuple[tuple[int, ...], ...]:
+        """The faces of each joint."""
+        return () if self.jointless else self.faces
 
     @property
     def n(self) -> int:

@@ -1,6 +1,7 @@
 """A scene or structure as a hybrid system in scaled units, where its motion begins, how exactly."""
 
 import itertools
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,7 +12,7 @@ from jaxtyping import Array, ArrayLike, DTypeLike, Float
 
 from .._base.parts import concrete, number, require_kind, require_scalar
 from .._contact.load_curve import tabulated
-from .._friction import Friction
+from .._friction import Coulomb, Friction
 from .._mechanism.joint import Joint
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.scene import Scene, stiffness
@@ -20,6 +21,10 @@ from .hybrid import HybridSystem
 from .lanes import log_spectral_radius
 
 FEW = 8  # degrees of freedom up to which steps are those of the highest frequency
+_NO_JOINT = (
+    1e-6,
+    1e30,
+)  # of a structure without joints: unit of velocity [m/s], and the belt's V in it
 _SQUARINGS = 10  # of the matrix whose spectral radius bounds all rates
 
 
@@ -137,6 +142,13 @@ def _of_structure(structure: Structure) -> HybridSystem:
         rows.append(normal)
         speeds.append(joint.V)
         faces[-1] = (len(rows) - 2, len(rows) - 1)
+    laws, sharing = _shared([joint.friction for joint in structure.joints], faces)
+    if not structure.joints:
+        # A face without load, on a belt too fast for any motion: nothing ever rubs or switches.
+        unit = jnp.eye(n, dtype=dtype)[0]
+        rows, weights, offsets = [unit], [0 * unit], [0 * unit[0]]
+        speeds, faces, curves = [jnp.asarray(math.prod(_NO_JOINT), dtype)], [(0,)], [None]
+        laws, sharing = (Coulomb(jnp.ones((), dtype)),), ((0,),)
     T, L, V, P = jnp.stack(rows), jnp.stack(weights), jnp.stack(speeds), jnp.stack(offsets)
     given = jnp.zeros(n, dtype) if structure.F is None else structure.F
     # M^-1 of everything at once.
@@ -146,9 +158,9 @@ def _of_structure(structure: Structure) -> HybridSystem:
     K, C, B, F = jnp.split(solved, [n, 2 * n, 2 * n + len(rows)], axis=1)
     # Between the highest eigenfrequency and n^(1/4) times it.
     omega = jnp.sum(K * K.T) ** 0.25
-    speed = V[0]
+    opens = tuple(bool(joint.preload) and joint.normal is not None for joint in structure.joints)
+    speed = V[0] if structure.joints else jnp.asarray(_NO_JOINT[0], dtype)
     unit = omega * speed
-    laws, sharing = _shared([joint.friction for joint in structure.joints], faces)
     return HybridSystem(
         laws=laws,
         speed=speed,
@@ -165,7 +177,8 @@ def _of_structure(structure: Structure) -> HybridSystem:
         curves=tuple(curves),
         faces=tuple(faces),
         sharing=sharing,
-        opens=tuple(bool(joint.preload) and joint.normal is not None for joint in structure.joints),
+        opens=opens or (False,),
+        jointless=not structure.joints,
         fastest=_fastest(K / omega**2, C / omega) if n > FEW else None,
     ).with_products()
 
