@@ -1,7 +1,6 @@
 """Friction laws: the coefficient as a function of the sliding speed."""
 
 import abc
-import dataclasses
 from collections.abc import Callable
 from typing import Any, ClassVar, final
 
@@ -11,17 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from ._base.parts import (
-    Numbers,
-    Part,
-    concrete,
-    nan_where,
-    number,
-    ordered,
-    quantity,
-    quantity_name,
-    require_kind,
-)
+from ._base.laws import make_arrays, refuse, register
+from ._base.parts import Numbers, Part, concrete, number, ordered, quantity, require_kind
 from ._base.singular import safe_divide
 
 LAWS: dict[str, type["Friction"]] = {}  # by their names in files
@@ -81,23 +71,13 @@ class Friction(Part):
 
     def __init_subclass__(cls, law: str | None = None, **options: Any) -> None:
         super().__init_subclass__(**options)
-        if law is None:
-            return
-        known = LAWS.get(law, cls)
-        # A cell of a notebook that is run again makes its class anew.
-        if (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
-            raise ValueError(f"the law {law!r} is {known.__name__} already")
-        LAWS[law] = cls
+        if law is not None:
+            register(law, cls, LAWS)
 
     def __check_init__(self):
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            plain = isinstance(value, (int, float, np.ndarray)) and not isinstance(value, bool)
-            if plain and not field.metadata.get("static", False):
-                # What a generated __init__ stores is not an array yet.
-                object.__setattr__(self, field.name, number(quantity_name(field), value))
         if type(self).__module__ == __name__:
             return
+        make_arrays(self)
         static = concrete(number("mu(0)", self.mu(jnp.zeros((), _dtype(self))), above=0))
         stored = concrete(jnp.asarray(self.mu_s))
         if static is None or stored is None:
@@ -113,10 +93,7 @@ class Friction(Part):
         bad = ~(static > 0) | ~jnp.isclose(
             stored, static, rtol=8 * float(jnp.finfo(stored.dtype).eps), atol=0
         )
-        for field in dataclasses.fields(self):
-            if not field.metadata.get("static", False):
-                value = nan_where(bad, getattr(self, field.name))
-                object.__setattr__(self, field.name, value)
+        refuse(self, bad)
 
     @abc.abstractmethod
     def mu(self, speed: ArrayLike) -> Numbers:

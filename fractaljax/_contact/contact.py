@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, ScalarLike
 
-from .._base.parts import Numbers, Part, Record, brief, number, substitute
+from .._base.laws import make_arrays, refuse, register
+from .._base.parts import Numbers, Part, Record, brief, concrete, number, substitute
 from .load_curve import LoadCurve, load_curve
 
 MU_M_MAX = 0.9  # Eq. 19 ends there
@@ -18,18 +19,72 @@ MU_M_MAX = 0.9  # Eq. 19 ends there
 class Contact(Part):
     """A contact law: the stiffness of a joint.
 
-    A law is a pytree of named quantities, with `stiffness`. It is differentiable and works under
-    `jit` and `vmap` if its `stiffness` does.
+    A law of your own declares its numbers as fields and writes `stiffness`, differentiable:
+
+        class Hertz(fj.Contact, law="hertz"):
+            k: jax.Array = fj.quantity("N/m", "normal stiffness under P_0", log=True)
+            P_0: jax.Array = fj.quantity("N", "load at which it is k", log=True)
+            stiffness_ratio: jax.Array = fj.quantity("-", "K_t/K_n")
+            P: jax.Array = fj.quantity("N", "normal load", log=True)
+
+            def stiffness(self, mu_s, mu_m):
+                K_n = self.k * (self.P / self.P_0) ** (1 / 3)
+                return K_n, self.stiffness_ratio * K_n
+
+    `Hertz(k=4e8, P_0=1900, stiffness_ratio=0.5, P=1900)` is the contact of a scene or a joint like
+    any other. `law` is its name in TOML files, which a law without one cannot be written to;
+    `fj.quantity` puts unit and meaning there and makes a number known to sweeps and designs.
+
+    P is the normal load, which a preloaded joint needs. With `opening_exponent` beside it, 1/3
+    here, the joint follows the load curve that `stiffness` gives. A field `stiffness_ratio`, or K_n
+    and K_t, lets "K_t/K_n" be set.
+
+    **Raises:** `ValueError` unless P > 0, and K_n >= 0 and K_t >= 0 are finite, of a law that
+    depends on friction once a `Scene` or a `Joint` has both; `TypeError` unless they are two real
+    numbers; `ValueError` for a name of a law that another has. Of a traced law every number is NaN
+    instead.
     """
 
     has_surface: ClassVar[bool] = False  # its stiffness is that of a `Surface`
     fractal: ClassVar[bool] = False  # the source's law: there is a `ContactState`
     yields: ClassVar[bool] = False  # friction lowers its pressure at yield: Eq. 19, to mu_m = 0.9
 
+    def __init_subclass__(cls, law: str | None = None, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if law is not None:
+            from .laws import CONTACTS  # the package's own, which are made of this class
+
+            register(law, cls, CONTACTS)
+
+    def __check_init__(self):
+        if self.of_the_package:
+            return
+        make_arrays(self)
+        if (P := getattr(self, "P", None)) is not None:
+            name = f"P of {type(self).__name__}"
+            object.__setattr__(self, "P", number(name, P, above=0))
+        if not self.depends_on_friction:
+            bad = refused_stiffness(self, 1.0, 1.0)
+            if bad is not None:
+                refuse(self, bad)
+
+    @property
+    def of_the_package(self) -> bool:
+        """Whether it is no law of the user's own: its `__init__` checks its numbers."""
+        return type(self).__module__.rpartition(".")[0] == __name__.rpartition(".")[0]
+
     @property
     def depends_on_friction(self) -> bool:
         """Whether the stiffness does."""
-        return self.yields
+        if self.yields:
+            return True
+        both = jnp.ones(2)
+        try:  # what does not follow a batch of friction is no batch
+            alone = jax.vmap(lambda *friction: _of_each(self, *friction), out_axes=None)
+            jax.eval_shape(alone, both, both)
+        except (ValueError, TypeError):
+            return True
+        return False
 
     @abc.abstractmethod
     def stiffness(
@@ -74,6 +129,33 @@ class Contact(Part):
     def real_area(self, mu_m: ScalarLike) -> Float[Array, ""] | None:
         """Real contact area [m^2]; None where the law has none."""
         return None
+
+
+def refused_stiffness(law: Contact, mu_s: ArrayLike, mu_m: ArrayLike) -> Array | None:
+    """Where a traced law has K_n or K_t below 0 or not finite; None if all is known, and right.
+
+    **Raises:** `TypeError` and `ValueError` as `Contact`.
+    """
+    pair = _of_each(law, mu_s, mu_m)
+    if not (isinstance(pair, (tuple, list)) and len(pair) == 2):
+        raise TypeError(
+            f"stiffness of {type(law).__name__} must give (K_n, K_t), got {brief(pair)}"
+        )
+    names = (f"{name} of {brief(law)}" for name in ("K_n", "K_t"))
+    K_n, K_t = (number(name, K, at_least=0) for name, K in zip(names, pair, strict=True))
+    bad = jnp.isnan(K_n) | jnp.isnan(K_t)
+    return bad if concrete(bad) is None else None
+
+
+def _of_each(law: Contact, mu_s: ArrayLike, mu_m: ArrayLike) -> Any:
+    """The `stiffness` of every member of a batch, one by one."""
+    arrays, rest = eqx.partition(law, eqx.is_array)
+    leaves, tree = jax.tree.flatten(arrays)
+
+    def one(mu_s, mu_m, *leaves):
+        return eqx.combine(tree.unflatten(leaves), rest).stiffness(mu_s, mu_m)
+
+    return jnp.vectorize(one)(mu_s, mu_m, *leaves)
 
 
 @jax.jit

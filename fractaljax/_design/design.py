@@ -24,6 +24,7 @@ from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import replaced
 from .._mechanism.scene import Scene
 from .._stability.stability import growth_rate, require_computable
+from .._stability.summary import stiffness_remarks
 from .._surface.roughness import Roughness, roughness
 from .._surface.topography import Topographies, topography
 from . import constraints as limits
@@ -39,7 +40,7 @@ from .search import Found, Search
 from .solvers import Solver, slsqp
 from .starts import choose_starts, designs_around, screened_designs
 from .statement import DEFAULT_BOUNDS, state_problem
-from .summary import comparison_table
+from .summary import NO_EQUILIBRIUM, comparison_table, growth_text
 from .tolerance import Tolerance, squeal_probability
 
 _STARTS, _FOLLOWED = 12, 1  # the latter where cycles are followed
@@ -88,6 +89,9 @@ class Design(Record):
     squeal_probability: float | None = None  # as machined
     squeal_probability_error: float | None = None  # its standard error
     initial_squeal_probability: float | None = None
+    # Share of the draws without a sliding equilibrium, neither quiet nor squealing, after, before.
+    undetermined: float | None = None
+    initial_undetermined: float | None = None
     # What is asked of the limit cycle, before and after; 0 at rest.
     cycles: Mapping[str, tuple[float, float]] | None = None
     quiet_radius: float | None = None  # the largest kick survived, as `quiet_within` measures it
@@ -161,7 +165,12 @@ class Design(Record):
 
     def __repr__(self) -> str:
         shown = self.initial, self.scene, self.friction_slope, self.active, self.wavelengths
-        lines = [comparison_table(*shown, designed=tuple(self.bounds))]
+        before, after = [], stiffness_remarks(self.scene)
+        if self.scene is not self.initial:
+            column = "The column {}".format
+            before = stiffness_remarks(self.initial, " as given", follows=column("before"))
+            after = stiffness_remarks(self.scene, " as designed", follows=column("after"))
+        lines = [*before, *after, comparison_table(*shown, designed=tuple(self.bounds))]
         if self.has_surface:
             L, L_s = self.wavelengths
             lines.append(f"Sq and Sdq: wavelengths from {L:g} to {L_s:g} m")
@@ -173,8 +182,11 @@ class Design(Record):
             lines += ["", *str(self.least_growth).splitlines(), ""]
         growth = self.growth_rate if self.growth_rates is None else self.growth_rates[1]
         promise = "not stable: small disturbances grow"
-        if growth < 0:
+        if not np.isfinite(growth):
+            promise = f"undetermined: {NO_EQUILIBRIUM}"
+        elif growth < 0:
             promise = "stable against small disturbances; a larger kick may still end in squeal"
+            promise = "no promise: see above" if after else promise
         return "\n".join([*lines, self.outcome, promise])
 
     def _under_kicks(self) -> list[str]:
@@ -202,11 +214,15 @@ class Design(Record):
             sigmas = tolerance.standard_deviations.items()
             words.append("where " + ", ".join(f"{n} scatters by {s:g}" for n, s in sigmas))
         for row, growth in zip(rows, self.growth_rates, strict=True):
-            row["growth rate as required [1/s]"] = f"{growth:+.6g}"
+            row["growth rate as required [1/s]"] = growth_text(growth)
         if self.squeal_probability is not None:
             error = f" +- {self.squeal_probability_error:.1g}"
             rows[0]["probability of squeal"] = f"{self.initial_squeal_probability:.3g}"
             rows[1]["probability of squeal"] = f"{self.squeal_probability:.3g}{error}"
+        if self.undetermined or self.initial_undetermined:
+            shares = self.initial_undetermined, self.undetermined
+            for row, share in zip(rows, shares, strict=True):
+                row["undetermined: no sliding equilibrium"] = f"{share:.3g}"
         lines = ["", "; ".join(words), table(["before", "after"], rows)]
         if self.worst is not None:
             lines.append(f"worst at {condition_text(self.worst)}")
@@ -424,6 +440,7 @@ def _conclude(
         draw = dict(friction_slope=problem.friction_slope, seed=options["seed"])
         first, last = (squeal_probability(s, tolerance, envelope, **draw) for s in (x, final))
         more["initial_squeal_probability"] = first.value
+        more |= {"initial_undetermined": first.undetermined, "undetermined": last.undetermined}
         more |= {"squeal_probability": last.value, "squeal_probability_error": last.standard_error}
     if problem.cycles is not None:
         more["cycles"] = problem.cycles.ends(problem, path[-1])

@@ -187,9 +187,12 @@ def averaged(rows: np.ndarray, risk: float | np.ndarray) -> tuple[np.ndarray, np
     if np.ndim(risk):
         weights = np.empty_like(rows)
         np.put_along_axis(weights, rows.argsort(axis=0), np.asarray(risk)[:, None], axis=0)
-        return (weights * rows).sum(axis=0), weights
+        with np.errstate(invalid="ignore"):  # infinite rows of weight 0
+            return np.where(weights > 0, weights * rows, 0).sum(axis=0), weights
     largest = rows.max(axis=0)
-    shares = np.exp((rows - largest) / risk)
+    known = np.isfinite(largest)  # an infinite one is all that counts
+    below = np.where(known, rows, 0) - np.where(known, largest, 0)
+    shares = np.where(known, np.exp(below / risk), ~(rows < largest))
     total = shares.sum(axis=0)
     return largest + risk * np.log(total), shares / total
 

@@ -80,8 +80,11 @@ class LeastGrowth(Record):
         return "\n".join([first, least, grows, there, held, f"{can}: {cancel}", agreed])
 
 
-def least_growth(search: Search, paths: list[np.ndarray], found: Evaluation) -> LeastGrowth:
-    """What holds the least growth rate at the ends of `Search.least_growth`."""
+def least_growth(search: Search, paths: list[np.ndarray], found: Evaluation) -> LeastGrowth | None:
+    """What holds the least growth rate at the ends of `Search.least_growth`; None if it has none.
+
+    That is so where no design slides steadily at all that is asked.
+    """
     problem = search.evaluator.problem
     target, scale = float(problem.target), float(problem.growth_scale)
     count = 1 + len(problem.residual_names)
@@ -93,6 +96,8 @@ def least_growth(search: Search, paths: list[np.ndarray], found: Evaluation) -> 
     possible, rates = unmet <= 0, target + scale * np.sinh(growth)
     best = int(np.lexsort((rates, ~possible, np.maximum(unmet, 0) * ~possible))[0])
     u, residuals = paths[best][-1], found.residuals[best]
+    if not np.isfinite(rates[best] if possible[best] else unmet[best]):
+        return None
     if possible[best]:
         near = _AGREE * max(abs(rates[best]), abs(rates[best] - target), scale)
         agreed = possible & (np.abs(rates - rates[best]) <= near)

@@ -2,12 +2,21 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from .._base.table import table
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import unit, value_of
 from .._mechanism.scene import Scene
 from .._stability.stability import stability
 from .._stability.summary import ABSENT, scene_rows
+
+NO_EQUILIBRIUM = "no closed equilibrium"
+
+
+def growth_text(growth: float) -> str:
+    """A growth rate [1/s] as printed, or that there is none."""
+    return f"{growth:+.6g}" if np.isfinite(growth) else NO_EQUILIBRIUM
 
 
 def comparison_table(

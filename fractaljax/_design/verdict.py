@@ -30,6 +30,7 @@ from .design import DesignResult, design
 from .envelope import Envelope
 from .joints import under, with_contacts
 from .quiet import Kicks
+from .summary import growth_text
 from .tolerance import Tolerance, squeal_probability
 
 _WAVES = 100  # of the side of the area, for a law that needs a shortest wavelength
@@ -134,7 +135,7 @@ def verdict(
     found = _growth_rates(tuple(other for *_, other in asked), friction_slope)
     rates = found.rates.tolist()
     questions = [
-        Question(assumed, name, _as_text(rate), rate < 0, not np.isfinite(rate))
+        Question(assumed, name, growth_text(rate), rate < 0, not np.isfinite(rate))
         for (assumed, name, _), rate in zip(asked, rates[: len(asked)], strict=True)
     ]
     if (stiff := np.asarray(found.stiff)).any():
@@ -155,10 +156,6 @@ def verdict(
     wanted["kicks (quiet_within)"] = quiet_within is not None
     not_asked = tuple(name for name, was in wanted.items() if not was)
     return Verdict(tuple(questions), incurable, not_asked)
-
-
-def _as_text(growth: float) -> str:
-    return f"{growth:+.6g}" if np.isfinite(growth) else "no closed equilibrium"
 
 
 def _other_load(x: Mechanism, friction_slope: bool) -> list[tuple[str, str, Mechanism]]:
@@ -276,7 +273,7 @@ def _of_ratios(ratios: np.ndarray, rates: np.ndarray, own: np.ndarray) -> Questi
     """The worst growth rate between the own K_t/K_n, the fractal law's and Mindlin's."""
     worst = int(np.argmax(rates))
     name = f"K_t/K_n from {ratios[0].min():.3g} to {ratios[-1].max():.3g}"
-    found = f"{_as_text(rates[worst])} at {_extent(ratios[worst])}"
+    found = f"{growth_text(rates[worst])} at {_extent(ratios[worst])}"
     quiet, undetermined = bool(rates[worst] < 0), bool(np.isnan(rates[worst]))
     return Question(f"K_t/K_n = {_extent(own)}", name, found, quiet, undetermined)
 

@@ -6,7 +6,7 @@ from .._base.table import table
 from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
 from .._stability.stability import stability
-from .._stability.summary import friction_remark, stiffness_remark, verdict
+from .._stability.summary import friction_remark, stiffness_remarks, verdict
 from .cycle import CycleResult, LimitCycle
 
 _MOST = 12  # degrees of freedom of a structure, and multipliers, that are listed
@@ -20,7 +20,7 @@ _CONTACT_STATES = {
 
 def cycle_table(mechanism: Scene | Structure, cycle: LimitCycle) -> str:
     """The result of the search for one limit cycle, its numbers and its switches."""
-    lacking = stiffness_remark(mechanism) if isinstance(mechanism, Scene) else []
+    lacking = stiffness_remarks(mechanism)
     found = {"result": str(CycleResult[cycle.result])}
     found |= verdict(stability(mechanism), without_joint=bool(lacking))
     if not np.isfinite(cycle.period):
@@ -52,7 +52,7 @@ def cycle_table(mechanism: Scene | Structure, cycle: LimitCycle) -> str:
     if isinstance(mechanism, Structure):
         names = mechanism.names or [f"x{i}" for i in range(1, mechanism.n + 1)]
         most = sorted(range(mechanism.n), key=lambda i: -cycle.amplitude[i])[:_MOST]
-        tables = [
+        tables = ["\n".join(lacking)] * bool(lacking) + [
             table([""], [whole]),
             table(list(mechanism.joint_names), _joint_columns(cycle)),
             table([names[i] for i in most], [directions[i] for i in most]),

@@ -11,6 +11,7 @@ from jax import Array
 from jax.core import Tracer
 from jaxtyping import ArrayLike
 
+from .._base.laws import refused_where
 from .._base.parts import (
     Numbers,
     Part,
@@ -23,23 +24,13 @@ from .._base.parts import (
     require_kind,
 )
 from .._base.toml import Laws
-from .._contact.asperity import AsperityContact
-from .._contact.contact import MU_M_MAX, Contact
-from .._contact.fixed import FixedContact
-from .._contact.fractal import FractalContact
-from .._contact.measured import MeasuredContact
-from .._contact.persson import PerssonContact
+from .._contact.contact import MU_M_MAX, Contact, refused_stiffness
+from .._contact.laws import CONTACTS
 from .._friction import LAWS, Friction
 
 # By their names in files.
 JOINT_LAWS: Laws = {
-    "contact": {
-        "fractal": FractalContact,
-        "asperity": AsperityContact,
-        "persson": PerssonContact,
-        "measured": MeasuredContact,
-        "fixed": FixedContact,
-    },
+    "contact": CONTACTS,
     "friction": LAWS,
     "of": LAWS,  # the law that a `Scaled` one scales
 }
@@ -58,10 +49,15 @@ def friction_for(contact: Contact, friction: Friction) -> Friction:
     """The friction law of a joint, checked against its contact.
 
     **Raises:** `TypeError` for a part of the wrong kind; `ValueError` if the contact yields
-    and the smallest friction exceeds 0.9, where Eq. 19 ends.
+    and the smallest friction exceeds 0.9, where Eq. 19 ends, and if the stiffness of a law of the
+    user's is below 0 or no number under this friction.
     """
     require_kind("contact", contact, Contact)
     require_kind("friction", friction, Friction)
+    if not contact.of_the_package and contact.depends_on_friction:
+        bad = refused_stiffness(contact, friction.mu_s, friction.mu_m)
+        if bad is not None:
+            friction = refused_where(bad, friction)
     if not contact.yields:
         return friction
     number(friction.lowest, friction.mu_m, at_most=MU_M_MAX)

@@ -338,4 +338,8 @@ _DERIVED = {
 
 
 def _derived(x: Mechanism) -> Mapping[str, _Derived]:
-    return {} if isinstance(x, Structure) else _DERIVED
+    if not isinstance(x, Scene):
+        return {}
+    contact = x.contact
+    settable = hasattr(contact, "stiffness_ratio") or {"K_n", "K_t"} <= {*own_quantities(contact)}
+    return {name: _DERIVED[name] for name in _DERIVED if settable or name != STIFFNESS_RATIO}

@@ -127,18 +127,34 @@ def stability_table(scene: Scene, friction_slope: bool = True) -> str:
     return "\n".join(lines)
 
 
-def stiffness_remark(part: Scene | Joint, K: Any = None, name: str = "The joint") -> list[str]:
-    """A line if the law of a contact gives it no stiffness, normal or tangential, else none."""
+def stiffness_remark(
+    part: Scene | Joint, K: Any = None, name: str = "The joint", follows: str = "What follows"
+) -> list[str]:
+    """A line if the law of a contact gives it no stiffness, normal or tangential, else none.
+
+    It calls `follows` what is of the mechanism without it.
+    """
     if isinstance(part.contact, FixedContact):  # as it was asked for
         return []
     pair: Any = stiffness(part) if K is None and isinstance(part, Scene) else K
     K_n, K_t = map(float, pair)
     if K_n == 0:
         why = "every contact is plastic" if part.contact.fractal else "its law gives none"
-        return [f"{name} carries no stiffness: {why}. What follows is of the mechanism without it."]
+        return [f"{name} carries no stiffness: {why}. {follows} is of the mechanism without it."]
     if K_t == 0:
         return [f"{name} has no tangential stiffness: it slips as a whole."]
     return []
+
+
+def stiffness_remarks(x: Scene | Structure, which: str = "", **words: str) -> list[str]:
+    """`stiffness_remark` of every joint, with its words; `which` one follows its name."""
+    if isinstance(x, Scene):
+        return stiffness_remark(x, None, f"The joint{which}", **words)
+    return [
+        line
+        for name, joint in zip(x.joint_names, x.joints, strict=True)
+        for line in stiffness_remark(joint, joint.stiffness(), f"Joint {name}{which}", **words)
+    ]
 
 
 def verdict(modes: Stability, without_joint: bool = False) -> dict[str, str]:
@@ -198,11 +214,7 @@ def structure_table(structure: Structure, friction_slope: bool = True) -> str:
     if not np.isfinite(np.asarray(modes.eigenvalues)).all():
         raise ValueError(f"M, C and K have no eigenvalues in the range of {modes.margin.dtype}")
     unstable, unresolved = modes.unstable(), modes.unresolved()
-    lacking = [
-        line
-        for name, joint in zip(structure.joint_names, structure.joints, strict=True)
-        for line in stiffness_remark(joint, joint.stiffness(), f"Joint {name}")
-    ]
+    lacking = stiffness_remarks(structure)
     meaning = _structure_verdict(modes, unstable, unresolved, lacking)
     whole = {
         "degrees of freedom": f"{structure.n}",

@@ -15,7 +15,7 @@ from .._mechanism.structure import Structure
 from .._stability.stability import growth_rate
 from .._sweep.sweep import sweep
 from .axes import Axes, given_or_new, legend_above, over_quantity
-from .maps import regime_of, shade_regimes
+from .maps import regime_of, shade_regimes, shade_unsteady
 
 _POINTS = 240  # a side
 _WINDOW = {"D": (2.1, 2.9), "G": (1e-12, 1e-8)}
@@ -59,16 +59,18 @@ def stability_map(
         np.asarray(regime != Regime.elastic_plastic) if fractal else np.zeros_like(K_n, bool)
     )
     # Outside the elastic-plastic regime a growth rate is that of another mechanism.
-    valid = np.ma.masked_where(inelastic, growth)
+    none = np.isnan(growth)
+    valid = np.ma.masked_where(inelastic | none, growth)
     if valid.count() and valid.max() > 0:
         top = 10 ** np.ceil(np.log10(valid.max()))
         norm = LogNorm(top / 10**_DECADES, top)
-        shown = np.ma.masked_where(inelastic | (growth <= 0), np.clip(growth, norm.vmin, None))
+        shown = np.ma.masked_where(inelastic | ~(growth > 0), np.clip(growth, norm.vmin, None))
         mesh = ax.pcolormesh(x, y, shown.T, norm=norm, cmap="YlOrBr", shading="nearest")
         mesh.set_rasterized(True)
         bar = ax.figure.colorbar(mesh, ax=ax, extend="min", pad=0.02)
         bar.set_label("growth rate where it squeals [1/s]")
     handles: list[Any] = shade_regimes(ax, x, y, regime) if fractal else []
+    handles += shade_unsteady(ax, x, y, none)
     handles.append(Patch(facecolor="white", edgecolor="0.3", label="stable"))
     limits = [(valid, 0.0, "solid", 1.6, "stability boundary")]
     if target is not None:

@@ -122,6 +122,11 @@ def shade_regimes(ax: Axes, x: np.ndarray, y: np.ndarray, regime: Regime) -> lis
     ]
 
 
+def shade_unsteady(ax: Axes, x: np.ndarray, y: np.ndarray, none: np.ndarray) -> list[Artist]:
+    """Hatch where there is no growth rate (n, m): neither stable nor squealing."""
+    return _shade(ax, x, y, none, "no steady sliding", "1.0", "xx")
+
+
 def _shade(ax, x, y, inside, words: str, grey: str, hatch: str) -> list[Artist]:
     """Hatch where `inside` (n, m) holds, a point and what is half way to its neighbours."""
     from matplotlib.patches import Patch
@@ -150,17 +155,14 @@ def _start(result, ax):
     none = _no_number(result)
     growth = np.ma.masked_where(none, getattr(result.values, "growth_rate", result.values))
 
-    def hatched() -> list[Artist]:
-        return _shade(ax, x, y, none, "no steady sliding", "1.0", "xx")
-
     if not (isinstance(result.scene, Scene) and result.scene.contact.fractal):
-        return ax, growth, hatched()
+        return ax, growth, shade_unsteady(ax, x, y, none)
     axes: Any = result.axes
     regime = sweep(regime_of, result.scene, progress=False, **axes).values
     inelastic = np.asarray(regime != Regime.elastic_plastic)
     if not inelastic.all():
         growth = np.ma.masked_where(inelastic, growth)
-    return ax, growth, shade_regimes(ax, x, y, regime) + hatched()
+    return ax, growth, shade_regimes(ax, x, y, regime) + shade_unsteady(ax, x, y, none)
 
 
 def _no_number(result) -> np.ndarray:

@@ -150,6 +150,41 @@ def test_reference_design(scene, best, capsys):
     assert again.scene.to_toml() == best.scene.to_toml() and capsys.readouterr() == ("", "")
 
 
+def test_a_joint_without_stiffness_is_said_first(scene, best):
+    """Of the given and of the designed one, each with its column; no promise for the latter."""
+    plastic, slipping, fixed = (
+        scene.replace(G=1.342e-4),
+        scene.replace(D=2.7),
+        fj.FixedContact(0, 0),
+    )
+    none = "carries no stiffness: every contact is plastic. {} is of the mechanism without it."
+    before, after, both = map(
+        none.format, ("The column before", "The column after", "What follows")
+    )
+    slips = "has no tangential stiffness: it slips as a whole."
+    structures = [fj.Structure.from_scene(x) for x in (plastic, best.scene)]
+    (joint,) = structures[0].joint_names
+    cases = [  # given, designed, what is said of them, whether the last line promises anything
+        (scene, best.scene, [], True),
+        (plastic, best.scene, [f"The joint as given {before}"], True),
+        (scene, slipping, [f"The joint as designed {slips}"], False),
+        (
+            slipping,
+            plastic,
+            [f"The joint as given {slips}", f"The joint as designed {after}"],
+            False,
+        ),
+        (plastic, plastic, [f"The joint {both}"], False),
+        (scene.replace(contact=fixed), best.scene, [], True),
+        (*structures, [f"Joint {joint} as given {before}"], True),
+    ]
+    for given, designed, lines, promise in cases:
+        changed = {"initial": given, "scene": designed, "bounds": {"mu_s": (0.1, 1.0)}}
+        shown = repr(dataclasses.replace(best, **changed)).splitlines()
+        assert shown[: len(lines)] == lines and shown[len(lines)].split() == ["before", "after"]
+        assert shown[-1].startswith("stable against" if promise else "no promise: see above")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("surface", [{"D": 2.2, "G": 1e-9}, {"D": 2.7, "G": 1e-11}])
 def test_starts_outside_the_elastic_regime(scene, surface):

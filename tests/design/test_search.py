@@ -200,6 +200,10 @@ def test_averages_and_their_derivatives(risk):
     moved = rows + 1e-7 * (direction := np.random.default_rng(1).normal(size=rows.shape))
     change = (averaged(moved, risk)[0] - found) / 1e-7
     np.testing.assert_allclose(change, (weights * direction).sum(axis=0), atol=1e-5)
+    # What has no number at one condition is not met, and the rest is as before.
+    rows[4, 1], rows[0] = np.inf, -1e6
+    lost, weights = averaged(rows, risk)
+    assert lost[1] == np.inf and np.isfinite(lost[[0, 2]]).all() and np.isfinite(weights).all()
 
 
 def outside_disc(scene):

@@ -1,6 +1,8 @@
 """Quadrature, quantiles and draws of scatter against the normal distribution."""
 
+import dataclasses
 import math
+import re
 from statistics import NormalDist
 from typing import Any
 
@@ -126,11 +128,38 @@ def test_a_correlation_counts_in_the_probability_of_squeal():
     assert alone.value > 20 * found.value
 
 
-def test_draws_without_an_equilibrium_are_neither_quiet_nor_squeal():
-    """A force that scatters opens the joint beyond a limit: they are its normal tail."""
+def pulled_open():
+    """A damped brake whose force nearly opens the joint."""
     brake = fj.brake_scene()
     scene = fj.Scene(brake.contact, brake.friction, brake.oscillator, preload="linear")
-    scene = scene.replace(F=2000.0, xi_1=0.3, xi_2=0.3)
+    return scene.replace(F=2000.0, xi_1=0.3, xi_2=0.3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "over", [{}] + [{"envelope": {"V": (0.1, 0.2)}, "risk": r} for r in ("smooth", ("cvar", 0.5))]
+)
+def test_a_design_names_draws_without_an_equilibrium(over):
+    """Neither quiet nor squealing: no promise, no limit of a growth rate, no warning."""
+    scene, bounds, sigma = pulled_open(), {"xi_1": (0.2, 0.6)}, {"F": 600.0}
+    quick: Any = {"starts": 2, "lattice": 4, "progress": False}
+    best = fj.design(scene, bounds, target=-1.0, tolerance=sigma, **over, **quick)
+    found = fj.squeal_probability(scene, sigma, over.get("envelope"))
+    assert best.initial_undetermined == found.undetermined > 0.2
+    assert best.undetermined is not None and best.undetermined > 0.2
+    assert best.result == fj.DesignResult.infeasible and best.least_growth is None
+    rows = {name: cells for name, *cells in (re.split("  +", x) for x in repr(best).splitlines())}
+    shares = [f"{x:.3g}" for x in (best.initial_undetermined, best.undetermined)]
+    assert rows["undetermined: no sliding equilibrium"] == shares
+    assert rows["growth rate as required [1/s]"] == ["no closed equilibrium"] * 2
+    assert repr(best).splitlines()[-1] == "undetermined: no closed equilibrium"
+    closed = dataclasses.replace(best, undetermined=0.0, initial_undetermined=0.0)
+    assert "no sliding equilibrium" not in repr(closed)
+
+
+def test_draws_without_an_equilibrium_are_neither_quiet_nor_squeal():
+    """A force that scatters opens the joint beyond a limit: they are its normal tail."""
+    scene = pulled_open()
     rate = jax.jit(lambda F: fj.growth_rate(scene.replace(F=F)))
     low, high = 2000.0, 4000.0
     while high - low > 1e-3:

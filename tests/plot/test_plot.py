@@ -338,6 +338,13 @@ def test_all_that_is_a_number_is_drawn(draw):
     assert areas[0] > 0.8 * areas[1]
 
 
+def test_stability_map_does_not_call_stable_what_does_not_slide():
+    """A force that opens the joint leaves no growth rate: hatched, not white."""
+    scene = fj.Scene(BRAKE.contact, BRAKE.friction, BRAKE.oscillator, preload="linear")
+    ax = plot.stability_map(scene.replace(xi_1=0.3, xi_2=0.3), {"F": (1e3, 5e3), "P": (1e3, 3e3)})
+    assert labels(ax) == ["no steady sliding", "stable"]
+
+
 def test_map_without_a_boundary():
     """All stable and all alike: no boundary, no legend, no warning; other regimes are hatched."""
     same = eqx.tree_at(lambda s: s.values, modes(), jax.tree.map(np.ones_like, modes().values))

@@ -1,0 +1,51 @@
+"""What laws of the user's own have in common: a name in files, arrays of numbers, and refusal."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array, Bool
+
+from .parts import Part, nan_where, number, quantity_name
+
+
+def register(law: str, kind: type[Part], laws: dict[str, Any]) -> None:
+    """Let `law` be the name of this kind in TOML files.
+
+    **Raises:** `ValueError` if another kind has it.
+    """
+    known = laws.get(law, kind)
+    # A cell of a notebook that is run again makes its class anew.
+    if (known.__module__, known.__qualname__) != (kind.__module__, kind.__qualname__):
+        raise ValueError(f"the law {law!r} is {known.__name__} already")
+    laws[law] = kind
+
+
+def make_arrays(law: Part) -> None:
+    """Make arrays of the numbers that a generated `__init__` has stored as they were given.
+
+    **Raises:** as `number`, for a quantity that is none.
+    """
+    for field in dataclasses.fields(law):
+        value, static = getattr(law, field.name), field.metadata.get("static", False)
+        plain = isinstance(value, (int, float, np.number, np.ndarray))
+        given = "unit" in field.metadata or (plain and not isinstance(value, bool))
+        if given and value is not None and not static:
+            object.__setattr__(law, field.name, number(quantity_name(field), value))
+
+
+def refuse(law: Part, bad: Bool[Array, "..."]) -> None:
+    """NaN for the numbers of a traced law where it is `bad`."""
+    found = refused_where(bad, law)
+    for field in dataclasses.fields(law):
+        if not field.metadata.get("static", False):
+            object.__setattr__(law, field.name, getattr(found, field.name))
+
+
+def refused_where(bad: Bool[Array, "..."], tree: Any) -> Any:
+    """As `nan_where`; of a batch, the numbers that members do not share, or all if any is bad."""
+    own = any(np.shape(x) == bad.shape for x in jax.tree.leaves(tree))
+    if not own:
+        return nan_where(bad.any(), tree)
+    return jax.tree.map(lambda x: nan_where(bad, x) if np.shape(x) == bad.shape else x, tree)
