@@ -4,7 +4,7 @@ import shlex
 from pathlib import Path
 
 from .output import output, picture
-from .parsing import add_out, envelope_of, load_given
+from .parsing import add_out, envelope_of, load_given, pairs_of
 
 _MANY = 5  # warnings, with which a surface is not worth a design
 _OPTIONS = {
@@ -13,6 +13,11 @@ _OPTIONS = {
     "--unit": {"help": "unit of the heights, if not in the file: m, mm, um, nm"},
     "--position-unit": {"metavar": "UNIT", "help": "unit of positions, if different"},
     "--channel": {"help": "name or number of one of several in the file"},
+    "--columns": {
+        "nargs": "+",
+        "metavar": "ROLE=COLUMN",
+        "help": "title or number from 0 of the columns x, y, z, valid or invalid of a text",
+    },
     "--band": {
         "type": float,
         "nargs": 2,
@@ -74,7 +79,10 @@ def _run(arguments) -> int:
     if envelope is not None:
         envelope.check(base, ())
     names = ("dx", "dy", "unit", "position_unit", "channel")
-    read = read_measurement(arguments.file, **{name: getattr(arguments, name) for name in names})
+    given = {name: getattr(arguments, name) for name in names}
+    if arguments.columns is not None:
+        given["columns"] = pairs_of("--columns", arguments.columns, "ROLE=COLUMN")
+    read = read_measurement(arguments.file, **given)
     given = {name: getattr(arguments, name) for name in ("resolution", "stylus_radius")}
     with output(arguments.out) as write:
         found = identify(

@@ -138,11 +138,10 @@ def load_given(
     **Raises:** `ValueError` if it has no such table.
     """
     from .._mechanism.scene import Scene, brake_scene
-    from .._mechanism.structure import load
 
     if path is None:
         return brake_scene()
-    found = load(path) if structures else Scene.load(path)
+    found = load_noted(path) if structures else Scene.load(path)
     if isinstance(found, Scene) or not found.is_sparse:
         return found
     from .._stability.reduction import reduce
@@ -155,6 +154,16 @@ def load_given(
         )
     wanted["over"] = wanted.get("over", {}) | dict(over or {})
     return reduce(found, **wanted, progress=not quiet)
+
+
+def load_noted(path: Path) -> Any:
+    """The scene or structure in a file, whose notes go to standard error."""
+    from .._mechanism.structure import load
+
+    found = load(path)
+    for note in getattr(found, "notes", ()):
+        print(f"fractaljax: {note}", file=sys.stderr)
+    return found
 
 
 def reduction_of(path: Path) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from .output import output
-from .parsing import add_out, numbers, pairs_of, reduction_of
+from .parsing import add_out, load_noted, numbers, pairs_of, reduction_of
 
 _FORM = "NAME=LOW:HIGH"
 _FILE = "reduced.toml"
@@ -43,7 +43,7 @@ def _run(arguments) -> int:
     Writes reduced.toml and reduced.npz, which go wherever a structure goes.
     """
     from .._base.table import table
-    from .._mechanism.structure import Structure, load
+    from .._mechanism.structure import Structure
     from .._stability.reduction import reduce
     from .._stability.summary import structure_table
 
@@ -59,7 +59,7 @@ def _run(arguments) -> int:
         }
     if "band" not in options:
         raise ValueError("--band must be LOW:HIGH in rad/s: the file has no table [reduction]")
-    structure = load(arguments.structure)
+    structure = load_noted(arguments.structure)
     if not isinstance(structure, Structure):
         raise ValueError(f"{arguments.structure}: a scene has two directions, which are few enough")
     with output(arguments.out) as write:

@@ -1,15 +1,18 @@
 """Measured heights from files: plain text, NumPy's own, and instrument formats."""
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from .._base.numpy_file import read_npy, read_npz
+from .columns import choose, unclear
 from .grid import map_on_grid, profile_on_grid
+from .header import height_scale, step
 from .measurement import Measurement, measurement
-from .text import read_table, text_encoding
-from .units import agreed, scale
+from .text import Table, read_table, text_encoding
+from .units import agreed, known_unit, scale
 
 _TEXTS, _ARRAYS = {".csv", ".tsv", ".txt", ".dat", ".xyz", ".asc"}, {".npy", ".npz"}
 _MOST_TEXT, _MOST_ARRAYS, _MOST = 2**28, 2**30, 2**31  # bytes; the last of instrument formats
@@ -21,9 +24,10 @@ def read_measurement(
     *,
     dx: float | None = None,
     dy: float | None = None,
-    unit: str | None = None,
-    position_unit: str | None = None,
+    unit: str | float | None = None,
+    position_unit: str | float | None = None,
     channel: str | int | None = None,
+    columns: Mapping[str, str | int] | None = None,
 ) -> Measurement:
     """Read a profile or a map of heights.
 
@@ -34,8 +38,16 @@ def read_measurement(
     1 GiB of arrays, and 2 GiB in an instrument's format.
 
     `dx`, `dy` [m] are steps, `unit` that of the heights and `position_unit` that of positions
-    (default `unit`), for files that do not say. They must not contradict the file. `channel` is
-    the name or number of one of several. Missing heights are NaN.
+    (default `unit`), for files that do not say. They must not contradict the file. A unit may be a
+    number of metres, 2.9e-8. `channel` is the name or number of one of several. Missing heights
+    are NaN.
+
+    In text, titles such as X, Z, valid or quality choose the columns, also where there are others;
+    heights whose flag is 0 are missing. `columns` chooses by title, or by number from 0, where
+    titles do not: {"x": "X", "z": "Y", "valid": "flag"}, of x, y, z, valid and invalid (whose 1
+    stands for a missing height). A factor for heights and the size of a pixel in the header count:
+    `height conversion factor (-> m)=2.9e-8`, `pixel size=0.35 um`; `unit` is then that of heights
+    after the factor, and a size without a unit is in metres if the factor leads to them.
 
     **Raises:** `OSError` if the file cannot be read; `ValueError` naming it for an unknown or
     damaged format, a file that is too large, a unit or step that neither the file nor an argument
@@ -56,22 +68,42 @@ def read_measurement(
         if encoding is None and suffix not in _ARRAYS:
             from .instrument_file import read_instrument_file
 
+            if columns is not None:
+                raise ValueError(f"it is no table of text, got columns {dict(columns)!r}")
             return read_instrument_file(path, dx, dy, unit, channel)
         if channel is not None:
             raise ValueError(f"it has no channels, got channel {channel!r}")
         if encoding is None:
+            if columns is not None:
+                raise ValueError(f"it is no table of text, got columns {dict(columns)!r}")
             return _read_arrays(path, content, dx, dy, unit)
-        numbers, units = read_table(content, encoding)
-        return _from_table(path, numbers, units, dx, dy, unit, position_unit)
+        table = choose(whole := read_table(content, encoding), columns)
+        return _from_table(path, whole, table, dx, dy, unit, position_unit)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
 
 
-def _from_table(path, numbers, units, dx, dy, unit, position_unit) -> Measurement:
-    rows, columns = numbers.shape
+def _from_table(path, whole: Table, table: Table, dx, dy, unit, position_unit) -> Measurement:
+    """A measurement from the chosen columns of the whole table."""
+    numbers, units, settings = table.numbers, table.units, table.settings
+    rows, columns = whole.numbers.shape
     source = f"{path.name}: text of {rows} lines and {columns} columns"
-    z = numbers * scale(units[-1], unit, "heights", "--unit")
+    columns = numbers.shape[1]
+    if columns < whole.numbers.shape[1]:
+        source += f", of which {columns} for positions and heights"
+    try:
+        metre = height_scale(settings, units[-1], unit)
+    except ValueError as error:
+        known = units[-1] is None or known_unit(units[-1]) is not None
+        raise (error if known else unclear(whole, error)) from None
+    if "factor" in settings:
+        source += f", heights times {metre:g} m by its header"
+    z = numbers * metre
     if columns not in (2, 3):
+        dx = agreed("dx", step(settings, "dx", dx, position_unit), dx)
+        if columns > 1:
+            given = dx if dy is None else dy
+            dy = agreed("dy", step(settings, "dy", given, position_unit), dy)
         return measurement(z[:, 0] if columns == 1 else z.T, dx, dy, source)
     if np.isnan(numbers[:, :-1]).any():
         raise ValueError("positions must not have gaps")
@@ -81,7 +113,10 @@ def _from_table(path, numbers, units, dx, dy, unit, position_unit) -> Measuremen
     if columns == 2:
         z, own_dx = profile_on_grid(place[0], z[:, 1])
     else:
-        z, own_dx, own_dy = map_on_grid(place[0], place[1], z[:, 2])
+        try:
+            z, own_dx, own_dy = map_on_grid(place[0], place[1], z[:, 2])
+        except ValueError as error:
+            raise unclear(whole, error) from None
         dy = agreed("dy", own_dy, dy)
     return measurement(z, agreed("dx", own_dx, dx), dy, source)
 

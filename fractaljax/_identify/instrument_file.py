@@ -11,7 +11,7 @@ import numpy as np
 from .._base.parts import one_line
 from .grid import profile_on_grid
 from .measurement import Measurement, measurement
-from .units import agreed, metres, scale
+from .units import Unit, agreed, metres, scale
 
 _ANY_BYTES = {"hgt": ".hgt", "nms": ".nms"}  # formats that accept any bytes: by suffix only
 _MOST_UNPACKED, _MOST_POINTS = 2**31, 2**27  # bytes, and heights
@@ -19,7 +19,7 @@ _LIMITS = {"resolution": "resolution", "tip_radius": "stylus_radius"}
 
 
 def read_instrument_file(
-    path: Path, dx: float | None, dy: float | None, unit: str | None, channel: str | int | None
+    path: Path, dx: float | None, dy: float | None, unit: Unit, channel: str | int | None
 ) -> Measurement:
     """Read a file in a format known to SurfaceTopography; arguments as `read_measurement`.
 

@@ -1,5 +1,6 @@
 """Plain text: a header, then the same number of columns in every line."""
 
+import dataclasses
 import io
 import math
 import re
@@ -8,17 +9,32 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from .header import Settings, is_setting, read_settings, sets_something
 from .units import known_unit
 
 _SEPARATORS = (";", "\t", ",", None)  # None: white space
 _COMMENTS = ("#", "%", "//", "!")
 _GAPS = {"", "nan", "na", "n/a", "null", "none", "bad", "invalid"}
+_WORDS = {"true": 1.0, "false": 0.0}  # of flags
+_FIRST = ("t", "T", "f", "F")
+_BITS = re.compile(r"[01]\s*/\s*[01]")  # what stands for the unit of flags
 _LONGEST_LINE = 2**23  # characters
 # No leading zeros: in 1,034.5 a comma separates thousands.
 _NUMBER = re.compile(r"[-+]?((0|[1-9]\d*)(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _LIKE_A_NUMBER = re.compile(r"[-+.\"]*\d")
 # Bracketed, z [nm], or last, z/nm, z_nm, z in nm, but not the unit of a quantity, 5 nm.
 _UNIT = re.compile(r"[\[(]\s*([^\[\]()]+?)\s*[\])]$|(?:^|[/_]\s*|[^\W\d]\s+)([^\s/_\[\]()]+)$")
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """The numbers of a text, and what its header says about them."""
+
+    numbers: np.ndarray  # (rows, columns), NaN for gaps
+    titles: list[str] | None  # of the columns, without their units
+    units: list[str | None]
+    settings: Settings
+    words: dict[int, str]  # by column: the error of the first true or false, unless it has flags
 
 
 def text_encoding(content: bytes) -> str | None:
@@ -34,8 +50,8 @@ def text_encoding(content: bytes) -> str | None:
     return "utf-8-sig"
 
 
-def read_table(content: bytes, encoding: str) -> tuple[np.ndarray, list[str | None]]:
-    """The numbers, (rows, columns) with NaN for gaps, and the unit of each column or None.
+def read_table(content: bytes, encoding: str) -> Table:
+    """The numbers with their titles, units, and the settings above them.
 
     The first line of numbers sets the separator. Any other comma is a decimal comma.
 
@@ -43,6 +59,7 @@ def read_table(content: bytes, encoding: str) -> tuple[np.ndarray, list[str | No
     """
     header: list[str] = []
     numbers, columns, separator, marks = array("d"), 0, None, set()
+    words: dict[int, str] = {}
     for at, line in _lines(content, encoding):
         if not columns:
             fitting = [s for s in _SEPARATORS if _is_data(line, s)]
@@ -56,8 +73,10 @@ def read_table(content: bytes, encoding: str) -> tuple[np.ndarray, list[str | No
         cells = _cells(line, separator)
         if len(cells) != columns:
             raise ValueError(f"line {at} has {len(cells)} columns, the first one has {columns}")
-        for cell in cells:
+        for column, cell in enumerate(cells):
             value = _number(cell)
+            if cell[:1] in _FIRST and cell.lower() in _WORDS:
+                words.setdefault(column, f"line {at}: {cell!r} is not a number")
             if value is None or math.isinf(value):
                 why = "is not a number" if value is None else "is too large"
                 raise ValueError(f"line {at}: {cell[:40]!r} {why}")
@@ -69,7 +88,9 @@ def read_table(content: bytes, encoding: str) -> tuple[np.ndarray, list[str | No
         raise ValueError("it mixes decimal points and decimal commas")
     table = np.array(numbers).reshape(-1, columns)
     width = int(np.flatnonzero(~np.isnan(table).all(axis=0))[-1]) + 1  # separators may end lines
-    return table[:, :width], _units(header, separator, width)
+    units = _units(header, separator, width)
+    titles, settings = _titles(header, separator, width), read_settings(header)
+    return Table(table[:, :width], titles, units, settings, words)
 
 
 def _lines(content: bytes, encoding: str) -> Iterator[tuple[int, str]]:
@@ -88,9 +109,11 @@ def _cells(line: str, separator: str | None) -> list[str]:
 
 
 def _number(cell: str) -> float | None:
-    """A number, NaN for a gap, or None."""
+    """A number, also of a flag, NaN for a gap, or None."""
     if _NUMBER.fullmatch(cell):
         return float(cell)
+    if cell.lower() in _WORDS:
+        return _WORDS[cell.lower()]
     return math.nan if cell.strip("-*").lower() in _GAPS else None
 
 
@@ -106,21 +129,46 @@ def _refuse_damaged(header: list[str], separator: str | None):
     at, line = max(
         ((at, line) for at, line in enumerate(header, 1) if line.strip()), default=(0, "#")
     )
-    if line.lstrip().startswith(_COMMENTS):
+    if line.lstrip().startswith(_COMMENTS) or sets_something(line):
         return
-    if any(_LIKE_A_NUMBER.match(cell) for cell in _cells(line, separator)):
+    cells = [cell for cell in _cells(line, separator) if not _BITS.fullmatch(cell)]
+    if any(_LIKE_A_NUMBER.match(cell) for cell in cells):
         raise ValueError(f"line {at} is neither a title nor numbers: {line[:40]!r}")
 
 
 def _units(header: list[str], separator: str | None, columns: int) -> list[str | None]:
     """From the last line that names the columns, or else the only unit in the header."""
-    lines = [line.strip().lstrip("".join(_COMMENTS)).strip() for line in header]
+    lines = _plain(header)
     for line in reversed(lines):
         units = [_unit(cell.strip('"')) for cell in _cells(line, separator) if cell]
         if len(units) == columns and any(units):
             return units
     alone = {unit for unit in map(_unit, lines) if unit and known_unit(unit)}
     return [alone.pop() if len(alone) == 1 else None] * columns
+
+
+def _titles(header: list[str], separator: str | None, columns: int) -> list[str] | None:
+    """Those in the last line of the header, or above a line of nothing but units."""
+    for line in reversed([line for line in _plain(header) if line][-2:]):
+        cells = [cell.strip('"') for cell in _cells(line, separator) if cell]
+        titles = [_without_unit(cell) for cell in cells]
+        if len(titles) == columns and all(titles):
+            return titles
+    return None
+
+
+def _plain(header: list[str]) -> list[str]:
+    """The lines that hold titles, units or words, without the signs of a comment."""
+    lines = [line.strip().lstrip("".join(_COMMENTS)).strip() for line in header]
+    return [line for line in lines if not is_setting(line)]
+
+
+def _without_unit(title: str) -> str:
+    found = _UNIT.search(title)
+    if found and (found[1] or known_unit(found[2])):
+        unit = 1 if found[1] else 2
+        title = title[: found.start(unit)].rstrip("([/_ ").removesuffix(" in").rstrip()
+    return "" if _BITS.fullmatch(title) or title == "-" else title.strip()
 
 
 def _unit(title: str) -> str | None:

@@ -1,4 +1,4 @@
-"""Matrices of numbers in MATLAB's files of version 5 to 7.
+"""Matrices of numbers in MATLAB's files of version 5 to 7, and 4.
 
 `scipy.io.loadmat` cannot serve: damaged sparse matrices crash the interpreter (SciPy 1.17), and a
 small file may unpack to any amount.
@@ -11,26 +11,34 @@ from typing import Any
 
 import numpy as np
 
+from .matlab4_file import read_matlab_4
 from .matrix_entries import check_size
 
 _ORDERS = {b"\0\1IM": "<", b"\1\0MI": ">"}
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4"}
 _TYPES |= {7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _MATRIX, _COMPRESSED = 14, 15
-_NUMBERS, _SPARSE, _COMPLEX = range(5, 16), 5, 0x800  # classes, and a flag
+_NUMBERS, _SPARSE, _OPAQUE = range(5, 16), 5, 17  # classes
+_KINDS = {1: "a cell array", 2: "a struct", 3: "an object", 4: "text", 16: "a function"}
+_KINDS |= {17: "an object"}
+_COMPLEX, _LOGICAL = 0x800, 0x200  # flags
 
 
 def read_matlab(content: bytes, most: int) -> dict[str, Any]:
-    """The matrices of a .mat file by name, arrays or sparse, of at most `most` bytes in total.
+    """The variables of a .mat file by name, arrays or sparse, of at most `most` bytes in total.
 
-    **Raises:** `ValueError` if the file is damaged, too large or holds anything else.
+    A `ValueError` stands in the place of one that is no matrix of real numbers.
+
+    **Raises:** `ValueError` if the file is damaged or too large.
     """
-    if content.startswith(b"MATLAB 7.3"):
+    if content.startswith((b"MATLAB 7.3", b"\x89HDF")):
         raise ValueError("it is of MATLAB's version 7.3; save it with -v7")
     order = _ORDERS.get(content[124:128])
+    if order is None and b"\0" in content[:4]:  # which a text never has, and version 4 always
+        return read_matlab_4(content)
     if order is None:
-        raise ValueError("it is no file of MATLAB's version 5 to 7")
-    found = {}
+        raise ValueError("it is no file of MATLAB's version 5 to 7, or 4")
+    found: dict[str, Any] = {}
     for kind, element in _elements(content[128:], order, padded=False):
         most -= len(element)
         if kind == _COMPRESSED:
@@ -39,10 +47,15 @@ def read_matlab(content: bytes, most: int) -> dict[str, Any]:
             kind, element = next(_elements(element, order), (0, b""))
         if kind != _MATRIX:
             raise ValueError(f"it is damaged: a variable was to begin, not {kind}")
-        name, value = _variable(list(_elements(element, order)), order)
+        parts = list(_elements(element, order))
+        name, flags = _header(parts, order)
         if name in found:
             raise ValueError(f"it holds {name} twice")
-        found[name] = value
+        if name:  # what objects consist of has none
+            try:
+                found[name] = _matrix(name, flags, parts, order)
+            except ValueError as error:
+                found[name] = error
     return found
 
 
@@ -75,19 +88,33 @@ def _elements(content: bytes, order: str, padded: bool = True) -> Iterator[tuple
         place = end + (place - end) % 8 if padded else end
 
 
-def _variable(parts: list[tuple[int, bytes]], order: str) -> tuple[str, Any]:
-    import scipy.sparse
-
+def _header(parts: list[tuple[int, bytes]], order: str) -> tuple[str, int]:
+    """The name of a variable, and its flags with its class."""
     if len(parts) < 3 or len(parts[0][1]) != 8:
         raise ValueError("it is damaged: a variable lacks its header")
     flags = struct.unpack(f"{order}2I", parts[0][1])[0]
-    name = parts[2][1].decode("ascii", "backslashreplace")
+    at = 1 if flags & 0xFF == _OPAQUE else 2  # which has no size
+    return parts[at][1].decode("ascii", "backslashreplace"), flags
+
+
+def _of_bytes(data: bytes, begun: np.ndarray) -> bool:
+    """Whether the values of sparse columns, which begin at `begun`, have a byte each."""
+    count = int(begun[-1]) if len(begun) else 0
+    return count <= len(data) < 8 * count
+
+
+def _matrix(name: str, flags: int, parts: list[tuple[int, bytes]], order: str) -> Any:
+    import scipy.sparse
+
     if flags & 0xFF not in _NUMBERS or flags & _COMPLEX:
-        kind = "complex ones" if flags & _COMPLEX else f"MATLAB's class {flags & 0xFF}"
+        kind = _KINDS.get(flags & 0xFF, f"MATLAB's class {flags & 0xFF}")
+        kind = "complex ones" if flags & 0xFF in _NUMBERS else kind
         raise ValueError(f"{name} must be real numbers, got {kind}")
     sparse = flags & 0xFF == _SPARSE
-    arrays = []
+    arrays: list[np.ndarray] = []
     for kind, data in [parts[1], *parts[3:]]:
+        if sparse and flags & _LOGICAL and len(arrays) == 3 and _of_bytes(data, arrays[2]):
+            kind = 2  # MATLAB calls the bytes of sparse logicals doubles
         dtype = np.dtype(order + _TYPES.get(kind, "f8"))
         if kind not in _TYPES or len(data) % dtype.itemsize:
             raise ValueError(f"{name} is damaged: it has numbers of type {kind}")
@@ -97,11 +124,11 @@ def _variable(parts: list[tuple[int, bytes]], order: str) -> tuple[str, Any]:
         raise ValueError(f"{name} is damaged: it has {len(arrays) - 1} arrays")
     try:
         if not sparse:
-            return name, arrays[1].reshape(shape, order="F")
+            return arrays[1].reshape(shape, order="F")
         check_size(name, shape)
         _, i, begun, values = arrays  # with room for more entries, which SciPy lets go
         matrix = scipy.sparse.csc_array((values, i, begun), shape=shape)
         matrix.check_format(full_check=True)
-        return name, matrix
+        return matrix
     except (ValueError, IndexError, OverflowError) as error:
         raise ValueError(f"{name} is damaged: {' '.join(str(error).split())}") from None

@@ -54,7 +54,7 @@ def label_dofs(node: np.ndarray, dof: np.ndarray) -> tuple[np.ndarray, tuple[str
 
 
 def read_abaqus(name: str, content: bytes):
-    """The matrix of an .mtx file of Abaqus, and the names of its degrees of freedom.
+    """The matrix of an .mtx file of Abaqus, the names of its dofs, and whether it was mirrored.
 
     Lines of row node, dof, column node, dof and value (FORMAT=MATRIX INPUT and LABELS), or of row,
     column and value (COORDINATE), which have no names.
@@ -83,7 +83,8 @@ def read_abaqus(name: str, content: bytes):
     # is full on both sides of the diagonal, so a file without any pair gives a triangle.
     off = i != j
     paired = np.isin(i[off] * size + j[off], j[off] * size + i[off]).any()
-    return assemble(name, (size, size), i, j, values, 0 if paired else 1), names
+    mirrored = not paired and bool(off.any())
+    return assemble(name, (size, size), i, j, values, int(mirrored)), names, mirrored
 
 
 def read_harwell_boeing(name: str, content: bytes):

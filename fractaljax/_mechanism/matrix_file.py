@@ -5,6 +5,7 @@ import dataclasses
 import gzip
 import io
 import os
+import re
 import struct
 import zlib
 from pathlib import Path
@@ -22,34 +23,76 @@ from .nastran import read_dmig, read_op4
 
 _MOST = 2**30  # bytes of a file, unpacked
 _PACKED = {".gz": gzip.open, ".bz2": bz2.open}
+_COMPLEX = re.compile("must be real numbers, got .*complex")
+_DAMPING = (
+    "; a complex K, K (1 + i eta), is structural damping: save its real part as K and imag(K) /"
+    " omega as C, of the frequency omega [rad/s] in question"
+)
 
 
-@dataclasses.dataclass(frozen=True)
+class _ByName(dict[str, Any]):
+    """Matrices by name; asking for one that could not be read says why."""
+
+    def __init__(self, matrices: dict[str, Any], file: str, unread: dict[str, str]):
+        super().__init__(matrices)
+        self._file, self._unread = file, unread
+
+    def __missing__(self, name: str):
+        if name in self._unread:
+            raise ValueError(f"{self._file}: {self._unread[name]}")
+        raise KeyError(name)
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
 class Matrices:
     """Matrices by name, in float64, and the names of their degrees of freedom if a file has them.
 
     Each is a `scipy.sparse.csr_array`, square (n, n) or one column (n, 1) of a load. Only those of
     Nastran may have another shape, for it writes matrices to recover results beside them.
+
+    `unread` says by name why something else in the file is no such matrix; `matrices[name]` raises
+    that as a `ValueError`. `mirrored` names those of which the file gives one triangle, without
+    saying that they are symmetric.
     """
 
     matrices: dict[str, Any]
     names: tuple[str, ...] | None = None
+    unread: dict[str, str] = dataclasses.field(default_factory=dict)
+    mirrored: tuple[str, ...] = ()
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was done that the file does not ask for, in a line each."""
+        said = "{} has entries in one triangle only, which was mirrored as of a symmetric matrix"
+        return tuple(said.format(name) for name in self.mirrored)
+
+    def __repr__(self) -> str:
+        shown = [
+            f"{name} {X.shape[0]} x {X.shape[1]} of {X.nnz} numbers"
+            for name, X in self.matrices.items()
+        ]
+        left = [f"not read: {why}" for why in self.unread.values()]
+        return f"Matrices({'; '.join([*shown, *self.notes, *left])})"
 
 
 def read_matrices(path: str | os.PathLike) -> Matrices:
     """Read the matrices of a finite-element model, sparse.
 
     `.npz`: one sparse matrix of `scipy.sparse.save_npz`, or arrays of `numpy.savez`. `.mat`: MATLAB
-    up to version 7. `.mtx`: Matrix Market, or Abaqus (*MATRIX OUTPUT). `.op4`: OUTPUT4 of Nastran.
+    version 4 to 7. `.mtx`: Matrix Market, or Abaqus (*MATRIX OUTPUT). `.op4`: OUTPUT4 of Nastran.
     `.pch`, `.bdf`, `.dat`: its DMIG cards. `.hb`, `.rb`, `.rua`, `.rsa`, `.matrix`: Harwell-Boeing
     in ASCII, which Ansys writes with HBMAT. Each may be compressed as .gz or .bz2. A single matrix
     has the name of its file. Symmetric matrices are filled. Matrices of Abaqus and DMIG cards have
     names of degrees of freedom, "node.dof", in order. At most 1 GiB and 1000000 degrees of freedom
     are read.
 
+    A matrix that is complex, not finite, or neither square nor one column, of Nastran's rectangular
+    ones excepted, and text or a cell array of MATLAB do not disturb the others: `unread` says why.
+    Abaqus does not say whether it writes one triangle: `mirrored` names matrices that were filled
+    because no entry has its mirror image.
+
     **Raises:** `OSError` if the file cannot be read; `ValueError` in a line that begins with its
-    name for a format that is unknown or damaged, and for matrices that are complex, not finite, or
-    neither square nor one column, of Nastran's rectangular ones excepted.
+    name for a format that is unknown or damaged, and if nothing in it is a matrix as above.
     """
     path = Path(path)
     packed = path.suffix.lower() if path.suffix.lower() in _PACKED else ""
@@ -59,11 +102,15 @@ def read_matrices(path: str | os.PathLike) -> Matrices:
         if reader is None:
             raise ValueError(f"of unknown format; known are {', '.join(_READERS)}, .gz and .bz2")
         content = read_bounded(path, _MOST)
-        found, names = reader(inner.stem, _unpacked(content, packed) if packed else content)
+        unpacked = _unpacked(content, packed) if packed else content
+        found, names, *mirrored = reader(inner.stem, unpacked)
         if not found:
             raise ValueError("it holds no matrix")
-        any_shape = reader in (_op4, _dmig)
-        return Matrices({x: _sound(x, found[x], any_shape) for x in found}, names)
+        matrices, unread = _sorted(found, any_shape=reader in (_op4, _dmig))
+        if not matrices:
+            raise ValueError("; ".join(unread.values()))
+        by_name = _ByName(matrices, path.name, unread)
+        return Matrices(by_name, names, unread, tuple(found) if any(mirrored) else ())
     except ValueError as error:
         raise ValueError(f"{path.name}: {error}") from None
 
@@ -77,6 +124,20 @@ def _unpacked(content: bytes, packed: str) -> bytes:
     if len(content) > _MOST:
         raise ValueError(f"it unpacks to more than {_MOST / 1e6:g} MB, the most that is read")
     return content
+
+
+def _sorted(found: dict[str, Any], any_shape: bool) -> tuple[dict[str, Any], dict[str, str]]:
+    """The sound matrices among what was found, and by name why the others are not."""
+    matrices, unread = {}, {}
+    for name, value in found.items():
+        try:
+            if isinstance(value, ValueError):
+                raise value
+            matrices[name] = _sound(name, value, any_shape)
+        except ValueError as error:
+            why = str(error)
+            unread[name] = why + _DAMPING * bool(_COMPLEX.search(why))
+    return matrices, unread
 
 
 def _sound(name: str, value: Any, any_shape: bool):
@@ -106,7 +167,7 @@ def _npz(stem: str, content: bytes):
 
     members = read_members(content, _MOST)
     if "format" not in members:
-        return {name: read_npy(member, name) for name, member in members.items()}, None
+        return {name: _array(member, name) for name, member in members.items()}, None
     kind = next(
         (k for k in ("csr", "csc", "coo", "bsr", "dia") if k.encode() in members["format"]), ""
     )
@@ -131,13 +192,25 @@ def _npz(stem: str, content: bytes):
         raise ValueError(f"it is no sound file of SciPy's save_npz: {one_line(error)}") from None
 
 
+def _array(member: bytes, name: str) -> np.ndarray | ValueError:
+    try:
+        return read_npy(member, name)
+    except ValueError as error:
+        return error
+
+
 def _mtx(stem: str, content: bytes):
-    if content[: len(BANNER)].lower() != BANNER.lower():
-        matrix, names = read_abaqus(stem, content)
-        return {stem: matrix}, names
+    content = content.removeprefix(b"\xef\xbb\xbf")  # the byte order mark of UTF-8
+    banner = content.lstrip()
+    if banner[: len(BANNER)].lower() != BANNER.lower():
+        matrix, names, mirrored = read_abaqus(stem, content)
+        return {stem: matrix}, names, mirrored
+    # Blank lines go behind the banner, where they are allowed: all lines keep their numbers.
+    blank = content[: len(content) - len(banner)].count(b"\n")
+    content = banner.replace(b"\n", b"\n" * (1 + blank), 1)
     shape, i, j, values = read_entries(io.BytesIO(content), LARGEST, _MOST)
     if np.iscomplexobj(values):
-        raise ValueError("it must be real numbers, got complex ones")
+        return {stem: ValueError(f"{stem} must be real numbers, got complex ones")}, None
     return {stem: assemble(stem, shape, i, j, values)}, None
 
 

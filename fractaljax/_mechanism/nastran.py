@@ -22,27 +22,50 @@ _Column = tuple[int, int, np.ndarray]  # its number, its first row, both from 1,
 def read_op4(content: bytes) -> dict[str, Any]:
     """The sparse matrices of an OUTPUT4 file by their names.
 
-    Symmetric ones are full in such a file.
+    Symmetric ones are full in such a file. A `ValueError` stands in the place of a matrix that is
+    complex, too large or unsound.
 
     **Raises:** `ValueError` with the line or the matrix that is wrong.
     """
-    word, matrices = _WORDS.get(content[:4]), {}
+    word = _WORDS.get(content[:4])
+    matrices: dict[str, Any] = {}
     for name, shape, kind, columns in _binary(content, word) if word else _text(content):
         if name in matrices:
             raise ValueError(f"it gives {name} twice")
-        if kind not in (1, 2):
-            raise ValueError(f"{name} must be real numbers, got type {kind} of 1 to 4")
-        check_size(name, shape)
-        pieces = list(columns)
-        number, first = (np.array([piece[k] for piece in pieces], int) for k in (0, 1))
-        length = np.array([len(piece[2]) for piece in pieces], int)
-        begun = np.cumsum(length) - length
-        i = np.repeat(first - 1 - begun, length) + np.arange(length.sum())
-        values = np.concatenate([np.empty(0), *(piece[2] for piece in pieces)])
-        if i.size and (number.min() < 1 or i.min() < 0 or i.max() >= shape[0]):
-            raise ValueError(f"{name} is damaged: an entry lies outside {shape[0]} x {shape[1]}")
-        matrices[name] = assemble(name, shape, i, np.repeat(number - 1, length), values)
+        unfit = _unfit(name, shape, kind)
+        try:
+            pieces = list(columns)
+            matrices[name] = unfit or _of_columns(name, shape, pieces)
+        except ValueError as error:  # whatever follows cannot be found
+            raise (unfit or error) from None
     return matrices
+
+
+def _unfit(name: str, shape: tuple[int, int], kind: int) -> ValueError | None:
+    """Why a matrix cannot be had, by its first record."""
+    try:
+        if kind not in (1, 2):
+            known = "complex ones" if kind in (3, 4) else "of 1 to 4"
+            raise ValueError(f"{name} must be real numbers, got type {kind}, {known}")
+        check_size(name, shape)
+    except ValueError as error:
+        return error
+    return None
+
+
+def _of_columns(name: str, shape: tuple[int, int], pieces: list[_Column]) -> Any:
+    """The sparse matrix of its columns, or the `ValueError` that it is damaged."""
+    number, first = (np.array([piece[k] for piece in pieces], int) for k in (0, 1))
+    length = np.array([len(piece[2]) for piece in pieces], int)
+    begun = np.cumsum(length) - length
+    i = np.repeat(first - 1 - begun, length) + np.arange(length.sum())
+    values = np.concatenate([np.empty(0), *(piece[2] for piece in pieces)])
+    if i.size and (number.min() < 1 or i.min() < 0 or i.max() >= shape[0]):
+        return ValueError(f"{name} is damaged: an entry lies outside {shape[0]} x {shape[1]}")
+    try:
+        return assemble(name, shape, i, np.repeat(number - 1, length), values)
+    except ValueError as error:
+        return error
 
 
 def _binary(content: bytes, word: str) -> Iterator[tuple[str, tuple[int, int], int, Any]]:
@@ -54,7 +77,7 @@ def _binary(content: bytes, word: str) -> Iterator[tuple[str, tuple[int, int], i
             raise ValueError("it is damaged: a matrix was to begin")
         columns, rows, _, kind = np.frombuffer(record, f"{sign}i{wide}", 4).tolist()
         name = _name(record[4 * wide :])
-        real = f"{sign}f{8 if kind == 2 else wide}"
+        real = f"{sign}f{8 if kind in (2, 4) else wide}"  # 3 and 4 are pairs of those of 1 and 2
         yield (
             name,
             (abs(rows), columns),
@@ -121,6 +144,8 @@ def _text(content: bytes) -> Iterator[tuple[str, tuple[int, int], int, Any]]:
 def _text_columns(
     lines: list[bytes], at: list[int], columns: int, big: bool, kind: int, layout: tuple[int, int]
 ) -> Iterator[_Column]:
+    per_number = 2 if kind in (2, 4) else 1  # words
+
     def whole(count: int) -> list[int]:
         """The `count` whole numbers in the next line."""
         if at[0] >= len(lines):
@@ -140,7 +165,7 @@ def _text_columns(
             if not row:
                 length, first = whole(2) if big else divmod(whole(1)[0], 2**16)
                 words -= length + big
-                length, rest = divmod(length - 1, kind)
+                length, rest = divmod(length - 1, per_number)
                 if length < 1 or rest or words < 0:
                     raise wrong_line(at[0], lines[at[0] - 1], "must begin a string of its column")
             values, at[0] = fixed_fields(lines, at[0], length, layout)
@@ -159,21 +184,29 @@ def read_dmig(content: bytes):
     """The sparse matrices in DMIG cards by their names, and the names of the degrees of freedom.
 
     Other cards are left out. All matrices have the degrees of freedom of any of them, a scalar
-    point's being component 0; a rectangular matrix keeps its own columns.
+    point's being component 0; a rectangular matrix keeps its own columns. A `ValueError` stands in
+    the place of a complex one, whose degrees of freedom do not count.
 
     **Raises:** `ValueError` with the line that is wrong.
     """
     heads: dict[str, tuple[int, int]] = {}  # by name: the form, and the columns of form 9
     entries: dict[str, list[tuple[int, int, int, int, str]]] = {}
+    unfit: dict[str, ValueError] = {}
     for number, line, fields in _cards(content):
         name, point, *rest = fields
         try:
             if point == "0":
                 form, kind = int(rest[0]), int(rest[1])
-                if form not in (1, 2, 6, 9) or kind not in (1, 2) or name in heads:
-                    what = "must have a form of 1, 2, 6 and 9, type 1 or 2 (real), and a new name"
-                    raise wrong_line(number, line, what)
-                heads[name] = form, int(rest[5] or 0)
+                what = "must have a form of 1, 2, 6 and 9, type 1 or 2 (real), and a new name"
+                wrong = wrong_line(number, line, what)
+                if form not in (1, 2, 6, 9) or kind not in (1, 2, 3, 4) or name in heads | unfit:
+                    raise wrong
+                if kind > 2:
+                    unfit[name] = ValueError(f"{name} must be real numbers, got complex: {wrong}")
+                else:
+                    heads[name] = form, int(rest[5] or 0)
+                continue
+            if name in unfit:
                 continue
             column = int(point), int(rest[0] or 0)
             for k in range(2, len(rest), 4):
@@ -189,11 +222,12 @@ def read_dmig(content: bytes):
             if str(error).startswith("line"):
                 raise
             raise wrong_line(number, line, "begins a DMIG card that cannot be read") from None
-    if not heads:
+    if not heads | unfit:
         raise ValueError("it holds no DMIG card that begins a matrix")
     if not set(entries) <= set(heads):
         raise ValueError(f"no DMIG card begins {', '.join(sorted(set(entries) - set(heads)))}")
-    return _dmig_matrices(heads, entries)
+    matrices, names = _dmig_matrices(heads, entries) if heads else ({}, None)
+    return matrices | unfit, names
 
 
 def _dmig_matrices(heads, entries):

@@ -121,7 +121,7 @@ class ReducedStructure(ParametricStructure):
             reduction = Reduction(**about)
         except TypeError:
             raise ValueError(f"[reduced] has an unknown key among {brief(list(about))}") from None
-        given = {key: x for key, x in given.items() if key != "names"}
+        given = {key: x for key, x in given.items() if key not in ("names", "notes")}
         return cls(**{"parameters": {}, **given}, reduction=reduction)
 
     def _more_tables(self):

@@ -55,7 +55,8 @@ class Structure(Mechanism):
     units. `joints` is one `Joint`, a sequence of them (named joint_1, joint_2, ...) or a mapping
     from names. `F` (n,) [N], or a mapping from degrees of freedom to forces, presses the joints
     together: the slope of a friction law acts through the static equilibrium under it. `names` of
-    the degrees of freedom are optional, and so is a `Mesh` for pictures.
+    the degrees of freedom are optional, and so is a `Mesh` for pictures. `notes` say
+    what was made of the files of the matrices, such as a mirrored triangle; `load` finds them.
 
     **Raises:** `ValueError` or `TypeError` saying which matrix does not fit, is not finite or not
     positive definite, which degree of freedom is unknown, or which joint is wrong.
@@ -68,6 +69,7 @@ class Structure(Mechanism):
     joint_names: tuple[str, ...] = eqx.field(static=True)
     names: tuple[str, ...] | None = eqx.field(static=True)
     mesh: Mesh | None = eqx.field(static=True)
+    notes: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(
         self,
@@ -78,11 +80,13 @@ class Structure(Mechanism):
         F: ArrayLike | Sequence[float] | Mapping[Any, ArrayLike] | None = None,
         names: Iterable[str] | None = None,
         mesh: Mesh | None = None,
+        notes: Iterable[str] = (),
     ):
-        self._fill({"M": M, "C": C, "K": K}, {}, joints, F, names, mesh)
+        self._fill({"M": M, "C": C, "K": K}, {}, joints, F, names, mesh, notes)
 
-    def _fill(self, given, parameters, joints, F, names, mesh):
+    def _fill(self, given, parameters, joints, F, names, mesh, notes):
         self.parameters = parameters
+        self.notes = tuple(notes)
         mass = matrix_sum("M", given["M"], parameters, square_or_sparse)
         # Each term symmetric to the last bit, if their sum is a mass matrix.
         if mass.sparse:
@@ -251,7 +255,7 @@ class Structure(Mechanism):
         if changes.keys() & {*self.sums, "F"}:
             own = {name: changes.get(name, self._terms(name)) for name in self.sums}
             own |= {"joints": joints, "F": changes.get("F", self.F), "names": self.names}
-            own |= {"mesh": self._own_mesh()}
+            own |= {"mesh": self._own_mesh(), "notes": self.notes}
             if not self.parameters:
                 return Structure(**own)
             return ParametricStructure(**own, parameters=parameters)
@@ -282,6 +286,7 @@ class Structure(Mechanism):
         yield f"n={self.n}"
         yield from (f"{name}={value}" for name, value in self.parameters.items())
         yield from (f"{name}={j!r}" for name, j in zip(self.joint_names, self.joints, strict=True))
+        yield from map(repr, self.notes)
 
     @classmethod
     def _from_document(cls, document, folder):
@@ -353,11 +358,12 @@ class ParametricStructure(Structure):
         F: ArrayLike | Sequence[float] | Mapping[Any, ArrayLike] | None = None,
         names: Iterable[str] | None = None,
         mesh: Mesh | None = None,
+        notes: Iterable[str] = (),
     ):
         if not isinstance(parameters or {}, Mapping):
             raise TypeError(f"parameters must be a mapping, got {brief(parameters)}")
         held = {name: number(str(name), value) for name, value in (parameters or {}).items()}
-        self._fill({"M": M, "C": C, "K": K}, held, joints, F, names, mesh)
+        self._fill({"M": M, "C": C, "K": K}, held, joints, F, names, mesh, notes)
         taken = {"M", "C", "K", "F", "pi"}.union(*map(quantities, self.joints))
         for name in held:
             if not (isinstance(name, str) and name.isidentifier()):

@@ -17,7 +17,7 @@ from .coefficient import Expression
 from .damping import modal_damping, rayleigh_damping
 from .joint import JOINT_LAWS, Joint
 from .matrices import MatrixSum, is_sparse
-from .matrix_file import read_matrices
+from .matrix_file import Matrices, read_matrices
 from .mesh import Mesh
 
 _LARGEST_FILE = 2**30
@@ -44,22 +44,29 @@ class _Source:
     def __init__(self, table: dict[str, Any], folder: Path):
         self.folder, self.names = folder, table.get("names")
         self.held: dict[str, Any] = {}
+        self.unread: dict[str, str] = {}  # of the file of matrices, and why
+        self.notes: list[str] = []
         self.used: set[str] = set()
         self.file = table.get("matrices")
         if self.file is not None:
             path = folder / self.file
             # Arrays of NumPy's stay dense.
-            self.held = _npz(path) if path.suffix.lower() == ".npz" else self._read(path)
+            if path.suffix.lower() == ".npz":
+                self.held = _npz(path)
+            else:
+                found = self._read(path)
+                self.held, self.unread = found.matrices, found.unread
 
     def matrix(self, key: str, value: str) -> Any:
         """The matrix of a name in the file of matrices, or in a file of its own."""
-        if value in self.held:
+        if value in self.held or value in self.unread:
             self.used.add(value)
             return self.held[value]
-        found = self._read(self.folder / value)
-        if len(found) == 1:
+        read = self._read(self.folder / value)
+        found = read.matrices
+        if len(found) == 1 and key not in read.unread:
             return next(iter(found.values()))
-        if key not in found:
+        if key not in found and key not in read.unread:
             raise ValueError(f"{value} must hold {key} or one matrix; it holds {', '.join(found)}")
         return found[key]
 
@@ -97,10 +104,11 @@ class _Source:
             raise ValueError(f"[structure] mesh must be {_KEYS['mesh'][1]}, got {brief(name)}")
         return Mesh.of_arrays(_npz(self.folder / name), name)
 
-    def _read(self, path: Path) -> dict[str, Any]:
+    def _read(self, path: Path) -> Matrices:
         found = read_matrices(path)
         self.names = self.names or found.names
-        return found.matrices
+        self.notes += [f"{path.name}: {note}" for note in found.notes]
+        return found
 
 
 def read_structure(document: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -128,7 +136,7 @@ def read_structure(document: dict[str, Any], folder: Path) -> dict[str, Any]:
     for name in (*_MATRICES, "F"):
         if name in table and name in source.held and not _among(table[name], source.held):
             raise ValueError(f"[structure] gives {name} twice: in matrices and as {name}")
-        if name in source.held and name not in table:
+        if name not in table and (name in source.held or name in source.unread):
             given[name] = source.held[name]
         elif name in table and (name != "F" or isinstance(table[name], str)):
             given[name] = source.sum(name, table[name])
@@ -163,6 +171,7 @@ def read_structure(document: dict[str, Any], folder: Path) -> dict[str, Any]:
         attached[name] = toml.read_part(Joint, joint, JOINT_LAWS, f"joints.{name}")
     found = {"C": None, **given, "F": F, "joints": attached, "names": names}
     found["mesh"] = source.mesh(table.get("mesh"))
+    found["notes"] = tuple(dict.fromkeys(source.notes))  # a file may be named twice
     if "reduced" in document:
         bases = {name: source.held.get(name) for name in _BASES}
         found["reduced"] = {**toml.table_at(document, "reduced"), **bases}

@@ -98,10 +98,10 @@ def test_options_reach_reading_and_identification(capsys, monkeypatch):
         for name, value in (reading | limits).items()
         for word in (f"--{name.replace('_', '-')}", value)
     ]
-    options += ["--band", 1, "2e3", "--aliased", "no"]
+    options += ["--band", 1, "2e3", "--aliased", "no", "--columns", "x=X", "z=1"]
     assert run(capsys, "identify", "f", *options) == (2, "", "fractaljax: enough\n")
     fitting = {"band": [1.0, 2000.0], "aliased": False, "gamma": 1.5, "resolution": 3e-6}
-    expected = {"path": Path("f"), "steps": (1e-6, None)}
+    expected = {"path": Path("f"), "steps": (1e-6, None), "columns": {"x": "X", "z": "1"}}
     assert asked == reading | limits | fitting | expected
 
 

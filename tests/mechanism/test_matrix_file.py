@@ -217,6 +217,8 @@ CASES = {  # by name: the file, what writes it, the names, and the relative erro
     "mat dense": ("x.mat", mat(np.asarray), None, 0),
     "mat sparse": ("x.mat", mat(csc), None, 0),
     "mat 7": ("x.mat", mat(csc, do_compression=True), None, 0),
+    "mat 4": ("x.mat", mat(np.asarray, format="4"), None, 0),
+    "mat 4 sparse": ("x.mat", mat(csc, format="4"), None, 0),
     "abaqus": ("KAA.mtx", matrix_input, dof_names(NODES), 0),
     "abaqus labels": ("KAA.mtx", labels, dof_names(NODES), 0),
     "abaqus coordinate": ("KAA.mtx", coordinate, None, 0),

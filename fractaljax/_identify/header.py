@@ -1,0 +1,135 @@
+"""What the header of a text file says beside the titles: a factor for heights, pixels, a unit."""
+
+import dataclasses
+import math
+import re
+
+from .units import Unit, known_unit, metres, scale
+
+_LARGEST_BARE = 1e-3  # a pixel's size without a unit up to it is in metres, as its file's factor
+_SETTING = re.compile(r"\W*([^\W\d][^=:;,\t]*)[=:;,\t]\s*(\S.*?)\s*")
+_PLAIN = re.compile(r"\W*[^\W\d][^=:]*[=:]")  # sets anything
+_KEY_UNIT = re.compile(r"\s*(?:[\[(]\s*(?:->|to\b|in\b)?|->)\s*([^\[\]()]*?)\s*[\])]?$")
+_VALUE = re.compile(
+    r"([-+]?(?:\d+[.,]?\d*|[.,]\d+)(?:e[-+]?\d+)?)\s*[\[(]?([^\d\s\])]*)[\])]?", re.I
+)
+_FACTOR = re.compile(
+    r"(?:height|z|data|phase)(?: to height)?(?: conversion| scale| scaling)? factor"
+)
+_CONVERSION = re.compile(r"conversion factor")
+_PIXEL = re.compile(r"(?:([xy]) )?(?:pixel|px) (?:size|pitch|spacing)(?: ([xy]))?")
+_DATA_UNIT = re.compile(r"(?:data|heights?|z|values?) units?")
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """A line of a header: a number with its unit, either of which may be missing."""
+
+    line: str  # as an error names it
+    number: float | None
+    unit: str | None
+
+
+Settings = dict[str, Setting]  # by "factor", "unit", "dx" and "dy"
+
+
+def sets_something(line: str) -> bool:
+    """Whether a line of the header is a key and its value."""
+    return bool(_PLAIN.match(line)) or is_setting(line)
+
+
+def is_setting(line: str) -> bool:
+    """Whether a line of the header is one of those that `read_settings` knows."""
+    return bool(_known(line))
+
+
+def read_settings(header: list[str]) -> Settings:
+    """The settings of heights and steps in the lines above the numbers.
+
+    **Raises:** `ValueError` for a factor or a size that is not above 0.
+    """
+    found: Settings = {}
+    for at, line in enumerate(header, 1):
+        for name, setting in _known(line, f"line {at}, {line.strip()[:60]!r},").items():
+            found.setdefault(name, setting)
+    return found
+
+
+def _known(line: str, named: str = "") -> Settings:
+    parts = _SETTING.fullmatch(line.strip().strip('"'))
+    if parts is None:
+        return {}
+    key, value = parts[1].rstrip(), parts[2]
+    unit = _KEY_UNIT.search(key)
+    words = " ".join(re.split(r"[\s_-]+", key[: unit.start()] if unit else key)).strip().lower()
+    if _DATA_UNIT.fullmatch(words):
+        return {"unit": Setting(named, None, value.strip("[]()\"' "))}
+    pixel = _PIXEL.fullmatch(words)
+    number = _VALUE.fullmatch(value)
+    if number is None or not (pixel or _FACTOR.fullmatch(words) or _CONVERSION.fullmatch(words)):
+        return {}
+    of = (unit[1] if unit and unit[1] else number[2]).strip()
+    of = re.split(r"[/\s]", of)[0]  # m/rad
+    setting = Setting(named, float(number[1].replace(",", ".")), of or None)
+    if named and not 0 < (setting.number or 0) < math.inf:
+        raise ValueError(f"{named} must have a number above 0")
+    axis = pixel and (pixel[1] or pixel[2])
+    names = [f"d{axis}"] if axis else ["dx", "dy"] if pixel else ["factor"]
+    return dict.fromkeys(names, setting)
+
+
+def height_scale(settings: Settings, own: str | None, given: Unit) -> float:
+    """What numbers are multiplied by to be heights in metres.
+
+    `own` is the unit of their column and `given` that of the user: of heights after the factor.
+
+    **Raises:** `ValueError` naming the line that is no length or contradicts another, and as
+    `scale`.
+    """
+    factor, data = settings.get("factor"), settings.get("unit")
+    said = own or (data.unit if data else None)
+    if factor is None or factor.number is None:
+        known = said is None or known_unit(said) is not None
+        if not known and given is not None and not known_unit(str(given).strip()):
+            return metres(given)
+        if not known and own is None and data:
+            of = f"the metres of one {said}"
+            raise ValueError(f"{data.line} is no length: give {of} as unit (--unit 2.9e-8)")
+        return scale(said, given, "heights", "--unit")
+    if factor.unit is None and given is None:
+        raise ValueError(
+            f"{factor.line} does not say its unit: give that of the heights after it (--unit m)"
+        )
+    if factor.unit is not None and known_unit(factor.unit) is None:
+        raise ValueError(
+            f"{factor.line} does not lead to a length: take it out of the header, and give the"
+            " metres of one number as unit (--unit 2.9e-8)"
+        )
+    metre = factor.number * scale(factor.unit, given, "heights", "--unit")
+    if said and known_unit(said) and abs(metre - metres(said)) > 1e-6 * metre:
+        raise ValueError(f"{factor.line} contradicts the heights' unit {said}: take one out")
+    return metre
+
+
+def step(settings: Settings, axis: str, given: float | None, unit: Unit) -> float | None:
+    """The size of a pixel along an axis [m]; None if the header has none.
+
+    Without a unit of its own it has `unit`, or is in metres if the factor leads to metres.
+
+    **Raises:** `ValueError` naming the line if its unit is not known and no step is `given`.
+    """
+    pixel, factor = settings.get(axis), settings.get("factor")
+    if pixel is None or pixel.number is None:
+        return None
+    if pixel.unit and known_unit(pixel.unit):
+        return pixel.number * metres(pixel.unit)
+    if pixel.unit is None and unit is not None:
+        return pixel.number * metres(unit)
+    if pixel.unit is None and factor and factor.unit == "m" and pixel.number <= _LARGEST_BARE:
+        return pixel.number
+    if given is None:
+        raise ValueError(
+            f"{pixel.line} has no unit of length: give it (--position-unit um), or {axis} in"
+            f" metres (--{axis} 1e-6)"
+        )
+    return None

@@ -1,0 +1,75 @@
+"""Matrices of numbers in MATLAB's files of version 4, which have no header of their own."""
+
+import struct
+from typing import Any
+
+import numpy as np
+
+from .matrix_entries import assemble, check_size
+
+_TYPES = ("f8", "f4", "i4", "i2", "u2", "u1")
+_FULL, _TEXT, _SPARSE = range(3)
+_LONGEST_NAME = 64  # bytes
+
+
+def read_matlab_4(content: bytes) -> dict[str, Any]:
+    """The variables of a file by name, arrays or sparse.
+
+    A `ValueError` stands in the place of one that is no matrix of real numbers.
+
+    **Raises:** `ValueError` if the file is damaged.
+    """
+    found: dict[str, Any] = {}
+    place = 0
+    while place < len(content):
+        head = content[place : place + 20]
+        if len(head) < 20:
+            raise ValueError("it ends within a variable")
+        order = "<" if int.from_bytes(head[:4], "little") < 1000 else ">"
+        kind, rows, columns, imaginary, length = struct.unpack(f"{order}5i", head)
+        machine, rest = divmod(kind, 1000)
+        number, what = divmod(rest, 10)
+        sound = machine == (order == ">") and number < len(_TYPES) and what <= _SPARSE
+        sound = sound and min(rows, columns) >= 0 and imaginary in (0, 1)
+        if not (sound and 1 <= length <= _LONGEST_NAME):
+            raise ValueError(f"it is no file of MATLAB's version 4, or damaged at byte {place}")
+        name = content[place + 20 : place + 20 + length].partition(b"\0")[0]
+        name = name.decode("ascii", "backslashreplace")
+        dtype = np.dtype(order + _TYPES[number])
+        start = place + 20 + length
+        size = rows * columns * dtype.itemsize
+        place = start + size * (1 + imaginary)
+        if place > len(content):
+            raise ValueError("it ends within a variable")
+        if name in found:
+            raise ValueError(f"it holds {name} twice")
+        values = np.frombuffer(content[start : start + size], dtype).astype(dtype.newbyteorder("="))
+        values = values.reshape((rows, columns), order="F")
+        try:
+            found[name] = _matrix(name, what, bool(imaginary), values)
+        except ValueError as error:
+            found[name] = error
+    return found
+
+
+def _matrix(name: str, what: int, is_complex: bool, values: np.ndarray) -> Any:
+    if what == _TEXT:
+        raise ValueError(f"{name} must be real numbers, got text")
+    # The imaginary parts of a sparse matrix are a column of its own.
+    if is_complex or (what == _SPARSE and values.shape[1] == 4):
+        raise ValueError(f"{name} must be real numbers, got complex ones")
+    return values if what == _FULL else _sparse(name, values)
+
+
+def _sparse(name: str, table: np.ndarray) -> Any:
+    """Of lines of row, column and value, the last of which is the shape."""
+    whole = np.isfinite(table[:, :2]).all() and (table[:, :2] == np.rint(table[:, :2])).all()
+    if table.shape[1] != 3 or not len(table) or not whole:
+        raise ValueError(f"{name} is damaged: it has no rows, columns and values")
+    rows, columns = map(int, table[-1, :2])
+    check_size(name, (rows, columns))
+    i, j, values = table[:-1].T
+    inside = (i >= 1) & (i <= rows) & (j >= 1) & (j <= columns)
+    if not inside.all():
+        raise ValueError(f"{name} is damaged: an entry lies outside {rows} x {columns}")
+    return assemble(name, (rows, columns), i - 1, j - 1, values)
