@@ -14,6 +14,7 @@ from .._base.table import table
 from .._surface.surface import Surface
 from .band import HIGHEST, LOWEST, PER_RESOLUTION, chosen_band, given_band
 from .fit import PowerLaw
+from .gaps import without_gaps
 from .measurement import Measurement
 from .patches import between_patches
 from .preparation import prepared, spacing
@@ -104,6 +105,7 @@ def identify(
     and their `resolution` and `stylus_radius`, which given ones replace.
     The surface is taken to be that of Eq. 13, a profile a cut through it. Standard errors of a map
     count what differs from place to place in it; those of a profile hold where nothing does.
+    What filling missing points does to the spectrum is found on surrogates and taken out.
 
     - `band`: lowest and highest frequency [1/m] of the fit; chosen by default.
     - `resolution` [m]: lateral resolution, or the cut-off wavelength of a Gaussian filter.
@@ -124,11 +126,20 @@ def identify(
     ratio = float(Surface(2.5, 1e-9, gamma).gamma)
     heights = prepared(z)
     if z.ndim == 1:
-        spectra, lines = (profile_spectrum(heights.segments, dx),), heights.segments
+        lines = heights.segments
         length = dx * max(segment.size for segment in lines)
     else:
-        spectra, lines = map_spectra(heights.segments[0], dx, dy), [*heights.segments[0].T]
+        lines = [*heights.known.T]
         length = min(z.shape[0] * dx, z.shape[1] * dy)
+
+    def spectra_of(segments):
+        if z.ndim == 1:
+            return (profile_spectrum(segments, dx),)
+        return map_spectra(segments[0], dx, dy)
+
+    spectra = spectra_of(heights.segments)
+    if any(gap.any() for gap in heights.gaps):
+        spectra = without_gaps(spectra, heights.gaps, steps, spectra_of)
     spectrum = spectra[0]
     top = spectrum.nyquist
     if resolution is not None:

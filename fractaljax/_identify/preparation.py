@@ -20,6 +20,7 @@ class Heights(NamedTuple):
     """Heights without gaps, and what was changed."""
 
     segments: list[np.ndarray]  # contiguous segments of a profile, or one map
+    gaps: list[np.ndarray]  # which heights of each were filled
     missing: int  # NaN in the input
     outliers: int  # spikes taken out
     unused: int  # points in segments that are too short
@@ -73,19 +74,20 @@ def prepared(z: np.ndarray) -> Heights:
         share = np.isnan(z).mean()
         if share > _MOST_MISSING:
             raise ValueError(f"z has too many gaps: {share:.0%} of the map are missing")
-        return Heights([_interpolated(z)], missing, outliers, 0, z)
+        return Heights([filled(z)], [np.isnan(z)], missing, outliers, 0, z)
     known = np.flatnonzero(~np.isnan(z))
     runs = np.split(known, np.flatnonzero(np.diff(known) > _SHORT + 1) + 1)
-    segments = [_interpolated(z[run[0] : run[-1] + 1]) for run in runs]
-    sizes = np.array([segment.size for segment in segments])
+    measured = [z[run[0] : run[-1] + 1] for run in runs]
+    sizes = np.array([segment.size for segment in measured])
     if sizes.max() < FEWEST:
         raise ValueError(
             f"z has too many gaps: {FEWEST} points in a row are needed (gaps of up to {_SHORT} are "
             f"interpolated), the longest segment has {sizes.max()}"
         )
     used = sizes >= max(FEWEST // 2, sizes.max() / 8)
-    kept = [segment for segment, use in zip(segments, used, strict=True) if use]
-    return Heights(kept, missing, outliers, int(sizes[~used].sum()), z)
+    kept = [segment for segment, use in zip(measured, used, strict=True) if use]
+    gaps = [np.isnan(segment) for segment in kept]
+    return Heights([*map(filled, kept)], gaps, missing, outliers, int(sizes[~used].sum()), z)
 
 
 def _refuse_flat(z):
@@ -106,7 +108,7 @@ def _without_spikes(z):
     cross = ndimage.generate_binary_structure(z.ndim, 1)
     for _ in range(_SPIKE_ROUNDS):
         known = ~np.isnan(z)
-        size = np.where(known, np.abs(_from_neighbours(_interpolated(z))), 0.0)
+        size = np.where(known, np.abs(_from_neighbours(filled(z))), 0.0)
         # Most of a quantised profile may be straight, so the median alone is too small a scale.
         usual = max(1.4826 * np.median(size[known]), 0.3 * np.quantile(size[known], 0.9))
         # A spike shifts the means of its neighbours as well: only the largest counts.
@@ -127,7 +129,7 @@ def _from_neighbours(z):
     return away / z.ndim
 
 
-def _interpolated(z):
+def filled(z):
     """Gaps filled linearly along each axis, the mean of both in a map, level beyond the ends."""
 
     def fill(line):
