@@ -1,7 +1,8 @@
 """Scatter of quantities as machined: quantiles over a fixed quadrature, and draws at random.
 
-The scatter is normal, with any covariance. The nodes of the quadrature are a lattice of a normal
-distribution twice as wide, weighted back, so that the tails which decide a quantile are well
+The scatter is normal, with any covariance; that of a fractal dimension is truncated where it would
+leave (2, 3), and what is correlated with it follows. The nodes of the quadrature are a lattice of a
+normal distribution twice as wide, weighted back, so that the tails which decide a quantile are well
 resolved. The same nodes serve every design, so that a quantile is continuous in the design.
 """
 
@@ -31,11 +32,12 @@ from .._mechanism.quantities import (
 from .._mechanism.structure import Structure
 from .._stability.stability import growth_rate
 from .envelope import Envelope
+from .truncated import HIGHEST, LOWEST, REACH, is_fractal_dimension, truncated
 
 _NODES = 55  # in one and two dimensions: a Fibonacci number, whose lattice is the best of its size
 _WIDENING = 2.0  # of the distribution that the nodes are drawn from
 _MOST = 6  # quantities that scatter
-_REACH = 6.0  # standard deviations that must stay inside the domain of a quantity
+_LARGEST = 0.5  # of the logarithm of the largest number: the largest shift of a logarithm
 _SAMPLES = 100_000  # of a scene; of a structure fewer:
 _WORK, _SAMPLES_LEAST = 4e9, 1000  # draws times cubed sizes of the eigenvalue problem
 _EIGENVALUES_AT_ONCE = 1 << 15
@@ -46,6 +48,11 @@ class Tolerance(Record):
 
     "ln G" scatters ln G. `Tolerance.of` takes a mapping of independent standard deviations and an
     `Identification`, whose D and ln G are strongly correlated.
+
+    Scatter is normal. A fractal dimension D whose six standard deviations would leave (2, 3) has
+    the normal distribution truncated to it, at any standard deviation; ln G and whatever else is
+    correlated with D keeps its normal distribution at each D. Others must stay inside their domains
+    within six standard deviations.
 
     **Raises:** `ValueError` unless the covariance is symmetric, positive semidefinite and not 0.
     """
@@ -104,7 +111,8 @@ class Tolerance(Record):
     def check(self, x: Mechanism, ranges: Mapping[str, Sequence[float]]) -> None:
         """Refuse names that `x` lacks, and a scatter that leaves a domain within six deviations.
 
-        `ranges` are those inside which a quantity is moved otherwise.
+        That of a fractal dimension is truncated instead. `ranges` are those inside which a quantity
+        is moved otherwise.
         """
         known = known_quantities(x)
         for name, (given, sigma) in zip(
@@ -115,15 +123,18 @@ class Tolerance(Record):
             for each in _moved_by(x, name):
                 ends = ranges.get(each, ranges.get(name, (float(value_of(x, each)),)))
                 low, high = min(ends), max(ends)
-                if name == given:
-                    low, high = low - _REACH * sigma, high + _REACH * sigma
+                if is_fractal_dimension(x, each):
+                    pass
+                elif name == given:
+                    low, high = low - REACH * sigma, high + REACH * sigma
                 else:
-                    low, high = low * math.exp(-_REACH * sigma), high * math.exp(_REACH * sigma)
+                    most = min(REACH * sigma, _largest(value_of(x, each).dtype))
+                    low, high = low * math.exp(-most), high * math.exp(most)
                 try:
                     replaced(x, {each: np.array([low, high])})
                 except ValueError as error:
                     raise ValueError(
-                        f"tolerance of {given} leaves its domain within {_REACH:g} deviations: "
+                        f"tolerance of {given} leaves its domain within {REACH:g} deviations: "
                         f"{error}"
                     ) from None
         require_independent(x, self.quantities)
@@ -156,11 +167,50 @@ class Tolerance(Record):
         `values` holds a plain name, "D", where it is moved for all joints at once.
         """
         found = {}
-        for name, given, by in zip(self.quantities, self.names, shift, strict=True):
-            for each in _moved_by(x, name):
-                value = values[name] if name in values else values[each]
-                found[each] = value + by if name == given else value * jnp.exp(by)
+        shifts = self._inside(x, values, shift)
+        for name, given, by in zip(self.quantities, self.names, shifts, strict=True):
+            for each, value in _values(x, name, values).items():
+                if name == given:
+                    found[each] = value + by
+                else:
+                    most = _largest(jnp.result_type(value))
+                    found[each] = value * jnp.exp(jnp.clip(by, -most, most))
         return found
+
+    def _inside(self, x: Mechanism, values: Mapping[str, Any], shift: Any) -> list[Any]:
+        """The shifts, those of fractal dimensions truncated and what is correlated moved along.
+
+        A second dimension is truncated by itself: it does not move the first.
+        """
+        shifts, fixed = [*shift], set()
+        for i, (name, given) in enumerate(zip(self.quantities, self.names, strict=True)):
+            if not is_fractal_dimension(x, name):
+                continue
+            low, high = -math.inf, math.inf  # all joints move by the same amount
+            for value in _values(x, name, values).values():
+                below, above = (
+                    end - value if name == given else jnp.log(end / value)
+                    for end in (LOWEST, HIGHEST)
+                )
+                low, high = jnp.maximum(low, below), jnp.minimum(high, above)
+            variance = self.covariance[i, i]
+            more = truncated(shifts[i], jnp.sqrt(variance), low, high) - shifts[i]
+            share = self.covariance[i] / jnp.where(variance > 0, variance, 1)
+            fixed.add(i)
+            for j in range(len(shifts)):
+                if j == i or j not in fixed:
+                    shifts[j] = shifts[j] + (more if j == i else share[j] * more)
+        return shifts
+
+
+def _values(x: Mechanism, name: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of what a name moves, each by its own name."""
+    return {each: values[name if name in values else each] for each in _moved_by(x, name)}
+
+
+def _largest(dtype) -> float:
+    """The largest shift of a logarithm, for any error: the number stays finite, and above 0."""
+    return _LARGEST * math.log(float(jnp.finfo(dtype).max))
 
 
 def _moved_by(x: Mechanism, name: str) -> list[str]:
@@ -237,7 +287,8 @@ def squeal_probability(
     structure moves all joints that have one by the same amount. `samples` are 100,000 by default,
     fewer, down to 1000, of a structure of more than 17 degrees of freedom.
 
-    **Raises:** `ValueError` for quantities that `x` lacks, or scattered beyond their domain.
+    **Raises:** `ValueError` for quantities that `x` lacks, or scattered beyond their domain; D is
+    truncated to its own instead (see `Tolerance`).
     """
     tolerance, values = Tolerance.of(tolerance), {}
     n = x.n if isinstance(x, Structure) else 2

@@ -1,6 +1,8 @@
 """D and G of a measured profile or map, with standard errors."""
 
 import math
+import os
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -12,9 +14,12 @@ from .._base.table import table
 from .._surface.surface import Surface
 from .band import HIGHEST, LOWEST, PER_RESOLUTION, chosen_band, given_band
 from .fit import PowerLaw
+from .gaps import without_gaps
+from .measurement import Measurement
 from .patches import between_patches
-from .preparation import checked, prepared, spacing
+from .preparation import prepared, spacing
 from .quantisation import quantisation_limit
+from .source import measured
 from .spectrum import Spectrum, log_mean_cosine_power, map_spectra, profile_spectrum
 from .structure_function import StructureFunction, structure_function
 from .stylus import tip_limit
@@ -81,8 +86,8 @@ class Identification(Record):
 
 
 def identify(
-    z: ArrayLike,
-    dx: float,
+    z: ArrayLike | Measurement | str | os.PathLike | Any,
+    dx: float | None = None,
     dy: float | None = None,
     *,
     band: tuple[float, float] | None = None,
@@ -94,8 +99,13 @@ def identify(
     """D and G of heights z [m], a profile (n,) or a map (n, m), from their power spectrum.
 
     Points are dx [m] apart along the first axis, dy (default dx) along the second; NaN is missing.
+    z may also be a `Measurement`, the path of a file that `read_measurement` reads without
+    options but dx and dy, or a topography of SurfaceTopography: with `heights()`, a `unit`, and
+    `pixel_size` or `positions()`. They bring their dx and dy, which given ones must not contradict,
+    and their `resolution` and `stylus_radius`, which given ones replace.
     The surface is taken to be that of Eq. 13, a profile a cut through it. Standard errors of a map
     count what differs from place to place in it; those of a profile hold where nothing does.
+    What filling missing points does to the spectrum is found on surrogates and taken out.
 
     - `band`: lowest and highest frequency [1/m] of the fit; chosen by default.
     - `resolution` [m]: lateral resolution, or the cut-off wavelength of a Gaussian filter.
@@ -105,21 +115,31 @@ def identify(
     - `gamma` of Eq. 13, also the ratio of the ends of a bin: waves may come in steps of it.
 
     **Raises:** `ValueError` for heights that are too few, flat, complex, infinite or not (n,) or
-    (n, m); distances not above 0; a band that is empty or outside the data, or that the instrument
-    leaves empty.
+    (n, m); distances that are missing, not above 0 or not those of z; a band that is empty or
+    outside the data, or that the instrument leaves empty; and as `read_measurement`.
     """
-    z = checked(z)
-    dx = spacing("dx", dx)
-    dy = dx if dy is None else spacing("dy", dy)
+    read = measured(z, dx, dy)
+    z, dx, dy = read.z, read.dx, read.dx if read.dy is None else read.dy
+    resolution = read.resolution if resolution is None else resolution
+    stylus_radius = read.stylus_radius if stylus_radius is None else stylus_radius
     steps = (dx, dy)[: z.ndim]
     ratio = float(Surface(2.5, 1e-9, gamma).gamma)
     heights = prepared(z)
     if z.ndim == 1:
-        spectra, lines = (profile_spectrum(heights.segments, dx),), heights.segments
+        lines = heights.segments
         length = dx * max(segment.size for segment in lines)
     else:
-        spectra, lines = map_spectra(heights.segments[0], dx, dy), [*heights.segments[0].T]
+        lines = [*heights.known.T]
         length = min(z.shape[0] * dx, z.shape[1] * dy)
+
+    def spectra_of(segments):
+        if z.ndim == 1:
+            return (profile_spectrum(segments, dx),)
+        return map_spectra(segments[0], dx, dy)
+
+    spectra = spectra_of(heights.segments)
+    if any(gap.any() for gap in heights.gaps):
+        spectra = without_gaps(spectra, heights.gaps, steps, spectra_of)
     spectrum = spectra[0]
     top = spectrum.nyquist
     if resolution is not None:

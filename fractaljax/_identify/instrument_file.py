@@ -11,11 +11,11 @@ import numpy as np
 from .._base.parts import one_line
 from .grid import profile_on_grid
 from .measurement import Measurement, measurement
-from .units import Unit, agreed, metres, scale
+from .topography import instrument_limits
+from .units import Unit, agreed, scale
 
 _ANY_BYTES = {"hgt": ".hgt", "nms": ".nms"}  # formats that accept any bytes: by suffix only
 _MOST_UNPACKED, _MOST_POINTS = 2**31, 2**27  # bytes, and heights
-_LIMITS = {"resolution": "resolution", "tip_radius": "stylus_radius"}
 
 
 def read_instrument_file(
@@ -60,14 +60,8 @@ def read_instrument_file(
         dy = agreed("dy", own[1], dy) if z.ndim == 2 else dy
     instrument = topography.info.get("instrument") or {}
     words = [source, f"channel {chosen.name!r}", instrument.get("vendor"), instrument.get("name")]
-    parameters = instrument.get("parameters") or {}
-    limits = {
-        name: float(parameters[key]["value"]) * metres(parameters[key]["unit"])
-        for key, name in _LIMITS.items()
-        if parameters.get(key)
-    }
     source = f"{path.name}: {', '.join(word for word in words if word)}"
-    return measurement(z * metre, dx, dy, source, **limits)
+    return measurement(z * metre, dx, dy, source, **instrument_limits(topography.info))
 
 
 def _refuse_large_archive(path):

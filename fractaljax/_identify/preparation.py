@@ -14,12 +14,14 @@ _ABSURD = 1e50  # m, and 1/m: squares of larger numbers lose their digits
 _ROUNDING = 1e-12  # of the largest height
 _SPIKE_ROUNDS = 3
 _SPIKE = 8.0  # robust standard deviations of a height from the mean of its neighbours
+_AROUND, _KINK = 4, 3.0  # points away, and how much further from them a kink is than from the next
 
 
 class Heights(NamedTuple):
     """Heights without gaps, and what was changed."""
 
     segments: list[np.ndarray]  # contiguous segments of a profile, or one map
+    gaps: list[np.ndarray]  # which heights of each were filled
     missing: int  # NaN in the input
     outliers: int  # spikes taken out
     unused: int  # points in segments that are too short
@@ -73,19 +75,20 @@ def prepared(z: np.ndarray) -> Heights:
         share = np.isnan(z).mean()
         if share > _MOST_MISSING:
             raise ValueError(f"z has too many gaps: {share:.0%} of the map are missing")
-        return Heights([_interpolated(z)], missing, outliers, 0, z)
+        return Heights([filled(z)], [np.isnan(z)], missing, outliers, 0, z)
     known = np.flatnonzero(~np.isnan(z))
     runs = np.split(known, np.flatnonzero(np.diff(known) > _SHORT + 1) + 1)
-    segments = [_interpolated(z[run[0] : run[-1] + 1]) for run in runs]
-    sizes = np.array([segment.size for segment in segments])
+    measured = [z[run[0] : run[-1] + 1] for run in runs]
+    sizes = np.array([segment.size for segment in measured])
     if sizes.max() < FEWEST:
         raise ValueError(
             f"z has too many gaps: {FEWEST} points in a row are needed (gaps of up to {_SHORT} are "
             f"interpolated), the longest segment has {sizes.max()}"
         )
     used = sizes >= max(FEWEST // 2, sizes.max() / 8)
-    kept = [segment for segment, use in zip(segments, used, strict=True) if use]
-    return Heights(kept, missing, outliers, int(sizes[~used].sum()), z)
+    kept = [segment for segment, use in zip(measured, used, strict=True) if use]
+    gaps = [np.isnan(segment) for segment in kept]
+    return Heights([*map(filled, kept)], gaps, missing, outliers, int(sizes[~used].sum()), z)
 
 
 def _refuse_flat(z):
@@ -100,34 +103,42 @@ def _refuse_flat(z):
 
 
 def _without_spikes(z):
-    """NaN for heights much further from the mean of their neighbours than most are."""
+    """NaN for heights much further from the mean of their neighbours than most are.
+
+    A kink, such as the cusp between two arcs of a tip, is no spike: it is four times as far from
+    the mean of the points four steps away, a spike of one or two points at most twice.
+    """
     from scipy import ndimage
 
     cross = ndimage.generate_binary_structure(z.ndim, 1)
     for _ in range(_SPIKE_ROUNDS):
         known = ~np.isnan(z)
-        size = np.where(known, np.abs(_from_neighbours(_interpolated(z))), 0.0)
+        complete = filled(z)
+        away = _from_neighbours(complete)
+        size = np.where(known, np.abs(away), 0.0)
         # Most of a quantised profile may be straight, so the median alone is too small a scale.
         usual = max(1.4826 * np.median(size[known]), 0.3 * np.quantile(size[known], 0.9))
         # A spike shifts the means of its neighbours as well: only the largest counts.
         largest = ndimage.maximum_filter(size, footprint=cross, mode="constant")
         spikes = (size > _SPIKE * usual) & (size >= largest) & (usual > 0)
+        if spikes.any():
+            spikes &= _from_neighbours(complete, _AROUND) * np.sign(away) < _KINK * size
         if not spikes.any():
             break
         z = np.where(spikes, np.nan, z)
     return z
 
 
-def _from_neighbours(z):
-    """Height above the mean of the two neighbours, averaged over the axes; 0 at the ends."""
+def _from_neighbours(z, lag=1):
+    """Height above the mean of the two points `lag` away, averaged over the axes; 0 at the ends."""
     away = np.zeros(z.shape)
     for axis in range(z.ndim):
-        inner = np.moveaxis(away, axis, 0)[1:-1]
-        inner -= np.diff(np.moveaxis(z, axis, 0), 2, axis=0) / 2
+        inner, lines = np.moveaxis(away, axis, 0)[lag:-lag], np.moveaxis(z, axis, 0)
+        inner -= (lines[2 * lag :] - 2 * lines[lag:-lag] + lines[: -2 * lag]) / 2
     return away / z.ndim
 
 
-def _interpolated(z):
+def filled(z):
     """Gaps filled linearly along each axis, the mean of both in a map, level beyond the ends."""
 
     def fill(line):

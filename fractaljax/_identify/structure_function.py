@@ -51,7 +51,7 @@ def structure_function(
     end: float | None,
     noise: float = 0.0,
 ) -> StructureFunction:
-    """Of lines without gaps, `dx` [m] apart in each: D and G from distances within a band [1/m].
+    """D and G of lines, NaN where missing, dx [m] apart, from distances within a band [1/m].
 
     Heights may have no waves above the frequency `end` [1/m]. White noise of mean square `noise`
     [m^2] is subtracted.
@@ -64,9 +64,9 @@ def structure_function(
     for z in lines:
         for j, lag in enumerate(lags[2 * lags < z.size - _BLOCKS]):
             squares = (z[2 * lag :] - 2 * z[lag:-lag] + z[: -2 * lag]) ** 2
-            edges = np.arange(_BLOCKS) * squares.size // _BLOCKS
-            sums[:, j] += np.add.reduceat(squares, edges)
-            counts[:, j] += np.diff(edges, append=squares.size)
+            edges, known = np.arange(_BLOCKS) * squares.size // _BLOCKS, ~np.isnan(squares)
+            sums[:, j] += np.add.reduceat(np.where(known, squares, 0), edges)
+            counts[:, j] += np.add.reduceat(known, edges, dtype=float)
     tau = lags * dx
 
     def estimate(blocks):

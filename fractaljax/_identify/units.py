@@ -38,17 +38,19 @@ def scale(own: str | None, given: Unit, what: str, option: str) -> float:
 
     **Raises:** `ValueError` if neither says it, if both differ, and as `metres`.
     """
-    found = [None if unit is None else metres(unit, f" of {what}") for unit in (own, given)]
-    unit = agreed(f"the unit of {what}", *found)
+    from_file, asked = (None if u is None else metres(u, f" of {what}") for u in (own, given))
+    unit = agreed(f"the unit of {what}", from_file, asked)
     if unit is None:
         raise ValueError(f"the file does not say in which unit {what} are: give it ({option} um)")
     return unit
 
 
-def agreed(name: str, own: float | None, given: float | None) -> float | None:
-    """The file's value, or the given one where it has none. They must not differ."""
+def agreed(
+    name: str, own: float | None, given: float | None, where: str = "in the file"
+) -> float | None:
+    """The file's own value, or the given one where it has none. They must not differ."""
     if own is None or given is None:
         return given if own is None else own
     if abs(own - given) > 1e-6 * abs(own):
-        raise ValueError(f"{name} is {own:g} m in the file, got {given:g}")
+        raise ValueError(f"{name} is {own:g} m {where}, got {given:g}")
     return own

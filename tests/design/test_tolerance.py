@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import norm, truncnorm
 
 import fractaljax as fj
 from fractaljax._design.statement import DEFAULT_BOUNDS
@@ -187,6 +188,80 @@ def test_squeal_probability_under_an_envelope_and_by_seed():
     assert same.value == pytest.approx(first.value, abs=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("D", "sigma"), [(2.05, 0.02), (2.05, 0.3), (2.97, 0.01), (2.5, 0.1), (2.4, 5.0), (2.01, 1.0)]
+)
+def test_a_wide_D_is_a_truncated_normal(D, sigma):
+    """Against SciPy's, quantile by quantile, with finite derivatives; ln G follows D."""
+    z = np.linspace(-5, 5, 101)
+    slope, rest = -20.0, 0.03
+    covariance = np.array([[1, slope], [slope, slope**2]]) * sigma**2 + np.diag([0, rest**2])
+    tolerance, x = Tolerance(("ln G", "D"), covariance[::-1, ::-1]), fj.brake_scene().replace(D=D)
+    tolerance.check(x, {})
+    given = np.stack([slope * sigma * z + rest, sigma * z])
+
+    def scattered(D):
+        return tolerance.scattered(x, {"D": D, "G": jnp.asarray(1e-10)}, given)
+
+    found = {name: np.asarray(value) for name, value in scattered(jnp.asarray(D)).items()}
+    wanted = truncnorm((2 - D) / sigma, (3 - D) / sigma, D, sigma)
+    assert found["D"].min() > 2 and found["D"].max() < 3
+    # But for 1e-9 of mass beyond six deviations, and 1e-6 in D from either end.
+    most = 2e-9 + max(wanted.cdf(2 + 1e-6), wanted.sf(3 - 1e-6))
+    np.testing.assert_allclose(wanted.cdf(found["D"]), norm.cdf(z), rtol=0, atol=most)
+    np.testing.assert_allclose(found["D"], wanted.ppf(norm.cdf(z)), rtol=0, atol=5e-5)
+    by = np.clip(slope * (found["D"] - D) + rest, -354, 354)
+    np.testing.assert_allclose(np.log(found["G"] / 1e-10), by, rtol=1e-6, atol=1e-9)
+    derivative = jax.jacfwd(lambda D: scattered(D)["D"])(jnp.asarray(D))
+    h = 1e-6
+    difference = (scattered(D + h)["D"] - scattered(D - h)["D"]) / (2 * h)
+    np.testing.assert_allclose(derivative, difference, rtol=1e-3, atol=1e-3)
+
+
+def test_a_D_inside_six_deviations_is_not_changed():
+    """To the last digit; and there is no step where it begins to be."""
+    tolerance, x = Tolerance.of({"D": 0.01, "P": 10.0}), fj.brake_scene()
+    shift = tolerance.shifts(np.random.default_rng(0).standard_normal((1000, 2))).T
+    base = tolerance.base(x) | {"D": jnp.asarray(2.06 + 1e-12)}
+    found = tolerance.scattered(x, base, shift)
+    np.testing.assert_array_equal(found["D"], 2.06 + 1e-12 + shift[0])
+    np.testing.assert_array_equal(found["P"], base["P"] + shift[1])
+    beyond = tolerance.scattered(x, base | {"D": jnp.asarray(2.06 - 1e-9)}, shift)
+    np.testing.assert_allclose(beyond["D"], found["D"], rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("sigma", [0.02, 0.5])
+def test_any_identified_surface_has_a_probability_and_a_verdict(sigma):
+    """The share of squeal of a wide D by SciPy's truncated normal; ln G may be very wide too."""
+    x = fj.brake_scene().replace(D=2.435)
+    found = fj.squeal_probability(x, {"D": sigma}, samples=20_000)
+    D = truncnorm(-0.435 / sigma, 0.565 / sigma, 2.435, sigma).ppf((np.arange(2000) + 0.5) / 2000)
+    growth = jax.jit(jax.vmap(lambda D: fj.growth_rate(x.replace(D=D))))(D)
+    share = float((growth > 0).mean())
+    assert 0.02 < share < 0.98
+    assert found.value == pytest.approx(share, abs=5 * found.standard_error)
+    wide = Tolerance(("D", "ln G"), np.outer([sigma, -400.0], [sigma, -400.0]))
+    assert "squeals with probability" in repr(fj.verdict(x, tolerance=wide, progress=False))
+
+
+@pytest.mark.slow
+def test_a_design_of_a_surface_close_to_2():
+    """Its quantile is met, as draws of the truncated distribution confirm."""
+    x = fj.brake_scene().replace(D=2.06)
+    tolerance = Tolerance(("D", "ln G"), np.array([[4e-4, -0.0152], [-0.0152, 0.64]]))
+    found = fj.design(
+        x,
+        bounds={"D": (2.04, 2.2), "G": (1e-12, 1e-9)},
+        K_n_min=0.0,
+        target=0.0,
+        tolerance=tolerance,
+        starts=2,
+        lattice=8,
+        progress=False,
+    )
+    assert found.result == fj.DesignResult.found and (found.squeal_probability or 0) < 0.06
+
+
 test_refusals = refusals(
     [
         ({"D": -0.1}, "tolerance of D must be at least 0, got -0.1"),
@@ -194,7 +269,11 @@ test_refusals = refusals(
         ({"K": 0.1}, "tolerance names 'K'; there are D, G"),
         ({}, "tolerance must name a quantity, got none"),
         ({"D": 0.0}, "tolerance must be above 0 for some quantity, got 0 for all"),
-        ({"D": 0.02}, "leaves its domain within 6 deviations: D must be above 2 and below 3, got"),
+        (
+            {"P": 400.0},
+            "tolerance of P leaves its domain within 6 deviations: P must be above 0, got",
+        ),
+        ({"D": 0.02, "mu_s": 0.1}, "tolerance of mu_s leaves its domain within 6 deviations: mu_s"),
         (0.1, "tolerance must be a mapping, a Tolerance or an Identification, got 0.1"),
         ({"D": "small"}, "tolerance of D must be a number, got 'small'"),
     ],

@@ -210,6 +210,20 @@ def test_a_tip_and_a_resolution():
     assert abs(np.mean(D)) < 1.5
 
 
+@pytest.mark.parametrize("H", [0.5, 0.8])
+def test_finer_sampling_of_a_stylus_scan_changes_nothing(H):
+    """Points 0.03 um apart tell the cusps of a tip of 5 um: D is that of every fourth point."""
+    n, dx = 33_333, 3e-8
+    f = np.fft.rfftfreq(2 * n, dx)[1:]
+    waves = f ** -(0.5 + H) * np.exp(2j * np.pi * np.random.default_rng(0).random(f.size))
+    z = np.fft.irfft(np.append(0, waves), 2 * n)[:n]
+    z = traced(z * 0.3 / np.std(np.diff(z) / dx), dx, 5e-6)
+    fine, coarse = (fj.identify(z[::k], k * dx, stylus_radius=5e-6) for k in (1, 4))
+    assert fine.outliers == fine.unused == 0
+    assert abs(fine.D - coarse.D) < 0.1 * fine.D_standard_error
+    assert abs(fine.D - (3 - H)) < 1.5 * fine.D_standard_error < 0.12
+
+
 test_bad_options_are_refused = refusals(
     [
         ({"dx": 0}, "dx must be above 0"),

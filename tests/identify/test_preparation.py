@@ -54,6 +54,20 @@ def test_spikes_become_gaps_and_a_spacing_is_one_number():
         spacing("dx", [1e-6, 2e-6])  # pyright: ignore
 
 
+def test_kinks_are_no_spikes():
+    """The cusps between arcs of a tip stay; spikes of one point and of two do not."""
+    x = np.arange(2000.0)
+    arcs = -((x % 96.7 - 48.35) ** 2) / 4000 + 1e-4 * np.random.default_rng(0).normal(size=x.size)
+    assert prepared(arcs).outliers == 0
+    spikes = [300, 707, 1400, 1401]
+    arcs[spikes] += [0.1, -0.2, 0.3, 0.3]
+    found = prepared(arcs)
+    assert set(spikes) <= set(np.flatnonzero(np.isnan(found.known))) and found.outliers < 6
+    both = np.add.outer(arcs[1500:1600], 0.5 * arcs[1550:1650])
+    both[40, 50] += 0.5
+    assert prepared(both).outliers == 1
+
+
 def test_gaps_of_a_map_and_masked_heights():
     """Exactly, where the map is a plane; a whole missing line as well."""
     z = rough(64, 80)

@@ -1,0 +1,44 @@
+"""Normal scatter of a fractal dimension, which has to stay above 2 and below 3.
+
+Where six standard deviations stay inside, nothing is changed. Elsewhere the normal distribution is
+cut off at the ends and scaled up to a total of 1, as a measured D is known with nothing else known
+but 2 < D < 3: a wide one tends to an even distribution. Draws are mapped by their quantiles, so
+that they follow the design continuously. The mass beyond six deviations, 1e-9, is left aside.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+from jax.scipy.special import ndtr, ndtri
+from jaxtyping import Array
+
+from .._mechanism.mechanism import Mechanism
+from .._mechanism.quantities import own_quantities
+from .._surface.surface import Surface
+
+REACH = 6.0  # standard deviations that must stay inside the domain of a quantity
+LOWEST, HIGHEST = 2.0, 3.0  # of a fractal dimension
+_INSIDE = 1e-6  # closest that a draw comes to an end: single precision tells it from 2
+_MEANING = dataclasses.fields(Surface)[0].metadata["meaning"]
+
+
+def is_fractal_dimension(x: Mechanism, name: str) -> bool:
+    """Whether a quantity is the D of a surface, of all joints or of one."""
+    own = own_quantities(x)
+    return name in own and own[name].meaning == _MEANING
+
+
+def truncated(shift: Any, sigma: Array, low: Any, high: Any) -> Array:
+    """Normal shifts of a standard deviation, as those of the normal cut off at `low` and `high`.
+
+    low < 0 < high. The shift of a quantile becomes that of the same quantile.
+    """
+    scale = jnp.where(sigma > 0, sigma, 1)
+    # The lower half by itself, and the upper half as its mirror image: small tails stay exact.
+    up = shift > 0
+    lost = [jnp.maximum(ndtr(end / scale) - ndtr(-REACH), 0) for end in (low, -high)]
+    here, there = jnp.where(up, lost[1], lost[0]), jnp.where(up, lost[0], lost[1])
+    below = here + ndtr(-jnp.abs(shift) / scale) * (1 - here - there)
+    found = jnp.clip(jnp.where(up, -1, 1) * scale * ndtri(below), low + _INSIDE, high - _INSIDE)
+    return jnp.where((here + there > 0) & (sigma > 0), found, shift)

@@ -1,0 +1,69 @@
+"""What gaps, and the filling of them, do to a spectrum: found on surrogates, and taken out.
+
+Filled heights are smoother than measured ones, so a spectrum with gaps has too little power at
+short wavelengths. A surrogate has the spectrum found so far and random phases on the same grid. It
+gets the same gaps and the same filling, and the ratio of its power with and without them is what
+they do to the measured spectrum, which is divided by it (indirect inference: Gourieroux, Monfort
+and Renault 1993). The phases are the same in both, so that they hardly add to the scatter. On maps
+of 200 x 200 points, D = 2.2 to 2.8, with a fifth of them missing, D comes within 0.15 standard
+errors of that of the whole map in the mean.
+
+The cost is that of 2 rounds of 2 surrogates, two spectra each: `identify` takes twice as long.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import numpy as np
+
+from .preparation import filled
+from .spectrum import Spectrum
+
+_ROUNDS, _SURROGATES = 2, 2
+_TAIL = 0.5  # of the Nyquist frequency: above, a power law that continues into a map's corners
+
+
+def without_gaps(
+    spectra: tuple[Spectrum, ...],
+    gaps: list[np.ndarray],
+    steps: tuple[float, ...],
+    spectra_of: Callable[[list[np.ndarray]], tuple[Spectrum, ...]],
+) -> tuple[Spectrum, ...]:
+    """The spectra of filled segments, or of a filled map, corrected for where its `gaps` are.
+
+    `steps` [m] between points along its axes; `spectra_of` gives the spectra of heights.
+    """
+    found = spectra
+    for rank in range(_ROUNDS):
+        change = [np.zeros(each.f.size) for each in spectra]
+        for i in range(_SURROGATES):
+            random = np.random.default_rng([rank, i])
+            whole = [_surrogate(found[0], gap.shape, steps, random) for gap in gaps]
+            holed = [filled(np.where(gap, np.nan, z)) for z, gap in zip(whole, gaps, strict=True)]
+            pairs = zip(spectra_of(holed), spectra_of(whole), strict=True)
+            for total, (after, before) in zip(change, pairs, strict=True):
+                total += np.log(after.power / before.power) / _SURROGATES
+        found = tuple(
+            eqx.tree_at(lambda each: each.power, each, each.power * np.exp(-by))
+            for each, by in zip(spectra, change, strict=True)
+        )
+    return found
+
+
+def _surrogate(spectrum, shape, steps, random) -> np.ndarray:
+    """Periodic heights of this spectrum, of any size, with random phases."""
+    *first, last = zip(shape, steps, strict=True)
+    axes = [*(np.fft.fftfreq(*each) for each in first), np.fft.rfftfreq(*last)]
+    f = np.hypot(axes[0][:, None], axes[1]) if first else axes[0]
+    f.flat[0] = spectrum.f[0]
+    log_f, log_power = np.log(spectrum.f), np.log(spectrum.power)
+    tail = spectrum.f > _TAIL * spectrum.nyquist
+    slope, level = np.polyfit(log_f[tail], log_power[tail], 1)
+    log = np.log(f)
+    radial = np.where(f > spectrum.nyquist, level + slope * log, np.interp(log, log_f, log_power))
+    if spectrum.kind == "map":  # over |f|, spread around the circle
+        radial -= log
+    waves = np.fft.rfftn(random.standard_normal(shape))
+    waves *= np.exp(radial / 2) / np.maximum(np.abs(waves), 1e-300)
+    waves.flat[0] = 0
+    return np.fft.irfftn(waves, shape, axes=range(len(shape)))
