@@ -97,6 +97,16 @@ def test_the_example_does_what_a_joint_of_that_stiffness_does(Hertz):
     assert float(moved.contact.stiffness_ratio) == pytest.approx(0.4)
 
 
+def test_with_an_opening_exponent_it_has_its_load_curve(Hertz):
+    """Hertz's, N = P (1 + 2 K_n u/(3 P))^(3/2), 0 where it is open."""
+    law = type("Opening", (Hertz,), {"opening_exponent": 1 / 3})(**NUMBERS)
+    u = np.array([-1e-5, -5e-6, 0.0, 2e-6])
+    wanted = 1900 * np.maximum(0, 1 + 2 * 4e8 * u / (3 * 1900)) ** 1.5
+    np.testing.assert_allclose(law.load(u), wanted, rtol=1e-9)
+    with pytest.raises(ValueError, match="load needs a contact law with a load curve, got Hertz"):
+        Hertz(**NUMBERS).load(u)
+
+
 @pytest.mark.slow
 def test_its_limit_cycle_is_that_of_a_joint_of_that_stiffness(Hertz):
     scene = BRAKE.replace(contact=Hertz(**NUMBERS))
