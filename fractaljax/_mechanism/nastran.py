@@ -77,7 +77,7 @@ def _binary(content: bytes, word: str) -> Iterator[tuple[str, tuple[int, int], i
             raise ValueError("it is damaged: a matrix was to begin")
         columns, rows, _, kind = np.frombuffer(record, f"{sign}i{wide}", 4).tolist()
         name = _name(record[4 * wide :])
-        real = f"{sign}f{8 if kind in (2, 4) else wide}"  # 3 and 4 are pairs of those of 1 and 2
+        real = f"{sign}f{8 if kind == 2 else wide}"
         yield (
             name,
             (abs(rows), columns),
