@@ -28,9 +28,10 @@ OPEN = 2
 SECTION, NONE, UNUSED = 0, -1, -2
 _SMOOTH = 1e-4  # of the way to the opening: nearer, what a load curve adds is below rounding
 FEW = 4  # degrees of freedom up to which a product is a sum, which compiles into one loop
-_FAR = 1e6  # factor by which a motion grows that diverges: of a small V, many are ordinary
+_FAR = 1e3  # factor by which a motion that diverges exceeds all scales that it has
+_RESONANCE = 1e3  # times what a harmonic force moves at rest
 _HALVINGS = 48  # of the unit of velocity, to where a law can be continued below w = 0
-_TRIALS = 4.0 ** -np.arange(6)  # shares of a step at which the steepness ahead is looked at
+_TRIALS = 4.0 ** -np.arange(13)  # shares of a step at which the steepness ahead is looked at
 
 
 def _traced_once(method: Callable) -> Callable:
@@ -82,6 +83,7 @@ class HybridSystem(eqx.Module):
     # no law depends on the velocity.
     below: Float[Array, " f"] | None = None
     steepest: Float[Array, " f"] | None = None
+    falls_until: Float[Array, " f"] | None = None  # speed where friction is least, to 100 m/s
 
     def with_steps_of_laws(self) -> "HybridSystem":
         """With what steps need of laws that depend on the velocity.
@@ -98,11 +100,15 @@ class HybridSystem(eqx.Module):
             mu = law.mu(-self.speed * shares)
             inside = ((mu >= 0) & (mu <= 2 * law.mu_s)).astype(shares.dtype)
             below = jnp.max(jax.lax.cummin(inside, reverse=True) * shares)
-            return one * jnp.stack([below, self.speed * jnp.max(jnp.abs(law.slope(speeds)))])
+            steepest = self.speed * jnp.max(jnp.abs(law.slope(speeds)))
+            return one * jnp.stack(
+                [below, steepest, speeds[jnp.argmin(law.mu(speeds))] / self.speed]
+            )
 
         one = jnp.ones_like(self.P)
-        below, steepest = jax.lax.stop_gradient(self._each(numbers, one)).T
-        return replace(self, below=below, steepest=self._own(steepest))
+        below, steepest, falls_until = jax.lax.stop_gradient(self._each(numbers, one)).T
+        steepest = self._own(steepest)
+        return replace(self, below=below, steepest=steepest, falls_until=falls_until)
 
     def with_products(self) -> "HybridSystem":
         """With them, if its faces have directions of their own; K and C are matrices then."""
@@ -160,8 +166,10 @@ class HybridSystem(eqx.Module):
         """The size (...) that a motion from y (2n, ...) passes only where it diverges."""
         size = 1 + jnp.max(jnp.abs(y), axis=0)
         size = size + jnp.max(jnp.where(jnp.isfinite(equilibrium), jnp.abs(equilibrium), 0), axis=0)
-        # At resonance an excitation may move far more than its force does at rest.
-        return _FAR * (size + self.largest_force if self.excited else size)
+        if self.falls_until is not None:
+            # With a small V, motions that take many V are ordinary.
+            size = size + jnp.max(self.falls_until, axis=0)
+        return _FAR * (size + _RESONANCE * self.largest_force if self.excited else size)
 
     def with_excitation(self, y, t) -> Array:
         """States (2n, ...) of the mechanism at the times t (...), with z = cos(Omega t)."""
