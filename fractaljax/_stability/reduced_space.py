@@ -51,7 +51,9 @@ class Space:
             L.append(X.T @ self.W)
         D = snapshots.directions.D
         R, L = (np.concatenate([*each, D], axis=1) for each in (R, L))
-        self.residuals = L.T @ factors.solve(R)
+        solved = factors.solve(R)
+        # In parts: a product of L as a complex matrix would take four times the time.
+        self.residuals = L.T @ solved.real + 1j * (L.T @ solved.imag)
 
     @property
     def size(self) -> int:

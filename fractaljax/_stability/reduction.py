@@ -15,7 +15,7 @@ the product of two residuals. One factorised Q for all estimates it, and the res
 are known beforehand, so that an estimate takes no work of size n.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -42,8 +42,11 @@ _CHECKED = 2  # fresh points at which the eigenvalues are compared at the end
 _CUT = 1e-2  # times sqrt(tol): where the decomposition ends, at first
 _FINER = 0.1  # times that, where it is what limits the error
 _LEAST_CUT = 1e-10
+_STUCK = 0.5  # of an error: a point that leaves more of it shows that the cut limits it
 _SPURIOUS = 0.02  # of |s|: an error beyond which a mode may be none
+_FEW = 8  # candidates at which errors are estimated together, largest ones of before first
 _SIZES = 10  # degrees of freedom less, among which there are none without
+_NEAR = 4  # sizes tried together for the same reason
 _SAFE = 0.2  # of tol: the estimate is of leading order
 _COARSE = 1e-3  # of |s|: to this the coarse space knows the modes
 _WORTH = 40, 0.6  # degrees of freedom from which a coarse space of such a share saves time
@@ -129,7 +132,7 @@ def _range(name: str, ends: Any) -> tuple[float, float]:
     return low, high
 
 
-_Estimates = list[tuple[np.ndarray, np.ndarray]]  # eigenvalues and their errors at each point
+_Estimate = tuple[np.ndarray, np.ndarray]  # eigenvalues and their errors at a point
 
 
 class _Greedy:
@@ -153,6 +156,7 @@ class _Greedy:
         self.factors = Factors(snapshots.matrices(x, numbers({})), shift)
         candidates, fresh = snapshots.candidates(), snapshots.fresh()
         self.candidates = [(u, numbers(snapshots.values(u))) for u in candidates]
+        self.errors = np.full(len(candidates), np.inf)  # of |s|, as last estimated
         self.fresh = [(u, numbers(snapshots.values(u))) for u in fresh]
         for u in [middle, *(np.full_like(middle, end) for end in (0.0, 1.0) if middle.size)]:
             self.add(u)
@@ -171,25 +175,29 @@ class _Greedy:
 
     def run(self) -> ReducedStructure:
         """The smallest reduced structure found that meets the tolerance."""
+        before, finer = np.inf, False
         while True:
-            known = self.snapshots, self.taken, self.weight, self.cut, self.factors
-            space = Space(*known)
+            space = Space(self.snapshots, self.taken, self.weight, self.cut, self.factors)
             reduced, estimates = self.sound(space)
-            errors = _largest(estimates)
-            self.bar.set_postfix_str(f"error {errors.max():.1e}, {reduced.n} degrees of freedom")
-            worst, _ = self.candidates[errors.argmax()]
-            if errors.max() > _SAFE * self.tol:
-                # Where its own vectors are known, what was cut off of them is the error.
-                if not any(np.array_equal(worst, u) for u in self.points):
+            error, at = max((_relative(errors, s), i) for i, (s, errors) in estimates.items())
+            self.bar.set_postfix_str(f"error {error:.1e}, {reduced.n} degrees of freedom")
+            worst, _ = self.candidates[at]
+            if error > _SAFE * self.tol:
+                # Where its own vectors are known, what was cut off of them is the error, and where
+                # those of one more point hardly made it smaller, most of it.
+                known = any(np.array_equal(worst, u) for u in self.points)
+                stuck = error > _STUCK * before and not finer and self.cut >= _LEAST_CUT
+                before, finer = error, known or stuck
+                if not finer:
                     self.add(worst)
-                    continue
-                if self.cut < _LEAST_CUT:
+                elif self.cut < _LEAST_CUT:
                     raise ValueError(f"tol = {self.tol:g} is below what rounding allows")
-                self.cut *= _FINER
+                else:
+                    self.cut *= _FINER
                 continue
-            wanted = [s for s, _ in estimates]
+            wanted = {i: s for i, (s, _) in estimates.items()}
             trimmed = self.trimmed(space, wanted, self.tol)
-            reduced, estimate = trimmed or (reduced, float(errors.max()))
+            reduced, estimate = trimmed or (reduced, error)
             compared = self.compared(reduced)
             if compared <= self.tol:
                 break
@@ -202,8 +210,8 @@ class _Greedy:
                 reduced.reduction.coarse = space.coarse(reduced.n, coarse[0].n, _COARSE)
         return reduced
 
-    def sound(self, space: Space) -> tuple[ReducedStructure, _Estimates]:
-        """The largest structure without spurious modes in the band, and the errors at candidates.
+    def sound(self, space: Space) -> tuple[ReducedStructure, dict[int, _Estimate]]:
+        """The largest structure without spurious modes in the band, and `estimates` of it.
 
         A spurious mode has an error of its own size, and comes and goes with the directions kept.
         """
@@ -212,39 +220,68 @@ class _Greedy:
             if found is not None and not space.regular(r):
                 continue
             reduced = self.reduced(space, r)
-            estimates = [self.estimated(reduced, at) for at in self.candidates]
-            largest = _largest(estimates).max()
+            estimates = self.estimates(reduced)
+            largest = _largest(estimates.values()).max()
             if found is None or largest < found[0]:
                 found = largest, reduced, estimates
             if largest < _SPURIOUS:
                 break
         return found[1:]
 
+    def estimates(self, reduced: ReducedStructure) -> dict[int, _Estimate]:
+        """Eigenvalues and errors at candidates, those first whose error was large before.
+
+        At all of them, unless a few have an error that is too large already.
+        """
+        found: dict[int, _Estimate] = {}
+        for i in map(int, np.argsort(-self.errors, kind="stable")):
+            if len(found) % _FEW == 0 and max(self.errors[[*found]], default=0) > _SAFE * self.tol:
+                break
+            s, errors = found[i] = self.estimated(reduced, self.candidates[i])
+            self.errors[i] = _relative(errors, s)
+        return found
+
     def trimmed(
-        self, space: Space, wanted: list[np.ndarray], tol: float
+        self, space: Space, wanted: dict[int, np.ndarray], tol: float
     ) -> tuple[ReducedStructure, float] | None:
         """The smallest that has the eigenvalues `wanted` of all candidates, and its error there.
 
-        None if that is the space itself.
+        None if that is the space itself. Sizes are tried at a few candidates, and every one at
+        which the smallest that holds there fails is added to them.
         """
-        fails, holds, found = 0, space.size, None
-        while holds - fails > 1:
-            r = (fails + holds) // 2
-            if not space.regular(r):
-                fails = r
-                continue
-            smaller, largest = self.reduced(space, r), 0.0
-            for at, s in zip(self.candidates, wanted, strict=True):
-                there, errors = self.estimated(smaller, at)
-                # A mode that is lost has no error.
-                largest = max(largest, _relative(errors, there), _apart(there, s))
-                if largest > _SAFE * tol:
-                    break
-            if largest <= _SAFE * tol:
-                holds, found = r, (smaller, largest)
-            else:
-                fails = r
-        return found
+        hard = {int(i): wanted[i] for i in np.argsort(-self.errors)[:_FEW]}
+        fails, holds = 0, space.size
+        while True:
+            while holds - fails > 1:
+                r = (fails + holds) // 2
+                near = range(r, max(r - _NEAR, fails), -1)  # one may have a spurious mode
+                sound = next((x for x in near if self.holds(space, x, hard, tol)), None)
+                fails, holds = (r, holds) if sound is None else (fails, sound)
+            if holds == space.size:
+                return None
+            smaller = self.reduced(space, holds)
+            largest, at = self.failing(smaller, wanted, tol)
+            if at is None:
+                return smaller, largest
+            hard = {at: wanted[at], **hard}
+            fails, holds = holds, space.size
+
+    def holds(self, space: Space, r: int, wanted: dict[int, np.ndarray], tol: float) -> bool:
+        """Whether r degrees of freedom have such eigenvalues at candidates."""
+        return space.regular(r) and self.failing(self.reduced(space, r), wanted, tol)[1] is None
+
+    def failing(
+        self, reduced: ReducedStructure, wanted: dict[int, np.ndarray], tol: float
+    ) -> tuple[float, int | None]:
+        """The largest error at candidates with such eigenvalues, and where one is too large."""
+        largest = 0.0
+        for i, s in wanted.items():
+            there, errors = self.estimated(reduced, self.candidates[i])
+            # A mode that is lost has no error.
+            largest = max(largest, _relative(errors, there), _apart(there, s))
+            if largest > _SAFE * tol:
+                return largest, i
+        return largest, None
 
     def reduced(self, space: Space, r: int) -> ReducedStructure:
         """The structure in a space of r degrees of freedom."""
@@ -290,7 +327,7 @@ class _Greedy:
         return largest
 
 
-def _largest(estimates: _Estimates) -> np.ndarray:
+def _largest(estimates: Iterable[_Estimate]) -> np.ndarray:
     """The largest error at each point, of |s|."""
     return np.array([_relative(errors, s) for s, errors in estimates])
 

@@ -3,10 +3,12 @@
 A reduced structure holds a coarse space in which every mode of its band is known to a few digits.
 Those that may grow most are refined by two-sided Rayleigh quotient iteration (B. N. Parlett, Math.
 Comput. 28 (1974) 679), which takes an LU factorisation of size n in the place of all eigenvalues of
-size 2n. Where the coarse modes do not settle which is the largest, all are computed.
+size 2n: one to the last digit, each other until it is known to grow less. Where the coarse modes do
+not settle which is the largest, all are computed.
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -93,6 +95,7 @@ class _Search(NamedTuple):
 
     refined: Bool[Array, " k"]
     s: Complex[Array, " k"]  # infinite where it is not refined
+    error: Float[Array, " k"]  # of s, at most
     sound: Bool[Array, ""]  # whether each was refined to a mode of its own, near the coarse one
     best: _Mode
 
@@ -111,32 +114,51 @@ def _refined(band, coarse: CoarseSpace, M, C, K) -> tuple[_Mode, Bool[Array, ""]
     known = wider & (jnp.abs(z.real) <= MOST_DAMPED * size + 2 * radius)
 
     def wanted(now: _Search) -> Bool[Array, " k"]:
-        near = (jnp.abs(now.s[None] - z[:, None]) <= radius[:, None]).any(axis=1)
+        reach = now.error[None] + radius[:, None]
+        near = (jnp.abs(now.s[None] - z[:, None]) <= reach).any(axis=1)
         return known & ~now.refined & (near | (z.real + radius >= now.best.s.real))
 
     def refine(now: _Search) -> _Search:
         i = jnp.argmax(jnp.where(wanted(now), z.real, -jnp.inf))
-        mode, converged = _iterated(M, C, K, _Mode(z[i], V @ rough.x[i], W @ rough.y[i]))
+
+        def alone(s, error) -> Bool[Array, ""]:
+            return (jnp.abs(now.s - s) > jnp.maximum(now.error + error, _SAME * size[i])).all()
+
+        def beaten(s, error) -> Bool[Array, ""]:
+            return (s.real + error < now.best.s.real) & alone(s, error)
+
+        start = _Mode(z[i], V @ rough.x[i], W @ rough.y[i])
+        mode, error, converged = _iterated(M, C, K, start, beaten)
         s = mode.s
-        alone = (jnp.abs(now.s - s) > _SAME * size[i]).all()
-        sound = now.sound & converged & alone & (jnp.abs(s - z[i]) <= radius[i])
+        sound = now.sound & converged & alone(s, error) & (jnp.abs(s - z[i]) <= radius[i])
         better = in_band(s, band) & (s.real > now.best.s.real)
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), mode, now.best)
-        return _Search(now.refined.at[i].set(True), now.s.at[i].set(s), sound, best)
+        refined, known = now.refined.at[i].set(True), now.s.at[i].set(s)
+        return _Search(refined, known, now.error.at[i].set(error), sound, best)
 
     none = _Mode(jnp.full((), -jnp.inf, z.dtype), *jnp.zeros((2, len(M)), z.dtype))
-    start = _Search(jnp.zeros(len(z), bool), jnp.full_like(z, jnp.inf), jnp.array(True), none)
-    end = jax.lax.while_loop(lambda now: now.sound & wanted(now).any(), refine, start)
+    nothing = jnp.zeros(len(z), bool), jnp.full_like(z, jnp.inf), jnp.zeros_like(size)
+    first = _Search(*nothing, jnp.array(True), none)
+    end = jax.lax.while_loop(lambda now: now.sound & wanted(now).any(), refine, first)
     return end.best, end.sound & jnp.isfinite(end.best.s.real)
 
 
-def _iterated(M, C, K, mode: _Mode) -> tuple[_Mode, Bool[Array, ""]]:
-    """A mode by two-sided Rayleigh quotient iteration, and whether it converged."""
+def _iterated(
+    M, C, K, mode: _Mode, beaten: Callable
+) -> tuple[_Mode, Float[Array, ""], Bool[Array, ""]]:
+    """A mode by two-sided Rayleigh quotient iteration, its error and whether it converged.
+
+    The error is below the last change, since digits triple. An eigenvalue that is `beaten` within
+    it needs no more of them.
+    """
     eps = _ROUNDING * jnp.finfo(M.dtype).eps
+
+    def known(s, moved):
+        return (moved <= eps * jnp.abs(s)) | beaten(s, moved)
 
     def going(now):
         step, mode, moved = now
-        return (step < _STEPS) & (moved > eps * jnp.abs(mode.s))
+        return (step < _STEPS) & (moved >= 0) & ~known(mode.s, moved)
 
     def improve(now):
         step, (s, x, y), _ = now
@@ -150,7 +172,7 @@ def _iterated(M, C, K, mode: _Mode) -> tuple[_Mode, Bool[Array, ""]]:
     first = 0, mode, jnp.full((), jnp.inf, M.dtype)
     _, (s, x, y), moved = jax.lax.while_loop(going, improve, first)
     y = y / (y @ ((2 * s * M + C) @ x))
-    return _Mode(s, x, y), moved <= eps * jnp.abs(s)
+    return _Mode(s, x, y), moved, known(s, moved)
 
 
 def _inverse(lu, order, b, c) -> tuple[jax.Array, jax.Array]:

@@ -11,7 +11,8 @@ import scipy.linalg
 from scipy.sparse import csr_array
 
 import fractaljax as fj
-from fractaljax._stability.sparse_modes import Factors
+from fractaljax._stability import reduction
+from fractaljax._stability.sparse_modes import Factors, band_modes
 from structures import beam, state_matrix
 from tools import mostly_slow
 
@@ -139,6 +140,20 @@ def test_joints_and_equilibrium_are_kept():
     )
 
 
+@pytest.mark.slow
+def test_few_estimates_and_an_error_below_the_tolerance_everywhere(monkeypatch):
+    """Errors are estimated first where they were large, and at every candidate at the end."""
+    calls, original = [], reduction.estimated_errors
+    monkeypatch.setattr(reduction, "estimated_errors", lambda *x: calls.append(1) or original(*x))
+    reduced = fj.reduce(full_structure("no joints"), OVER, BAND, tol=1e-8)
+    grid: Any = np.stack(np.meshgrid(*[np.linspace(*ends, 9) for ends in OVER.values()]), axis=-1)
+    assert len(calls) < 4 * (32 * len(OVER) + 4)
+    for place in grid.reshape(-1, len(OVER)):
+        x = reduced.replace(**dict(zip(OVER, place, strict=True)))
+        s, errors = original(x, x.parameters, np.zeros((0, 5)))
+        assert len(s) > 5 and (errors <= 1e-8 * np.abs(s)).all()
+
+
 def chain(count: int):
     """A chain of masses between walls: s^2 + alpha s + kappa omega_j^2 = 0, all sparse."""
     from scipy.sparse import diags_array, eye_array
@@ -207,9 +222,13 @@ def test_many_right_hand_sides_on_many_processors(monkeypatch, columns):
 BRAKE = os.environ.get("FRACTALJAX_BRAKE", "")
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(not BRAKE, reason="not run: no matrices in the folder FRACTALJAX_BRAKE")
-def test_an_industrial_brake():
+NEEDS_BRAKE = pytest.mark.skipif(
+    not BRAKE, reason="not run: no matrices in the folder FRACTALJAX_BRAKE"
+)
+
+
+def industrial_brake():
+    """The structure, and a function of its parameters that gives (M, C, K) without the package."""
     from scipy.sparse import load_npz
 
     X = {path.stem: load_npz(path) for path in Path(BRAKE).glob("*.npz")}
@@ -224,6 +243,55 @@ def test_an_industrial_brake():
         [(1, X["BKLL"]), ("kr", X["BKQLL"]), ("Omega**2 - 1", X["BWLL"])],
         parameters={"Omega": 4 * np.pi, "kr": 1.0},
     )
+
+    def matrices(Omega, kr):
+        C = X["BDLL"] + Omega * X["BYLL"] + (1 / Omega - 1) * X["BDIWLL"]
+        K = X["BKLL"] + kr * X["BKQLL"] + (Omega**2 - 1) * X["BWLL"]
+        return X["BMLL"], C + X["BHLL"] / (2 * np.pi * 1600), K
+
+    return full, matrices
+
+
+@pytest.mark.slow
+@NEEDS_BRAKE
+def test_an_industrial_brake_over_wide_ranges():
+    """Beside all modes in full, at corners and at random, with slopes in both modes."""
+    full, matrices = industrial_brake()
+    over = {"Omega": (2 * np.pi, 8 * np.pi), "kr": (0.1, 1.0)}
+    reduced = fj.reduce(full, over, (0.0, 20000.0))
+
+    def rate(values):
+        return fj.growth_rate(reduced.replace(**values))
+
+    @jax.jit
+    def answers(values):
+        modes = fj.stability(reduced.replace(**values))
+        return modes, rate(values), jax.jacfwd(rate)(values), jax.jacrev(rate)(values)
+
+    corners = np.array(np.meshgrid(*over.values())).reshape(2, -1).T
+    for values in (*(dict(zip(over, x, strict=True)) for x in corners), *places(over)):
+        modes, growth, *slopes = answers({name: float(x) for name, x in values.items()})
+        found: Any = np.asarray(modes.eigenvalues)[np.asarray(modes.counted)]
+        M, C, K = matrices(**values)
+        full_modes: Any = band_modes((M, C, K), (0.0, 20000.0))
+        s, right, left = full_modes
+        for each in s:
+            assert np.abs(found - each).min() < 1e-8 * abs(each)
+        i = np.argmax(s.real)
+        assert abs(growth - s[i].real) < 1e-8 * abs(s[i])
+        y, x = left[:, i], right[:, i]
+        for name, value in values.items():
+            up, down = (matrices(**values | {name: value * (1 + h)}) for h in (1e-5, -1e-5))
+            dM, dC, dK = ((a - b) @ x for a, b in zip(up, down, strict=True))
+            slope = -(y @ (s[i] ** 2 * dM + s[i] * dC + dK)) / (y @ (2 * s[i] * (M @ x) + C @ x))
+            for mode in slopes:
+                assert abs(mode[name] * value - slope.real / 2e-5) < 1e-7 * abs(s[i])
+
+
+@pytest.mark.slow
+@NEEDS_BRAKE
+def test_an_industrial_brake():
+    full = industrial_brake()[0]
     reduced = fj.reduce(full, {"Omega": (2 * np.pi, 40 * np.pi)}, (0.0, 20000.0))
     found = np.asarray(fj.stability(reduced).eigenvalues)
     for s in (74.830642475 + 17399.587752736j, 5.474173698 + 4932.238867j):

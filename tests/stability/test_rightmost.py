@@ -202,3 +202,32 @@ def test_a_reduced_structure_keeps_its_coarse_space(monkeypatch, tmp_path):
         found, wanted = slopes({"kr": kr, "mu": 0.3})
         for ours, theirs in zip(*map(jax.tree.leaves, (found, wanted)), strict=True):
             assert ours == pytest.approx(float(theirs), rel=1e-9)
+
+
+def even(matrices):
+    """The same without what makes one mode grow before all others: many are to be told apart."""
+    M, C, K = matrices
+    return M, C - C.T, (K + K.T) / 2 + 0.02 * (K - K.T)
+
+
+@pytest.mark.parametrize("matrices", [problem(), even(problem())], ids=["uneven", "even"])
+@pytest.mark.parametrize("at", [0.0, 0.37, 1.0])
+def test_the_short_cut_holds_at_the_ends_of_a_range_in_both_modes(matrices, at):
+    """Without all modes: settled, few factorisations, and slopes forwards and in reverse."""
+    M, C, K = matrices
+    coarse = coarse_space(matrices)
+    other = problem(1)[1]
+
+    def moved(t):
+        return M, C + 1e-3 * t * other, (1 + 1e-3 * t) * K
+
+    (s, *_), settled = refined(BAND, *vars(coarse).values(), *moved(at))
+    assert settled and abs(s - largest(moved(at))) < 1e-12 * abs(s)
+
+    def rate(t):
+        return rightmost(moved(t), BAND, coarse).real
+
+    up, down = (largest(moved(at + h)).real for h in (1e-3, -1e-3))
+    for mode in (jax.jacfwd, jax.jacrev):
+        slope = jax.jit(mode(rate))(at)
+        assert slope == pytest.approx((up - down) / 2e-3, rel=1e-5, abs=1e-10)
