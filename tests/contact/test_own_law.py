@@ -30,11 +30,16 @@ def example() -> Any:
     return names["Hertz"]
 
 
+@pytest.fixture(autouse=True)
+def forgotten():
+    """The example's name is gone from files after each test."""
+    yield
+    CONTACTS.pop("hertz", None)
+
+
 @pytest.fixture
 def Hertz():
-    """Gone from files after the test."""
-    yield example()
-    CONTACTS.pop("hertz", None)
+    return example()
 
 
 class Softened(fj.Contact):
