@@ -195,9 +195,10 @@ def test_steps_go_on(seed):
     system = jax.jit(hybrid_system)(of_problem(problem(numbers(seed))))
     y = jnp.asarray(BEFORE_A_STEP[seed])
     y = y.at[3].add((system.V[0] - system.T[0] @ y[3:]) / system.T[0, 0])
-    record = Record.begin(system, y[:, None], 128)
-    after = jax.jit(lambda record: record.advance(system, 0.3, 128))(record)
-    assert float(after.sums[0, 0]) > 10
+    # Under so large a load friction is steep, and a step takes less than a tenth.
+    record = Record.begin(system, y[:, None], 256)
+    after = jax.jit(lambda record: record.advance(system, 0.3, 256))(record)
+    assert float(after.sums[0, 0]) > 20
 
 
 def followed(seed, quantity, low) -> fj.Branch | None:
