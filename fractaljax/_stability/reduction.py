@@ -250,7 +250,9 @@ class _Greedy:
         which the smallest that holds there fails is added to them.
         """
         hard = {int(i): wanted[i] for i in np.argsort(-self.errors)[:_FEW]}
-        fails, holds = 0, space.size
+        # In one degree of freedom the two directions of a joint would be one.
+        joints = self.snapshots.structure.joints
+        fails, holds = int(any(joint.normal is not None for joint in joints)), space.size
         while True:
             while holds - fails > 1:
                 r = (fails + holds) // 2
