@@ -114,12 +114,16 @@ class _Lanes(Record):
 
 
 @exported_jit
-def _linearised(system: HybridSystem) -> tuple[Array, Array, Array, Array]:
-    """The equilibrium (2n,), the field's Jacobian there, the normal forces and their Jacobian."""
+def _linearised(system: HybridSystem, starts) -> tuple[Array, ...]:
+    """The equilibrium (2n,), the field's Jacobian there, the normal forces and their Jacobian.
+
+    And the size beyond which a motion from `starts` (2n, k) diverges.
+    """
     y, slip = system.equilibrium(), jnp.ones(len(system.P), system.P.dtype)
     x = y[: system.n]
     slope = jax.jacfwd(lambda y: system.field(y, slip))(y)
-    return y, slope, system.closures(x), jax.jacfwd(system.closures)(x)
+    bound = system.bound(starts.ravel(), y)
+    return y, slope, system.closures(x), jax.jacfwd(system.closures)(x), bound
 
 
 class _Modes(eqx.Module):
@@ -136,15 +140,15 @@ class _Modes(eqx.Module):
 
     @classmethod
     def of(cls, system: HybridSystem, starts) -> "_Modes":
-        n, (equilibrium, A, closures, normals) = system.n, map(np.asarray, _linearised(system))
+        n, found = system.n, map(np.asarray, _linearised(system, starts))
+        equilibrium, A, closures, normals, bound = found
         values, vectors = map(np.asarray, np.linalg.eig(A))
         T = np.eye(n) if system.T is None else np.asarray(system.T)
         rows = [T @ vectors[n:] / np.asarray(system.V)[:, None]]
         opens = list(system.opens)
         rows.append(normals[opens] @ vectors[:n] / closures[opens, None])
         inverse, reach = np.linalg.inv(vectors), abs(np.concatenate(rows))
-        arrays = equilibrium, values, vectors, inverse, reach, np.real(values).max() < 0
-        arrays = *arrays, system.bound(starts.ravel(), equilibrium)
+        arrays = equilibrium, values, vectors, inverse, reach, np.real(values).max() < 0, bound
         return cls(*map(jnp.asarray, arrays), free=not system.excited)
 
     def amplitudes(self, y) -> Array:

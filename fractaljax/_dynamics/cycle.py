@@ -1,7 +1,6 @@
 """A limit cycle: its numbers, its orbit, its spectrum and its switches."""
 
 import functools
-import operator
 from collections.abc import Iterator
 from typing import Any
 
@@ -11,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from .._base.parts import Record, concrete, nan_where
+from .._base.parts import Record, concrete, nan_where, refused
 from .._base.programs import exported_jit
 from .extremes import extreme_values, time_below_zero
 from .hybrid import NONE, OPEN, UNUSED, HybridSystem
@@ -360,10 +359,7 @@ def _of_orbit(orbit, system: HybridSystem, period, what: str) -> Any:
         # A choice, as of `period`: its derivative without a cycle is 0, which a batch can select,
         # but not a number for a mechanism that is none.
         found = jax.tree.map(lambda x: jnp.where(exists, x, jnp.nan), found)
-        numbers = [x for x in jax.tree.leaves(system) if eqx.is_inexact_array(x)]
-        return nan_where(
-            functools.reduce(operator.or_, [jnp.isnan(x).any() for x in numbers]), found
-        )
+        return found if (bad := refused(system)) is None else nan_where(bad, found)
 
     for _ in range(period.ndim):
         of_one = jax.vmap(of_one)

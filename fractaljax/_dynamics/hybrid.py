@@ -53,6 +53,14 @@ class Products(eqx.Module):
     F: Float[Array, " f"]  # T F
 
 
+class LawScales(eqx.Module):
+    """What steps need to know of friction that depends on the velocity, of each face."""
+
+    below: Float[Array, " f"]  # how far below w = 0 its law is continued
+    steepest: Float[Array, " f"]  # its slope at any speed: what a unit of load does to dw/dt
+    falls_until: Float[Array, " f"]  # where it is least, up to 100 m/s
+
+
 class HybridSystem(eqx.Module):
     """M x'' + C x' + K x = F + joints (Eq. 39 and its generalisation), in scaled units."""
 
@@ -79,14 +87,10 @@ class HybridSystem(eqx.Module):
     # cent: steps then follow the motion, as far as that allows. None: steps are those of rate 1.
     fastest: Float[Array, ""] | None = None
     products: Products | None = None  # of a structure
-    # How far below w = 0 each face's law is continued, and its steepest slope at any speed. None:
-    # no law depends on the velocity.
-    below: Float[Array, " f"] | None = None
-    steepest: Float[Array, " f"] | None = None
-    falls_until: Float[Array, " f"] | None = None  # speed where friction is least, to 100 m/s
+    scales: LawScales | None = None  # None: no law depends on the velocity
 
-    def with_steps_of_laws(self) -> "HybridSystem":
-        """With what steps need of laws that depend on the velocity.
+    def with_scales(self) -> "HybridSystem":
+        """With those of laws that depend on the velocity.
 
         Below w = 0 a law goes on while mu is between 0 and 2 mu_s, and is constant beyond: a coarse
         step may overshoot to there, where the formula of a law may be anything.
@@ -107,8 +111,7 @@ class HybridSystem(eqx.Module):
 
         one = jnp.ones_like(self.P)
         below, steepest, falls_until = jax.lax.stop_gradient(self._each(numbers, one)).T
-        steepest = self._own(steepest)
-        return replace(self, below=below, steepest=steepest, falls_until=falls_until)
+        return replace(self, scales=LawScales(below, self._own(steepest), falls_until))
 
     def with_products(self) -> "HybridSystem":
         """With them, if its faces have directions of their own; K and C are matrices then."""
@@ -166,9 +169,9 @@ class HybridSystem(eqx.Module):
         """The size (...) that a motion from y (2n, ...) passes only where it diverges."""
         size = 1 + jnp.max(jnp.abs(y), axis=0)
         size = size + jnp.max(jnp.where(jnp.isfinite(equilibrium), jnp.abs(equilibrium), 0), axis=0)
-        if self.falls_until is not None:
+        if self.scales is not None:
             # With a small V, motions that take many V are ordinary.
-            size = size + jnp.max(self.falls_until, axis=0)
+            size = size + jnp.max(self.scales.falls_until, axis=0)
         return _FAR * (size + _RESONANCE * self.largest_force if self.excited else size)
 
     def with_excitation(self, y, t) -> Array:
@@ -322,9 +325,9 @@ class HybridSystem(eqx.Module):
         return self._by_laws(self.sliding(y[self.n :]), self.loads(y[: self.n]), signs)
 
     def _by_laws(self, w, loads, signs) -> Array:
-        if self.below is not None:
+        if self.scales is not None:
             side = jnp.sign(signs)
-            w = side * jnp.maximum(side * w, -self._leaf(self.below, w.ndim - 1))
+            w = side * jnp.maximum(side * w, -self._leaf(self.scales.below, w.ndim - 1))
         return self._each(
             lambda law, w, load, sign: law.branch(self.speed * w, sign) * load, w, loads, signs
         )
@@ -435,6 +438,11 @@ class HybridSystem(eqx.Module):
         """By how much shorter than elsewhere segments should be where load curves bend (...)."""
         return 2 * self._of_curves(y, s, 1 / 4)
 
+    def density(self, y, s, longest) -> Array:
+        """By how much shorter than `longest` (...) segments that begin at y should be (...)."""
+        shortest = self.step_length(y, s, self.field(y, s), longest, longest)
+        return jnp.maximum(longest / shortest, self.crowding(y, s))
+
     def _own(self, forces) -> Array:
         """What each of the forces (f, ...) on the faces accelerates that face by itself."""
         if self.T is None or self.B is None:
@@ -453,11 +461,11 @@ class HybridSystem(eqx.Module):
         """
         least = allowed / longest
         step = allowed / jnp.maximum(least, 2 * self._of_curves(y, s, 1 / 16))
-        if self.below is None or self.steepest is None:
+        if self.scales is None:
             return step
         u, loads = y[self.n :], self.loads(y[: self.n])
         loads = self._own(jnp.where(jnp.abs(s) == 1, jnp.abs(loads), 0))
-        bound = jnp.max(self._leaf(self.steepest, u.ndim - 1) * loads, axis=0)
+        bound = jnp.max(self._leaf(self.scales.steepest, u.ndim - 1) * loads, axis=0)
 
         def shortened():
             w, change = jnp.abs(self.sliding(u)), jnp.abs(self.along(rate[self.n :]))

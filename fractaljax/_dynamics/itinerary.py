@@ -167,7 +167,7 @@ class Shooting:
         starts, lengths = times[:-1], np.diff(times)
         span = times[-1] - times[0]
         clock = np.linspace(0, span, _SAMPLES + 1)
-        if self.family.template.below is not None:
+        if self.family.template.scales is not None:
             # Where a law falls within a small part of the velocity the old segments are short.
             phase, begin = np.asarray(old.chain.phase), np.asarray(old.chain.begin)
             known = old.times[phase] + begin * np.diff(old.times)[phase]

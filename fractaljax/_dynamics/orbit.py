@@ -179,15 +179,12 @@ def solve_periodic_orbits(
         stale = going & ((change > 1e-3 * size) | slow)
         # Where a law bends much within a segment, rough maps converge slowly or not at all.
         exact = ends_here | jnp.any(going & slow)
-        local = jax.lax.switch(
-            jnp.where(exact, 2, jnp.where(jnp.any(stale), 1, 0)),
-            [
-                lambda: local,
-                lambda: coarse_maps(system, found.segments),
-                # Of an affine field these are exact.
-                lambda: (coarse_maps if system.affine else exact_maps)(system, found.segments),
-            ],
-        )
+        renewals = [lambda: local, lambda: coarse_maps(system, found.segments)]
+        if not system.affine:  # where coarse ones are exact
+            renewals.append(lambda: exact_maps(system, found.segments))
+        last = len(renewals) - 1
+        renewal = jnp.where(exact, last, jnp.where(jnp.any(stale), 1, 0))
+        local = jax.lax.switch(renewal, renewals)
         parts = jnp.where(ends_here, 2, 1)
 
         def flows(some):

@@ -50,9 +50,8 @@ class Steps(eqx.Module):
         time = jnp.where(used, segments.duration, 0)
         ended = used & (segments.guard != NONE), used & (segments.guard == SECTION)
         if system.fastest is None:
-            y, s, longest = segments.y, segments.s, jnp.broadcast_to(h[None], time.shape)
-            shortest = system.step_length(y, s, system.field(y, s), longest, longest)
-            weight = jnp.maximum(longest / shortest, system.crowding(y, s)) * time
+            longest = jnp.broadcast_to(h[None], time.shape)
+            weight = system.density(segments.y, segments.s, longest) * time
         else:
             _, error = flow(system, segments.y, time, segments.s, error=True)
             weight = jnp.max(jnp.abs(error), axis=0) ** 0.125

@@ -1,7 +1,6 @@
 """A scene or structure as a hybrid system in scaled units, where its motion begins, how exactly."""
 
 import itertools
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,10 +20,8 @@ from .hybrid import HybridSystem
 from .lanes import log_spectral_radius
 
 FEW = 8  # degrees of freedom up to which steps are those of the highest frequency
-_NO_JOINT = (
-    1e-6,
-    1e30,
-)  # of a structure without joints: unit of velocity [m/s], and the belt's V in it
+_UNIT = 1e-6  # m/s: unit of velocity of a structure without joints
+_BEYOND = 1e30  # in that unit: a velocity that no motion has
 _SQUARINGS = 10  # of the matrix whose spectral radius bounds all rates
 
 
@@ -77,7 +74,7 @@ def hybrid_system(mechanism: Any) -> HybridSystem:
     """The scaled system of a scene or a structure."""
     is_structure = isinstance(mechanism, Structure)
     system = _of_structure(mechanism) if is_structure else _of_scene(mechanism)
-    return system.with_steps_of_laws()
+    return system.with_scales()
 
 
 def _of_scene(scene: Scene) -> HybridSystem:
@@ -147,7 +144,7 @@ def _of_structure(structure: Structure) -> HybridSystem:
         # A face without load, on a belt too fast for any motion: nothing ever rubs or switches.
         unit = jnp.eye(n, dtype=dtype)[0]
         rows, weights, offsets = [unit], [0 * unit], [0 * unit[0]]
-        speeds, faces, curves = [jnp.asarray(math.prod(_NO_JOINT), dtype)], [(0,)], [None]
+        speeds, faces, curves = [jnp.asarray(_BEYOND * _UNIT, dtype)], [(0,)], [None]
         laws, sharing = (Coulomb(jnp.ones((), dtype)),), ((0,),)
     T, L, V, P = jnp.stack(rows), jnp.stack(weights), jnp.stack(speeds), jnp.stack(offsets)
     given = jnp.zeros(n, dtype) if structure.F is None else structure.F
@@ -159,7 +156,7 @@ def _of_structure(structure: Structure) -> HybridSystem:
     # Between the highest eigenfrequency and n^(1/4) times it.
     omega = jnp.sum(K * K.T) ** 0.25
     opens = tuple(bool(joint.preload) and joint.normal is not None for joint in structure.joints)
-    speed = V[0] if structure.joints else jnp.asarray(_NO_JOINT[0], dtype)
+    speed = V[0] if structure.joints else jnp.asarray(_UNIT, dtype)
     unit = omega * speed
     return HybridSystem(
         laws=laws,

@@ -291,10 +291,9 @@ def resampled(x, window: Window, chain: Chain, lifted: Lifted, u, times, longest
     ends = jnp.cumsum(h)
     last = jnp.max(jnp.where(chain.share > 0, jnp.arange(len(h)), 0))
     k = jnp.minimum(jnp.searchsorted(ends, times, side="right"), last)
-    s, longest = chain.s[:, k], jnp.broadcast_to(longest, k.shape)
+    s = chain.s[:, k]
     y = flow(system, lifted.at(u)[:, k], times - (ends - h)[k], s)
-    shortest = system.step_length(y, s, system.field(y, s), longest, longest)
-    return y, jnp.maximum(longest / shortest, system.crowding(y, s))
+    return y, system.density(y, s, jnp.broadcast_to(longest, k.shape))
 
 
 @exported_jit

@@ -65,17 +65,15 @@ def read_measurement(
         encoding = text_encoding(content) if suffix in _TEXTS else None
         if _GWYDDION in content[:4096]:
             encoding = None
+        if encoding is None and columns is not None:
+            raise ValueError(f"it is no table of text, got columns {dict(columns)!r}")
         if encoding is None and suffix not in _ARRAYS:
             from .instrument_file import read_instrument_file
 
-            if columns is not None:
-                raise ValueError(f"it is no table of text, got columns {dict(columns)!r}")
             return read_instrument_file(path, dx, dy, unit, channel)
         if channel is not None:
             raise ValueError(f"it has no channels, got channel {channel!r}")
         if encoding is None:
-            if columns is not None:
-                raise ValueError(f"it is no table of text, got columns {dict(columns)!r}")
             return _read_arrays(path, content, dx, dy, unit)
         table = choose(whole := read_table(content, encoding), columns)
         return _from_table(path, whole, table, dx, dy, unit, position_unit)

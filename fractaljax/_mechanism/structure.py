@@ -55,8 +55,8 @@ class Structure(Mechanism):
     units. `joints` is one `Joint`, a sequence of them (named joint_1, joint_2, ...) or a mapping
     from names. `F` (n,) [N], or a mapping from degrees of freedom to forces, presses the joints
     together: the slope of a friction law acts through the static equilibrium under it. `names` of
-    the degrees of freedom are optional, and so is a `Mesh` for pictures. `notes` say
-    what was made of the files of the matrices, such as a mirrored triangle; `load` finds them.
+    the degrees of freedom are optional, and so is a `Mesh` for pictures. `notes` say what was made
+    of the files of the matrices, such as a mirrored triangle; `load` finds them.
 
     **Raises:** `ValueError` or `TypeError` saying which matrix does not fit, is not finite or not
     positive definite, which degree of freedom is unknown, or which joint is wrong.

@@ -212,7 +212,7 @@ def test_laws_go_on_below_zero_and_are_bounded():
     signs = jnp.ones((2, 1))
     for law in laws:
         system = hybrid_system(reference_scene().replace(friction=law))
-        assert system.below is not None and float(system.below[0]) > 0
+        assert system.scales is not None and float(system.scales.below[0]) > 0
         far = [
             float(system._by_laws(jnp.full((2, 1), w), signs, signs)[0, 0])
             for w in (-1e-12, -1e-3, -1.0, -1e3)
@@ -220,7 +220,7 @@ def test_laws_go_on_below_zero_and_are_bounded():
         assert min(far) >= 0 and max(far) <= 0.8 * (1 + 1e-12), law
         assert far[2] == far[3]
         # As smooth as the law.
-        steps = 1e-3 * float(system.below[0]) * jnp.arange(-2, 3)
+        steps = 1e-3 * float(system.scales.below[0]) * jnp.arange(-2, 3)
         values = [float(system._by_laws(jnp.full((2, 1), w), signs, signs)[0, 0]) for w in steps]
         known = law.mu(float(system.speed) * steps)
         np.testing.assert_allclose(values, known, rtol=1e-12)
