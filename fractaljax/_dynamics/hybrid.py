@@ -57,7 +57,8 @@ class LawScales(eqx.Module):
     """What steps need to know of friction that depends on the velocity, of each face."""
 
     below: Float[Array, " f"]  # how far below w = 0 its law is continued
-    steepest: Float[Array, " f"]  # its slope at any speed: what a unit of load does to dw/dt
+    # Its steepest slope up to each of `SPEEDS`: by how much a unit of load changes dw/dt with w.
+    steepest: Float[Array, "f v"]
     falls_until: Float[Array, " f"]  # where it is least, up to 100 m/s
 
 
@@ -104,14 +105,13 @@ class HybridSystem(eqx.Module):
             mu = law.mu(-self.speed * shares)
             inside = ((mu >= 0) & (mu <= 2 * law.mu_s)).astype(shares.dtype)
             below = jnp.max(jax.lax.cummin(inside, reverse=True) * shares)
-            steepest = self.speed * jnp.max(jnp.abs(law.slope(speeds)))
-            return one * jnp.stack(
-                [below, steepest, speeds[jnp.argmin(law.mu(speeds))] / self.speed]
-            )
+            falls_until = speeds[jnp.argmin(law.mu(speeds))] / self.speed
+            steepest = self.speed * jax.lax.cummax(jnp.abs(law.slope(speeds)))
+            return one * jnp.concatenate([jnp.stack([below, falls_until]), steepest])
 
-        one = jnp.ones_like(self.P)
-        below, steepest, falls_until = jax.lax.stop_gradient(self._each(numbers, one)).T
-        return replace(self, scales=LawScales(below, self._own(steepest), falls_until))
+        found = jax.lax.stop_gradient(self._each(numbers, jnp.ones_like(self.P)))
+        steepest = self._own(found[:, 2:])
+        return replace(self, scales=LawScales(found[:, 0], steepest, found[:, 1]))
 
     def with_products(self) -> "HybridSystem":
         """With them, if its faces have directions of their own; K and C are matrices then."""
@@ -465,13 +465,14 @@ class HybridSystem(eqx.Module):
             return step
         u, loads = y[self.n :], self.loads(y[: self.n])
         loads = self._own(jnp.where(jnp.abs(s) == 1, jnp.abs(loads), 0))
-        bound = jnp.max(self._leaf(self.scales.steepest, u.ndim - 1) * loads, axis=0)
+        w, change = jnp.abs(self.sliding(u)), jnp.abs(self.along(rate[self.n :]))
+        # No eigenfrequency exceeds 1, so that accelerations change by about the velocities.
+        bend = (1 + jnp.max(jnp.abs(u), axis=0)) / 2
+        fastest = w + (change + (longest * bend)[None]) * longest[None]
+        bound = jnp.max(self._steepest(fastest) * loads, axis=0)
 
         def shortened():
-            w, change = jnp.abs(self.sliding(u)), jnp.abs(self.along(rate[self.n :]))
             trials = jnp.multiply.outer(jnp.asarray(_TRIALS, y.dtype), longest)
-            # No eigenfrequency exceeds 1, so that accelerations change by about the velocities.
-            bend = (1 + jnp.max(jnp.abs(u), axis=0)) / 2
             ways = (change[None] + (trials * bend[None])[:, None]) * trials[:, None]
             speeds = jnp.concatenate([jnp.maximum(w[None] - ways, 0), w[None], w[None] + ways])
             rates = jax.vmap(lambda w: self._steepness(w, loads))(speeds)
@@ -481,7 +482,19 @@ class HybridSystem(eqx.Module):
             steps = jnp.minimum(trials, allowed[None] / jnp.maximum(least[None], 2 * most))
             return jnp.minimum(step, jnp.max(steps, axis=0))
 
-        return jax.lax.cond(jnp.any(2 * bound * longest > allowed), shortened, lambda: step)
+        return jax.lax.cond(jnp.all(2 * bound * longest <= allowed), lambda: step, shortened)
+
+    def _steepest(self, w) -> Array:
+        """The steepest slope of each face's friction at speeds up to w (f, ...)."""
+        assert self.scales is not None
+        speeds = self.speed * w
+        # They are 0 and then evenly spaced in their logarithm.
+        decades = jnp.log10(jnp.maximum(speeds, SPEEDS[1]) / SPEEDS[1])
+        place = 1 + jnp.ceil(decades / np.log10(SPEEDS[2] / SPEEDS[1])).astype(int)
+        known = self._leaf(self.scales.steepest, w.ndim - 1)
+        place = jnp.minimum(place, len(SPEEDS) - 1)[:, None]
+        found = jnp.take_along_axis(known, place, axis=1)[:, 0]
+        return jnp.where(speeds <= SPEEDS[-1], found, jnp.inf)
 
     def _steepness(self, w, loads) -> Array:
         """The largest rate (...) at which friction at |w| (f, ...) changes that; 0 of no load."""
