@@ -29,12 +29,15 @@ from ._contact.persson import PerssonContact as PerssonContact
 from ._design import constraints as constraints
 from ._design.design import (
     Design as Design,
-    DesignResult as DesignResult,
     design as design,
     repeat_design as repeat_design,
 )
 from ._design.envelope import Envelope as Envelope
+from ._design.many import DesignMany as DesignMany, design_many as design_many
 from ._design.pareto import Front as Front, pareto as pareto
+from ._design.problem import DesignProblem as DesignProblem
+from ._design.result import DesignResult as DesignResult
+from ._design.sensitivity import Sensitivity as Sensitivity
 from ._design.tolerance import Tolerance as Tolerance, squeal_probability as squeal_probability
 from ._design.verdict import (
     Suggestion as Suggestion,

@@ -133,6 +133,11 @@ def concrete(array: jax.Array) -> np.ndarray | None:
     return None if isinstance(primal, Tracer) else np.asarray(primal)
 
 
+def is_traced(tree: Any) -> bool:
+    """True if any number in it is known only to a program that is being traced."""
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
+
+
 def nan_where(bad: Bool[ArrayLike, "..."], tree: Any) -> Any:
     """`tree` with NaN for its numbers where they are `bad`; one by one if that has their shape.
 

@@ -14,7 +14,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from .._base.parts import Record, flag, scalar, whole
+from .._base.parts import Record, flag, is_traced, scalar, whole
 from .._contact.contact import ContactState
 from .._dynamics.cycle import VELOCITY_REFERENCE, CycleResult
 from .._dynamics.limit_cycle import limit_cycle
@@ -83,11 +83,15 @@ class Constraint(Record):
     def name(self) -> str:
         """What is required, as results show it: `K_n >= 4e+08 N/m`."""
         unit = f" {self.unit}" if self.unit else ""
-        if self.at_least is None:
-            return f"{self.symbol} <= {self.at_most:.6g}{unit}"
-        if self.at_most is None:
-            return f"{self.symbol} >= {self.at_least:.6g}{unit}"
-        return f"{self.at_least:.6g} <= {self.symbol} <= {self.at_most:.6g}{unit}"
+        low, high = (
+            "its limit" if is_traced(limit) else limit if limit is None else f"{limit:.6g}"
+            for limit in (self.at_least, self.at_most)
+        )
+        if low is None:
+            return f"{self.symbol} <= {high}{unit}"
+        if high is None:
+            return f"{self.symbol} >= {low}{unit}"
+        return f"{low} <= {self.symbol} <= {high}{unit}"
 
 
 class Plain(Constraint):

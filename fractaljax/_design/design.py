@@ -5,12 +5,12 @@ on the constraints, and the best of all that meet every requirement, evaluated a
 answer (`search.py`). What is asked is stated in `statement.py` and required in `problem.py`.
 """
 
+import functools
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import ScalarLike
@@ -28,18 +28,22 @@ from .._stability.summary import stiffness_remarks
 from .._surface.roughness import Roughness, roughness
 from .._surface.topography import Topographies, topography
 from . import constraints as limits
-from .design_file import design_files, read_design
+from .descent import descend, distinct
+from .design_file import STATED, design_files, read_design
 from .envelope import Envelope, condition_text
 from .evaluator import Evaluation, evaluator_of
 from .few_modes import in_few_modes
 from .limit import LeastGrowth, least_growth
+from .optimum import limited_columns
 from .problem import DesignProblem
 from .quiet import VERIFIED, Kicks, quiet
+from .result import DesignResult
 from .rows import describe
 from .search import Found, Search
+from .sensitivity import Sensitivity, sensitivity_of
 from .solvers import Solver, slsqp
 from .starts import choose_starts, designs_around, screened_designs
-from .statement import DEFAULT_BOUNDS, state_problem
+from .statement import DEFAULT_BOUNDS
 from .summary import NO_EQUILIBRIUM, comparison_table, growth_text
 from .tolerance import Tolerance, squeal_probability
 
@@ -51,18 +55,11 @@ _STARTS_OF_STRUCTURES, _STARTS_OF_MANY_JOINTS = 8, 32
 # Of the bounds, about the given design, in which the latter are: where best is nearest, near.
 _SHARES = {True: (0.1, 0.2, 0.6), False: (0.2, 0.6, 1.0)}
 _STARTS_MAX = 10_000
+_DESCENDED = 4  # ends of descents that a solver lands from
 _FEW_JOINTS = 2  # of more, nearly no design of an even spread is inside all limits
 _SEED_MAX = 2**63 - 1  # of a JAX key
 _ACTIVE = 1e-4  # a requirement met by less than this is called active
 _WAVELENGTHS = (1e-3, 1e-6)  # [m], of the roughness that is reported
-
-
-class DesignResult(eqx.Enumeration):
-    """How a design ended; an outcome, raised by nobody."""
-
-    found = "found: the best surface that meets every requirement"
-    unchanged = "unchanged: the given surface meets every requirement already"
-    infeasible = "infeasible: no surface inside the bounds was found to meet every requirement"
 
 
 class Design(Record):
@@ -101,6 +98,23 @@ class Design(Record):
     def outcome(self) -> str:
         """The result in words."""
         return DesignResult[self.result]
+
+    @functools.cached_property
+    def sensitivity(self) -> Sensitivity | None:
+        """How the design moves with each quantity that is held fixed, and what its limits cost.
+
+        `sensitivity["D"]["P"]` is dD/dP. None where it cannot be told: without a design, with
+        limits on cycles or on kicks, at a kink, and where the worst condition is inside an
+        envelope. Of a structure it takes several evaluations for each quantity.
+        """
+        cycles = [self.options["objective"], *self.options["constraints"]]
+        told = self.options["quiet_within"] is None and self.result != DesignResult.infeasible
+        if not told or any(isinstance(each, limits.CycleConstraint) for each in cycles):
+            return None
+        problem = stated(self.initial, self.options)
+        state = functools.partial(stated, options=self.options, modes=problem.modes or None)
+        evaluator = evaluator_of(problem, self.options["envelope"], self.options["risk"])
+        return sensitivity_of(self.initial, self.scene, state, evaluator)
 
     @property
     def has_surface(self) -> bool:
@@ -245,6 +259,7 @@ def design(
     area_ratio_min: float = 2.0,
     slip_ratio_max: float = 0.9,
     friction_slope: bool = True,
+    optimiser: Any = None,
     solver: Solver | None = None,
     starts: int | None = None,
     lattice: int | None = None,
@@ -304,6 +319,11 @@ def design(
     four corners and the worst conditions of the requirements, each in its own V/omega and V.
     It takes no tolerance: whether a start comes to rest has no quantile.
 
+    With an `optimiser`, any `optax.GradientTransformation` such as
+    `optax.adam(optax.cosine_decay_schedule(0.03, 100))`, all starts first descend side by side for
+    100 steps, on scaled variables and an exact penalty of what is unmet; the solver lands from the
+    distinct best of their ends.
+
     `solver(objective, constraints, start, bounds)`, by default SciPy's SLSQP (see `slsqp`), lands
     from `starts` designs, by default 12, or 8 of a structure: those given, the most promising of
     `lattice` a side (48, or 24 of a structure, with an envelope or a tolerance; 1024 or 256 in one
@@ -326,10 +346,15 @@ def design(
     options["envelope"] = envelope = None if envelope is None else Envelope.of(envelope)
     options["tolerance"] = None if tolerance is None else Tolerance.of(tolerance)
     progress = flag("progress", progress)
+    if optimiser is not None and not callable(getattr(optimiser, "update", None)):
+        raise TypeError(
+            "optimiser must be an optax.GradientTransformation, such as optax.adam(0.03), got "
+            + brief(optimiser)
+        )
     if solver is not None and not callable(solver):
         raise TypeError(f"solver must be a function, got {brief(solver)}")
     whole("seed", seed, 0, _SEED_MAX)
-    problem = state_problem(x, **options)
+    problem = stated(x, options)
     options["bounds"] = dict(options["bounds"])
     kicks = None
     if quiet_within is not None:
@@ -355,6 +380,10 @@ def design(
         landing = solver or solver_of(problem)
         rough = None if landing else in_few_modes(problem, us)
         search = Search(evaluator, landing, 1.0 if objective is None else scale, rough)
+        if optimiser is not None:
+            limited = np.isin(np.arange(len(problem.asked)), limited_columns(problem))
+            ends, merit = descend(evaluator, us, optimiser, limited, search.scale)
+            us = distinct(ends, merit, _DESCENDED)
         path, after, failed, lowest = search.best(us, progress)
         limit = None if lowest is None else least_growth(search, *lowest)
         return Found(path, after, len(us), failed, limit)
@@ -368,6 +397,14 @@ def design(
     found, survived = quiet(problem, found, solved, kicks, envelope)
     found = found._replace(evaluation=evaluator.evaluate(found.path[-1:]))  # without cuts
     return _conclude(x, problem, options, before, found, survived)
+
+
+def stated(x: Mechanism, options: Mapping[str, Any], modes: int | None = None) -> DesignProblem:
+    """The problem that options of `design` state; of a structure perhaps of so many modes."""
+    problem = DesignProblem(x, **{name: options[name] for name in STATED}, modes=modes)
+    # An average of smooth residuals over conditions is not that of the growth rates.
+    smooth = problem.smooth and (problem.least_growth or options["risk"] == "worst")
+    return problem.with_fields(smooth=smooth)
 
 
 def screened(problem: DesignProblem, starts: int | None, lattice: int | None):
@@ -410,12 +447,8 @@ def _conclude(
     path, after, starts, failed, limit = found
     final, history = x, describe(problem, path)
     if starts:
-        # exp(ln G) and the scaling back may end a rounding beyond a bound.
-        ends = {
-            name: np.asarray(np.clip(history[name][-1], *ends), problem.low.dtype)
-            for name, ends in options["bounds"].items()
-        }
-        final = replaced(x, ends)
+        dtype = problem.low.dtype
+        final = replaced(x, {name: np.asarray(history[name][-1], dtype) for name in problem.names})
     names, envelope, tolerance = (problem.residual_names, options["envelope"], options["tolerance"])
     residuals = dict(zip(names, after.residuals[0].tolist(), strict=True))
     for name, place in zip(problem.names, path[-1].tolist(), strict=True):

@@ -31,14 +31,15 @@ from .._mechanism.structure import Structure
 from . import constraints as known_constraints
 from .constraints import Constraint
 from .envelope import Envelope
-from .statement import state_problem
 from .tolerance import Tolerance
 
 _PACKAGE = __name__.split(".")[0]
-OPTIONS = (*[*inspect.signature(state_problem).parameters][1:-1], "risk", "solver", "starts")
-OPTIONS += ("lattice", "seed", "quiet_within")  # the arguments of `design` that a file holds
+# The arguments of `design` that state its problem, and all that a file holds.
+STATED = ("bounds", "objective", "target", "K_n_min", "constraints", "envelope", "tolerance")
+STATED += ("quantile", "area_ratio_min", "slip_ratio_max", "friction_slope", "laws")
+OPTIONS = (*STATED, "risk", "optimiser", "solver", "starts", "lattice", "seed", "quiet_within")
 # Of the fields of a `Design`.
-_NOT_RESULTS = {"scene", "initial", "result", "history", "options", "least_growth"}
+_NOT_RESULTS = {"scene", "initial", "result", "history", "options", "least_growth", "sensitivity"}
 
 
 def design_files(best: Any, path: Path) -> dict[Path, bytes]:
@@ -60,6 +61,7 @@ def design_files(best: Any, path: Path) -> dict[Path, bytes]:
             files |= x._files(beside)
     options = dict(best.options)
     options["solver"] = options["solver"] and _function_name(options["solver"])
+    options["optimiser"] = options["optimiser"] and "optimiser"  # it has no name of its own
     if (objective := options["objective"]) is not None:
         table = _constraint_table(objective)
         options["objective"] = table if isinstance(objective, Constraint) else table["function"]
@@ -158,7 +160,7 @@ def _options(table, functions) -> dict[str, Any]:
     refuse_unknown("[options]", table, OPTIONS)
     options = dict(table)
     options["bounds"] = table_at(options, "bounds", "options.")
-    for name in ("objective", "solver"):
+    for name in ("objective", "optimiser", "solver"):
         if name in options:
             given = options[name]
             if name == "objective" and isinstance(given, dict):

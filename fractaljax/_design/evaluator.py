@@ -69,7 +69,7 @@ class Evaluator:
     def screen(self, us: np.ndarray) -> np.ndarray:
         """Objective and residuals (n, 1 + k) of us (n, v), roughly: to choose starts by."""
         # Cycles are followed from the starts only.
-        rough = dataclasses.replace(self, problem=dataclasses.replace(self.problem, cycles=None))
+        rough = dataclasses.replace(self, problem=self.problem.with_fields(cycles=None))
         return rough._at_all(us, self.likely).max(axis=1)[:, self.problem.asked]
 
     def evaluate(self, us: np.ndarray) -> Evaluation:

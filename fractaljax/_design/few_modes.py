@@ -5,7 +5,6 @@ Elsewhere they are off by what the modes of these designs leave out: a search en
 problem.
 """
 
-import dataclasses
 import functools
 
 import jax
@@ -40,7 +39,7 @@ def in_few_modes(problem: DesignProblem, us: np.ndarray) -> DesignProblem | None
     V = decomposed(list(vectors[np.isfinite(vectors).all(axis=(1, 2))]), np.sqrt(size[0]), _CUT)
     if V.shape[1] > _SHARE * x.n:
         return None
-    return dataclasses.replace(problem, x=ParametricStructure(**projected(x, V, V)))
+    return problem.with_fields(x=ParametricStructure(**projected(x, V, V)))
 
 
 @exported_jit

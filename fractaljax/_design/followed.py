@@ -6,7 +6,7 @@ is followed from a state of the last cycle to whatever attracts it.
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,7 +37,7 @@ class _Known(NamedTuple):
     slopes: np.ndarray  # (2, n, v)
 
 
-@dataclasses.dataclass
+@dataclasses.dataclass(eq=False)  # hashable: a problem holds it beside its numbers
 class FollowedCycles:
     """The cycles of the designs of one problem, as far as they have been asked for."""
 
@@ -46,15 +46,10 @@ class FollowedCycles:
 
     def fill(self, problem, us: np.ndarray, rows: np.ndarray, jacobians: np.ndarray) -> None:
         """Write what is asked of the cycles into rows (n, 1 + k) and Jacobians (n, 1 + k, v)."""
-        first = 1 + len(problem.residual_names) - len(problem.constraints)
-        first -= 0 if problem.cuts is None else len(problem.cuts.reach)
-        columns: list[tuple[int, Any, Any]] = [
-            (first + i, asked, lambda asked, value: asked.above(value))
-            for i, asked in enumerate(problem.constraints)
-            if isinstance(asked, CycleConstraint)
+        columns = [
+            (column, asked, (lambda asked, value: asked.above(value)) if column else _itself)
+            for column, asked in self.columns(problem)
         ]
-        if self.objective is not None:
-            columns.append((0, self.objective, lambda asked, value: value))
         for i, u in enumerate(np.asarray(us, float)):
             found = self.at(problem, u)
             for column, asked, residual in columns:
@@ -63,6 +58,17 @@ class FollowedCycles:
                     lambda pair, asked=asked, residual=residual: residual(asked, asked.of(*pair))
                 )(given)
                 jacobians[i, column] = np.asarray(slope) @ found.slopes[:, asked.dof]
+
+    def columns(self, problem) -> list[tuple[int, CycleConstraint]]:
+        """Which columns of a row are of cycles: requirements, and perhaps the objective."""
+        first = 1 + problem.requirements - len(problem.constraints)
+        first -= 0 if problem.cuts is None else len(problem.cuts.reach)
+        columns = [
+            (first + i, asked)
+            for i, asked in enumerate(problem.constraints)
+            if isinstance(asked, CycleConstraint)
+        ]
+        return columns if self.objective is None else [*columns, (0, self.objective)]
 
     def ends(self, problem, u: np.ndarray) -> dict[str, tuple[float, float]]:
         """What is asked of the cycles, of the given design and of u (v,), by name and unit."""
@@ -118,7 +124,7 @@ class FollowedCycles:
     def _newton(self, problem, u, segments) -> _Known | None:
         """The orbit near that of another design; None unless it is a cycle that attracts."""
         (segments, start, ok), measures, slopes = _followed(
-            dataclasses.replace(problem, cycles=None, cuts=None, constraints=()),
+            problem.with_fields(cycles=None, cuts=None, constraints=(), grid=None),
             jnp.asarray(u, problem.low.dtype),
             segments,
         )
@@ -141,6 +147,10 @@ class FollowedCycles:
             found = _Known(u, None, np.full(2 * n, np.nan), measures, none)
         self.known[u.tobytes()] = found
         return found
+
+
+def _itself(asked: CycleConstraint, value: jax.Array) -> jax.Array:
+    return value
 
 
 def _mechanism(problem, u):

@@ -1,6 +1,6 @@
 """How many modes of a structure may grow: each has a growth rate to keep low."""
 
-import dataclasses
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -11,27 +11,29 @@ from .._base.ranges import low_discrepancy
 from .._stability.linearise import assembled
 from .._stability.quadratic import leading
 from .joints import under
-from .problem import DesignProblem
 from .rows import paired, rows_in_batches
 
+if TYPE_CHECKING:
+    from .problem import DesignProblem
+
 _LOOKED_AT = 15  # designs, besides the given one, in which growing modes are counted
-_MODES_MOST = 16  # that requirements are made of
+MODES_MOST = 16  # that requirements are made of
 
 
-def modes_to_keep(problem: DesignProblem) -> int:
+def modes_to_keep(problem: "DesignProblem") -> int:
     """How many modes may grow: two more than grow in any of a few designs."""
     designs = np.concatenate(
         [np.asarray(problem.start)[None], low_discrepancy(_LOOKED_AT, len(problem.names))]
     )
-    modes = max(2, min(_MODES_MOST, problem.x.n))
-    looking = dataclasses.replace(problem, modes=modes)
+    modes = max(2, min(MODES_MOST, problem.x.n))
+    looking = problem.with_fields(modes=modes)
     own = paired(designs, np.asarray(problem.own_condition)[None])
     growing = rows_in_batches(_rates, looking, *own) > float(problem.target)
     return min(int(growing.sum(axis=2).max()) + 2, modes)
 
 
 @exported_jit
-def _rates(problem: DesignProblem, us, conditions):
+def _rates(problem: "DesignProblem", us, conditions):
     """The largest growth rates (n, laws, modes), NaN where there is no steady sliding."""
 
     def one(u, condition):

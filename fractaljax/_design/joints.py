@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._base.parts import substitute
+from .._base.parts import is_traced, substitute
 from .._contact.contact import Contact, on_the_same_joint
 from .._contact.fixed import FixedContact
 from .._mechanism.joint import Joint
@@ -136,23 +136,25 @@ def moved_contacts(x, names) -> tuple[str, ...]:
     return tuple(found)
 
 
-def least_damping(x) -> tuple[float, float]:
+def least_damping(x) -> tuple[Any, Any]:
     """The least damping rate [1/s] without friction, and the least frequency [rad/s]."""
+    xp: Any = jnp if is_traced(x) else np
     if isinstance(x, Scene):
         o = x.oscillator
-        omega = np.array([o.omega_1, o.omega_2], float)
-        return float((np.array([o.xi_1, o.xi_2]) * omega).min()), float(omega.min())
-    M, C, K = (np.asarray(X, float) for X in (x.M, x.C, x.K))
+        omega = xp.asarray([o.omega_1, o.omega_2], float)
+        return (xp.asarray([o.xi_1, o.xi_2], float) * omega).min(), omega.min()
+    M, C, K = (xp.asarray(X, float) for X in (x.M, x.C, x.K))
     for joint in x.joints:
         stiffness = joint.stiffness()
         for each, dofs in zip(stiffness, (joint.normal, joint.tangential), strict=True):
             if dofs is None:
                 continue
-            d = np.asarray(x.direction(dofs), float)
-            K = K + float(each) * np.outer(d, d)
-    n = len(M)
-    A = np.block([[np.zeros((n, n)), np.eye(n)], [-np.linalg.solve(M, K), -np.linalg.solve(M, C)]])
-    s = np.linalg.eigvals(A)
-    inside = np.asarray(in_band(jnp.asarray(s), x.band))
-    s = s[inside] if inside.any() else s
-    return max(0.0, float(-s.real.max())), float(np.abs(s).min())
+            d = xp.asarray(x.direction(dofs), float)
+            K = K + xp.asarray(each, float) * xp.outer(d, d)
+    zero, eye = xp.zeros_like(M), xp.eye(len(M))
+    A = xp.block([[zero, eye], [-xp.linalg.solve(M, K), -xp.linalg.solve(M, C)]])
+    s = xp.linalg.eigvals(A)
+    inside = xp.asarray(in_band(jnp.asarray(s), x.band))
+    inside = inside | ~inside.any()
+    damping = -xp.where(inside, s.real, -xp.inf).max()
+    return xp.maximum(damping, 0.0), xp.where(inside, abs(s), xp.inf).min()

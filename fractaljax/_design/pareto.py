@@ -15,12 +15,11 @@ from .._base.parts import Record, brief, flag, scalar, whole
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import replaced
 from .constraints import Constraint
-from .design import Design, design, screened, solver_of
+from .design import Design, design, screened, solver_of, stated
 from .evaluator import Evaluator
 from .problem import DesignProblem
 from .rows import describe
 from .search import Search
-from .statement import state_problem
 
 _STARTS = 6  # of each member of the front
 _RESOLVED = 1e-6  # relative, of the values at the ends of a front
@@ -115,7 +114,7 @@ def pareto(
 
     def problem_at(limit: float, scale: float) -> DesignProblem:
         constraints: Any = (*made["constraints"], _Second(second, limit, scale))
-        return state_problem(x, **made | {"constraints": constraints})
+        return stated(x, made | {"constraints": constraints})
 
     problem = problem_at(0.0, 1.0)
     places = np.stack([problem.scaled(end.scene) for end in ends])

@@ -6,29 +6,31 @@ informative on both sides of every regime boundary. A fully plastic joint knows 
 far it is from carrying load elastically. Where quantities scatter, a residual is its quantile.
 """
 
-from collections.abc import Callable, Mapping
+import copy
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
+from .._base.parts import is_traced, whole
+from .._base.programs import exported_jit
 from .._contact.contact import Contact
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import (
-    joints_of,
-    substituted,
-    value_of,
-)
+from .._mechanism.quantities import joints_of, substituted, value_of
+from .._mechanism.structure import Structure
 from .._stability.linearise import assembled
 from .._stability.quadratic import leading
 from .._stability.stability import growth_rate
 from .coalescence import of_neighbours, of_scene
 from .constraints import Constraint, CycleConstraint
 from .cuts import Cuts
+from .envelope import Envelope
 from .followed import FollowedCycles
+from .growing_modes import MODES_MOST, modes_to_keep
 from .joints import (
     is_fractal,
     of_joint,
@@ -37,25 +39,45 @@ from .joints import (
     under,
     with_stiffness,
 )
-from .tolerance import Tolerance, quantile
+from .statement import stated_fields
+from .tolerance import Scatter, quantile
 
 UNKNOWN = 1e3  # stands for a residual without a number
 
 
-class Scatter(eqx.Module):
-    """The quadrature over a tolerance, and the quantile that counts."""
-
-    tolerance: Tolerance
-    base: dict[str, Float[Array, ""]]  # what the quantities are where nothing moves them
-    shifts: Float[Array, "n k"]
-    weights: Float[Array, " n"]
-    level: Float[Array, ""]
-
-
 class DesignProblem(eqx.Module):
-    """What a design asks; problems that differ in leaves alone share one compiled program."""
+    """What `design` solves, as plain functions of scaled variables u (v,) in [0, 1]^v.
+
+    A variable is linear in its quantity between the bounds or, where the quantity is a scale such
+    as G, P or a stiffness, in its logarithm. `loss`, `residuals`, `quantities` and `mechanism` are
+    pure JAX: they take `jax.jit`, `jax.vmap` and both modes of derivatives, and a problem may be
+    made of a traced mechanism, so that designs can be mapped over mechanisms too.
+
+    **Arguments**, which mean what they mean for `design`:
+
+    - `x`: a `Scene` or a `Structure`.
+    - `bounds`: {name: (lower, upper)} in SI units, of the quantities that are designed.
+    - `objective`: a function of a mechanism, which is minimised; by default the squared scaled
+      distance from the quantities that `x` has.
+    - `constraints`: functions of a mechanism that are at most 0 where they are met, of order one.
+    - `target`: the largest growth rate allowed [1/s]; by default minus half the least damping rate
+      without friction.
+    - `K_n_min`: the least normal stiffness [N/m] of each contact that the bounds move; by default
+      its own.
+    - `laws`: other contact laws, under each of which the growth rate must be as low.
+    - `envelope`: ranges or samples of other quantities; loss and residuals are the largest of those
+      at the points of a grid over it (`design` searches between them, too).
+    - `tolerance`, `quantile`: scatter of quantities; loss and residuals are their quantiles.
+    - `area_ratio_min`, `slip_ratio_max`: limits of each fractal contact that the bounds move.
+    - `friction_slope`: whether growth rates count the slope of friction.
+    - `modes`: how many modes of a structure have a growth rate of their own to keep low; by default
+      two more than grow in any of a few designs, of a traced structure at most 16.
+
+    **Raises:** `ValueError` or `TypeError` as `design`.
+    """
 
     x: Any  # the given scene or structure
+    ends: Float[Array, "2 v"]  # bounds of the quantities
     low: Float[Array, " v"]  # bounds of the variables, logarithms of scales
     high: Float[Array, " v"]
     start: Float[Array, " v"]  # the given design, scaled
@@ -68,27 +90,108 @@ class DesignProblem(eqx.Module):
     constraints: tuple[Constraint, ...]
     laws: tuple[Contact, ...]  # under each of which the growth rate must be as low
     scatter: Scatter | None
+    grid: Float[Array, "m c"] | None  # conditions over which loss and residuals are the largest
     names: tuple[str, ...] = eqx.field(static=True)
     logarithmic: tuple[bool, ...] = eqx.field(static=True)
     contacts: tuple[str, ...] = eqx.field(static=True)  # with a law, that the design moves
     objective: Callable[[Any], Any] | None = eqx.field(static=True)
     friction_slope: bool = eqx.field(static=True)
     conditions: tuple[str, ...] = eqx.field(static=True)  # quantities of the envelope
-    modes: int = eqx.field(static=True, default=0)  # that a structure must keep from growing
+    modes: int = eqx.field(static=True)  # that a structure must keep from growing
     # Whether rows end with what solvers follow in the place of growth rates.
-    smooth: bool = eqx.field(static=True, default=False)
-    cuts: Cuts | None = None
-    cycles: FollowedCycles | None = None  # where a requirement or the objective is of a cycle
+    smooth: bool = eqx.field(static=True)
+    cuts: Cuts | None
+    # Where a requirement or the objective is of a cycle.
+    cycles: FollowedCycles | None = eqx.field(static=True)
+
+    def __init__(
+        self,
+        x: Mechanism,
+        bounds: Mapping[str, Sequence[float]],
+        objective: Callable[[Any], Any] | None = None,
+        constraints: Sequence[Callable[[Any], Any]] = (),
+        target: ArrayLike | None = None,
+        K_n_min: ArrayLike | None = None,
+        *,
+        laws: Sequence[Contact] = (),
+        envelope: Envelope | Mapping[str, Any] | None = None,
+        tolerance: Any = None,
+        quantile: ArrayLike = 0.95,
+        area_ratio_min: ArrayLike = 2.0,
+        slip_ratio_max: ArrayLike = 0.9,
+        friction_slope: bool = True,
+        modes: int | None = None,
+    ):
+        asked: dict[str, Any] = dict(objective=objective, constraints=constraints, target=target)
+        asked |= dict(K_n_min=K_n_min, laws=laws, envelope=envelope, tolerance=tolerance)
+        asked |= dict(
+            quantile=quantile, area_ratio_min=area_ratio_min, slip_ratio_max=slip_ratio_max
+        )
+        for name, value in stated_fields(x, bounds, friction_slope=friction_slope, **asked).items():
+            setattr(self, name, value)
+        self.modes, self.smooth, self.cuts = 0, False, None
+        if isinstance(x, Structure):
+            most = min(MODES_MOST, x.n)
+            if modes is not None:
+                self.modes = whole("modes", modes, 1, most)
+            else:
+                self.modes = most if is_traced(x) else modes_to_keep(self)
+        # A quantile of smooth residuals is not that of the growth rates.
+        self.smooth = self.least_growth or self.scatter is None
+        if K_n_min is None and self.contacts:
+            self.K_n_min = _own_stiffness(self)
+
+    def with_fields(self, **changes: Any) -> "DesignProblem":
+        """The same problem with some of its fields changed, unchecked."""
+        changed = copy.copy(self)
+        for name, value in changes.items():
+            object.__setattr__(changed, name, value)
+        return changed
+
+    # --- for users: a design -------------------------------------------------------------
+
+    @eqx.filter_jit
+    def loss(self, u: Float[ArrayLike, " v"]) -> Float[Array, ""]:
+        """The objective, in its own unit; by default the squared scaled distance from `start`."""
+        return self._named_row(u)[0]
+
+    @eqx.filter_jit
+    def residuals(self, u: Float[ArrayLike, " v"]) -> Float[Array, " k"]:
+        """The requirements (k,), at most 0 where met, of order one; `residual_names` names them."""
+        return self._named_row(u)[1:]
+
+    def mechanism(self, u: Float[ArrayLike, " v"]) -> Any:
+        """The scene or structure of a design."""
+        return self.moved(jnp.asarray(u, self.low.dtype), self.own_condition)
+
+    def _named_row(self, u) -> Float[Array, " k"]:
+        """Objective and residuals, the largest of those at all conditions."""
+        u = jnp.asarray(u, self.low.dtype)
+        if u.shape != self.low.shape:
+            raise ValueError(f"u must have the shape {self.low.shape}, got {u.shape}")
+        if self.grid is not None:
+            rows = jax.vmap(lambda condition: self.at(u, condition)[0])(self.grid)
+            return jnp.max(rows[:, self.asked], axis=0)
+        row = self.at(u, self.own_condition)[0][self.asked]
+        if self.cycles is None:
+            return row
+        x = self.mechanism(u)
+        for column, cycle in self.cycles.columns(self):
+            row = row.at[column].set(cycle(x))
+        return row
 
     # --- in JAX: one design at one condition ---------------------------------------------
 
-    def quantities(self, u: Float[Array, " v"]) -> dict[str, Array]:
-        """The designed quantities at scaled variables u."""
-        values = self.low + u * (self.high - self.low)
-        return {
-            name: jnp.exp(value) if logarithmic else value
-            for name, logarithmic, value in zip(self.names, self.logarithmic, values, strict=True)
-        }
+    def quantities(self, u: Float[ArrayLike, " v"]) -> dict[str, Array]:
+        """The designed quantities, by name and in SI units."""
+        values = self.low + jnp.asarray(u, self.low.dtype) * (self.high - self.low)
+        scales = np.array(self.logarithmic)
+        values = jnp.where(scales, jnp.exp(jnp.where(scales, values, 0)), values)
+        # A rounding beyond a bound would be outside a domain; slopes are not those of a limit.
+        inside = jnp.clip(values, *self.ends)
+        near = jnp.abs(inside - values) <= 1e3 * jnp.finfo(values.dtype).eps * jnp.abs(inside)
+        values = values + jax.lax.stop_gradient(jnp.where(near, inside - values, 0))
+        return dict(zip(self.names, values, strict=True))
 
     def moved(self, u: Float[Array, " v"], condition: Float[Array, " c"], shift=None) -> Any:
         """The scene or structure at scaled variables u, a condition and perhaps a shift (k,)."""
@@ -209,7 +312,7 @@ class DesignProblem(eqx.Module):
     @property
     def asked(self) -> np.ndarray:
         """Which columns (1 + k,) of a row are the objective and the requirements by name."""
-        named, laws = 1 + len(self.residual_names), 1 + len(self.laws)
+        named, laws = 1 + self.requirements, 1 + len(self.laws)
         smooth = self.modes if self.least_growth else (self.modes or 2) * laws
         return np.arange(named + self.smooth * smooth) < named
 
@@ -217,6 +320,14 @@ class DesignProblem(eqx.Module):
     def rounding(self) -> float:
         """Of a residual."""
         return 3e4 * float(np.finfo(self.low.dtype).eps)
+
+    @property
+    def requirements(self) -> int:
+        """How many residuals have names."""
+        rates = self.growth_columns.stop - self.growth_columns.start
+        cuts = 0 if self.cuts is None else len(self.cuts.reach)
+        others = len(self.contacts) + len(self.constraints)
+        return self.model_residuals + rates + others + cuts
 
     @property
     def model_residuals(self) -> int:
@@ -246,3 +357,10 @@ class DesignProblem(eqx.Module):
         values = np.log(values, out=values, where=self.logarithmic)
         low, high = np.asarray(self.low, float), np.asarray(self.high, float)
         return np.clip((values - low) / (high - low), 0, 1)
+
+
+@exported_jit
+def _own_stiffness(problem: DesignProblem) -> tuple[Array, ...]:
+    """K_n [N/m] of each contact that a design moves, as it is given."""
+    states = problem.stiffened(problem.mechanism(problem.start))[0]
+    return tuple(states[name].K_n for name in problem.contacts)

@@ -142,7 +142,7 @@ def quiet(
             reach = max(_REACH, 2 * gaps[gaps < _NONE].max(initial=0))
             cuts = cuts.added(len(failed), u, normals, gaps, reach)
             failed.append((radius, found))
-        found = solve(dataclasses.replace(problem, cuts=cuts))
+        found = solve(problem.with_fields(cuts=cuts))
     best = max(failed, key=lambda pair: pair[0])[1] if failed else found
     return best, kicks.survived(scenes(best))
 
@@ -158,7 +158,7 @@ def _moved_back(problem, failed, found, solve, kicks, scenes) -> list[Found]:
     for _ in range(_BISECTIONS):
         plane = np.stack([way / length, np.zeros_like(way)]), np.array([share * length, _NONE])
         cuts = Cuts.none(_EXCHANGES, problem.low).added(0, centre, *plane, _NONE)
-        other = solve(dataclasses.replace(problem, cuts=cuts))
+        other = solve(problem.with_fields(cuts=cuts))
         if other.evaluation.worst[0] <= 0 and kicks.least(scenes(other))[0] == kicks.size:
             moved.insert(0, other)
             high = share

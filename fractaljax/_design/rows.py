@@ -1,21 +1,23 @@
 """Designs by the many: their rows, Jacobians and descriptions, by compiled programs."""
 
-import dataclasses
 import functools
+from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
 
 from .._base.batches import in_batches
 from .._base.programs import exported_jit
-from .problem import DesignProblem
+
+if TYPE_CHECKING:
+    from .problem import DesignProblem
 
 BATCH = 32  # designs, each at one condition, evaluated at once
 # Structures take so long that filling up a batch costs more than a call.
 _BATCH_OF_STRUCTURES, _SMALL = 8, 16  # of at most so many degrees of freedom; of larger ones 1
 
 
-def linearise(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray):
+def linearise(problem: "DesignProblem", us: np.ndarray, conditions: np.ndarray):
     """Rows (n, 1 + k), their Jacobians (n, 1 + k, v), and what describes designs us (n, v).
 
     Each design is at a condition (n, c).
@@ -28,16 +30,16 @@ def linearise(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray):
     return rows, jacobians, numbers
 
 
-def evaluate(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray) -> np.ndarray:
+def evaluate(problem: "DesignProblem", us: np.ndarray, conditions: np.ndarray) -> np.ndarray:
     """Objective and residuals (n, 1 + k) of designs us (n, v), each at a condition (n, c)."""
     if not problem.robust:
         return linearise(problem, us, conditions)[0]  # compiled already
     return rows_in_batches(evaluated, problem, us, conditions).astype(float)
 
 
-def describe(problem: DesignProblem, us: np.ndarray) -> dict[str, np.ndarray]:
+def describe(problem: "DesignProblem", us: np.ndarray) -> dict[str, np.ndarray]:
     """Quantities and results (n,) of designs us (n, v), as they are, without scatter."""
-    nominal = dataclasses.replace(problem, scatter=None)
+    nominal = problem.with_fields(scatter=None)
     return linearise(nominal, *paired(us, np.asarray(problem.own_condition)[None]))[2]
 
 
@@ -48,7 +50,7 @@ def paired(us: np.ndarray, conditions: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 def rows_in_batches(program, problem, us, conditions):
     """A compiled program of a problem, designs (b, v) and conditions (b, c), for (n, v) of them."""
-    problem = dataclasses.replace(problem, cycles=None)
+    problem = problem.with_fields(cycles=None, grid=None)
     dtype = problem.low.dtype
     pairs = np.asarray(us, dtype), np.asarray(conditions, dtype)
     batch = BATCH
@@ -58,7 +60,7 @@ def rows_in_batches(program, problem, us, conditions):
 
 
 @exported_jit
-def linearised(problem: DesignProblem, us, conditions):
+def linearised(problem: "DesignProblem", us, conditions):
     """What `linearise` compiles."""
 
     def one(u, condition):
@@ -73,5 +75,5 @@ def linearised(problem: DesignProblem, us, conditions):
 
 
 @exported_jit
-def evaluated(problem: DesignProblem, us, conditions):
+def evaluated(problem: "DesignProblem", us, conditions):
     return jax.vmap(lambda u, condition: problem.at(u, condition)[0])(us, conditions)

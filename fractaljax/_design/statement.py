@@ -1,6 +1,5 @@
 """The statement of a design problem: the arguments of `design`, checked."""
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -8,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._base.parts import brief, flag, require_kind, require_scalar, scalar
+from .._base.parts import brief, flag, is_traced, nan_where, require_kind, require_scalar, scalar
 from .._contact.contact import Contact
 from .._dynamics.scaled import degrees_of_freedom, hybrid_system
 from .._mechanism.mechanism import Mechanism
@@ -23,38 +22,32 @@ from .._mechanism.quantities import (
     with_optional,
 )
 from .._mechanism.scene import Scene
-from .._mechanism.structure import Structure
 from .constraints import Constraint, CycleConstraint, Plain
 from .envelope import Envelope
 from .followed import FollowedCycles
-from .growing_modes import modes_to_keep
-from .joints import least_damping, moved_contacts, of_joint, under
-from .problem import DesignProblem, Scatter
-from .rows import describe
-from .tolerance import Tolerance, nodes
+from .joints import least_damping, moved_contacts, under
+from .tolerance import Scatter, Tolerance, nodes
 
 DEFAULT_BOUNDS: dict[str, tuple[float, float]] = {"D": (2.1, 2.9), "G": (1e-12, 1e-8)}
 
 
-def state_problem(
+def stated_fields(
     x: Mechanism,
     bounds: Mapping[str, Sequence[float]],
     *,
     objective: Callable[[Any], Any] | None,
-    target: float | None,
-    K_n_min: float | None,
     constraints: Sequence[Callable[[Any], Any]],
-    envelope: Envelope | None,
-    tolerance: Tolerance | None,
-    quantile: float,
-    area_ratio_min: float,
-    slip_ratio_max: float,
+    target: Any,
+    K_n_min: Any,
+    laws: Sequence[Contact],
+    envelope: Any,
+    tolerance: Any,
+    quantile: Any,
+    area_ratio_min: Any,
+    slip_ratio_max: Any,
     friction_slope: bool,
-    risk: Any = "worst",
-    laws: Sequence[Contact] = (),
-    **_: Any,
-) -> DesignProblem:
-    """Check the arguments of `design` that state a problem, which that documents; no others."""
+) -> dict[str, Any]:
+    """Check the arguments of a `DesignProblem`, which documents them; most of its fields."""
     require_one("x", x)
     if objective is not None and not callable(objective):
         raise TypeError(f"objective must be a function of a scene, got {brief(objective)}")
@@ -75,6 +68,8 @@ def state_problem(
         raise ValueError("laws of a structure need a joint whose contact has a surface")
     for law in laws:
         under(x, law)  # refuses one that a joint cannot have
+    envelope = None if envelope is None else Envelope.of(envelope)
+    tolerance = None if tolerance is None else Tolerance.of(tolerance)
     bounds = checked_bounds(x, bounds)
     cycles = _cycles(x, objective, constraints, envelope is not None or tolerance is not None)
     objective = _followed if isinstance(objective, CycleConstraint) else objective
@@ -93,39 +88,44 @@ def state_problem(
     if tolerance is not None:
         tolerance.check(x, ranges)
         z, weights = nodes(len(tolerance.names))
-        shifts = tolerance.shifts(z)
-        scatter = Scatter(
-            tolerance, tolerance.base(x), jnp.asarray(shifts), jnp.asarray(weights), level
-        )
+        shifts = jnp.asarray(tolerance.shifts(z))
+        scatter = Scatter(tolerance, tolerance.base(x), shifts, jnp.asarray(weights), level)
     require_independent(x, tuple(ranges))
     everything = dict.fromkeys([*ranges, *(tolerance.quantities if tolerance else ())])
     logarithmic = tuple(_is_scale(x, name) and low > 0 for name, (low, _) in bounds.items())
-    own = [float(value_of(x, name)) for name in bounds]
-    ends = np.array([*zip(*bounds.values(), strict=True), own])
-    low, high, own = np.log(ends, out=ends, where=logarithmic)
+    xp = jnp if is_traced(x) else np
+    low, high = ends = np.array([*bounds.values()]).T
+    own = xp.stack([xp.asarray(value_of(x, name), float) for name in bounds])
+    if is_traced(x):
+        own = nan_where((own < low) | (own > high), own)
+    scales = np.array(logarithmic)
+    low, high, own = (
+        xp.where(scales, xp.log(xp.where(scales, each, 1)), each) for each in (low, high, own)
+    )
     damping, frequency = least_damping(x)
-    own_condition = np.array([float(value_of(x, name)) for name in conditions])
+    own_condition = xp.asarray([value_of(x, name) for name in conditions], float)
     x = with_optional(x, tuple(everything))
     contacts = moved_contacts(x, bounds)
     least = 0.0 if K_n_min is None else scalar("K_n_min", K_n_min, at_least=0)
     dtype = jax.tree.leaves(x)[0].dtype
     numbers |= dict(
+        ends=ends,
         low=low,
         high=high,
         start=(own - low) / (high - low),
         own_condition=own_condition,
         target=-damping / 2 if target is None else scalar("target", target),
-        growth_scale=max(damping, 1e-4 * frequency),
+        growth_scale=xp.maximum(damping, 1e-4 * frequency),
         K_n_min=(least,) * len(contacts),
         constraints=tuple(c if isinstance(c, Constraint) else Plain(c) for c in constraints),
         laws=tuple(laws),
         scatter=scatter,
+        grid=None if envelope is None else envelope.values(envelope.grid()),
     )
     # In the precision of the scene, whatever that of the arguments.
     numbers = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), numbers)
-    problem = DesignProblem(
+    return numbers | dict(
         x=x,
-        **numbers,
         names=tuple(bounds),
         logarithmic=logarithmic,
         contacts=contacts,
@@ -134,16 +134,6 @@ def state_problem(
         conditions=conditions,
         cycles=cycles,
     )
-    if isinstance(x, Structure):
-        problem = dataclasses.replace(problem, modes=modes_to_keep(problem))
-    # An average or a quantile of smooth residuals is not that of the growth rates.
-    smooth = problem.least_growth or (scatter is None and risk == "worst")
-    problem = dataclasses.replace(problem, smooth=smooth)
-    if K_n_min is not None or not contacts:
-        return problem
-    given = describe(problem, np.asarray(problem.start)[None])
-    own = tuple(jnp.asarray(given[of_joint(name) + "K_n"][0], dtype) for name in contacts)
-    return dataclasses.replace(problem, K_n_min=own)
 
 
 def _followed(x) -> float:
@@ -188,10 +178,11 @@ def checked_bounds(x: Mechanism, bounds: Mapping[str, Sequence[float]]) -> dict[
             replaced(x, {name: end})  # refuses an end outside the domain of the model
         if not (len(ends) == 2 and ends[0] < ends[1]):
             raise ValueError(f"bounds on {name} must be (lower, upper), got {given!r}")
-        value = float(value_of(x, name))
-        if not ends[0] <= value <= ends[1]:
+        value = value_of(x, name)
+        if not is_traced(value) and not ends[0] <= float(value) <= ends[1]:
             raise ValueError(
-                f"{name} must lie inside its bounds [{ends[0]:g}, {ends[1]:g}], got {value:g}"
+                f"{name} must lie inside its bounds [{ends[0]:g}, {ends[1]:g}], got "
+                f"{float(value):g}"
             )
         checked[name] = ends
     return checked

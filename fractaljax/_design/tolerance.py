@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from .._base.batches import in_batches
-from .._base.parts import Record, brief, number, scalar
+from .._base.parts import Record, brief, is_traced, number, scalar
 from .._base.ranges import low_discrepancy
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import (
@@ -120,7 +120,7 @@ class Tolerance(Record):
         ):
             if name not in known:
                 raise ValueError(f"tolerance names {given!r}; there are {', '.join(known)}")
-            for each in _moved_by(x, name):
+            for each in [] if is_traced(x) else _moved_by(x, name):
                 ends = ranges.get(each, ranges.get(name, (float(value_of(x, each)),)))
                 low, high = min(ends), max(ends)
                 if is_fractal_dimension(x, each):
@@ -243,6 +243,16 @@ def quantile(values: Float[Array, "n ..."], weights: Float[Array, " n"], level) 
     reached = jnp.clip((below - level + half) / (2 * half), 0, 1)
     share = jnp.diff(reached, axis=0, prepend=jnp.zeros_like(reached[:1]))
     return jnp.sum(share * jnp.take_along_axis(values, order, axis=0), axis=0)
+
+
+class Scatter(eqx.Module):
+    """The quadrature over a tolerance, and the quantile that counts."""
+
+    tolerance: Tolerance
+    base: dict[str, Float[Array, ""]]  # what the quantities are where nothing moves them
+    shifts: Float[Array, "n k"]
+    weights: Float[Array, " n"]
+    level: Float[Array, ""]
 
 
 # --- probability of squeal ----------------------------------------------------------------

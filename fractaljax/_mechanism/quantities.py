@@ -23,6 +23,7 @@ from jaxtyping import Array, ArrayLike, Float
 from .._base.parts import (
     Part,
     brief,
+    is_traced,
     number,
     quantities,
     quantity_name,
@@ -137,7 +138,7 @@ def value_of(x: Mechanism, name: str) -> Float[Array, ""]:
     found, *others = values.values()
     if found is None or any(value is None for value in others):
         raise ValueError(f"{name} is not given")
-    if any(value != found for value in others):
+    if not is_traced((found, others)) and any(value != found for value in others):
         raise ValueError(
             f"{name} differs between the joints: name {' and '.join(values)} by themselves, or "
             f"replace({name}=...) first"

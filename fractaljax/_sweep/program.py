@@ -53,11 +53,14 @@ class Program:
         self,
         measure: Callable[[Scene], PyTree[ArrayLike]],
         names: Sequence[str],
-        scene: Scene,
+        scene: Any,
         grid: Sequence[np.ndarray],
+        place: Callable[[Any, Mapping[str, Any]], Any] = substituted,
     ):
+        """`place` gives the scene at a point, from the whole and the values there by name."""
+
         def point(scene, values):
-            moved = substituted(scene, dict(zip(names, values, strict=True)))
+            moved = place(scene, dict(zip(names, values, strict=True)))
             return jax.tree.map(jnp.asarray, measure(moved))
 
         values = [jax.ShapeDtypeStruct((), axis.dtype) for axis in grid]

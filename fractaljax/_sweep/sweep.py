@@ -84,25 +84,50 @@ def sweep(
     another program; `OSError` if the folder cannot be written; `ImportError` for `out` without
     Zarr.
     """
+    grid = _checked(x, axes)
+    names = tuple(grid)
+    whole: Any = with_optional(x, names)  # pyright: ignore[reportArgumentType]
+    program = Program(measure, names, whole, list(grid.values()))
+    values = run(
+        program, whole, grid, x, measure, batch_size, progress, out, devices, executor, _each(x)
+    )
+    return Sweep(values, tuple(grid.values()), names, x)
+
+
+def run(
+    program: Program,
+    whole: Any,
+    grid: Mapping[str, np.ndarray],
+    x: Any,
+    measure: Callable[[Any], Any],
+    batch_size: int | None,
+    progress: bool,
+    out: str | os.PathLike | None,
+    devices: Sequence[Any] | None,
+    executor: Any,
+    each: int,
+) -> Any:
+    """The pytree of a program's arrays over a grid, in batches; arguments and errors as `sweep`.
+
+    Of `whole` the program takes what is at a point. By default there are `each` points in a batch,
+    on every device.
+    """
     if executor is not None:
         require_executor(executor)
         if devices is not None:
             raise ValueError("devices are those of this process: leave them out beside executor")
     if out is not None:
         zarr()
-    grid = _checked(x, axes)
     names, shape = tuple(grid), tuple(map(len, grid.values()))
     points, mesh = math.prod(shape), mesh_of(devices)
     if batch_size is None and out is not None and (begun := describe(out)) is not None:
         most: int = begun["batch"]
     else:
-        most = _batch_size(batch_size, points, mesh.size, x)
+        most = _batch_size(batch_size, points, mesh.size, each)
     parts = blocks(shape, most)
-    whole: Any = with_optional(x, names)  # pyright: ignore[reportArgumentType]
-    program = Program(measure, names, whole, list(grid.values()))
     leaves, tree = jax.tree.flatten(program.shapes)
-    each = max(1, sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in leaves))
-    require_memory(f"a sweep of {points} points", points * each)
+    size = max(1, sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in leaves))
+    require_memory(f"a sweep of {points} points", points * size)
     store = None
     if out is not None:
         named = dict(zip(leaf_names(measure, program.shapes, grid), leaves, strict=True))
@@ -140,7 +165,7 @@ def sweep(
             sync_global_devices("the batches of a sweep are written")
         for k in sorted(set(range(parts.number)) - set(missing)):
             put(k, store.read(k))
-    return Sweep(jax.tree.unflatten(tree, arrays), tuple(grid.values()), names, x)
+    return jax.tree.unflatten(tree, arrays)
 
 
 def _in_turn(batches: Batches, numbers: Sequence[int]) -> Computed:
@@ -166,11 +191,15 @@ def _checked(x: Any, axes: Mapping[str, Any]) -> dict[str, np.ndarray]:
     return grid
 
 
-def _batch_size(asked: int | None, points: int, devices: int, x: Any) -> int:
+def _each(x: Any) -> int:
+    """The points of a batch on a device."""
+    if isinstance(x, Structure):  # whose modes take memory by the square of their number
+        return max(1, min(_POINTS_EACH, _ENTRIES_EACH // (2 * x.n) ** 2))
+    return _POINTS_EACH
+
+
+def _batch_size(asked: int | None, points: int, devices: int, each: int) -> int:
     if asked is None:
-        each = _POINTS_EACH
-        if isinstance(x, Structure):  # whose modes take memory by the square of their number
-            each = max(1, min(each, _ENTRIES_EACH // (2 * x.n) ** 2))
         return devices * min(each, -(-points // devices))
     if isinstance(asked, bool) or not isinstance(asked, int) or asked < 1:
         raise ValueError(f"batch_size must be an integer of at least 1, got {asked!r}")

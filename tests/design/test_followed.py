@@ -13,7 +13,6 @@ import fractaljax as fj
 from fractaljax._design import followed
 from fractaljax._design.constraints import CycleAmplitude, VelocityLevel
 from fractaljax._design.rows import linearise
-from fractaljax._design.statement import state_problem
 from mechanisms import PROBLEMS
 from structures import of_problem
 from tools import refusals
@@ -29,7 +28,7 @@ LIMIT = 12e-6
 
 def problem(x=None, bounds=None, objective=None, constraints=()):
     x, bounds = x or fj.brake_scene(), bounds or BOUNDS
-    return state_problem(x, bounds, objective=objective, constraints=constraints, **OPTIONS)
+    return fj.DesignProblem(x, bounds, objective=objective, constraints=constraints, **OPTIONS)
 
 
 def rows(problem, u):

@@ -16,7 +16,6 @@ from fractaljax._design.joints import state_of, states_of
 from fractaljax._design.rows import evaluate, linearise
 from fractaljax._design.solvers import slsqp
 from fractaljax._design.starts import screened_designs
-from fractaljax._design.statement import state_problem
 from random_brakes import random_brake
 from structures import two_joints
 
@@ -68,7 +67,7 @@ def test_states_of_joints_that_share_a_law_are_those_of_each():
 def test_designs_that_are_screened_are_inside_the_limits_of_all_joints():
     """Of those of an even spread nearly none is; two joints, as before, take those as they are."""
     x = several_joints(4)
-    problem = state_problem(x, bounds_of(x), **STATED)
+    problem = fj.DesignProblem(x, bounds_of(x), **STATED)
     drawn = screened_designs(12, 8)
     nothing = np.zeros((len(drawn), 0))  # of an envelope
     residuals, slopes = limits_of_joints(problem)(drawn, nothing)
@@ -93,7 +92,7 @@ def test_designs_that_are_screened_are_inside_the_limits_of_all_joints():
     assert solver_of(problem) is None
 
     few = several_joints(2)
-    problem = state_problem(few, bounds_of(few), **STATED)
+    problem = fj.DesignProblem(few, bounds_of(few), **STATED)
     np.testing.assert_array_equal(screened(problem, 8, 12)[1], screened_designs(12, 4))
     assert solver_of(problem) is slsqp
 
@@ -105,7 +104,7 @@ def test_limits_of_joints_are_those_of_each_condition(tolerance):
     x = several_joints(3, mu=0.5)
     asked: dict[str, Any] = dict(envelope=fj.Envelope.of({"j0.mu": (0.4, 0.6), "j2.P": (1e3, 2e3)}))
     asked["tolerance"] = None if tolerance is None else fj.Tolerance.of(tolerance)
-    problem = state_problem(x, bounds_of(x), **STATED | asked)
+    problem = fj.DesignProblem(x, bounds_of(x), **STATED | asked)
     us = np.asarray(problem.start) + np.linspace(-0.05, 0.05, 6) * [[1], [-1], [0.5]]
     conditions = np.array([[0.4, 1e3], [0.6, 2e3], [0.5, 1.5e3]])
     found, slopes = limits_of_joints(problem)(us, conditions)
@@ -150,7 +149,7 @@ def parametric_brake():
     for name, joint in joints.items():
         P = float(joint.contact.P)
         bounds |= {f"{name}.P": (0.6 * P, 1.6 * P), f"{name}.mu": (0.2, 0.65)}
-    return brake, state_problem(brake, bounds, **dict(STATED, K_n_min=None))
+    return brake, fj.DesignProblem(brake, bounds, **dict(STATED, K_n_min=None))
 
 
 def rates_by_scipy(x, count: int) -> np.ndarray:
@@ -227,5 +226,5 @@ def test_a_brake_in_few_modes_has_nearly_its_growth_rates():
 
     assert in_few_modes(dataclasses.replace(problem, objective=objective), us) is None
     few_joints = several_joints(4)
-    small = state_problem(few_joints, bounds_of(few_joints), **STATED)
+    small = fj.DesignProblem(few_joints, bounds_of(few_joints), **STATED)
     assert in_few_modes(small, np.asarray(small.start)[None]) is None

@@ -152,7 +152,6 @@ def test_every_law_has_its_modes():
     """A structure of two joints under its own law and another: rates as of each by itself."""
     from fractaljax._design.joints import under
     from fractaljax._design.rows import evaluate
-    from fractaljax._design.statement import state_problem
 
     x: Any = fractal_joints()
     contact = x.joints[0].contact
@@ -160,7 +159,7 @@ def test_every_law_has_its_modes():
     none: Any = dict.fromkeys(("objective", "target", "envelope", "tolerance"))
     rest: Any = dict(K_n_min=0.0, constraints=(), quantile=0.95, friction_slope=True)
     limits: Any = dict(area_ratio_min=2.0, slip_ratio_max=0.9, laws=[law])
-    problem = state_problem(x, {"left.D": (2.3, 2.5)}, **none, **rest, **limits)
+    problem = fj.DesignProblem(x, {"left.D": (2.3, 2.5)}, **none, **rest, **limits)
     k = problem.modes
     row = evaluate(problem, np.asarray(problem.start)[None], np.zeros((1, 0)))[0]
     growing = np.sinh(row[problem.growth_columns]) * float(problem.growth_scale)

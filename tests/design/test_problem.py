@@ -10,7 +10,7 @@ import pytest
 import fractaljax as fj
 from fractaljax._design.constraints import NormalStiffness
 from fractaljax._design.rows import describe, linearised
-from fractaljax._design.statement import DEFAULT_BOUNDS, state_problem
+from fractaljax._design.statement import DEFAULT_BOUNDS
 from fractaljax._design.tolerance import Tolerance
 from structures import fractal_joints
 from tools import primitives
@@ -30,7 +30,7 @@ STATED: dict[str, Any] = dict(
 
 
 def stated(x=None, bounds=DEFAULT_BOUNDS, **changes):
-    return state_problem(fj.brake_scene() if x is None else x, bounds, **STATED | changes)
+    return fj.DesignProblem(fj.brake_scene() if x is None else x, bounds, **STATED | changes)
 
 
 def traced(problem, conditions=0):

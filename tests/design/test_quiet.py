@@ -12,7 +12,6 @@ import fractaljax as fj
 from fractaljax._design.cuts import Cuts
 from fractaljax._design.design_file import read_design
 from fractaljax._design.quiet import Kicks, _planes
-from fractaljax._design.statement import state_problem
 from hybrid_truth import Mechanism, phases
 from mechanisms import PROBLEMS, changed
 from structures import of_problem, source_form_of, two_joints
@@ -157,7 +156,7 @@ def test_a_plane_is_the_tangent_of_where_the_cycle_ends():
     """Over speed and load: at other loads the cycle ends there, up to second order."""
     x = belt(1.5)
     bounds = {"V": (0.5, 2.5), "P": (0.5, 2.0)}
-    problem = state_problem(x, bounds, friction_slope=True, **OPTIONS)
+    problem = fj.DesignProblem(x, bounds, friction_slope=True, **OPTIONS)
     u = np.asarray(problem.start)
     ends = fj.basin(x, radius=2.0, starts=16, progress=False)
     normals, gaps = _planes(problem, u, np.zeros(0), ends)

@@ -1,0 +1,234 @@
+"""How a design moves with all that it holds fixed, and what its requirements cost.
+
+At an optimum the slope of the Lagrangian is zero and the active residuals are. Both stay so while
+the active set does: a linear system gives the change of the design and of the multipliers. (A. V.
+Fiacco, "Introduction to sensitivity and stability analysis in nonlinear programming", 1983, section
+3.2.) Its matrix takes second derivatives, which are differences of fourth order of the Jacobians
+that the search has compiled.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+
+from .._base.parts import Record
+from .._base.table import aligned
+from .._mechanism.mechanism import Mechanism
+from .._mechanism.quantities import moved_by, own_quantities, replaced, unit, value_of
+from .._mechanism.structure import Structure
+from .evaluator import Evaluator, OnAverage
+from .optimum import limited_columns
+from .problem import DesignProblem
+from .rows import linearise
+
+_STEP = 1e-4  # of differences: of a variable in its bounds, of a quantity as a share of it
+_ACTIVE = 1e-5  # a residual that is met by less than this may be active
+_FITS = 1e-3  # what multipliers may leave of a slope
+_SHOWN = 6  # quantities in a table
+_CHANGE = 0.01  # of each quantity, in a table
+_CENTRAL = {-2: 1 / 12, -1: -8 / 12, 1: 8 / 12, 2: -1 / 12}  # weights of steps
+_FORWARD = {0: -25 / 12, 1: 4.0, 2: -3.0, 3: 4 / 3, 4: -1 / 4}
+
+
+class Sensitivity(Record):
+    """How a design moves with each quantity that it holds fixed: `sensitivity["D"]["P"]` is dD/dP.
+
+    SI units. What follows the mechanism by default follows it here too: the target, and a K_n_min
+    that is the mechanism's own. All is of the requirements that are active: the slopes change where
+    these do, which `ranges` foretell by them.
+    """
+
+    slopes: Mapping[str, Mapping[str, float]]  # by designed, then by held quantity
+    # d(value)/d(residual) of each active requirement and bound: what tightening it would cost.
+    multipliers: Mapping[str, float]
+    ranges: Mapping[str, tuple[float, float]]  # of each held quantity, for the same active set
+    x: Mechanism = eqx.field(repr=False)  # the mechanism designed
+
+    def __getitem__(self, name: str) -> Mapping[str, float]:
+        return self.slopes[name]
+
+    def __repr__(self) -> str:
+        held = {name: float(value_of(self.x, name)) for name in self.ranges}
+        changes = {
+            name: {each: _CHANGE * held[each] * slope for each, slope in slopes.items()}
+            for name, slopes in self.slopes.items()
+        }
+        own = {name: abs(float(value_of(self.x, name))) or 1.0 for name in changes}
+        weight = {each: max(abs(changes[name][each]) / own[name] for name in own) for each in held}
+        lines = [["", *(f"{name} by 1 % more" for name in changes), "same requirements active"]]
+        for each in sorted(weight, key=lambda name: -weight[name])[:_SHOWN]:
+            title = f"{each} [{unit(self.x, each)}]".replace(" [-]", "")
+            low, high = self.ranges[each]
+            cells = [f"{changes[name][each]:+.3g}" for name in changes]
+            lines.append([f"{title} = {held[each]:.6g}", *cells, f"{low:.4g} to {high:.4g}"])
+        costs = ", ".join(f"{name}: {cost:.3g}" for name, cost in self.multipliers.items())
+        return "\n".join([aligned(lines), f"multipliers: {costs or 'none'}"])
+
+
+Rows = Callable[[DesignProblem, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+def sensitivity_of(
+    x: Mechanism,
+    designed: Mechanism,
+    state: Callable[[Mechanism], DesignProblem],
+    evaluator: Evaluator,
+) -> Sensitivity | None:
+    """That of the design of x, whose problem `state` states, as `evaluator` counts it.
+
+    None where it cannot be told: where the conditions of an optimum do not hold, as at a kink, and
+    where a requirement is at its worst inside of an envelope, at a condition that would move too.
+    """
+    problem = state(x)
+    u = problem.scaled(designed)
+    rows, columns = _rows_of(evaluator, u)
+    row, jacobian = rows(problem, u)
+    c, A = row[columns], jacobian[columns]
+    found = _multipliers(jacobian[0], c, A, u)
+    if found is None:
+        return None
+    multipliers, low, high = found
+    active, free = multipliers > 0, ~((low > 0) | (high > 0))
+    if problem.conditions and not isinstance(evaluator, OnAverage):
+        places = evaluator.evaluate(u[None]).places[0][columns][active, 1:]
+        if ((places > 0) & (places < 1)).any():
+            return None
+
+    def slopes(problem, u) -> np.ndarray:
+        """The slope of the Lagrangian (v,) and the residuals (k,)."""
+        row, jacobian = rows(problem, u)
+        return np.concatenate([jacobian[0] + multipliers @ jacobian[columns], row[columns]])
+
+    v, k = len(u), int(active.sum())
+    H = np.zeros((v, v))
+    for j, direction in enumerate(np.eye(v)):
+        for step, weight in _CENTRAL.items():
+            H[:, j] += weight / _STEP * slopes(problem, u + step * _STEP * direction)[:v]
+    H = np.where(np.outer(free, free), H, np.diag(1.0 - free))
+    K = np.block([[H, (A[active] * free).T], [A[active] * free, np.zeros((k, k))]])
+    values = {name: float(value) for name, value in problem.quantities(u).items()}
+    span = np.asarray(problem.high - problem.low, float).tolist()
+    changes: dict[str, dict[str, float]] = {name: {} for name in problem.names}
+    ranges = {}
+    for name in _held(x, problem):
+        by = _difference(lambda x: slopes(state(x), u), x, name)
+        if by is None:
+            continue
+        by_slope, by_c = by[:v], by[v:]
+        right = -np.concatenate([by_slope * free, by_c[active]])
+        solution = np.linalg.lstsq(K, right, rcond=None)[0]
+        du, dm = solution[:v] * free, solution[v:]
+        for i, each in enumerate(problem.names):
+            size = span[i] * (values[each] if problem.logarithmic[i] else 1.0)
+            changes[each][name] = float(size * du[i])
+        # Each is at most 0; where the first becomes 0, other requirements are active.
+        numbers = np.concatenate([c[~active], -multipliers[active], -u[free], u[free] - 1])
+        rates = [by_c[~active] + A[~active] @ du, -dm, -du[free], du[free]]
+        ranges[name] = _range(float(value_of(x, name)), numbers, np.concatenate(rates))
+    costs = _named(problem, columns, multipliers, jacobian)
+    bounds = [*zip(problem.names, low, high, strict=True)]
+    costs |= {f"{name} >= lower bound": float(m) for name, m, _ in bounds if m > 0}
+    costs |= {f"{name} <= upper bound": float(m) for name, _, m in bounds if m > 0}
+    return Sensitivity(slopes=changes, multipliers=costs, ranges=ranges, x=designed)
+
+
+def _rows_of(evaluator: Evaluator, u: np.ndarray) -> tuple[Rows, np.ndarray]:
+    """A function: the row that counts, at conditions fixed for u, and its Jacobian; its columns."""
+    problem = evaluator.problem
+    plain = not problem.conditions
+    conditions = evaluator.working
+    columns = limited_columns(problem) if plain else np.flatnonzero(problem.asked)[1:]
+    which = np.zeros(len(problem.asked), int)
+    average = isinstance(evaluator, OnAverage)
+    if not plain and not average:
+        values = evaluator.envelope.values(evaluator.evaluate(u[None]).places[0])
+        conditions, places = np.unique(values, axis=0, return_inverse=True)
+        which[problem.asked] = places.ravel()
+
+    def rows(problem, u):
+        us = np.repeat(u[None], len(conditions), axis=0)
+        found, jacobians, _ = linearise(problem, us, conditions)
+        if average:
+            found, jacobians = evaluator.average(found, jacobians)
+        every = np.arange(found.shape[1])
+        return found[which[every], every], jacobians[which[every], every]
+
+    return rows, columns
+
+
+def _multipliers(slope, c, A, u) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Multipliers of residuals (k,), of lower and of upper bounds (v,); None if they do not fit."""
+    from scipy.optimize import nnls
+
+    v, near = len(u), np.abs(c) <= _ACTIVE
+    low, high = u <= _ACTIVE, u >= 1 - _ACTIVE
+    matrix = np.concatenate([A[near], -np.eye(v)[low], np.eye(v)[high]]).T
+    size = float(np.abs(slope).max())
+    found = np.zeros(matrix.shape[1])
+    if size > 0:
+        found = nnls(matrix, -slope / size)[0] * size if matrix.size else found
+        if np.linalg.norm(matrix @ found + slope) > _FITS * size:
+            return None
+    by_c, by_low, by_high = np.zeros(len(c)), np.zeros(v), np.zeros(v)
+    first, second = int(near.sum()), int(near.sum() + low.sum())
+    by_c[near], by_low[low], by_high[high] = found[:first], found[first:second], found[second:]
+    return by_c, by_low, by_high
+
+
+def _held(x: Mechanism, problem: DesignProblem) -> list[str]:
+    """The quantities that neither the design nor the envelope moves."""
+    own = own_quantities(x)
+    names = [name for name in own if own[name].value is not None]
+    if isinstance(x, Structure):  # a plain name is that of several joints
+        names = [name for name in names if "." in name or name in x.parameters]
+    moved = {each for name in (*problem.names, *problem.conditions) for each in moved_by(x, name)}
+    return [name for name in names if name not in moved]
+
+
+def _difference(
+    function: Callable[[Any], np.ndarray], x: Mechanism, name: str
+) -> np.ndarray | None:
+    """The derivative of a function of x by a quantity; None where x may not have another one."""
+    value = float(value_of(x, name))
+    step = _STEP * (abs(value) or 1.0)
+    for steps, sign in ((_CENTRAL, 1), (_FORWARD, 1), (_FORWARD, -1)):
+        try:
+            changed = {n: replaced(x, {name: value + sign * n * step}) for n in steps}
+        except ValueError:  # outside its domain
+            continue
+        parts = [w / (sign * step) * function(changed[n]) for n, w in steps.items()]
+        return np.sum(parts, axis=0)
+    return None
+
+
+def _range(value: float, numbers: np.ndarray, rates: np.ndarray) -> tuple[float, float]:
+    """From where to where, around a value, numbers that are at most 0 there stay so."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ways = -np.minimum(numbers, 0) / rates
+    back = ways[rates < 0].max(initial=-np.inf)
+    return value + float(back), value + float(ways[rates > 0].min(initial=np.inf))
+
+
+def _named(problem: DesignProblem, columns, multipliers, jacobian) -> dict[str, float]:
+    """Multipliers by requirement: those of smooth residuals as of the growth rates they stand for.
+
+    Where a growth rate is at its target, both have slopes of one direction.
+    """
+    names, growing = problem.residual_names, problem.growth_columns
+    costs: dict[str, float] = {}
+    for column, multiplier in zip(columns.tolist(), multipliers.tolist(), strict=True):
+        if not multiplier > 0:
+            continue
+        if problem.asked[column]:
+            name = names[column - 1]
+        else:
+            slope, rates = jacobian[column], jacobian[growing]
+            sizes = np.maximum((rates**2).sum(axis=1), np.finfo(float).tiny)
+            along = rates @ slope / np.sqrt(sizes)
+            best = int(along.argmax())
+            name = names[growing.start + best - 1]
+            multiplier *= float(along[best] / np.sqrt(sizes[best]))
+        costs[name] = costs.get(name, 0.0) + multiplier
+    return costs
