@@ -51,6 +51,23 @@ def _joint(law):
     return lambda P: fj.stiffness(BRAKE.replace(contact=law, P=P))
 
 
+BOUNDS = {"D": (2.3, 2.8), "G": (1e-11, 1e-9)}
+
+
+def _designs(P):
+    """Two designs of several starts, and what they must meet."""
+    xs = BRAKE.replace(P=P * jnp.array([1.0, 1.1]))
+    found = fj.design_many(xs, BOUNDS, starts=2, lattice=8, progress=False)
+    return found.quantities, found.value, found.growth_rate, found.residuals
+
+
+def _problem(P):
+    """Loss and residuals of a problem, and their slopes."""
+    problem = fj.DesignProblem(BRAKE.replace(P=P), BOUNDS, fj.growth_rate)
+    slopes = jax.jacrev(problem.loss)(problem.start), jax.jacfwd(problem.residuals)(problem.start)
+    return problem.loss(problem.start), problem.residuals(problem.start), slopes
+
+
 def _batch(measure, x: Any = BRAKE):
     return lambda D: jax.vmap(lambda D: measure(x.replace(D=D)))(D * jnp.ones(3))
 
@@ -74,6 +91,8 @@ def _motion(**options):
 
 GAP = LAWS["persson"]
 PROGRAMS: dict[str, Program] = {
+    "design_many": Program(_designs, 1907.3, -1.0, slow=True),
+    "DesignProblem": Program(_problem, 1907.3, -1.0, slow=True),
     "replace": of(lambda x: x),
     "replace of a structure": of(lambda x: x, STRUCTURE),
     "replace of the matrices": Program(

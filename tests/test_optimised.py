@@ -42,6 +42,14 @@ def cycle_numbers() -> list[Any]:
     return [cycle.period, cycle.amplitude, cycle.velocity_max, cycle.tension_fraction]
 
 
+def design_numbers() -> list[Any]:
+    bounds = {"D": (2.3, 2.8), "G": (1e-11, 1e-9)}
+    found = fj.design_many(BRAKE.replace(P=np.array([1500.0, 1907.3])), bounds, **QUIET)
+    problem = fj.DesignProblem(BRAKE, bounds)
+    u = np.array([0.3, 0.5])
+    return [found.D, found.value, problem.loss(u), *problem.residuals(u)]
+
+
 @functools.cache
 def branch() -> fj.Branch:
     return fj.continue_cycle(BELT, "V", (0.5, 2.5), "hopf")
@@ -80,6 +88,7 @@ CALLS: dict[str, Callable[[], Any]] = {
     "continue_event": lambda: fj.continue_event(BELT, branch().grazings[0], "mu_s", (0.95, 1.05)).x,
     "critical_friction": lambda: fj.critical_friction(BRAKE),
     "design": lambda: fj.design(BRAKE, NEAR, starts=1, **QUIET).value,
+    "design_many": design_numbers,
     "dimensionless_normal_stiffness": lambda: fj.dimensionless_normal_stiffness(2.4, 1e-2, 1e-3),
     "dimensionless_tangential_stiffness": lambda: fj.dimensionless_tangential_stiffness(
         2.4, 0.3, 1e-2, 1e-3, 0.2

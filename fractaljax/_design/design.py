@@ -191,6 +191,9 @@ class Design(Record):
         for name, (before, after) in (self.cycles or {}).items():
             lines.append(f"{name}: {before:.6g}, then {after:.6g}")
         lines += self._under_conditions() + self._under_kicks()
+        changed = isinstance(self.scene, Scene) and self.result == DesignResult.found
+        if changed and self.sensitivity is not None:
+            lines += ["", "What this design hangs on:", repr(self.sensitivity), ""]
         lines += [f"not met: {name}" for name in self.violated]
         if self.least_growth is not None:
             lines += ["", *str(self.least_growth).splitlines(), ""]

@@ -50,6 +50,16 @@ class DesignMany(Record):
         """True for each member whose design meets every requirement."""
         return (self.result == DesignResult.found) | (self.result == DesignResult.unchanged)
 
+    @property
+    def member(self) -> Any:
+        """The first of the mechanisms as given."""
+        return _members(self.mechanisms)[0]
+
+    def given(self, name: str) -> np.ndarray:
+        """The values of a quantity of the mechanisms as given, in the shape of the batch."""
+        first, stacked, shape = _members(self.mechanisms)
+        return np.asarray(_values(first, stacked, name)).reshape(shape)
+
     def __getitem__(self, name: str) -> Array:
         return self.quantities[name]
 
@@ -89,8 +99,8 @@ def design_many(
     slip_ratio_max: ArrayLike = 0.9,
     friction_slope: bool = True,
     modes: int | None = None,
-    starts: int = 6,
-    lattice: int = 128,
+    starts: int = 10,
+    lattice: int = 256,
     steps: int = 40,
     batch_size: int | None = None,
     progress: bool = True,
@@ -111,8 +121,8 @@ def design_many(
       `area_ratio_min`, `slip_ratio_max`, `friction_slope`: as `design`, for every member alike;
       what is by default a member's own (`target`, `K_n_min`) is that of each.
     - `modes`: as `DesignProblem`; by default at most 16 of a structure.
-    - `starts`: designs from which each is solved, 6 by default, chosen from `lattice` designs that
-      are screened, 128 by default, each in at most `steps` steps, 40 by default.
+    - `starts`: designs from which each is solved, 10 by default, chosen from `lattice` designs that
+      are screened, 256 by default, each in at most `steps` steps, 40 by default.
     - `batch_size`: members side by side, by default 256 a device, 16 of structures; `progress`
       shows a bar; `out` names a folder in which batches are kept, so that the same call resumes
       (see `sweep`); `devices` share each batch, by default all of this process. They have no
@@ -153,7 +163,8 @@ def design_many(
 
     count = int(np.prod(shape, dtype=int))
     if is_traced((stacked, target, K_n_min)):
-        found, targets = jax.vmap(lambda leaves: designed(_at(first, leaves)))(stacked)
+        every = jax.jit(jax.vmap(lambda leaves: designed(_at(first, leaves))))
+        found, targets = every(stacked)
     else:
         grid = {_MEMBER: np.arange(count)}
 
@@ -225,12 +236,14 @@ def _at(first: Mechanism, leaves: Sequence[Array]) -> Any:
     return jax.tree.unflatten(jax.tree.structure(first), leaves)
 
 
+def _values(first, stacked, name: str) -> Array:
+    return jax.vmap(lambda leaves: value_of(_at(first, leaves), name))(stacked)
+
+
 def _check_inside(first, stacked, bounds: Mapping[str, Sequence[float]]) -> None:
     """Refuse a member with a designed quantity outside its bounds."""
     for name, (low, high) in bounds.items():
-        values = np.asarray(
-            jax.vmap(lambda leaves, n=name: value_of(_at(first, leaves), n))(stacked)
-        )
+        values = np.asarray(_values(first, stacked, name))
         outside = values[~((values >= low) & (values <= high))]
         if outside.size:
             raise ValueError(

@@ -49,6 +49,7 @@ def optimum(problem: DesignProblem, starts: int, lattice: int, steps: int) -> Op
     u, multipliers, result = jax.lax.stop_gradient(_search(frozen, starts, lattice, steps))
     found = (result == DesignResult.found) | (result == DesignResult.unchanged)
     u = _implicit(problem, u, multipliers, found)
+    u = nan_where(result == DesignResult.undetermined, u)
     row, numbers = problem.at(u, problem.own_condition)
     if problem.scatter is not None:
         numbers = problem.with_fields(scatter=None).at(u, problem.own_condition)[1]

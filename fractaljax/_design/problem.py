@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from .._base.parts import is_traced, whole
+from .._base.parts import is_traced, nan_where, whole
 from .._base.programs import exported_jit
 from .._contact.contact import Contact
 from .._mechanism.mechanism import Mechanism
@@ -169,6 +169,10 @@ class DesignProblem(eqx.Module):
         u = jnp.asarray(u, self.low.dtype)
         if u.shape != self.low.shape:
             raise ValueError(f"u must have the shape {self.low.shape}, got {u.shape}")
+        # A mechanism that is none has no slopes either.
+        u = nan_where(
+            jnp.stack([jnp.isnan(leaf).any() for leaf in jax.tree.leaves(self.x)]).any(), u
+        )
         if self.grid is not None:
             rows = jax.vmap(lambda condition: self.at(u, condition)[0])(self.grid)
             return jnp.max(rows[:, self.asked], axis=0)
@@ -269,7 +273,8 @@ class DesignProblem(eqx.Module):
                 model.append(2 * (jnp.log(self.area_ratio_min) - state.log_area_ratio))
             if state.slip_ratio is not None:
                 model.append(10 * (state.slip_ratio - self.slip_ratio_max))
-            stiff.append((K_n_min - state.K_n) / jnp.where(K_n_min > 0, K_n_min, 1))
+            scale = jnp.where(K_n_min > 0, K_n_min, jnp.maximum(state.K_n, 1))
+            stiff.append((K_n_min - state.K_n) / scale)
         return model, stiff
 
     def at(self, u: Float[Array, " v"], condition: Float[Array, " c"]):

@@ -3,8 +3,8 @@
 At an optimum the slope of the Lagrangian is zero and the active residuals are. Both stay so while
 the active set does: a linear system gives the change of the design and of the multipliers. (A. V.
 Fiacco, "Introduction to sensitivity and stability analysis in nonlinear programming", 1983, section
-3.2.) Its matrix takes second derivatives, which are differences of fourth order of the Jacobians
-that the search has compiled.
+3.2.) Its matrix takes second derivatives, which are differences of the Jacobians that the
+search has compiled.
 """
 
 from collections.abc import Callable, Mapping
@@ -23,13 +23,14 @@ from .optimum import limited_columns
 from .problem import DesignProblem
 from .rows import linearise
 
-_STEP = 1e-4  # of differences: of a variable in its bounds, of a quantity as a share of it
+_STEP = 0.25  # power of eps: of a variable in its bounds, of a quantity as a share of it
 _ACTIVE = 1e-5  # a residual that is met by less than this may be active
 _FITS = 1e-3  # what multipliers may leave of a slope
 _SHOWN = 6  # quantities in a table
 _CHANGE = 0.01  # of each quantity, in a table
-_CENTRAL = {-2: 1 / 12, -1: -8 / 12, 1: 8 / 12, 2: -1 / 12}  # weights of steps
-_FORWARD = {0: -25 / 12, 1: 4.0, 2: -3.0, 3: 4 / 3, 4: -1 / 4}
+# Weights of steps: of fourth order by designs, of second by quantities, of which there are many.
+_FOURTH = {-2: 1 / 12, -1: -8 / 12, 1: 8 / 12, 2: -1 / 12}
+_CENTRAL, _FORWARD = {-1: -0.5, 1: 0.5}, {0: -1.5, 1: 2.0, 2: -0.5}
 
 
 class Sensitivity(Record):
@@ -101,19 +102,19 @@ def sensitivity_of(
         row, jacobian = rows(problem, u)
         return np.concatenate([jacobian[0] + multipliers @ jacobian[columns], row[columns]])
 
-    v, k = len(u), int(active.sum())
+    v, k, size = len(u), int(active.sum()), float(np.finfo(problem.low.dtype).eps) ** _STEP
     H = np.zeros((v, v))
     for j, direction in enumerate(np.eye(v)):
-        for step, weight in _CENTRAL.items():
-            H[:, j] += weight / _STEP * slopes(problem, u + step * _STEP * direction)[:v]
+        for step, weight in _FOURTH.items():
+            H[:, j] += weight / size * slopes(problem, u + step * size * direction)[:v]
     H = np.where(np.outer(free, free), H, np.diag(1.0 - free))
     K = np.block([[H, (A[active] * free).T], [A[active] * free, np.zeros((k, k))]])
-    values = {name: float(value) for name, value in problem.quantities(u).items()}
+    values = {name: float(value_of(designed, name)) for name in problem.names}
     span = np.asarray(problem.high - problem.low, float).tolist()
     changes: dict[str, dict[str, float]] = {name: {} for name in problem.names}
-    ranges = {}
+    ranges, own = {}, own_quantities(x)
     for name in _held(x, problem):
-        by = _difference(lambda x: slopes(state(x), u), x, name)
+        by = _difference(lambda x: slopes(state(x), u), x, name, size)
         if by is None:
             continue
         by_slope, by_c = by[:v], by[v:]
@@ -121,12 +122,13 @@ def sensitivity_of(
         solution = np.linalg.lstsq(K, right, rcond=None)[0]
         du, dm = solution[:v] * free, solution[v:]
         for i, each in enumerate(problem.names):
-            size = span[i] * (values[each] if problem.logarithmic[i] else 1.0)
-            changes[each][name] = float(size * du[i])
+            unit_size = span[i] * (values[each] if problem.logarithmic[i] else 1.0)
+            changes[each][name] = float(unit_size * du[i])
         # Each is at most 0; where the first becomes 0, other requirements are active.
         numbers = np.concatenate([c[~active], -multipliers[active], -u[free], u[free] - 1])
         rates = [by_c[~active] + A[~active] @ du, -dm, -du[free], du[free]]
-        ranges[name] = _range(float(value_of(x, name)), numbers, np.concatenate(rates))
+        begin, end = _range(float(value_of(x, name)), numbers, np.concatenate(rates))
+        ranges[name] = (max(begin, 0.0) if own[name].log else begin), end
     costs = _named(problem, columns, multipliers, jacobian)
     bounds = [*zip(problem.names, low, high, strict=True)]
     costs |= {f"{name} >= lower bound": float(m) for name, m, _ in bounds if m > 0}
@@ -188,11 +190,11 @@ def _held(x: Mechanism, problem: DesignProblem) -> list[str]:
 
 
 def _difference(
-    function: Callable[[Any], np.ndarray], x: Mechanism, name: str
+    function: Callable[[Any], np.ndarray], x: Mechanism, name: str, size: float
 ) -> np.ndarray | None:
     """The derivative of a function of x by a quantity; None where x may not have another one."""
     value = float(value_of(x, name))
-    step = _STEP * (abs(value) or 1.0)
+    step = size * (abs(value) or 1.0)
     for steps, sign in ((_CENTRAL, 1), (_FORWARD, 1), (_FORWARD, -1)):
         try:
             changed = {n: replaced(x, {name: value + sign * n * step}) for n in steps}

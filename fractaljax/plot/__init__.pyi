@@ -11,6 +11,7 @@ from .curves import (
 from .cycle import cycle as cycle, phase_portrait as phase_portrait, spectrum as spectrum
 from .cycles import amplitudes as amplitudes, cycles as cycles
 from .design import design as design, stability_map as stability_map
+from .designs import design_map as design_map
 from .distribution import distribution as distribution
 from .explore import explore as explore
 from .identification import (

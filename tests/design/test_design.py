@@ -5,10 +5,12 @@ import itertools
 import math
 import random
 import sys
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from scipy.optimize import minimize
 
@@ -644,6 +646,28 @@ def test_another_solver_lands_as_well(scene, best):
     assert found.value == pytest.approx(best.value, rel=1e-3)
     lazy = fj.design(scene, solver=lambda f, c, start, bounds: start, starts=1, progress=False)
     assert lazy.result == fj.DesignResult.infeasible and lazy.failed_starts == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "optimiser",
+    [optax.adam(optax.cosine_decay_schedule(0.03, 100)), optax.sgd(1e-3, momentum=0.9)],
+    ids=["adam", "sgd"],
+)
+@pytest.mark.parametrize("start", [(2.4, 1.342e-10), (2.7, 5e-10), (2.35, 1.2e-11)])
+def test_any_optimiser_descends_to_where_the_solver_lands(scene, optimiser, start):
+    """From given surfaces in every regime the design is that of all starts landed by SLSQP."""
+    x = scene.replace(D=start[0], G=start[1])
+    bounds = {"D": (2.3, 2.8), "G": (1e-11, 1e-9)}
+    asked: Any = {"bounds": bounds, "K_n_min": 4e8, "progress": False}
+    plain, descended = fj.design(x, **asked), fj.design(x, **asked, optimiser=optimiser)
+    assert descended.value == pytest.approx(plain.value, rel=1e-6, abs=1e-12)
+    assert descended.result == plain.result
+
+
+def test_an_optimiser_is_one_of_optax(scene):
+    with pytest.raises(TypeError, match=r"must be an optax.GradientTransformation, such as"):
+        fj.design(scene, optimiser="adam", progress=False)
 
 
 @pytest.mark.slow

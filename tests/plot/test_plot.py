@@ -65,6 +65,13 @@ def best():
 
 
 @functools.cache
+def family():
+    """Designs over load and friction, some of which are out of reach."""
+    xs = BRAKE.replace(P=np.array([[1500.0], [2500.0]]), mu_s=np.array([0.4, 1.0, 3.0]))
+    return fj.design_many(xs, {"D": (2.3, 2.8), "G": (1e-11, 1e-9)}, progress=False)
+
+
+@functools.cache
 def nothing():
     return fj.limit_cycle(motionless_scene(), throw=False)
 
@@ -123,12 +130,19 @@ def cube():
 
 MAP = "friction coefficient mu [-]", "stiffness ratio K_t/K_n [-]"
 SURFACE = "fractal dimension D [-]", "fractal roughness G [m]"
+HELD = "normal load P [N]", "static friction coefficient mu_s [-]"
 BELT, NORMAL = "along the belt [µm]", "normal to the belt [µm]"
 GROWTH, KHZ = "growth rate [1/s]", "frequency [kHz]"
 LOADS: dict[str, Any] = {"P": [1e3, 2e3]}
 # What draws on given axes, and the labels of x and y.
 PICTURES: dict[str, tuple[Any, str, str]] = {
     "design": (lambda ax: plot.design(best(), ax), *SURFACE),
+    "design map": (lambda ax: plot.design_map(family(), "P", "mu_s", ax), *HELD),
+    "design line": (
+        lambda ax: plot.design_map(family(), "mu_s", ax=ax, quantity="G"),
+        HELD[1],
+        SURFACE[1],
+    ),
     "growth map": (lambda ax: plot.growth_map(modes(), ax), *MAP),
     "growth map of a surface": (lambda ax: plot.growth_map(rates(), ax), *SURFACE),
     "frequency map": (lambda ax: plot.frequency_map(modes(), ax, mode=2), *MAP),
@@ -227,6 +241,11 @@ test_refusals = refusals(
             lambda: plot.amplitudes(batch(), [1, 2, 3], label="x", slopes=[1, 2]),
             r"slopes must have shape \(3,\), got \(2,\)",
         ),
+        (
+            lambda: plot.design_map(family(), "P", quantity="H"),
+            "quantity must be one of D, G, got H",
+        ),
+        (lambda: plot.design_map(family(), "Q"), "no quantity 'Q'"),
         (lambda: plot.distribution({}, label="x"), "at least one set of samples"),
         *(
             (lambda x=x: plot.distribution({"bad": x}, label="x"), "samples 'bad' must be finite")
