@@ -10,7 +10,7 @@ from .page import INDEX, index, measured, write
 
 NAMES = (
     "boundary_element branches contact eigenvalues extremes first_answers growth_rate limit_cycle"
-    " many_cycles many_dofs reduction scale scene_cost whole_design"
+    " many_cycles many_designs many_dofs reduction scale scene_cost whole_design"
 )
 PAGES = {name: importlib.import_module(f".{name}", __package__) for name in NAMES.split()}
 

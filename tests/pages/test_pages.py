@@ -112,6 +112,13 @@ def many_cycles(numbers):
         assert row.get("results", {}).keys() <= {"converged"}
 
 
+def many_designs(numbers):
+    """Errors are those of the optima, which a polish on the loop leaves; times are of the machine."""
+    own = [row for row in numbers["methods"] if "design_many" in row["name"]]
+    assert own and all(row["met"] == row["designs"] for row in own)
+    assert all(row["right"] == numbers["sample"] for row in own)
+
+
 def many_dofs(numbers):
     """The same cycle by a loop that shares no code; times are of the machine."""
     for row in numbers["rows"]:
