@@ -513,7 +513,7 @@ def repeat_design(
 
     A file of other versions is run under a warning. Functions of the user's own, an objective,
     constraints or a solver, are in the file by name only: give them as `functions`,
-    {name: function}.
+    {name: function}; an optimiser of optax, which has no name, as {"optimiser": optimiser}.
 
     **Raises:** `OSError` if the file cannot be read; `ValueError` naming the file for anything
     unknown or missing in it, and for a precision that JAX is not set to.

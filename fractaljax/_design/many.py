@@ -60,6 +60,23 @@ class DesignMany(Record):
         first, stacked, shape = _members(self.mechanisms)
         return np.asarray(_values(first, stacked, name)).reshape(shape)
 
+    def designed(self) -> Any:
+        """The designed mechanisms: a batch, or a list as given.
+
+        Those without a number are as given.
+        """
+        values = {
+            name: np.where(np.isnan(found), self.given(name), found)
+            for name, found in self.quantities.items()
+        }
+        if not isinstance(self.mechanisms, (list, tuple)):
+            return replaced(self.mechanisms, values)
+        rows = zip(*values.values(), strict=True)
+        return [
+            replaced(x, dict(zip(values, row, strict=True)))
+            for x, row in zip(self.mechanisms, rows, strict=True)
+        ]
+
     def __getitem__(self, name: str) -> Array:
         return self.quantities[name]
 
@@ -151,7 +168,7 @@ def design_many(
         # What is wrong with the arguments is said of a member that is there.
         most = min(MODES_MOST, first.n) if isinstance(first, Structure) else None
         lowest: Any = 0.0 if K_n_min is None else K_n_min  # its own would take a program
-        DesignProblem(first, bounds, modes=modes or most, **{**asked, "K_n_min": lowest})
+        checked = DesignProblem(first, bounds, modes=modes or most, **{**asked, "K_n_min": lowest})
         _check_inside(first, stacked, bounds)
 
     names: list[str] = []
@@ -173,6 +190,8 @@ def design_many(
 
         program = Program(designed, (_MEMBER,), stacked, [*grid.values()], place)
         each = _BATCH_OF_STRUCTURES if isinstance(first, Structure) else _BATCH
+        if checked.scatter is not None:  # each design is as many as its quadrature has nodes
+            each = max(1, each // len(checked.scatter.weights))
         found, targets = run(
             program,
             stacked,

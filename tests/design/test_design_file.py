@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 import fractaljax as fj
@@ -96,6 +97,19 @@ def test_functions_of_the_package_are_found_again(tmp_path):
     _, options = read_design(tmp_path / "run.toml")
     assert options["objective"] is fj.growth_rate and options["risk"] == ("smooth", 0.05)
     assert options["envelope"] == fj.Envelope({"V": (0.1, 0.2)})
+
+
+@pytest.mark.slow
+def test_an_optimiser_is_given_again(tmp_path):
+    """It has no name of its own in the file."""
+    optimiser = optax.adam(0.03)
+    best = fj.design(fj.brake_scene(), optimiser=optimiser, **SMALL)
+    assert best.sensitivity is not None  # which is not kept
+    best.save(tmp_path / "run.toml")
+    with pytest.raises(ValueError, match="'optimiser' is not in the file: give it in `functions`"):
+        fj.repeat_design(tmp_path / "run.toml", progress=False)
+    again = fj.repeat_design(tmp_path / "run.toml", {"optimiser": optimiser}, progress=False)
+    assert repr(again) == repr(best)
 
 
 @pytest.mark.slow
