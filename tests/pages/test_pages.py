@@ -113,7 +113,7 @@ def many_cycles(numbers):
 
 
 def many_designs(numbers):
-    """Errors are those of the optima, which a polish on the loop leaves; times are of the machine."""
+    """Errors are those of the polished optima; times are of the machine."""
     own = [row for row in numbers["methods"] if "design_many" in row["name"]]
     assert own and all(row["met"] == row["designs"] for row in own)
     assert all(row["right"] == numbers["sample"] for row in own)
