@@ -52,7 +52,7 @@ _STARTS, _FOLLOWED = 12, 1  # the latter where cycles are followed
 _LATTICE = {False: (1024, 48), True: (256, 24)}  # whether a design takes long
 _LATTICE_MAX = 1_000_000, 1000
 _STARTS_OF_STRUCTURES, _STARTS_OF_MANY_JOINTS = 8, 32
-# Of the bounds, about the given design, in which the latter are: where best is nearest, near.
+# Shares of the bounds, about the given design, in which they lie: near, where the nearest is best.
 _SHARES = {True: (0.1, 0.2, 0.6), False: (0.2, 0.6, 1.0)}
 _STARTS_MAX = 10_000
 _DESCENDED = 4  # ends of descents that a solver lands from
@@ -105,11 +105,11 @@ class Design(Record):
 
         `sensitivity["D"]["P"]` is dD/dP. None where it cannot be told: without a design, with
         limits on cycles or on kicks, at a kink, and where the worst condition is inside an
-        envelope. Of a structure it takes several evaluations for each quantity.
+        envelope. For a structure it takes several evaluations a quantity.
         """
         cycles = [self.options["objective"], *self.options["constraints"]]
-        told = self.options["quiet_within"] is None and self.result != DesignResult.infeasible
-        if not told or any(isinstance(each, limits.CycleConstraint) for each in cycles):
+        is_plain = self.options["quiet_within"] is None and self.result != DesignResult.infeasible
+        if not is_plain or any(isinstance(each, limits.CycleConstraint) for each in cycles):
             return None
         problem = stated(self.initial, self.options)
         state = functools.partial(stated, options=self.options, modes=problem.modes or None)
@@ -118,7 +118,7 @@ class Design(Record):
 
     @property
     def has_surface(self) -> bool:
-        """Whether it is a scene with a fractal surface."""
+        """True for a scene with a fractal surface."""
         return isinstance(self.scene, Scene) and self.scene.contact.has_surface
 
     @property
@@ -127,9 +127,9 @@ class Design(Record):
 
         Of a limit on Sq, or of the contact law, or 1 mm and 1 um.
         """
-        for asked in self.options["constraints"]:
-            if isinstance(asked, limits.Roughness):
-                return float(asked.L), float(asked.L_s)
+        for constraint in self.options["constraints"]:
+            if isinstance(constraint, limits.Roughness):
+                return float(constraint.L), float(constraint.L_s)
         if isinstance(self.scene, Scene) and isinstance(self.scene.contact, PerssonContact):
             return float(self.scene.contact.L), float(self.scene.contact.L_s)
         return _WAVELENGTHS
@@ -273,73 +273,81 @@ def design(
     """Find by gradients the scene or structure inside `bounds` that is best and meets all that is
     required of it.
 
-    `bounds` maps any named quantity to (lower, upper): D, G, P, mu_s, omega_1, "K_t/K_n" and so on
-    of a `Scene`, "left.D", or "D" for all joints that have one, of a `Structure`; by default D and
-    G. Scales, such as G, P and stiffness, are moved in logarithms.
-
-    Best is, without an `objective`, nearest to the given quantities: the least sum of
-    (dq/(q_hi - q_lo))^2, with ln q for scales. An objective is any function of a scene that `jax`
-    can differentiate, and is minimised. `constraints.CycleAmplitude` and `VelocityLevel`, without a
-    limit as the objective or with one among the `constraints`, are of the limit cycle of the given
-    design that `limit_cycle` finds, which is followed from design to design, from the given one
-    alone if `starts` is not given. Such a cycle may need a larger `target`: where it is negative
-    only cycles beside a stable equilibrium are left. Where the cycle ends it leaves silence or
-    another cycle behind, suddenly, so that no slope leads there. They take no envelope and no
-    tolerance.
-
-    The growth rate of a structure, as objective and as requirement, is that of each of its modes
+    A design is required to have: a growth rate of at most `target`; every function in `constraints`
+    at most 0; and, of every fractal contact whose stiffness the bounds move, K_n >= `K_n_min`, a_l
+    >= `area_ratio_min` a_e and, without a given stiffness ratio, Q_e <= `slip_ratio_max` mu_s P.
+    The growth rate is that of small disturbances: a larger kick may still end in a limit cycle.
+    For a structure the growth rate, as objective and as requirement, is that of each of its modes
     which may grow: those with the largest real parts, two more than grow in any of a few designs.
     The largest alone has kinks where modes change places. `reduce` a structure of more than about
     a hundred degrees of freedom first, over the bounds.
 
-    The requirements: growth rate <= `target` [1/s], by default minus half the least damping rate
-    without friction (min xi_i omega_i of a scene); every function of a scene in `constraints` <= 0,
-    of order one, as those of `fractaljax.constraints` are; and the bounds. Of every fractal contact
-    whose stiffness the bounds move: K_n >= `K_n_min` [N/m], by default its own; a_l >=
-    `area_ratio_min` a_e; Q_e <= `slip_ratio_max` mu_s P, not with a given stiffness ratio. The
-    growth rate is that of small disturbances: a larger kick may still end in a limit cycle.
+    **What is asked:**
 
-    With other contact `laws` the growth rate must be as low under each, in the place of the scene's
-    own, or of those of all joints of a structure whose contacts have a surface: with their own
-    quantities, but with its surface, material and load where they have them.
+    - `x`: a `Scene` or a `Structure`.
+    - `bounds`: {name: (lower, upper)} of any named quantities in SI units: D, G, P, mu_s, omega_1,
+      "K_t/K_n" and so on of a scene, "left.D", or "D" for all joints that have one, of a structure;
+      by default D from 2.1 to 2.9 and G from 1e-12 to 1e-8 m. Scales, such as G, P and stiffness,
+      are moved in logarithms.
+    - `objective`: a function of a mechanism that `jax` can differentiate, which is minimised; by
+      default the distance from the given quantities, the sum of (dq/(q_hi - q_lo))^2, with ln q for
+      scales. `constraints.CycleAmplitude` and `VelocityLevel` without a limit are objectives, too.
+    - `target`: the largest growth rate allowed [1/s]; by default minus half the least damping rate
+      without friction (min xi_i omega_i of a scene).
+    - `K_n_min`: the least normal stiffness [N/m]; by default that of each contact as given.
+    - `constraints`: functions of a mechanism, at most 0 where met and of order one, as those of
+      `fractaljax.constraints` are. Those of a limit cycle are of the cycle of the given design that
+      `limit_cycle` finds, which is followed from design to design, from the given one alone if
+      `starts` is not given. Such a cycle may need a larger `target`: where it is negative only
+      cycles beside a stable equilibrium are left. Where the cycle ends it leaves silence or another
+      cycle behind, suddenly, so that no slope leads there. They take no envelope and no tolerance.
+    - `laws`: other contact laws, under each of which the growth rate must be as low, in the place
+      of the scene's own, or of those of all joints of a structure whose contacts have a surface:
+      with their own quantities, but with its surface, material and load where they have them.
+    - `envelope`: ranges (lower, upper) or samples of any quantities by name (see `Envelope`), over
+      all of which every requirement holds and the objective is taken.
+    - `risk`: how it is taken over an envelope: "worst", at the worst; "smooth" or ("smooth", T), a
+      log-sum-exp of temperature T that is at least the worst; ("cvar", alpha), the mean of the
+      worst 1 - alpha of all conditions.
+    - `tolerance`, `quantile`: standard deviations {"D": ..., "ln G": ...} of any quantities, a
+      `Tolerance` with their covariance, or an `Identification`; every requirement holds, and the
+      objective is taken, at this quantile, 0.95 by default, at each condition of the envelope by
+      itself. "D" of a structure scatters by the same amount in all joints, also where each is
+      designed by itself. The probability of squeal counts draws by `seed` (see
+      `squeal_probability`), each at a condition drawn evenly from the envelope.
+    - `area_ratio_min`, `slip_ratio_max`: 2 and 0.9 by default.
+    - `friction_slope`: False leaves the slope of friction out of growth rates.
+    - `quiet_within`: the `radius` of `basin`, in units of V/omega and V, or the semi-axes (2n,) of
+      an ellipsoid in m and m/s. No start within it of the sliding equilibrium ends anywhere else,
+      as 4000 starts drawn by `seed` confirm; `Design.quiet_radius` is the largest radius, or share
+      of the semi-axes, so confirmed. Motions follow the whole friction law whatever
+      `friction_slope`. It needs a V of every joint and takes no tolerance: whether a start comes to
+      rest has no quantile. Under an envelope the starts are shared by its middle, up to four
+      corners and the worst conditions of the requirements, each in its own V/omega and V.
 
-    With an `envelope`, a range (lower, upper) or samples of any quantities by name (see
-    `Envelope`), every requirement holds, and an objective is taken, over all its conditions:
-    `risk="worst"`, at the worst; `"smooth"` or ("smooth", T), a log-sum-exp of temperature T
-    that is at least the worst; ("cvar", alpha), the mean of the worst 1 - alpha of them.
-    With a `tolerance`, standard deviations {"D": ..., "ln G": ...} of any quantities, a `Tolerance`
-    with their covariance, or an `Identification`, every requirement holds, and an objective is
-    taken, at its `quantile`, at each condition of the envelope by itself. "D" of a structure
-    scatters by the same amount in all joints, also where each is designed by itself. The
-    probability of squeal counts draws by `seed` (see `squeal_probability`), each at a condition
-    drawn evenly from the envelope.
+    **How it is solved:**
 
-    With `quiet_within`, the `radius` of `basin`, in units of V/omega and V, or the semi-axes (2n,)
-    of an ellipsoid in m and m/s, no start within it of the sliding equilibrium ends anywhere else,
-    as 4000 starts drawn by `seed` confirm. `Design.quiet_radius` is the largest radius, or share of
-    the semi-axes, so confirmed. Motions follow the whole friction law whatever `friction_slope`.
-    It needs a V of every joint. Under an envelope the starts are shared by its middle, up to
-    four corners and the worst conditions of the requirements, each in its own V/omega and V.
-    It takes no tolerance: whether a start comes to rest has no quantile.
+    - `starts`: how many designs the solver lands from; by default 12, 8 for a structure, 32 for one
+      of more than two joints. They are the given design, the most promising of those screened, and
+      an even spread; for more than two joints they are drawn around the given design.
+    - `lattice`: how many designs a side are screened, 48, or 24 for a structure, with an envelope
+      or a tolerance; 1024 or 256 in one variable; lattice^2 designs of a low-discrepancy set in
+      more than two variables.
+    - `optimiser`: any `optax.GradientTransformation`, such as
+      `optax.adam(optax.cosine_decay_schedule(0.03, 100))`. All starts first descend by it side by
+      side for 100 steps, on scaled variables and an exact penalty of what is unmet; the solver
+      lands from the distinct best of their ends. By default there is no descent.
+    - `solver`: a function `solver(objective, constraints, start, bounds)`; by default SciPy's SLSQP
+      (see `slsqp`). For more than two joints steps in a trust region keep to the limits of every
+      joint instead, the eight best of their ends go on, and rounds of more starts near the best
+      follow until they cease to gain. With 60 degrees of freedom or more all that is in the space
+      of the modes that grow most, and the best end in all degrees of freedom.
+    - `seed`: of all that is drawn. The same arguments give the same design.
+    - `progress`: shows a bar.
 
-    With an `optimiser`, any `optax.GradientTransformation` such as
-    `optax.adam(optax.cosine_decay_schedule(0.03, 100))`, all starts first descend side by side for
-    100 steps, on scaled variables and an exact penalty of what is unmet; the solver lands from the
-    distinct best of their ends.
-
-    `solver(objective, constraints, start, bounds)`, by default SciPy's SLSQP (see `slsqp`), lands
-    from `starts` designs, by default 12, or 8 of a structure: those given, the most promising of
-    `lattice` a side (48, or 24 of a structure, with an envelope or a tolerance; 1024 or 256 in one
-    variable; lattice^2 designs of a low-discrepancy set in more than two variables), and an even
-    spread. Of more than two joints there are 32, drawn around the given design, the most promising
-    of lattice^2 if that is given; by default steps in a trust region keep to the limits of every
-    joint, the eight best of their ends go on, and rounds of more starts near the best follow until
-    they cease to gain. Of 60 degrees of freedom or more all that is in the space of the modes that
-    grow most, and the best end in all degrees of freedom.
-    The same arguments give the same design. A request that cannot be met is a result, not an error:
-    see `Design.result`. Then `Design.least_growth` is the least growth rate that was found with all
-    else met, where, what holds it there, and how many starts agree; or, if that cannot be met
-    either, what of it and why.
+    A request that cannot be met is a result, not an error: see `Design.result`. Then
+    `Design.least_growth` is the least growth rate that was found with all else met, where, what
+    holds it there, and how many starts agree; or, if that cannot be met either, what of it and why.
 
     **Raises:** `ValueError` for bounds on what `x` lacks, empty, inverted or without its own value,
     for an envelope of what it lacks or the design moves, and for options outside their domain.
@@ -370,14 +378,14 @@ def design(
         options["quiet_within"] = kicks.within
     evaluator = evaluator_of(problem, envelope, risk)
     count, designs = screened(problem, starts, lattice)
-    own = np.asarray(problem.start, float)
-    before = evaluator.evaluate(own[None])
+    start = np.asarray(problem.start, float)
+    before = evaluator.evaluate(start[None])
     if not np.isfinite(before.rows).all() and isinstance(x, Scene):
         require_computable(x, problem.friction_slope)
 
-    def solved(problem):
+    def solve(problem):
         evaluator = evaluator_of(problem, envelope, risk)
-        us, scale = choose_starts(own, designs, evaluator.screen(designs), count)
+        us, scale = choose_starts(start, designs, evaluator.screen(designs), count)
         if problem.cycles is not None:
             scale = abs(float(before.values[0])) or 1.0
         landing = solver or solver_of(problem)
@@ -392,14 +400,14 @@ def design(
         return Found(path, after, len(us), failed, limit)
 
     if objective is None and before.worst[0] <= 0:
-        found = Found(own[None], before, 0, 0)
+        best = Found(start[None], before, 0, 0)
     else:
-        found = solved(problem)
+        best = solve(problem)
     if kicks is None:
-        return _conclude(x, problem, options, before, found)
-    found, survived = quiet(problem, found, solved, kicks, envelope)
-    found = found._replace(evaluation=evaluator.evaluate(found.path[-1:]))  # without cuts
-    return _conclude(x, problem, options, before, found, survived)
+        return _conclude(x, problem, options, before, best)
+    best, survived = quiet(problem, best, solve, kicks, envelope)
+    best = best._replace(evaluation=evaluator.evaluate(best.path[-1:]))  # without cuts
+    return _conclude(x, problem, options, before, best, survived)
 
 
 def stated(x: Mechanism, options: Mapping[str, Any], modes: int | None = None) -> DesignProblem:
@@ -416,7 +424,7 @@ def screened(problem: DesignProblem, starts: int | None, lattice: int | None):
     default = _STARTS_OF_STRUCTURES if problem.modes else _STARTS
     default = _STARTS_OF_MANY_JOINTS if many_joints else default
     default = default if problem.cycles is None else _FOLLOWED
-    given = lattice is not None
+    sized = lattice is not None
     if lattice is None:
         many = problem.robust or problem.modes > 0  # each design takes long
         lattice = _LATTICE[many][min(variables, 2) - 1]
@@ -428,7 +436,7 @@ def screened(problem: DesignProblem, starts: int | None, lattice: int | None):
     if not many_joints:
         return starts, screened_designs(lattice, variables)
     # Near the given design more is met, and an objective is often that of few changes.
-    drawn = count if given else max(1, starts - 1)
+    drawn = count if sized else max(1, starts - 1)
     shares = _SHARES[problem.objective is None]
     return starts, designs_around(problem, np.asarray(problem.start, float), drawn, shares, 0)
 
@@ -443,11 +451,11 @@ def _conclude(
     problem: DesignProblem,
     options: Mapping[str, Any],
     before: Evaluation,
-    found: Found,
+    end: Found,
     quiet_radius: float | None = None,
 ) -> Design:
     """How every requirement stands at the end of the path; unchanged without a start."""
-    path, after, starts, failed, limit = found
+    path, after, starts, failed, limit = end
     final, history = x, describe(problem, path)
     if starts:
         dtype = problem.low.dtype
@@ -457,9 +465,10 @@ def _conclude(
     for name, place in zip(problem.names, path[-1].tolist(), strict=True):
         residuals |= {f"{name} >= lower bound": -place, f"{name} <= upper bound": place - 1}
     violated = tuple(name for name, residual in residuals.items() if not residual <= 0)
-    asked = options["quiet_within"]
-    if quiet_radius is not None and quiet_radius < (1 if isinstance(asked, list) else asked):
-        violated += (f"quiet within {asked}",)
+    kick_size = options["quiet_within"]
+    least = 1 if isinstance(kick_size, list) else kick_size
+    if quiet_radius is not None and quiet_radius < least:
+        violated += (f"quiet within {kick_size}",)
     active = max(_ACTIVE, 100 * problem.rounding)
     more: dict[str, Any] = {}
     if envelope is not None or tolerance is not None:

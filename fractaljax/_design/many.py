@@ -66,8 +66,8 @@ class DesignMany(Record):
         Those without a number are as given.
         """
         values = {
-            name: np.where(np.isnan(found), self.given(name), found)
-            for name, found in self.quantities.items()
+            name: np.where(np.isnan(column), self.given(name), column)
+            for name, column in self.quantities.items()
         }
         if not isinstance(self.mechanisms, (list, tuple)):
             return replaced(self.mechanisms, values)
@@ -152,9 +152,9 @@ def design_many(
 
     **Raises:** as `design`, and `ValueError` for members of different kinds.
     """
-    asked: dict[str, Any] = dict(objective=objective, target=target, K_n_min=K_n_min)
-    asked |= dict(constraints=constraints, laws=laws, tolerance=tolerance, quantile=quantile)
-    asked |= dict(
+    request: dict[str, Any] = dict(objective=objective, target=target, K_n_min=K_n_min)
+    request |= dict(constraints=constraints, laws=laws, tolerance=tolerance, quantile=quantile)
+    request |= dict(
         friction_slope=friction_slope, area_ratio_min=area_ratio_min, slip_ratio_max=slip_ratio_max
     )
     for each in (objective, *constraints):
@@ -168,20 +168,22 @@ def design_many(
         # What is wrong with the arguments is said of a member that is there.
         most = min(MODES_MOST, first.n) if isinstance(first, Structure) else None
         lowest: Any = 0.0 if K_n_min is None else K_n_min  # its own would take a program
-        checked = DesignProblem(first, bounds, modes=modes or most, **{**asked, "K_n_min": lowest})
+        checked = DesignProblem(
+            first, bounds, modes=modes or most, **{**request, "K_n_min": lowest}
+        )
         _check_inside(first, stacked, bounds)
 
     names: list[str] = []
 
     def designed(x) -> tuple[Optimum, Array]:
-        problem = DesignProblem(x, bounds, modes=modes, **asked)
+        problem = DesignProblem(x, bounds, modes=modes, **request)
         names[:] = problem.residual_names
         return optimum(problem, starts, lattice, steps), problem.target
 
     count = int(np.prod(shape, dtype=int))
     if is_traced((stacked, target, K_n_min)):
         every = jax.jit(jax.vmap(lambda leaves: designed(_at(first, leaves))))
-        found, targets = every(stacked)
+        optima, targets = every(stacked)
     else:
         grid = {_MEMBER: np.arange(count)}
 
@@ -192,7 +194,7 @@ def design_many(
         each = _BATCH_OF_STRUCTURES if isinstance(first, Structure) else _BATCH
         if checked.scatter is not None:  # each design is as many as its quadrature has nodes
             each = max(1, each // len(checked.scatter.weights))
-        found, targets = run(
+        optima, targets = run(
             program,
             stacked,
             grid,
@@ -205,14 +207,14 @@ def design_many(
             None,
             each,
         )
-    found, targets = jax.tree.map(lambda a: a.reshape(shape + a.shape[1:]), (found, targets))
+    optima, targets = jax.tree.map(lambda a: a.reshape(shape + a.shape[1:]), (optima, targets))
     return DesignMany(
         mechanisms=xs,
-        quantities=found.quantities,
-        value=found.value,
-        growth_rate=found.growth_rate,
-        residuals=found.residuals,
-        result=found.result,
+        quantities=optima.quantities,
+        value=optima.value,
+        growth_rate=optima.growth_rate,
+        residuals=optima.residuals,
+        result=optima.result,
         residual_names=tuple(names),
         target=targets,
     )
@@ -231,11 +233,13 @@ def _members(xs: Any) -> tuple[Any, list[Array], tuple[int, ...]]:
         return xs[0], [jnp.stack(each) for each in leaves], (len(xs),)
     if not isinstance(xs, Scene | Structure):
         raise TypeError(f"xs must be a mechanism with arrays, or a list, got {brief(xs)}")
-    own = own_quantities(xs)
+    named = own_quantities(xs)
     if isinstance(xs, Structure):  # a plain name is that of several joints
-        own = {name: own[name] for name in own if "." in name or name in xs.parameters}
+        named = {name: named[name] for name in named if "." in name or name in xs.parameters}
     many = {
-        name: each.value for name, each in own.items() if each.value is not None and each.value.ndim
+        name: each.value
+        for name, each in named.items()
+        if each.value is not None and each.value.ndim
     }
     shape = jnp.broadcast_shapes(*(value.shape for value in many.values()))
     first = replaced(xs, {name: value.reshape(-1)[0] for name, value in many.items()})

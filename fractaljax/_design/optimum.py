@@ -47,8 +47,8 @@ def optimum(problem: DesignProblem, starts: int, lattice: int, steps: int) -> Op
     """
     frozen = jax.lax.stop_gradient(problem)
     u, multipliers, result = jax.lax.stop_gradient(_search(frozen, starts, lattice, steps))
-    found = (result == DesignResult.found) | (result == DesignResult.unchanged)
-    u = _implicit(problem, u, multipliers, found)
+    is_optimal = (result == DesignResult.found) | (result == DesignResult.unchanged)
+    u = _implicit(problem, u, multipliers, is_optimal)
     u = nan_where(result == DesignResult.undetermined, u)
     row, numbers = problem.at(u, problem.own_condition)
     if problem.scatter is not None:
@@ -66,19 +66,19 @@ def optimum(problem: DesignProblem, starts: int, lattice: int, steps: int) -> Op
 
 def _search(problem: DesignProblem, starts: int, lattice: int, steps: int):
     """The best design (v,), the multipliers of its residuals, and the result."""
-    limited, asked = limited_columns(problem), problem.asked
+    limited, is_named = limited_columns(problem), problem.asked
     slack = max(1e-9, problem.rounding)
-    slack = jnp.where(asked[limited], slack, 0.01 * slack).astype(problem.low.dtype)
-    own = jnp.clip(problem.start, 0, 1)
+    slack = jnp.where(is_named[limited], slack, 0.01 * slack).astype(problem.low.dtype)
+    start = jnp.clip(problem.start, 0, 1)
 
     def row_of(u):
         return problem.at(u, problem.own_condition)[0]
 
-    us = jnp.asarray(low_discrepancy(lattice, len(own)), own.dtype)
-    us = jnp.concatenate([own[None], us])
-    rows = jax.vmap(lambda u: row_of(u)[asked])(us)
+    us = jnp.asarray(low_discrepancy(lattice, len(start)), start.dtype)
+    us = jnp.concatenate([start[None], us])
+    rows = jax.vmap(lambda u: row_of(u)[is_named])(us)
     finite = jnp.all(jnp.isfinite(rows), axis=1)
-    scale: Any = jnp.ones_like(own[0])
+    scale: Any = jnp.ones_like(start[0])
     if problem.objective is not None:
         values = jnp.where(finite, rows[:, 0], jnp.nan)
         scale = jnp.nanquantile(values, 0.9) - jnp.nanquantile(values, 0.1)
@@ -93,7 +93,7 @@ def _search(problem: DesignProblem, starts: int, lattice: int, steps: int):
             return row, row
 
         slopes, row = jax.jacfwd(values, has_aux=True)(u)
-        named = row[asked]
+        named = row[is_named]
         row = jnp.nan_to_num(row, nan=UNKNOWN, posinf=UNKNOWN, neginf=-UNKNOWN)
         slopes = jnp.nan_to_num(slopes, nan=0, posinf=0, neginf=0)
         c, A = row[limited] + slack, slopes[limited]
@@ -107,8 +107,8 @@ def _search(problem: DesignProblem, starts: int, lattice: int, steps: int):
         first
     )
     named = ended.more
-    known = jnp.all(jnp.isfinite(named), axis=1)
-    worst = jnp.where(known, jnp.max(named[:, 1:], axis=1, initial=-jnp.inf), jnp.inf)
+    has_number = jnp.all(jnp.isfinite(named), axis=1)
+    worst = jnp.where(has_number, jnp.max(named[:, 1:], axis=1, initial=-jnp.inf), jnp.inf)
     met = worst <= 0
     best = jnp.where(
         jnp.any(met),
@@ -123,7 +123,7 @@ def _search(problem: DesignProblem, starts: int, lattice: int, steps: int):
         multipliers = jnp.where(unchanged, 0, multipliers)
     result = DesignResult.where(jnp.any(met), DesignResult.found, DesignResult.infeasible)
     result = DesignResult.where(unchanged, DesignResult.unchanged, result)
-    none = ~(jnp.any(finite) | jnp.any(known))
+    none = ~(jnp.any(finite) | jnp.any(has_number))
     return u, multipliers, DesignResult.where(none, DesignResult.undetermined, result)
 
 
@@ -154,14 +154,14 @@ def _distinct(us, merit, count: int) -> Array:
 
 
 @jax.custom_jvp
-def _implicit(problem: DesignProblem, u, multipliers, found: Bool[Array, ""]):
+def _implicit(problem: DesignProblem, u, multipliers, is_optimal: Bool[Array, ""]):
     """u itself, which follows its problem as the conditions of an optimum say."""
     return u
 
 
 @_implicit.defjvp
 def _implicit_jvp(primals, tangents):
-    problem, u, multipliers, found = primals
+    problem, u, multipliers, is_optimal = primals
     columns = limited_columns(problem)
 
     def values(problem, u):
@@ -196,8 +196,8 @@ def _implicit_jvp(primals, tangents):
     H = jnp.where(held[:, None] | held[None], jnp.eye(len(u), dtype=u.dtype), H)
     K = jnp.block([[H, A.T], [A, lower]])
     right = jnp.concatenate([jnp.where(held, 0, -forces), jnp.where(active, -shifts, 0)])
-    moved = jnp.linalg.solve(K, right[:, None])[: len(u), 0]
-    return u, nan_where(~found, moved)
+    u_tangent = jnp.linalg.solve(K, right[:, None])[: len(u), 0]
+    return u, nan_where(~is_optimal, u_tangent)
 
 
 def _differences(function: Callable[[Array], Any], u: Float[Array, " v"]) -> Any:

@@ -98,7 +98,7 @@ class DesignProblem(eqx.Module):
     friction_slope: bool = eqx.field(static=True)
     conditions: tuple[str, ...] = eqx.field(static=True)  # quantities of the envelope
     modes: int = eqx.field(static=True)  # that a structure must keep from growing
-    # Whether rows end with what solvers follow in the place of growth rates.
+    # True if rows end with what solvers follow in the place of growth rates.
     smooth: bool = eqx.field(static=True)
     cuts: Cuts | None
     # Where a requirement or the objective is of a cycle.
@@ -122,12 +122,14 @@ class DesignProblem(eqx.Module):
         friction_slope: bool = True,
         modes: int | None = None,
     ):
-        asked: dict[str, Any] = dict(objective=objective, constraints=constraints, target=target)
-        asked |= dict(K_n_min=K_n_min, laws=laws, envelope=envelope, tolerance=tolerance)
-        asked |= dict(
+        request: dict[str, Any] = dict(objective=objective, constraints=constraints, target=target)
+        request |= dict(K_n_min=K_n_min, laws=laws, envelope=envelope, tolerance=tolerance)
+        request |= dict(
             quantile=quantile, area_ratio_min=area_ratio_min, slip_ratio_max=slip_ratio_max
         )
-        for name, value in stated_fields(x, bounds, friction_slope=friction_slope, **asked).items():
+        for name, value in stated_fields(
+            x, bounds, friction_slope=friction_slope, **request
+        ).items():
             setattr(self, name, value)
         self.modes, self.smooth, self.cuts = 0, False, None
         if isinstance(x, Structure):
@@ -213,12 +215,12 @@ class DesignProblem(eqx.Module):
             if self.modes:
                 # The rates are NaN where there is no steady sliding; LAPACK gets numbers even so.
                 attached = assembled(each, self.friction_slope, refuse=False)
-                found = leading(*attached[:3], self.modes, x.band)
-                rates += list(jnp.where(attached.lost, jnp.nan, found.s.real))
+                leading_modes = leading(*attached[:3], self.modes, x.band)
+                rates += list(jnp.where(attached.lost, jnp.nan, leading_modes.s.real))
                 if not self.least_growth:
-                    smooth += list(of_neighbours(found, self.target, self.growth_scale))
+                    smooth += list(of_neighbours(leading_modes, self.target, self.growth_scale))
                 elif each is stiff_x:
-                    smooth += list(jnp.arcsinh(found.s.real / self.growth_scale))
+                    smooth += list(jnp.arcsinh(leading_modes.s.real / self.growth_scale))
             else:
                 rates.append(growth_rate(each, self.friction_slope))
                 smooth += of_scene(
@@ -228,12 +230,14 @@ class DesignProblem(eqx.Module):
         model, stiff = self.of_joints(states)
         pressing = [jnp.arcsinh((rate - self.target) / self.growth_scale) for rate in rates]
         # Cycles are followed outside of this program.
-        own = [
-            jnp.zeros_like(growth) if isinstance(asked, CycleConstraint) else jnp.asarray(asked(x))
-            for asked in self.constraints
+        others = [
+            jnp.zeros_like(growth)
+            if isinstance(constraint, CycleConstraint)
+            else jnp.asarray(constraint(x))
+            for constraint in self.constraints
         ]
         if self.cuts is not None:
-            own += list(self.cuts.residuals(u))
+            others += list(self.cuts.residuals(u))
         if self.objective is None:
             value = jnp.sum((u - self.start) ** 2)
         else:
@@ -246,23 +250,23 @@ class DesignProblem(eqx.Module):
             for key in ("K_n", "K_t", "log_area_ratio", "slip_ratio"):
                 if getattr(state, key) is not None:
                     numbers[of_joint(name) + key] = getattr(state, key)
-        row = [jnp.asarray(value, growth.dtype), *model, *pressing, *stiff, *own]
+        row = [jnp.asarray(value, growth.dtype), *model, *pressing, *stiff, *others]
         return jnp.stack(row + smooth * self.smooth), numbers
 
     def stiffened(self, x) -> tuple[dict[str, Any], Any]:
         """States of the contacts of `x` that have one or move, and `x` with their stiffness."""
         parts = joints_of(x)
-        asked = {
+        designed_parts = {
             name: part
             for name, part in parts.items()
             if part.contact.fractal or name in self.contacts
         }
-        states = states_of(asked)
+        states = states_of(designed_parts)
         # The load curve of a joint is that of its own law.
-        known = {
+        constant_states = {
             name: state for name, state in states.items() if not parts[name].follows_load_curve
         }
-        return states, with_stiffness(x, known)
+        return states, with_stiffness(x, constant_states)
 
     def of_joints(self, states: Mapping[str, Any]) -> tuple[list[Array], list[Array]]:
         """Residuals of contacts in known states: inside the model, and stiff enough."""
@@ -292,12 +296,12 @@ class DesignProblem(eqx.Module):
 
     @property
     def robust(self) -> bool:
-        """Whether there is an envelope or a tolerance."""
+        """True with an envelope or a tolerance."""
         return bool(self.conditions) or self.scatter is not None
 
     @property
     def least_growth(self) -> bool:
-        """Whether the objective is the growth rate of a structure, the largest of many modes'."""
+        """True if the growth rate of a structure, the largest of many modes', is minimised."""
         return self.modes > 0 and self.objective is growth_rate
 
     @property
@@ -323,7 +327,7 @@ class DesignProblem(eqx.Module):
 
     @property
     def rounding(self) -> float:
-        """Of a residual."""
+        """Rounding error of a residual."""
         return 3e4 * float(np.finfo(self.low.dtype).eps)
 
     @property
@@ -348,13 +352,13 @@ class DesignProblem(eqx.Module):
             model += [f"{of}a_l >= area_ratio_min a_e"] * is_fractal(self.x, name)
             model += [f"{of}Q_e <= slip_ratio_max mu_s P"] * slips(self.x, name)
             stiff.append(f"{of}K_n >= K_n_min")
-        own = [asked.name for asked in self.constraints]
+        others = [constraint.name for constraint in self.constraints]
         if self.cuts is not None:
-            own += [f"cut {k}" for k in range(len(self.cuts.reach))]
+            others += [f"cut {k}" for k in range(len(self.cuts.reach))]
         growing = ["growth_rate <= target"]
         growing += [f"growth_rate of mode {i} <= target" for i in range(2, self.modes + 1)]
         by = [f"{name} by {type(law).__name__}" for law in self.laws for name in growing]
-        return [*model, *growing, *by, *stiff, *own]
+        return [*model, *growing, *by, *stiff, *others]
 
     def scaled(self, x: Mechanism) -> np.ndarray:
         """The scaled variables (v,) of a scene or structure."""

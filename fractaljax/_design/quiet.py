@@ -69,9 +69,11 @@ class Kicks:
         self.seed += 1
         centre, axes = ellipsoid(compiled_system(x, None), self.within)
         axes = axes / self.size  # of norm 1
-        found = basin(x, radius=radius * axes, starts=count, seed=self.seed, progress=self.progress)
-        moves = np.linalg.norm((found.starts[found.labels != 0] - centre) / axes, axis=1)
-        return moves.min(initial=radius), found
+        outcome = basin(
+            x, radius=radius * axes, starts=count, seed=self.seed, progress=self.progress
+        )
+        moves = np.linalg.norm((outcome.starts[outcome.labels != 0] - centre) / axes, axis=1)
+        return moves.min(initial=radius), outcome
 
     def worst(self, xs: Sequence[Mechanism], radius: float, count: int) -> tuple[float, int, Basin]:
         """As `tried`, of `count` kicks shared by mechanisms; also which one is kicked so."""
@@ -82,11 +84,11 @@ class Kicks:
     def least(self, xs: Sequence[Mechanism]) -> tuple[float, int, Basin]:
         """As `worst`, of the size asked for, by larger and larger draws until a kick is found."""
         first, *more = _TRIED
-        radius, i, found = self.worst(xs, self.size, first)
+        radius, i, outcome = self.worst(xs, self.size, first)
         for count in more:
             if radius == self.size:
-                radius, i, found = self.worst(xs, self.size, count)
-        return radius, i, found
+                radius, i, outcome = self.worst(xs, self.size, count)
+        return radius, i, outcome
 
     def survived(self, xs: Sequence[Mechanism]) -> float:
         """The largest norm, up to `size`, below which a last draw has no counter-example."""
@@ -99,75 +101,75 @@ class Kicks:
         return float(radius)
 
 
-def kicked_at(found: Found, envelope: Envelope | None) -> np.ndarray:
+def kicked_at(design: Found, envelope: Envelope | None) -> np.ndarray:
     """Where a design is kicked (k, c): the worst conditions of its requirements, a few others."""
     if envelope is None:
         return np.zeros((1, 0))
-    places = np.concatenate([found.evaluation.places[0, 1:], envelope.likely(_LIKELY)])
+    places = np.concatenate([design.evaluation.places[0, 1:], envelope.likely(_LIKELY)])
     return envelope.values(np.unique(places, axis=0))
 
 
 def quiet(
     problem: DesignProblem,
-    found: Found,
+    design: Found,
     solve: Callable[[DesignProblem], Found],
     kicks: Kicks,
     envelope: Envelope | None,
 ) -> tuple[Found, float]:
     """The best design that survives the kicks, and the largest kick survived.
 
-    `found` solves `problem`. Where no design survives, the one that did best of those tried.
+    `design` solves `problem`. Where no design survives, the one that did best of those tried.
     """
     cuts, failed = Cuts.none(_EXCHANGES, problem.low), []
 
-    def scenes(found: Found):
-        u = jnp.asarray(found.path[-1])
-        return [problem.moved(u, jnp.asarray(at)) for at in kicked_at(found, envelope)]
+    def scenes(design: Found):
+        u = jnp.asarray(design.path[-1])
+        return [problem.moved(u, jnp.asarray(at)) for at in kicked_at(design, envelope)]
 
     for _ in range(_EXCHANGES):
-        if found.evaluation.worst[0] > 0:
+        if design.evaluation.worst[0] > 0:
             if not failed or float(cuts.reach.max()) < _REACH / 50:
                 break
             cuts = dataclasses.replace(cuts, reach=cuts.reach / 2)
         else:
-            radius, i, ends = kicks.least(scenes(found))
+            radius, i, ends = kicks.least(scenes(design))
             if radius == kicks.size:
                 # The last of these is the one that has been found.
-                for better in [*_moved_back(problem, failed, found, solve, kicks, scenes), found]:
+                for better in [*_moved_back(problem, failed, design, solve, kicks, scenes), design]:
                     radius, i, ends = kicks.worst(scenes(better), kicks.size, VERIFIED)
                     if radius == kicks.size:
                         return better, radius
-            u = found.path[-1]
-            normals, gaps = _planes(problem, u, kicked_at(found, envelope)[i], ends)
+            u = design.path[-1]
+            normals, gaps = _planes(problem, u, kicked_at(design, envelope)[i], ends)
             reach = max(_REACH, 2 * gaps[gaps < _NONE].max(initial=0))
             cuts = cuts.added(len(failed), u, normals, gaps, reach)
-            failed.append((radius, found))
-        found = solve(problem.with_fields(cuts=cuts))
-    best = max(failed, key=lambda pair: pair[0])[1] if failed else found
+            failed.append((radius, design))
+        design = solve(problem.with_fields(cuts=cuts))
+    best = max(failed, key=lambda pair: pair[0])[1] if failed else design
     return best, kicks.survived(scenes(best))
 
 
-def _moved_back(problem, failed, found, solve, kicks, scenes) -> list[Found]:
+def _moved_back(problem, failed, design, solve, kicks, scenes) -> list[Found]:
     """Better designs that seem to survive, the best first: towards the first one that failed."""
-    moved: list[Found] = []
+    better: list[Found] = []
     if not failed:
-        return moved
+        return better
     centre = failed[0][1].path[-1]
-    way = found.path[-1] - centre
+    way = design.path[-1] - centre
     length, low, high, share = float(np.linalg.norm(way)), 0.0, 1.0, _NEARLY
     for _ in range(_BISECTIONS):
         plane = np.stack([way / length, np.zeros_like(way)]), np.array([share * length, _NONE])
         cuts = Cuts.none(_EXCHANGES, problem.low).added(0, centre, *plane, _NONE)
         other = solve(problem.with_fields(cuts=cuts))
         if other.evaluation.worst[0] <= 0 and kicks.least(scenes(other))[0] == kicks.size:
-            moved.insert(0, other)
+            better.insert(0, other)
             high = share
         elif high == 1:  # a tenth of the way is not worth more
             break
         else:
             low = share
         share = (low + high) / 2
-    return moved
+    return better
 
 
 def _planes(problem: DesignProblem, u: np.ndarray, condition: np.ndarray, ends: Basin):

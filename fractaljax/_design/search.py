@@ -26,10 +26,11 @@ from .trust_region import FINE, NEAR, ROUGH, SETTLED, Accuracy, Local, in_trust_
 _ROUNDS = 12  # of the exchange
 _FEW = 2  # variables, in which a lattice of starts leaves nothing to restore
 _RESTORING = 30  # steps from a start to where all requirements are met
-# Of many ways in a trust region: how many go on, and of these to the end at once.
+# How many of many ways in a trust region go on, and how many of these to the end at once.
 _KEPT, _KEPT_NEAR, _AT_ONCE = 8, 4, 2
 _AGAIN, _AROUND = 12, 12  # rounds of new starts near the best end of such ways, and how many
-# Of the objective in such rounds; as good as the best; how many without a gain are the last. One
+# Gain of the objective that counts in such rounds; what is as good as the best; how many rounds
+# without a gain are the last. One
 # with several ends that agree with the best counts twice.
 _GAINED, _AGREE, _IDLE, _SEVERAL = 1e-3, 1e-3, 3, 2
 
@@ -86,38 +87,42 @@ class Search:
         way begins where the reader does. Last, ways and ends of `least_growth`, if all failed.
         """
         problem, lowest = self.evaluator.problem, None
-        paths, found = self._landed(starts, progress)
+        paths, evaluation = self._landed(starts, progress)
         plain = problem.cuts is None and problem.cycles is None
-        if (found.worst > 0).all():
+        if (evaluation.worst > 0).all():
             if plain and problem.modes:
-                # Of structures each landing takes long. With all else met no other design is as
+                # Each landing of a structure takes long. With all else met no other design is as
                 # close to the target.
-                near = paths[int(found.worst.argmin())][-1]
+                near = paths[int(evaluation.worst.argmin())][-1]
                 lowest = self.least_growth([*starts, near])
                 growth, unmet = self.growth_and_rest(lowest[1])
                 least = int(np.where(unmet <= 0, growth, np.inf).argmin())
                 if unmet[least] <= 0 < growth[least]:
                     return lowest[0][least], lowest[1].of(least), len(starts), lowest
             if lowest is None or not (lowest[1].worst <= 0).any():
-                paths, found = self._closest(paths, found)
-        failed = found.worst > 0
+                paths, evaluation = self._closest(paths, evaluation)
+        failed = evaluation.worst > 0
         if failed.all():
-            model = found.residuals[:, : problem.model_residuals]
-            best = int(np.lexsort((found.worst, model.max(axis=1, initial=0)))[0])
+            model = evaluation.residuals[:, : problem.model_residuals]
+            best = int(np.lexsort((evaluation.worst, model.max(axis=1, initial=0)))[0])
             if lowest is None and plain:
                 lowest = self.least_growth([*starts, paths[best][-1]])
             met = np.zeros(0, bool) if lowest is None else lowest[1].worst <= 0
             if lowest is None or not met.any():
-                return paths[best], found.of(best), len(starts), lowest
+                return paths[best], evaluation.of(best), len(starts), lowest
             # There is a design that meets all after all.
             chosen = np.flatnonzero(met).tolist()
             landed = self._land([lowest[0][i] for i in chosen])
             paths = [self._to_best(path) for path in landed]
-            found = self._ends(paths)
-            failed = found.worst > 0
-        values = np.where(failed, np.inf, found.values)
+            evaluation = self._ends(paths)
+            failed = evaluation.worst > 0
+        values = np.where(failed, np.inf, evaluation.values)
         best = int(np.flatnonzero(values <= values.min() + 1e-8 * abs(values.min()))[0])
-        path, end, count = paths[best], found.of(best), max(len(starts) - int((~failed).sum()), 0)
+        path, end, count = (
+            paths[best],
+            evaluation.of(best),
+            max(len(starts) - int((~failed).sum()), 0),
+        )
         # A solver may have stopped early: once more from where it is. What is better is often near.
         ways = [path] if self.solver else [np.array([*path, u]) for u in self._near(path[-1])]
         ways = self._land(ways, stages=[(self, FINE, len(ways))])
@@ -139,11 +144,11 @@ class Search:
             ways = [start[None] for start in (starts if again else [u, *starts])]
             stages = [(rough, NEAR, len(ways)), (rough, SETTLED, _KEPT_NEAR)]
             ended = np.array([way[-1] for way in rough._land(ways, stages=stages)])
-            found = rough.evaluator.evaluate(ended)
-            values = np.where(found.worst > 0, np.inf, found.values)
-            best, known = int(values.argmin()), bool(np.isfinite(value))
-            gained = values[best] < (value - _GAINED * abs(value) if known else value)
-            alike = known and np.isclose(values, value, rtol=_AGREE, atol=0).sum() >= _SEVERAL
+            evaluation = rough.evaluator.evaluate(ended)
+            values = np.where(evaluation.worst > 0, np.inf, evaluation.values)
+            best, has_value = int(values.argmin()), bool(np.isfinite(value))
+            gained = values[best] < (value - _GAINED * abs(value) if has_value else value)
+            alike = has_value and np.isclose(values, value, rtol=_AGREE, atol=0).sum() >= _SEVERAL
             idle = 0 if gained else idle + 1 + alike
             if values[best] < value:
                 value, ends = float(values[best]), [ended[best], *ends][:_AT_ONCE]
@@ -155,17 +160,17 @@ class Search:
         """The ways from all starts, and what their ends are."""
         problem = self.evaluator.problem
         paths = self._land([start[None] for start in starts], progress=progress)
-        found = self._ends(paths)
-        lost = np.flatnonzero(found.worst > 0)
+        evaluation = self._ends(paths)
+        lost = np.flatnonzero(evaluation.worst > 0)
         if self.solver and len(lost) and len(problem.names) > _FEW:
             # Far from many requirements a solver may stop: first to where all are met.
             landed = self._land([starts[i][None] for i in lost], restored=True)
             for i, path in zip(lost, landed, strict=True):
                 paths[i] = path
-            found = self._ends(paths)
-        return paths, found
+            evaluation = self._ends(paths)
+        return paths, evaluation
 
-    def _closest(self, paths, found):
+    def _closest(self, paths, evaluation):
         """Ways of which none ends where all is met, on to as close as can be, and their ends.
 
         Inside the model, if that is possible, and there as close as can be to all the rest.
@@ -174,19 +179,19 @@ class Search:
         model = np.arange(len(problem.residual_names)) < problem.model_residuals
         # Into the model, on to the rest of the requirements, and if they hold to the objective.
         for violated in (model, ~model, None):
-            outside = (found.residuals[:, model] > 0).any(axis=1)
-            going = found.worst <= 0 if violated is None else outside == (violated is model)
+            outside = (evaluation.residuals[:, model] > 0).any(axis=1)
+            going = evaluation.worst <= 0 if violated is None else outside == (violated is model)
             chosen = np.flatnonzero(going)
             landed = self._land([paths[i] for i in chosen], violated)
             for i, path in zip(chosen, landed, strict=True):
                 paths[i] = path
-            found = self._ends(paths)
-        return paths, found
+            evaluation = self._ends(paths)
+        return paths, evaluation
 
     def _to_best(self, path: np.ndarray) -> np.ndarray:
         """A way (s, v) up to the best design on it that meets every requirement, if any does."""
-        found = self.evaluator.evaluate(path)
-        values = np.where(found.worst <= 0, found.values, np.inf)
+        evaluation = self.evaluator.evaluate(path)
+        values = np.where(evaluation.worst <= 0, evaluation.values, np.inf)
         return path[: int(values.argmin()) + 1] if np.isfinite(values).any() else path
 
     def least_growth(self, starts: Sequence[np.ndarray]) -> tuple[list[np.ndarray], Evaluation]:
@@ -210,10 +215,10 @@ class Search:
         paths = self._ways([start[None] for start in starts], others, np.zeros_like(others))
         return paths, self._ends(paths)
 
-    def growth_and_rest(self, found: Evaluation) -> tuple[np.ndarray, np.ndarray]:
+    def growth_and_rest(self, evaluation: Evaluation) -> tuple[np.ndarray, np.ndarray]:
         """The largest residuals (n,) of growth rates, and of all other requirements."""
-        k = found.rows.shape[1]
-        growing, others = (found.rows[:, mask[:k]] for mask in (self.growing, self.others))
+        k = evaluation.rows.shape[1]
+        growing, others = (evaluation.rows[:, mask[:k]] for mask in (self.growing, self.others))
         return growing.max(axis=1), others.max(axis=1, initial=-np.inf)
 
     @property
@@ -239,17 +244,17 @@ class Search:
         meets those before them. If `restored`, by the nearest design that violates all the least.
         """
         problem = self.evaluator.problem
-        asked = problem.asked
-        columns = np.arange(len(asked))
+        is_named = problem.asked
+        columns = np.arange(len(is_named))
         aim, limited = columns == 0, columns > 0
         if violated is not None:
-            aim[asked] = np.append(False, violated)
-            limited &= asked & (columns < aim.argmax())
+            aim[is_named] = np.append(False, violated)
+            limited &= is_named & (columns < aim.argmax())
         elif problem.least_growth:
             # The largest of many modes has kinks where they change places; each has none. What
             # is minimised needs no limit of its own.
-            own = self.growing & (columns < problem.growth_columns.start + problem.modes)
-            aim, limited = ~asked, limited & asked & ~own
+            objectives = self.growing & (columns < problem.growth_columns.start + problem.modes)
+            aim, limited = ~is_named, limited & is_named & ~objectives
         elif problem.smooth:
             limited &= ~self.growing
         return self._ways(paths, aim, limited, progress, restored, stages)
@@ -266,16 +271,16 @@ class Search:
             with tqdm(total=len(paths), desc="design", unit="start", disable=not progress) as bar:
 
                 def task(path, ask):
-                    found = search._continued(path, aim, limited, ask, how)
+                    way = search._continued(path, aim, limited, ask, how)
                     bar.update()
-                    return found
+                    return way
 
                 tasks = [functools.partial(task, path) for path in paths]
-                found = in_lockstep(tasks, search._answer)
+                ways = in_lockstep(tasks, search._answer)
             if search is self:
-                return found
+                return ways
             # A way shows what was evaluated in the whole problem.
-            ends = zip(paths, found, strict=True)
+            ends = zip(paths, ways, strict=True)
             return [(np.concatenate([path, way[-1:]]), merit) for path, (way, merit) in ends]
 
         if self.solver:
@@ -284,13 +289,13 @@ class Search:
             rough = self._roughly
             # From the end of the rough problem it is not far: fewer need go on.
             stages = [(rough, ROUGH, len(paths)), (rough, SETTLED, _KEPT), (self, FINE, _AT_ONCE)]
-        found = [(path, 0.0) for path in paths]
+        ways = [(path, 0.0) for path in paths]
         for search, accuracy, count in stages:
-            best = np.argsort([merit for _, merit in found], kind="stable")[:count].tolist()
-            ended = run(search, [found[i][0] for i in best], accuracy)
+            best = np.argsort([merit for _, merit in ways], kind="stable")[:count].tolist()
+            ended = run(search, [ways[i][0] for i in best], accuracy)
             for i, end in zip(best, ended, strict=True):
-                found[i] = end
-        return [path for path, _ in found]
+                ways[i] = end
+        return [path for path, _ in ways]
 
     @property
     def _roughly(self) -> "Search":
@@ -369,7 +374,7 @@ class Search:
 
         if keep and limits(start)[0].max() > 0:
             start = within_joints(problem, start[None], working)[0]
-        # Of a distance little is lost for a growth rate.
+        # A distance gives up little for a growth rate.
         distance = not extra and problem.objective is None
         curvature, penalty = (2.0 / self.scale, 2.0) if distance else (0.0, 10.0)
         met = float(np.min(np.broadcast_to(functions.slack, limited.shape)[limited], initial=1) / 2)
@@ -386,10 +391,10 @@ class Search:
             methods = [self._limits]
         replies: dict[int, Any] = {}
         for method in methods:
-            asked = [i for i, question in questions.items() if question[0] == method]
-            if asked:
-                us, working = zip(*(questions[i][1:] for i in asked), strict=True)
-                replies |= zip(asked, method(np.array(us), working), strict=True)
+            tasks = [i for i, question in questions.items() if question[0] == method]
+            if tasks:
+                us, working = zip(*(questions[i][1:] for i in tasks), strict=True)
+                replies |= zip(tasks, method(np.array(us), working), strict=True)
         return replies
 
     def _linearise(self, us, working):
@@ -410,6 +415,6 @@ class Search:
 def _at_each(function, us, working) -> list[tuple[np.ndarray, np.ndarray]]:
     """Values and slopes of each of us (n, v) at its own conditions (m, c), in one call."""
     counts = [len(conditions) for conditions in working]
-    found = function(np.repeat(us, counts, axis=0), np.concatenate(working))[:2]
-    pieces = (np.split(x, np.cumsum(counts)[:-1]) for x in found)
+    arrays = function(np.repeat(us, counts, axis=0), np.concatenate(working))[:2]
+    pieces = (np.split(x, np.cumsum(counts)[:-1]) for x in arrays)
     return list(zip(*pieces, strict=True))

@@ -56,8 +56,10 @@ class Sensitivity(Record):
             name: {each: _CHANGE * held[each] * slope for each, slope in slopes.items()}
             for name, slopes in self.slopes.items()
         }
-        own = {name: abs(float(value_of(self.x, name))) or 1.0 for name in changes}
-        weight = {each: max(abs(changes[name][each]) / own[name] for name in own) for each in held}
+        sizes = {name: abs(float(value_of(self.x, name))) or 1.0 for name in changes}
+        weight = {
+            each: max(abs(changes[name][each]) / sizes[name] for name in sizes) for each in held
+        }
         lines = [["", *(f"{name} by 1 % more" for name in changes), "same requirements active"]]
         for each in sorted(weight, key=lambda name: -weight[name])[:_SHOWN]:
             title = f"{each} [{unit(self.x, each)}]".replace(" [-]", "")
@@ -87,10 +89,10 @@ def sensitivity_of(
     rows, columns = _rows_of(evaluator, u)
     row, jacobian = rows(problem, u)
     c, A = row[columns], jacobian[columns]
-    found = _multipliers(jacobian[0], c, A, u)
-    if found is None:
+    optimal = _multipliers(jacobian[0], c, A, u)
+    if optimal is None:
         return None
-    multipliers, low, high = found
+    multipliers, low, high = optimal
     active, free = multipliers > 0, ~((low > 0) | (high > 0))
     if problem.conditions and not isinstance(evaluator, OnAverage):
         places = evaluator.evaluate(u[None]).places[0][columns][active, 1:]
@@ -112,7 +114,7 @@ def sensitivity_of(
     values = {name: float(value_of(designed, name)) for name in problem.names}
     span = np.asarray(problem.high - problem.low, float).tolist()
     changes: dict[str, dict[str, float]] = {name: {} for name in problem.names}
-    ranges, own = {}, own_quantities(x)
+    ranges, quantities = {}, own_quantities(x)
     for name in _held(x, problem):
         by = _difference(lambda x: slopes(state(x), u), x, name, size)
         if by is None:
@@ -128,7 +130,7 @@ def sensitivity_of(
         numbers = np.concatenate([c[~active], -multipliers[active], -u[free], u[free] - 1])
         rates = [by_c[~active] + A[~active] @ du, -dm, -du[free], du[free]]
         begin, end = _range(float(value_of(x, name)), numbers, np.concatenate(rates))
-        ranges[name] = (max(begin, 0.0) if own[name].log else begin), end
+        ranges[name] = (max(begin, 0.0) if quantities[name].log else begin), end
     costs = _named(problem, columns, multipliers, jacobian)
     bounds = [*zip(problem.names, low, high, strict=True)]
     costs |= {f"{name} >= lower bound": float(m) for name, m, _ in bounds if m > 0}
@@ -151,11 +153,11 @@ def _rows_of(evaluator: Evaluator, u: np.ndarray) -> tuple[Rows, np.ndarray]:
 
     def rows(problem, u):
         us = np.repeat(u[None], len(conditions), axis=0)
-        found, jacobians, _ = linearise(problem, us, conditions)
+        values, jacobians, _ = linearise(problem, us, conditions)
         if average:
-            found, jacobians = evaluator.average(found, jacobians)
-        every = np.arange(found.shape[1])
-        return found[which[every], every], jacobians[which[every], every]
+            values, jacobians = evaluator.average(values, jacobians)
+        every = np.arange(values.shape[1])
+        return values[which[every], every], jacobians[which[every], every]
 
     return rows, columns
 
@@ -168,25 +170,29 @@ def _multipliers(slope, c, A, u) -> tuple[np.ndarray, np.ndarray, np.ndarray] | 
     low, high = u <= _ACTIVE, u >= 1 - _ACTIVE
     matrix = np.concatenate([A[near], -np.eye(v)[low], np.eye(v)[high]]).T
     size = float(np.abs(slope).max())
-    found = np.zeros(matrix.shape[1])
+    solution = np.zeros(matrix.shape[1])
     if size > 0:
-        found = nnls(matrix, -slope / size)[0] * size if matrix.size else found
-        if np.linalg.norm(matrix @ found + slope) > _FITS * size:
+        solution = nnls(matrix, -slope / size)[0] * size if matrix.size else solution
+        if np.linalg.norm(matrix @ solution + slope) > _FITS * size:
             return None
     by_c, by_low, by_high = np.zeros(len(c)), np.zeros(v), np.zeros(v)
     first, second = int(near.sum()), int(near.sum() + low.sum())
-    by_c[near], by_low[low], by_high[high] = found[:first], found[first:second], found[second:]
+    by_c[near], by_low[low], by_high[high] = (
+        solution[:first],
+        solution[first:second],
+        solution[second:],
+    )
     return by_c, by_low, by_high
 
 
 def _held(x: Mechanism, problem: DesignProblem) -> list[str]:
     """The quantities that neither the design nor the envelope moves."""
-    own = own_quantities(x)
-    names = [name for name in own if own[name].value is not None]
+    quantities = own_quantities(x)
+    names = [name for name in quantities if quantities[name].value is not None]
     if isinstance(x, Structure):  # a plain name is that of several joints
         names = [name for name in names if "." in name or name in x.parameters]
-    moved = {each for name in (*problem.names, *problem.conditions) for each in moved_by(x, name)}
-    return [name for name in names if name not in moved]
+    varied = {each for name in (*problem.names, *problem.conditions) for each in moved_by(x, name)}
+    return [name for name in names if name not in varied]
 
 
 def _difference(

@@ -30,8 +30,8 @@ def designs_around(
     """
     drawn = np.random.default_rng(seed).random((count, len(centre)))
     share = np.resize(shares, count)[:, None]
-    own = np.asarray(problem.own_condition)[None]
-    return within_joints(problem, centre + share * (drawn - centre), own)
+    condition = np.asarray(problem.own_condition)[None]
+    return within_joints(problem, centre + share * (drawn - centre), condition)
 
 
 def designs_near(problem: DesignProblem, best: np.ndarray, count: int, again: int) -> np.ndarray:
@@ -42,15 +42,17 @@ def designs_near(problem: DesignProblem, best: np.ndarray, count: int, again: in
     """
     if problem.objective is not None or again % 2 == 0:
         return designs_around(problem, best, count, _SHARES_NEAR, again)
-    own = np.asarray(problem.start, float)
-    drawn = np.random.default_rng([again, 1]).uniform(-1, 1, (count, len(own)))
-    size = _SPREAD * float(np.sqrt(3 * np.mean((best - own) ** 2)))  # as far as `best`, and a share
-    way = np.resize(_BACK, count)[:, None] * (best - own)
+    start = np.asarray(problem.start, float)
+    drawn = np.random.default_rng([again, 1]).uniform(-1, 1, (count, len(start)))
+    size = _SPREAD * float(
+        np.sqrt(3 * np.mean((best - start) ** 2))
+    )  # as far as `best`, and a share
+    way = np.resize(_BACK, count)[:, None] * (best - start)
     condition = np.asarray(problem.own_condition)[None]
-    return within_joints(problem, np.clip(own + way + size * drawn, 0, 1), condition)
+    return within_joints(problem, np.clip(start + way + size * drawn, 0, 1), condition)
 
 
-def choose_starts(own: np.ndarray, designs: np.ndarray, rows: np.ndarray, count: int):
+def choose_starts(start: np.ndarray, designs: np.ndarray, rows: np.ndarray, count: int):
     """Starts (count, v) and the scale of the objective.
 
     The given design first, then the most promising of distinct basins, then an even spread.
@@ -71,4 +73,4 @@ def choose_starts(own: np.ndarray, designs: np.ndarray, rows: np.ndarray, count:
     ranked = np.concatenate([ranked[basin[ranked]], ranked[~basin[ranked]]])
     promising, rest = ranked[: count // 2], np.sort(ranked[count // 2 :])
     even = rest[np.linspace(0, len(rest) - 1, count - count // 2).astype(int)][1:]
-    return np.concatenate([own[None], designs[promising], designs[even]])[:count], scale
+    return np.concatenate([start[None], designs[promising], designs[even]])[:count], scale

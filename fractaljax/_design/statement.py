@@ -95,12 +95,12 @@ def stated_fields(
     logarithmic = tuple(_is_scale(x, name) and low > 0 for name, (low, _) in bounds.items())
     xp = jnp if is_traced(x) else np
     low, high = ends = np.array([*bounds.values()]).T
-    own = xp.stack([xp.asarray(value_of(x, name), float) for name in bounds])
+    start = xp.stack([xp.asarray(value_of(x, name), float) for name in bounds])
     if is_traced(x):
-        own = nan_where((own < low) | (own > high), own)
+        start = nan_where((start < low) | (start > high), start)
     scales = np.array(logarithmic)
-    low, high, own = (
-        xp.where(scales, xp.log(xp.where(scales, each, 1)), each) for each in (low, high, own)
+    low, high, start = (
+        xp.where(scales, xp.log(xp.where(scales, each, 1)), each) for each in (low, high, start)
     )
     damping, frequency = least_damping(x)
     own_condition = xp.asarray([value_of(x, name) for name in conditions], float)
@@ -112,7 +112,7 @@ def stated_fields(
         ends=ends,
         low=low,
         high=high,
-        start=(own - low) / (high - low),
+        start=(start - low) / (high - low),
         own_condition=own_condition,
         target=-damping / 2 if target is None else scalar("target", target),
         growth_scale=xp.maximum(damping, 1e-4 * frequency),
@@ -144,14 +144,14 @@ def _followed(x) -> float:
 def _cycles(x, objective, constraints, robust: bool) -> FollowedCycles | None:
     """What follows the cycles of the designs, where something is asked of them."""
     of_cycle = objective if isinstance(objective, CycleConstraint) else None
-    asked = [each for each in constraints if isinstance(each, CycleConstraint)]
-    if of_cycle is None and not asked:
+    limits = [each for each in constraints if isinstance(each, CycleConstraint)]
+    if of_cycle is None and not limits:
         return None
     if robust:
-        raise ValueError(f"{(of_cycle or asked[0]).symbol} takes no envelope and no tolerance")
+        raise ValueError(f"{(of_cycle or limits[0]).symbol} takes no envelope and no tolerance")
     n = degrees_of_freedom(x)
     hybrid_system(x)  # refuses a joint without V
-    for each in asked if of_cycle is None else [of_cycle, *asked]:
+    for each in limits if of_cycle is None else [of_cycle, *limits]:
         if each.dof >= n:
             raise ValueError(f"dof of {each.symbol} must be below {n}, got {each.dof}")
         if each is not of_cycle and each.at_most is None:
@@ -163,21 +163,21 @@ def checked_bounds(x: Mechanism, bounds: Mapping[str, Sequence[float]]) -> dict[
     """Bounds by name, each (lower, upper), in their domain and around the value that `x` has."""
     if not isinstance(bounds, Mapping):
         raise TypeError(f"bounds must be a mapping, got {brief(bounds)}")
-    known = known_quantities(x)
+    names = known_quantities(x)
     for name in bounds:
-        if name not in known:
-            raise ValueError(f"bounds on {brief(name)}: there are {', '.join(known)}")
+        if name not in names:
+            raise ValueError(f"bounds on {brief(name)}: there are {', '.join(names)}")
     if not bounds:
         raise ValueError("bounds must name a quantity, got none")
     checked = {}
-    for name, given in bounds.items():
-        if not isinstance(given, (tuple, list, np.ndarray)) or not np.ndim(given):
-            raise TypeError(f"bounds on {name} must be (lower, upper), got {brief(given)}")
-        ends = tuple(float(scalar(f"{name} bound", end)) for end in given)
+    for name, pair in bounds.items():
+        if not isinstance(pair, (tuple, list, np.ndarray)) or not np.ndim(pair):
+            raise TypeError(f"bounds on {name} must be (lower, upper), got {brief(pair)}")
+        ends = tuple(float(scalar(f"{name} bound", end)) for end in pair)
         for end in ends:
             replaced(x, {name: end})  # refuses an end outside the domain of the model
         if not (len(ends) == 2 and ends[0] < ends[1]):
-            raise ValueError(f"bounds on {name} must be (lower, upper), got {given!r}")
+            raise ValueError(f"bounds on {name} must be (lower, upper), got {pair!r}")
         value = value_of(x, name)
         if not is_traced(value) and not ends[0] <= float(value) <= ends[1]:
             raise ValueError(
@@ -189,5 +189,5 @@ def checked_bounds(x: Mechanism, bounds: Mapping[str, Sequence[float]]) -> dict[
 
 
 def _is_scale(x, name) -> bool:
-    own = own_quantities(x)
-    return name in own and own[name].log
+    quantities = own_quantities(x)
+    return name in quantities and quantities[name].log

@@ -35,8 +35,8 @@ def comparison_table(
     for x in (before, after):
         rows = _rows(x, friction_slope, wavelengths)
         titles = {name: f"{name} [{unit(x, name)}]".replace(" [-]", "") for name in designed}
-        own = {title: f"{value_of(x, name):.6g}" for name, title in titles.items()}
-        columns.append({title: own[title] for title in own if title not in rows} | rows)
+        values = {title: f"{value_of(x, name):.6g}" for name, title in titles.items()}
+        columns.append({title: values[title] for title in values if title not in rows} | rows)
     names = list(active) or [ABSENT]
     for i, name in enumerate(names):
         columns[0]["active constraints" if i == 0 else " " * i] = ABSENT if i == 0 else ""

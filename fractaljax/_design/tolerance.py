@@ -62,8 +62,8 @@ class Tolerance(Record):
 
     def __init__(self, names: Sequence[str], covariance: ArrayLike):
         self.names = tuple(names)
-        given = covariance if hasattr(covariance, "dtype") else np.asarray(covariance)
-        self.covariance = number("covariance", given)
+        array = covariance if hasattr(covariance, "dtype") else np.asarray(covariance)
+        self.covariance = number("covariance", array)
         if self.covariance.shape != (len(self.names),) * 2 or not self.names:
             raise ValueError(
                 f"tolerance must name the rows of its covariance, got {len(self.names)} names and "
@@ -82,19 +82,20 @@ class Tolerance(Record):
             raise ValueError("tolerance must be above 0 for some quantity, got 0 for all")
 
     @classmethod
-    def of(cls, given: Any) -> "Tolerance":
+    def of(cls, scatter: Any) -> "Tolerance":
         """A tolerance, a mapping of names to standard deviations, or an identification."""
-        if isinstance(given, Tolerance):
-            return given
-        if hasattr(given, "D_standard_error") and hasattr(given, "covariance"):
-            return cls(("D", "ln G"), given.covariance)
-        if not isinstance(given, Mapping):
+        if isinstance(scatter, Tolerance):
+            return scatter
+        if hasattr(scatter, "D_standard_error") and hasattr(scatter, "covariance"):
+            return cls(("D", "ln G"), scatter.covariance)
+        if not isinstance(scatter, Mapping):
             raise TypeError(
-                f"tolerance must be a mapping, a Tolerance or an Identification, got {brief(given)}"
+                "tolerance must be a mapping, a Tolerance or an Identification, got "
+                + brief(scatter)
             )
-        if not given:
+        if not scatter:
             raise ValueError("tolerance must name a quantity, got none")
-        sigmas = {n: float(scalar(f"tolerance of {n}", s, at_least=0)) for n, s in given.items()}
+        sigmas = {n: float(scalar(f"tolerance of {n}", s, at_least=0)) for n, s in scatter.items()}
         names = [name for name in sigmas if sigmas[name] > 0] or [*sigmas]
         return cls(names, np.diag([sigmas[name] ** 2 for name in names]))
 
@@ -114,18 +115,18 @@ class Tolerance(Record):
         That of a fractal dimension is truncated instead. `ranges` are those inside which a quantity
         is moved otherwise.
         """
-        known = known_quantities(x)
-        for name, (given, sigma) in zip(
+        names = known_quantities(x)
+        for name, (label, sigma) in zip(
             self.quantities, self.standard_deviations.items(), strict=True
         ):
-            if name not in known:
-                raise ValueError(f"tolerance names {given!r}; there are {', '.join(known)}")
+            if name not in names:
+                raise ValueError(f"tolerance names {label!r}; there are {', '.join(names)}")
             for each in [] if is_traced(x) else _moved_by(x, name):
                 ends = ranges.get(each, ranges.get(name, (float(value_of(x, each)),)))
                 low, high = min(ends), max(ends)
                 if is_fractal_dimension(x, each):
                     pass
-                elif name == given:
+                elif name == label:
                     low, high = low - REACH * sigma, high + REACH * sigma
                 else:
                     most = min(REACH * sigma, _largest(value_of(x, each).dtype))
@@ -134,7 +135,7 @@ class Tolerance(Record):
                     replaced(x, {each: np.array([low, high])})
                 except ValueError as error:
                     raise ValueError(
-                        f"tolerance of {given} leaves its domain within {REACH:g} deviations: "
+                        f"tolerance of {label} leaves its domain within {REACH:g} deviations: "
                         f"{error}"
                     ) from None
         require_independent(x, self.quantities)
@@ -166,16 +167,16 @@ class Tolerance(Record):
 
         `values` holds a plain name, "D", where it is moved for all joints at once.
         """
-        found = {}
+        values_at = {}
         shifts = self._inside(x, values, shift)
-        for name, given, by in zip(self.quantities, self.names, shifts, strict=True):
+        for name, label, by in zip(self.quantities, self.names, shifts, strict=True):
             for each, value in _values(x, name, values).items():
-                if name == given:
-                    found[each] = value + by
+                if name == label:
+                    values_at[each] = value + by
                 else:
                     most = _largest(jnp.result_type(value))
-                    found[each] = value * jnp.exp(jnp.clip(by, -most, most))
-        return found
+                    values_at[each] = value * jnp.exp(jnp.clip(by, -most, most))
+        return values_at
 
     def _inside(self, x: Mechanism, values: Mapping[str, Any], shift: Any) -> list[Any]:
         """The shifts, those of fractal dimensions truncated and what is correlated moved along.
@@ -183,13 +184,13 @@ class Tolerance(Record):
         A second dimension is truncated by itself: it does not move the first.
         """
         shifts, fixed = [*shift], set()
-        for i, (name, given) in enumerate(zip(self.quantities, self.names, strict=True)):
+        for i, (name, label) in enumerate(zip(self.quantities, self.names, strict=True)):
             if not is_fractal_dimension(x, name):
                 continue
             low, high = -math.inf, math.inf  # all joints move by the same amount
             for value in _values(x, name, values).values():
                 below, above = (
-                    end - value if name == given else jnp.log(end / value)
+                    end - value if name == label else jnp.log(end / value)
                     for end in (LOWEST, HIGHEST)
                 )
                 low, high = jnp.maximum(low, below), jnp.minimum(high, above)
@@ -323,8 +324,8 @@ def squeal_probability(
         min(batch, samples),
         rows,
     )
-    found = proportion(int((growth > 0).sum()), samples)
-    return found._replace(undetermined=float(np.isnan(growth).mean()))
+    probability = proportion(int((growth > 0).sum()), samples)
+    return probability._replace(undetermined=float(np.isnan(growth).mean()))
 
 
 def proportion(hits: int, count: int) -> SquealProbability:

@@ -24,9 +24,9 @@ _MEANING = dataclasses.fields(Surface)[0].metadata["meaning"]
 
 
 def is_fractal_dimension(x: Mechanism, name: str) -> bool:
-    """Whether a quantity is the D of a surface, of all joints or of one."""
-    own = own_quantities(x)
-    return name in own and own[name].meaning == _MEANING
+    """True if a quantity is the D of a surface, of all joints or of one."""
+    quantities = own_quantities(x)
+    return name in quantities and quantities[name].meaning == _MEANING
 
 
 def truncated(shift: Any, sigma: Array, low: Any, high: Any) -> Array:
@@ -40,5 +40,5 @@ def truncated(shift: Any, sigma: Array, low: Any, high: Any) -> Array:
     lost = [jnp.maximum(ndtr(end / scale) - ndtr(-REACH), 0) for end in (low, -high)]
     here, there = jnp.where(up, lost[1], lost[0]), jnp.where(up, lost[0], lost[1])
     below = here + ndtr(-jnp.abs(shift) / scale) * (1 - here - there)
-    found = jnp.clip(jnp.where(up, -1, 1) * scale * ndtri(below), low + _INSIDE, high - _INSIDE)
-    return jnp.where((here + there > 0) & (sigma > 0), found, shift)
+    shifted = jnp.clip(jnp.where(up, -1, 1) * scale * ndtri(below), low + _INSIDE, high - _INSIDE)
+    return jnp.where((here + there > 0) & (sigma > 0), shifted, shift)

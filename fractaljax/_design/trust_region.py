@@ -61,7 +61,7 @@ class Local(NamedTuple):
 
     @property
     def largest(self) -> float:
-        """Of `aimed`."""
+        """The largest of `aimed`, 0 without any."""
         return float(self.aimed.max()) if len(self.aimed) else 0.0
 
     @property
@@ -115,9 +115,9 @@ def in_trust_region(
     return u
 
 
-def _nearest(at, wanted, u) -> Local:
+def _nearest(at, centre, u) -> Local:
     """What is asked at u, but for the objective: the squared distance from a design."""
-    return at(u)._replace(value=float((u - wanted) @ (u - wanted)), slope=2 * (u - wanted))
+    return at(u)._replace(value=float((u - centre) @ (u - centre)), slope=2 * (u - centre))
 
 
 def _descended(at, u, learnt, limits, curvature, accuracy, radius, penalty):
@@ -166,14 +166,14 @@ def _step(here: Local, limits: Limits, u, curvature, radius, penalty, exact):
     """
     v, a, r = len(u), len(here.aimed), len(here.unmet)
     bounds = np.stack([np.maximum(-u, -radius), np.minimum(1 - u, radius)], 1)
-    known: dict[bytes, Any] = {}
+    last_limits: dict[bytes, Any] = {}
 
     def limits_at(step):
         key = step.tobytes()
-        if key not in known:
-            known.clear()
-            known[key] = limits(np.clip(u + step, 0, 1))
-        return known[key]
+        if key not in last_limits:
+            last_limits.clear()
+            last_limits[key] = limits(np.clip(u + step, 0, 1))
+        return last_limits[key]
 
     def merit(z):
         step, largest, excess = z[:v], z[v], z[v + 1]
@@ -195,9 +195,9 @@ def _step(here: Local, limits: Limits, u, curvature, radius, penalty, exact):
 
     largest = (-np.inf, np.inf) if a else (0.0, 0.0)
     start = np.concatenate([np.zeros(v), [here.largest, here.excess]])
-    asked = {"type": "ineq", "fun": constraints, "jac": slopes}
+    conditions = {"type": "ineq", "fun": constraints, "jac": slopes}
     all_bounds = [*bounds, largest, (0.0, np.inf)]
-    end = minimized(merit, start, all_bounds, asked, _STEP_ITERATIONS, exact)
+    end = minimized(merit, start, all_bounds, conditions, _STEP_ITERATIONS, exact)
     step = np.clip(end[:v], *bounds.T)
     residuals, of_limits = limits_at(step)
     inside = residuals.max(initial=-np.inf) <= 0
@@ -219,8 +219,8 @@ def _learnt(here, there, expected, step, bounds, held, learnt, curvature, penalt
     matrix = np.hstack([np.concatenate(rows), kinds])
     if not expected.excess:
         matrix = np.vstack([matrix, np.append(np.zeros(v + 1), -1.0)])
-    wanted = np.concatenate([expected.slope, [float(aims.any()), penalty]])
-    by = nnls(matrix.T, -wanted)[0]
+    forces = np.concatenate([expected.slope, [float(aims.any()), penalty]])
+    by = nnls(matrix.T, -forces)[0]
     change = there.slope - here.slope
     change = change + by[: aims.sum()] @ (there.aimed_slopes - here.aimed_slopes)[aims]
     by = by[aims.sum() :][: unmet.sum()]

@@ -70,7 +70,7 @@ class Verdict(Record):
 
     @property
     def quiet(self) -> bool:
-        """Whether it is quiet in all that was asked."""
+        """True if it is quiet in all that was asked."""
         return all(question.quiet for question in self.questions)
 
     def __repr__(self) -> str:
@@ -124,23 +124,25 @@ def verdict(
     require_one("x", x)
     flag("friction_slope", friction_slope)
     parts = joints_of(x)
-    own = " and ".join(dict.fromkeys(type(part.contact).__name__ for part in parts.values()))
+    laws_in_use = " and ".join(
+        dict.fromkeys(type(part.contact).__name__ for part in parts.values())
+    )
     for i, law in enumerate(laws):
         require_kind(f"laws[{i}]", law, Contact)
-    asked = [("", f"as it is ({own})", x), *_other_load(x, friction_slope)]
+    cases = [("", f"as it is ({laws_in_use})", x), *_other_load(x, friction_slope)]
     by = [(type(law).__name__, under(x, law)) for law in laws]
     if area is not None:
         by += [(kind.__name__, with_contacts(x, laws)) for kind, laws in _laws_of(x, area)]
-    asked += [(own, f"by {name}", other) for name, other in by]
-    found = _growth_rates(tuple(other for *_, other in asked), friction_slope)
-    rates = found.rates.tolist()
+    cases += [(laws_in_use, f"by {name}", other) for name, other in by]
+    growth = _growth_rates(tuple(other for *_, other in cases), friction_slope)
+    rates = growth.rates.tolist()
     questions = [
         Question(assumed, name, growth_text(rate), rate < 0, not np.isfinite(rate))
-        for (assumed, name, _), rate in zip(asked, rates[: len(asked)], strict=True)
+        for (assumed, name, _), rate in zip(cases, rates[: len(cases)], strict=True)
     ]
-    if (stiff := np.asarray(found.stiff)).any():
-        ratios, own_ratios = (np.asarray(r)[..., stiff] for r in (found.ratios, found.own_ratios))
-        questions.append(_of_ratios(ratios, np.array(rates[len(asked) :]), own_ratios))
+    if (stiff := np.asarray(growth.stiff)).any():
+        ratios, own_ratios = (np.asarray(r)[..., stiff] for r in (growth.ratios, growth.own_ratios))
+        questions.append(_of_ratios(ratios, np.array(rates[len(cases) :]), own_ratios))
     if tolerance is not None:
         questions.append(_scattered(x, tolerance, envelope, friction_slope, seed))
     if quiet_within is not None:
@@ -149,12 +151,12 @@ def verdict(
         words = f"comes to rest from {survived:.3g} of {size:.3g}"
         name = f"kicks within {quiet_within}"
         questions.append(Question("smaller kicks", name, words, survived >= size))
-    # Of a reduced structure not all eigenvalues are known.
-    incurable = bool(found.trace > 0) and getattr(x, "band", None) is None
+    # A reduced structure does not have all eigenvalues.
+    incurable = bool(growth.trace > 0) and getattr(x, "band", None) is None
     others = "area" if any(part.contact.has_surface for part in parts.values()) else "laws"
-    wanted = {f"other contact laws ({others})": by, "scatter (tolerance)": tolerance is not None}
-    wanted["kicks (quiet_within)"] = quiet_within is not None
-    not_asked = tuple(name for name, was in wanted.items() if not was)
+    options = {f"other contact laws ({others})": by, "scatter (tolerance)": tolerance is not None}
+    options["kicks (quiet_within)"] = quiet_within is not None
+    not_asked = tuple(name for name, was in options.items() if not was)
     return Verdict(tuple(questions), incurable, not_asked)
 
 
@@ -201,9 +203,9 @@ def _laws_of(x: Mechanism, area: Any) -> list[tuple[type[Contact], dict[str, Con
     for name, part in parts.items():
         A = scalar(f"area {name}".strip(), area[name], above=0)
         contact, L = part.contact, jnp.sqrt(A)
-        given = contact.surface, contact.material, contact.P
-        asperity[name] = AsperityContact(*given, L / _WAVES)
-        persson[name] = PerssonContact(*given, A, L, L / _WAVES)
+        arguments = contact.surface, contact.material, contact.P
+        asperity[name] = AsperityContact(*arguments, L / _WAVES)
+        persson[name] = PerssonContact(*arguments, A, L, L / _WAVES)
     return [(AsperityContact, asperity), (PerssonContact, persson)]
 
 
@@ -218,12 +220,12 @@ class _Found(NamedTuple):
 
 
 @functools.partial(exported_jit, static_argnames="friction_slope")
-def _growth_rates(asked: tuple[Mechanism, ...], friction_slope: bool) -> _Found:
+def _growth_rates(mechanisms: tuple[Mechanism, ...], friction_slope: bool) -> _Found:
     """Growth rates of m mechanisms, and of the first over K_t/K_n, in one program.
 
     The ratios of each joint lie between its own, the fractal law's and Mindlin's.
     """
-    first, zero = asked[0], FixedContact(0.0, 0.0, 1.0)
+    first, zero = mechanisms[0], FixedContact(0.0, 0.0, 1.0)
     stiffness, ends = {}, []
     for name, part in joints_of(first).items():
         contact, friction = part.contact, part.friction
@@ -237,45 +239,47 @@ def _growth_rates(asked: tuple[Mechanism, ...], friction_slope: bool) -> _Found:
         mindlin = jnp.asarray(mindlin_ratio(contact.material.nu), pairs[0][0].dtype)
         ends.append(jnp.stack([*(K_t / K_n for K_n, K_t in pairs), mindlin]))
     count = _RATIOS if isinstance(first, Scene) else _RATIOS_OF_STRUCTURES
-    low, high, own = (
+    low, high, own_ratio = (
         jnp.stack([of(end) for end in ends]) if ends else jnp.zeros(0)
         for of in (jnp.min, jnp.max, lambda end: end[0])
     )
-    shares = jnp.linspace(0.0, 1.0, count if ends else 0, dtype=own.dtype)
+    shares = jnp.linspace(0.0, 1.0, count if ends else 0, dtype=own_ratio.dtype)
     ratios = low[None] + shares[:, None] * (high - low)[None]
 
     def at(row):
-        known = {}
+        contacts = {}
         for (name, (K_n, K_t)), ratio in zip(stiffness.items(), row, strict=True):
             K_t = jnp.where(K_n > 0, ratio * K_n, K_t)
             P = getattr(joints_of(first)[name].contact, "P", zero.P)
-            known[name] = substitute(zero, {"K_n": K_n, "K_t": K_t, "P": P})
-        return with_contacts(first, known)
+            contacts[name] = substitute(zero, {"K_n": K_n, "K_t": K_t, "P": P})
+        return with_contacts(first, contacts)
 
     if isinstance(first, Scene):
         # One closed form for all: each use of it takes long to compile.
-        systems = [linearised(x, friction_slope) for x in asked if isinstance(x, Scene)]
+        systems = [linearised(x, friction_slope) for x in mechanisms if isinstance(x, Scene)]
         own_systems = jax.tree.map(lambda *x: jnp.stack(x), *systems)
-        moved = jax.vmap(lambda row: linearised(at(row), friction_slope))(ratios)
-        every = jax.tree.map(lambda *x: jnp.concatenate(x), own_systems, moved)
+        at_ratios = jax.vmap(lambda row: linearised(at(row), friction_slope))(ratios)
+        every = jax.tree.map(lambda *x: jnp.concatenate(x), own_systems, at_ratios)
         rates = jax.vmap(rightmost_root)(every).real
         trace = -(systems[0].c_1 + systems[0].c_2)
     else:
-        moved = jax.lax.map(lambda row: growth_rate(at(row), friction_slope), ratios)
-        rates = jnp.stack([growth_rate(x, friction_slope) for x in asked])
-        rates = jnp.concatenate([rates, moved])
+        at_ratios = jax.lax.map(lambda row: growth_rate(at(row), friction_slope), ratios)
+        rates = jnp.stack([growth_rate(x, friction_slope) for x in mechanisms])
+        rates = jnp.concatenate([rates, at_ratios])
         trace = stability(first, friction_slope).eigenvalues.real.sum()
     stiff = [K_n > 0 for K_n, _ in stiffness.values()]
-    return _Found(rates, ratios, own, jnp.stack(stiff) if stiff else jnp.zeros(0, bool), trace)
+    return _Found(
+        rates, ratios, own_ratio, jnp.stack(stiff) if stiff else jnp.zeros(0, bool), trace
+    )
 
 
-def _of_ratios(ratios: np.ndarray, rates: np.ndarray, own: np.ndarray) -> Question:
+def _of_ratios(ratios: np.ndarray, rates: np.ndarray, own_ratio: np.ndarray) -> Question:
     """The worst growth rate between the own K_t/K_n, the fractal law's and Mindlin's."""
     worst = int(np.argmax(rates))
     name = f"K_t/K_n from {ratios[0].min():.3g} to {ratios[-1].max():.3g}"
-    found = f"{growth_text(rates[worst])} at {_extent(ratios[worst])}"
+    words = f"{growth_text(rates[worst])} at {_extent(ratios[worst])}"
     quiet, undetermined = bool(rates[worst] < 0), bool(np.isnan(rates[worst]))
-    return Question(f"K_t/K_n = {_extent(own)}", name, found, quiet, undetermined)
+    return Question(f"K_t/K_n = {_extent(own_ratio)}", name, words, quiet, undetermined)
 
 
 def _extent(values) -> str:
@@ -286,15 +290,17 @@ def _extent(values) -> str:
 
 def _scattered(x, tolerance, envelope, friction_slope, seed) -> Question:
     tolerance = Tolerance.of(tolerance)
-    found = squeal_probability(x, tolerance, envelope, friction_slope=friction_slope, seed=seed)
+    probability = squeal_probability(
+        x, tolerance, envelope, friction_slope=friction_slope, seed=seed
+    )
     names = " and ".join(tolerance.names)
     over = "" if envelope is None else f" over {Envelope.of(envelope)}"
-    words = f"squeals with probability {found.value:.3g} +- {found.standard_error:.1g}"
-    if found.undetermined:
-        words += f", has no sliding equilibrium with {found.undetermined:.3g}"
+    words = f"squeals with probability {probability.value:.3g} +- {probability.standard_error:.1g}"
+    if probability.undetermined:
+        words += f", has no sliding equilibrium with {probability.undetermined:.3g}"
     exact = f"{names} without scatter"
-    quiet = found.value + found.undetermined < _ACCEPTED
-    undetermined = not quiet and found.value < _ACCEPTED
+    quiet = probability.value + probability.undetermined < _ACCEPTED
+    undetermined = not quiet and probability.value < _ACCEPTED
     return Question(exact, f"{names} scatter{over}", words, quiet, undetermined)
 
 
@@ -308,10 +314,10 @@ class Suggestion(Record):
     def __repr__(self) -> str:
         rows = {}
         for name, value in self.values.items():
-            own, of = float(value_of(self.scene, name)), unit(self.scene, name)
+            value_now, of = float(value_of(self.scene, name)), unit(self.scene, name)
             low, high = self.bounds[name]
             to = f"nothing from {low:.4g} to {high:.4g}" if value is None else f"{value:.6g}"
-            rows[f"{name} [{of}]".replace(" [-]", "")] = f"{own:.6g} -> {to}"
+            rows[f"{name} [{of}]".replace(" [-]", "")] = f"{value_now:.6g} -> {to}"
         return "Quiet by one change:\n" + table([""], [rows])
 
 
@@ -349,21 +355,21 @@ def suggest(
             starts=4,
             progress=False,
         )
-        found = best.result != DesignResult.infeasible
-        values[name] = float(value_of(best.scene, name)) if found else None
+        is_quiet = best.result != DesignResult.infeasible
+        values[name] = float(value_of(best.scene, name)) if is_quiet else None
     return Suggestion(
         scene, values, {name: (float(a), float(b)) for name, (a, b) in bounds.items()}
     )
 
 
 def _suggested(scene: Scene) -> dict[str, tuple[float, float]]:
-    own = {name: float(value_of(scene, name)) for name in ("xi_1", "xi_2", "mu", "V")}
-    bounds = {name: (own[name], max(_DAMPING, 2 * own[name])) for name in ("xi_1", "xi_2")}
-    bounds["mu"] = own["mu"] / _RANGE, own["mu"]
-    known = known_quantities(scene)
-    if {"mu_s", "mu_m"} <= set(known) and scene.friction.mu_m < scene.friction.mu_s:
+    values = {name: float(value_of(scene, name)) for name in ("xi_1", "xi_2", "mu", "V")}
+    bounds = {name: (values[name], max(_DAMPING, 2 * values[name])) for name in ("xi_1", "xi_2")}
+    bounds["mu"] = values["mu"] / _RANGE, values["mu"]
+    names = known_quantities(scene)
+    if {"mu_s", "mu_m"} <= set(names) and scene.friction.mu_m < scene.friction.mu_s:
         bounds["mu_m"] = float(scene.friction.mu_m), float(scene.friction.mu_s)
     for name in ("P", "V"):
-        if name in known and (value := float(value_of(scene, name))) > 0:
+        if name in names and (value := float(value_of(scene, name))) > 0:
             bounds[name] = value / _RANGE, value * _RANGE
     return bounds
