@@ -514,7 +514,7 @@ def _conclude(
 
 def repeat_design(
     path: str | os.PathLike,
-    functions: Mapping[str, Callable[[Any], Any]] | None = None,
+    functions: Mapping[str, Any] | None = None,
     *,
     progress: bool = True,
 ) -> Design:

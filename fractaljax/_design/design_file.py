@@ -86,7 +86,7 @@ def design_files(best: Any, path: Path) -> dict[Path, bytes]:
 
 
 def read_design(
-    path: str | os.PathLike, functions: Mapping[str, Callable[[Any], Any]] | None = None
+    path: str | os.PathLike, functions: Mapping[str, Any] | None = None
 ) -> tuple[Mechanism, dict[str, Any]]:
     """What was given and the arguments of `design`; errors and warning as `repeat_design`."""
     if not isinstance(functions, Mapping) and functions is not None:
