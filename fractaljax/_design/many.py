@@ -185,7 +185,7 @@ def design_many(
         every = jax.jit(jax.vmap(lambda leaves: designed(_at(first, leaves))))
         optima, targets = every(stacked)
     else:
-        grid = {_MEMBER: np.arange(count)}
+        grid = {_MEMBER: np.arange(count, dtype=np.int32)}
 
         def place(leaves, values):
             return _at(first, [leaf[values[_MEMBER]] for leaf in leaves])

@@ -487,7 +487,8 @@ class HybridSystem(eqx.Module):
     def _steepest(self, w) -> Array:
         """The steepest slope of each face's friction at speeds up to w (f, ...)."""
         assert self.scales is not None
-        speeds = self.speed * w
+        # In lanes each has its own unit of speed.
+        speeds = (self.speed[None] if self.speed.ndim else self.speed) * w
         # They are 0 and then evenly spaced in their logarithm.
         decades = jnp.log10(jnp.maximum(speeds, SPEEDS[1]) / SPEEDS[1])
         place = 1 + jnp.ceil(decades / np.log10(SPEEDS[2] / SPEEDS[1])).astype(int)
