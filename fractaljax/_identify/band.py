@@ -10,21 +10,21 @@ from .fit import FLAT_DEVIATION, PowerLaw, fit
 from .spectrum import Spectrum, log_mean_cosine_power
 
 LOWEST = 5  # periods in the length: below, tilt has been taken out and the window is too wide
-# Of the Nyquist frequency: above, finer waves are aliased, or missing where a profile should cross
-# them at an angle.
+# Share of the Nyquist frequency: above, finer waves are aliased, or missing where a profile should
+# cross them at an angle.
 HIGHEST = {"profile": 0.5, "map": 0.6}
 PER_RESOLUTION = 4  # periods of the resolution: a Gaussian filter leaves 96 percent of the height
 _BEND = 9.0  # fall of the deviance that makes a bend or a noise floor credible
 _ALIASED = 2.0  # likewise for aliasing, which takes no further parameter
 _FEWEST = 12  # frequencies in a given band, ordinates within 2 percent being one
-_POOR = 0.25  # scatter of a law too far off to tell where a bend would be
+_POOR = 0.25  # scatter of a law too poor to locate a bend
 _CORNERS = 12  # frequencies tried for a bend
 _LEAST_END = 0.8  # of the Nyquist frequency: waves that end further down are a roll-off
-_MANY = 5  # bins, of which a part of one more can be spared
+_MANY = 5  # bins: with as many, a part of one more is left out
 _FINE = 1.1  # ratio of a bin at the very top
-_NOTHING = 0.3  # of the law in it: the surface's waves end below the Nyquist frequency
+_NOTHING = 0.3  # of the law: with less in it, the surface's waves end below Nyquist
 _ROUGH = 1e-4  # tolerance of laws that are compared
-_UNKNOWN = 1e6  # standard deviation of a flat share of which nothing is known
+_UNKNOWN = 1e6  # standard deviation of an unknown flat share
 
 
 class NoiseModel(NamedTuple):
@@ -53,7 +53,7 @@ class Band(NamedTuple):
 
 
 def given_band(band: Any, spectrum: Spectrum, length: float, ratio: float, top: float) -> Band:
-    """A band [1/m] as asked for. **Raises:** `ValueError` if it is empty or outside the data."""
+    """The user's band [1/m]. **Raises:** `ValueError` if it is empty or outside the data."""
     try:
         low, high = (float(end) for end in band)
     except (TypeError, ValueError):
@@ -74,7 +74,7 @@ def given_band(band: Any, spectrum: Spectrum, length: float, ratio: float, top: 
 
 
 def chosen_band(spectrum: Spectrum, length: float, ratio: float, top: float) -> Band:
-    """The widest band that shows nothing but a power law.
+    """The widest band over which the spectrum is a power law.
 
     `top` [1/m] is the instrument's limit. A noise floor ends the band where the law falls to twice
     the floor. A plateau begins it at three times its corner, a roll-off ends it at a quarter.
@@ -103,7 +103,7 @@ def chosen_band(spectrum: Spectrum, length: float, ratio: float, top: float) -> 
 
 
 def noise_model(spectrum: Spectrum, band: tuple[float, float], ratio: float) -> NoiseModel:
-    """Noise, aliasing, or neither: from a band up to the Nyquist frequency or the given limit."""
+    """Noise, aliasing, or neither, by a band up to the Nyquist or the instrument's frequency."""
     profile = spectrum.kind == "profile"
 
     law_of = functools.partial(fit, spectrum, band, tol=_ROUGH)
@@ -121,11 +121,11 @@ def noise_model(spectrum: Spectrum, band: tuple[float, float], ratio: float) -> 
         floor = noisy.flat * math.exp(noisy.log_A)
         return NoiseModel(floor=floor, crossing=crossing, flat_deviation=_UNKNOWN)
     fine = law_of(_FINE, flat_deviation=0.1)
-    seen = np.flatnonzero(fine.ratio >= _NOTHING)
-    if profile and band[1] == spectrum.nyquist and seen.size and seen[-1] < fine.f.size - 1:
+    occupied = np.flatnonzero(fine.ratio >= _NOTHING)
+    if profile and band[1] == spectrum.nyquist and occupied.size and occupied[-1] < fine.f.size - 1:
         # Finer waves are missing wherever the profile crosses them. The last discrete wave stands
         # for all up to half a step of gamma above it.
-        end = max(float(fine.f[seen[-1]]) * math.sqrt(ratio) / spectrum.nyquist, _LEAST_END)
+        end = max(float(fine.f[occupied[-1]]) * math.sqrt(ratio) / spectrum.nyquist, _LEAST_END)
         return NoiseModel(flat_mean=-missing_share(plain.p) * end**-plain.p)
     return NoiseModel(
         aliased=gain > _ALIASED or (gain > 0 and plain.p < 1 < aliased.p),
@@ -134,9 +134,9 @@ def noise_model(spectrum: Spectrum, band: tuple[float, float], ratio: float) -> 
 
 
 def missing_share(p: float) -> float:
-    """What a profile lacks if no wave is finer than Nyquist's: flat, relative to the law there.
+    """Power that a profile lacks without waves beyond Nyquist: flat, relative to the law there.
 
-    A wave of frequency k is seen at f = k |cos a|, so waves beyond k contribute at f the part
+    A wave of frequency k appears at f = k |cos a|, so waves beyond k contribute at f the part
     s < f/k of the mean of s^(p-1) over a: to first order 2/(pi p m(p)) (f/k)^p of it.
     """
     p = min(max(p, 1.0), 3.0)
@@ -144,12 +144,12 @@ def missing_share(p: float) -> float:
 
 
 def _plateau(f, corner):
-    """A factor of `fit`, of a law that is level below its corner: (1 + (corner/f)^2)^(-p/2)."""
+    """Factor of `fit` for a law that is level below its corner: (1 + (corner/f)^2)^(-p/2)."""
     return 0.0, -np.log1p((corner / f) ** 2) / 2
 
 
 def _roll_off(f, corner):
-    """A factor of `fit`, of a Gaussian filter, which halves amplitudes at its cut-off."""
+    """Factor of `fit` for a Gaussian filter, which halves amplitudes at its cut-off."""
     return np.maximum(-((f / corner) ** 2) * math.log(4), math.log(1e-6)), 0.0
 
 
@@ -158,7 +158,7 @@ def _bend(spectrum, band, ratio, noise):
     low, high = band
     law_of = functools.partial(noise.fit, spectrum, band, ratio, tol=_ROUGH)
     straight = law_of()
-    best, found = _BEND, (None, 0.0)
+    best, bend = _BEND, (None, 0.0)
     for kind, corners in (
         (_roll_off, np.geomspace(4 * low, 1.5 * high, _CORNERS)),
         (_plateau, np.geomspace(1.2 * low, high / 4, _CORNERS)),
@@ -171,8 +171,8 @@ def _bend(spectrum, band, ratio, noise):
         plain = law_of(scatter=law.scatter, start=straight)
         gain = plain.deviance - law.deviance
         if gain > best:
-            best, found = gain, (kind, float(corner))
-    return found
+            best, bend = gain, (kind, float(corner))
+    return bend
 
 
 def _gain(law: PowerLaw, constant, by_p):

@@ -18,23 +18,23 @@ _TITLES = {  # in lower case and without units
 _UNCLEAR = ("mask", "flag", "flags", "status", "code")  # 1 may stand for good or for bad
 
 
-def choose(table: Table, asked: Mapping[str, str | int] | None) -> Table:
+def choose(table: Table, selection: Mapping[str, str | int] | None) -> Table:
     """The columns of positions, if any, and heights, in this order; NaN where flags say so.
 
-    `asked` names columns, or numbers them from 0, by role: x, y, z, and the flags valid or invalid.
-    Roles that are not asked for go by title, or else by the number of columns.
+    `selection` has names of columns, or numbers from 0, by role: x, y, z, and the flags valid or
+    invalid. Other roles go by title, or else by the number of columns.
 
     **Raises:** `ValueError` naming the columns, and what to type, where titles are not clear.
     """
-    places = _asked(table, asked or {})
+    places = _places(table, selection or {})
     roles = {place: role for role, place in places.items()}
     titles = [_plain(title) for title in table.titles or [""] * table.numbers.shape[1]]
     flagged = "valid" in places or "invalid" in places
     for place, title in enumerate(titles):
-        role = next((role for role, known in _TITLES.items() if title in known), None)
+        role = next((role for role, synonyms in _TITLES.items() if title in synonyms), None)
         if role is None or place in roles or (flagged and role in ("valid", "invalid")):
             continue
-        # Beside chosen columns only what can be flags counts: else nothing could leave it out.
+        # Beside selected columns only proper flags count: no option could exclude others.
         flags = role in ("valid", "invalid")
         if "z" not in places or (flags and _other(table, place) is None):
             roles[place] = role
@@ -59,31 +59,31 @@ def choose(table: Table, asked: Mapping[str, str | int] | None) -> Table:
 
 
 def unclear(table: Table, error: ValueError) -> ValueError:
-    """The error, and how to say which columns are which, where there is more than one."""
+    """The error, with a hint how to select columns if there is more than one."""
     return _choice(table, str(error)) if table.numbers.shape[1] > 1 else error
 
 
 def _order(table: Table, roles: dict[int, str], places: dict[str, int], rest: list[int]):
-    """The columns to read: those with a role if they are clear, or else the rest as it comes."""
+    """The columns to read: those with a role if they are clear, or else the rest in order."""
     if "z" in places:
         return [places[role] for role in ("x", "y", "z") if role in places]
-    found = {role: [p for p in rest if roles.get(p) == role] for role in ("x", "y", "z")}
-    x, y, z = (len(found[role]) for role in ("x", "y", "z"))
+    by_role = {role: [p for p in rest if roles.get(p) == role] for role in ("x", "y", "z")}
+    x, y, z = (len(by_role[role]) for role in ("x", "y", "z"))
     if x == 1 and y <= 1 and z == 1:
-        return found["x"] + found["y"] + found["z"]
+        return by_role["x"] + by_role["y"] + by_role["z"]
     several = z > 1 and x > 0  # heights of one profile
     if (several and len(rest) > 2) or (len(rest) > 3 and x + y + z > 1 and z < len(rest)):
         raise _choice(table, "which column is the height is not clear")
     return rest
 
 
-def _asked(table: Table, asked: Mapping[str, str | int]) -> dict[str, int]:
-    """The number of each column that is asked for."""
+def _places(table: Table, selection: Mapping[str, str | int]) -> dict[str, int]:
+    """The number of each selected column, by role."""
     count = table.numbers.shape[1]
     names = {str(place): place for place in range(count)}
     names |= {title: place for place, title in reversed([*enumerate(table.titles or [])])}
     places = {}
-    for role, name in asked.items():
+    for role, name in selection.items():
         if role not in ROLES:
             raise _choice(table, f"the role of a column must be one of {', '.join(ROLES)}")
         if str(name) not in names:
@@ -99,7 +99,7 @@ def _asked(table: Table, asked: Mapping[str, str | int]) -> dict[str, int]:
 
 
 def _valid(table: Table, place: int, role: str) -> np.ndarray:
-    """Where a column of flags says that heights are valid; a gap does not."""
+    """True where a column of flags marks heights as valid; a gap does not."""
     other = _other(table, place)
     if other is not None:
         name = table.titles[place] if table.titles else place
@@ -109,7 +109,7 @@ def _valid(table: Table, place: int, role: str) -> np.ndarray:
 
 
 def _other(table: Table, place: int) -> float | None:
-    """The first number of a column that is no flag."""
+    """The first number of a column that is not a flag, or None."""
     flags = table.numbers[:, place]
     other = flags[~np.isnan(flags) & (flags != 0) & (flags != 1)]
     return float(other[0]) if other.size else None

@@ -15,7 +15,7 @@ from .text import Table, read_table, text_encoding
 from .units import agreed, known_unit, scale
 
 _TEXTS, _ARRAYS = {".csv", ".tsv", ".txt", ".dat", ".xyz", ".asc"}, {".npy", ".npz"}
-_MOST_TEXT, _MOST_ARRAYS, _MOST = 2**28, 2**30, 2**31  # bytes; the last of instrument formats
+_MOST_TEXT, _MOST_ARRAYS, _MOST = 2**28, 2**30, 2**31  # bytes; the last for instrument formats
 _GWYDDION = b"# Value units:"  # in the header of its text export, which has sizes and units
 
 
@@ -37,13 +37,13 @@ def read_measurement(
     Everything else is read by the SurfaceTopography package. At most 256 MiB of text are read,
     1 GiB of arrays, and 2 GiB in an instrument's format.
 
-    `dx`, `dy` [m] are steps, `unit` that of the heights and `position_unit` that of positions
-    (default `unit`), for files that do not say. They must not contradict the file. A unit may be a
+    `dx`, `dy` [m] are steps, `unit` that of heights and `position_unit` that of positions (default
+    `unit`), for files that do not state them. They must not contradict the file. A unit may be a
     number of metres, 2.9e-8. `channel` is the name or number of one of several. Missing heights
     are NaN.
 
     In text, titles such as X, Z, valid or quality choose the columns, also where there are others;
-    heights whose flag is 0 are missing. `columns` chooses by title, or by number from 0, where
+    heights whose flag is 0 are missing. `columns` selects by title, or by number from 0, where
     titles do not: {"x": "X", "z": "Y", "valid": "flag"}, of x, y, z, valid and invalid (whose 1
     stands for a missing height). A factor for heights and the size of a pixel in the header count:
     `height conversion factor (-> m)=2.9e-8`, `pixel size=0.35 um`; `unit` is then that of heights
@@ -92,31 +92,33 @@ def _from_table(path, whole: Table, table: Table, dx, dy, unit, position_unit) -
     try:
         metre = height_scale(settings, units[-1], unit)
     except ValueError as error:
-        known = units[-1] is None or known_unit(units[-1]) is not None
-        raise (error if known else unclear(whole, error)) from None
+        is_length = units[-1] is None or known_unit(units[-1]) is not None
+        raise (error if is_length else unclear(whole, error)) from None
     if "factor" in settings:
         source += f", heights times {metre:g} m by its header"
     z = numbers * metre
     if columns not in (2, 3):
         dx = agreed("dx", step(settings, "dx", dx, position_unit), dx)
         if columns > 1:
-            given = dx if dy is None else dy
-            dy = agreed("dy", step(settings, "dy", given, position_unit), dy)
+            user_step = dx if dy is None else dy
+            dy = agreed("dy", step(settings, "dy", user_step, position_unit), dy)
         return measurement(z[:, 0] if columns == 1 else z.T, dx, dy, source)
     if np.isnan(numbers[:, :-1]).any():
         raise ValueError("positions must not have gaps")
-    given = position_unit or (None if any(units[:-1]) else unit)
-    metres = [scale(own, given, "positions", "--position-unit") for own in units[:-1]]
+    user_unit = position_unit or (None if any(units[:-1]) else unit)
+    metres = [
+        scale(file_unit, user_unit, "positions", "--position-unit") for file_unit in units[:-1]
+    ]
     place = (numbers[:, :-1] * metres).T
     if columns == 2:
-        z, own_dx = profile_on_grid(place[0], z[:, 1])
+        z, grid_dx = profile_on_grid(place[0], z[:, 1])
     else:
         try:
-            z, own_dx, own_dy = map_on_grid(place[0], place[1], z[:, 2])
+            z, grid_dx, grid_dy = map_on_grid(place[0], place[1], z[:, 2])
         except ValueError as error:
             raise unclear(whole, error) from None
-        dy = agreed("dy", own_dy, dy)
-    return measurement(z, agreed("dx", own_dx, dx), dy, source)
+        dy = agreed("dy", grid_dy, dy)
+    return measurement(z, agreed("dx", grid_dx, dx), dy, source)
 
 
 def _read_arrays(path, content, dx, dy, unit) -> Measurement:
@@ -124,13 +126,13 @@ def _read_arrays(path, content, dx, dy, unit) -> Measurement:
         arrays = read_npz(content, _MOST_ARRAYS)
         if not {"z", "dx"} <= set(arrays):
             raise ValueError(f"it must hold z and dx in metres, got {', '.join(arrays)}")
-        z, own = arrays["z"], "m"
+        z, stored_unit = arrays["z"], "m"
         dx, dy = agreed("dx", _step(arrays, "dx"), dx), agreed("dy", _step(arrays, "dy"), dy)
     else:
-        z, own = read_npy(content, "z"), None
+        z, stored_unit = read_npy(content, "z"), None
     shape = " x ".join(map(str, z.shape))
     with np.errstate(invalid="ignore", over="ignore"):  # of NaN and large numbers in float16
-        z = z.astype(float) * scale(own, unit, "heights", "--unit")
+        z = z.astype(float) * scale(stored_unit, unit, "heights", "--unit")
     return measurement(z, dx, dy, f"{path.name}: array of {shape}")
 
 

@@ -17,11 +17,11 @@ from .spectrum import Spectrum
 FLAT_DEVIATION = (
     0.35  # standard deviation of the unknown flat share, relative to the law at Nyquist
 )
-_SPREAD = 0.15  # the flat share's own variance, relative to that of its prior
+_SPREAD = 0.15  # variance of the flat share, relative to that of its prior
 _SCATTER_ROUNDS = 4
 _STEPS = 20
 _TERMS = 40  # of aliased waves: the last is beyond rounding up to Nyquist, p up to 8
-_STEP = 1e-6  # of differences by p
+_STEP = 1e-6  # in p, of a difference quotient
 
 
 class PowerLaw(Record):
@@ -60,7 +60,7 @@ class PowerLaw(Record):
 
     @property
     def D_standard_error(self) -> float:
-        """Half of that of p."""
+        """Standard error of D: half of that of p."""
         return float(np.sqrt(self.covariance[1, 1])) / 2
 
 
@@ -75,7 +75,7 @@ def shape(u: np.ndarray, p: float, aliased: bool) -> np.ndarray:
 
 
 def shape_by_p(u: np.ndarray, aliased: bool) -> Callable[[float], tuple[np.ndarray, np.ndarray]]:
-    """What gives `shape` and its derivative by p: the rest is computed once."""
+    """Function of p that returns `shape` and its derivative by p; the rest is computed once."""
     log_u = np.log(u)
     even_powers = (u / 2) ** np.arange(0, 2 * _TERMS, 2)[:, None] if aliased else None
 
@@ -153,9 +153,10 @@ def fit(
     Waves beyond the Nyquist frequency follow the same law (`aliased`), or are unknown: a flat share
     of either sign, with a normal prior of `flat_mean` and `flat_deviation` in units of the law at
     Nyquist. (Aliased power is flat in the band, and so is the lack of waves that a profile should
-    cross at an angle.) A given `scatter` is not estimated: deviances of laws that share it compare.
-    A `factor(f)` gives a and b of exp(a + b p), which multiplies the law. Steps begin at the law
-    `start` and end with one of ln A, p and the flat share below `tol`.
+    cross at an angle.) A given `scatter` is not estimated, so that the deviances of laws that share
+    it are comparable. A `factor(f)` returns a and b of exp(a + b p), which multiplies the law.
+    Iterations begin at the law `start` and end when ln A, p and the flat share change by less than
+    `tol`.
     """
     bins = Bins(spectrum, band, ratio)
     u, widths = bins.f / spectrum.nyquist, bins.spread / bins.f**2
@@ -164,7 +165,7 @@ def fit(
     constant, by_p = (0.0, 0.0) if factor is None else factor(bins.f)
 
     def law(p):
-        """Relative to A, and its derivative by p."""
+        """The law relative to A, and its derivative by p."""
         value, slope = only_shape(p)
         # A window smears by half its mean square width times the relative second derivative.
         curve, bend = (p * (p + 1), 2 * p + 1) if profile else ((p + 1) ** 2, 2 * p + 2)
@@ -242,7 +243,7 @@ def fit(
 
 
 def _scatter(residual, variance, freedom) -> float:
-    """The common variance beside `variance` that explains the size of the residuals."""
+    """Common variance, added to `variance`, that explains the size of the residuals."""
     from scipy.optimize import root_scalar
 
     def excess(scatter):
@@ -255,18 +256,18 @@ def _scatter(residual, variance, freedom) -> float:
 
 
 def curvature(law: PowerLaw) -> tuple[float, float]:
-    """c of a factor exp(c ln^2 f) that the bins ask for, and its standard error.
+    """Fitted c of a factor exp(c ln^2 f) on the law, and its standard error.
 
     The local exponent changes by 2 c ln(f_2/f_1) from one end of the band to the other.
     """
     log_f = np.log(law.f / law.f.mean())
     columns = np.concatenate([law.slope[:, :2], (log_f**2)[:, None]], axis=1)
     variance, residual, scatter = law.error**2 - law.scatter, law.ratio - 1, law.scatter
-    normal, found = np.zeros((3, 3)), np.zeros(3)
+    normal, coefficients = np.zeros((3, 3)), np.zeros(3)
     for _ in range(3):  # the bend accounts for some of the scatter
         weighted = columns.T / (variance + scatter)
         normal = np.linalg.inv(weighted @ columns)
-        found = normal @ weighted @ residual
-        scatter = _scatter(residual - columns @ found, variance, residual.size - 3)
-    left = float(normal[2, 2])  # rounding may leave nothing of few bins
-    return float(found[2]), float(np.sqrt(left)) if left > 0 else np.inf
+        coefficients = normal @ weighted @ residual
+        scatter = _scatter(residual - columns @ coefficients, variance, residual.size - 3)
+    left = float(normal[2, 2])  # not positive by rounding where bins are few
+    return float(coefficients[2]), float(np.sqrt(left)) if left > 0 else np.inf

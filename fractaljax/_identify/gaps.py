@@ -1,9 +1,9 @@
-"""What gaps, and the filling of them, do to a spectrum: found on surrogates, and taken out.
+"""The effect of filled gaps on a spectrum, estimated on surrogates and removed.
 
 Filled heights are smoother than measured ones, so a spectrum with gaps has too little power at
-short wavelengths. A surrogate has the spectrum found so far and random phases on the same grid. It
-gets the same gaps and the same filling, and the ratio of its power with and without them is what
-they do to the measured spectrum, which is divided by it (indirect inference: Gourieroux, Monfort
+short wavelengths. A surrogate has the spectrum as corrected so far and random phases, on the same
+grid, with the same gaps and the same filling. The ratio of its power with and without them is their
+effect on the measured spectrum, which is divided by it (indirect inference: Gourieroux, Monfort
 and Renault 1993). The phases are the same in both, so that they hardly add to the scatter. On maps
 of 200 x 200 points, D = 2.2 to 2.8, with a fifth of them missing, D comes within 0.15 standard
 errors of that of the whole map in the mean.
@@ -33,21 +33,21 @@ def without_gaps(
 
     `steps` [m] between points along its axes; `spectra_of` gives the spectra of heights.
     """
-    found = spectra
+    corrected = spectra
     for rank in range(_ROUNDS):
         change = [np.zeros(each.f.size) for each in spectra]
         for i in range(_SURROGATES):
             random = np.random.default_rng([rank, i])
-            whole = [_surrogate(found[0], gap.shape, steps, random) for gap in gaps]
+            whole = [_surrogate(corrected[0], gap.shape, steps, random) for gap in gaps]
             holed = [filled(np.where(gap, np.nan, z)) for z, gap in zip(whole, gaps, strict=True)]
             pairs = zip(spectra_of(holed), spectra_of(whole), strict=True)
             for total, (after, before) in zip(change, pairs, strict=True):
                 total += np.log(after.power / before.power) / _SURROGATES
-        found = tuple(
+        corrected = tuple(
             eqx.tree_at(lambda each: each.power, each, each.power * np.exp(-by))
             for each, by in zip(spectra, change, strict=True)
         )
-    return found
+    return corrected
 
 
 def _surrogate(spectrum, shape, steps, random) -> np.ndarray:

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-_JITTER = 0.1  # of a step: how far from equal steps positions may lie
+_JITTER = 0.1  # of a step: largest deviation of positions from equal steps
 _FEW = 0.01  # of the points: where more are left out, rounded positions are tried first
 
 
@@ -42,14 +42,14 @@ def equal_steps(x: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def _line(x, k) -> tuple[float, float]:
-    """Slope of the line of least squares through x over k, and the range of what is left."""
+    """Slope of the least-squares line of x over k, and the range of the residuals."""
     k, x = k - k.mean(), x - x.mean()
     slope = x @ k / (k @ k)
     return float(slope), float(np.ptp(x - slope * k))
 
 
 def _rounding(x, dx) -> float:
-    """The power of ten, 0.1 to 2 steps, that all positions are multiples of, or 0."""
+    """Power of ten from 0.1 to 2 steps of which all positions are multiples, or 0."""
     coarse, fine = (math.floor(math.log10(share * dx)) for share in (2, _JITTER))
     for quantum in 10.0 ** np.arange(coarse, fine - 1, -1):
         if np.abs(x / quantum - np.rint(x / quantum)).max() < 1e-6:

@@ -1,4 +1,4 @@
-"""What the header of a text file says beside the titles: a factor for heights, pixels, a unit."""
+"""Settings in the header of a text file: a factor for heights, sizes of pixels, a unit."""
 
 import dataclasses
 import math
@@ -6,7 +6,7 @@ import re
 
 from .units import Unit, known_unit, metres, scale
 
-_LARGEST_BARE = 1e-3  # a pixel's size without a unit up to it is in metres, as its file's factor
+_LARGEST_BARE = 1e-3  # m: up to it, a size without a unit is in metres if the factor is
 _SETTING = re.compile(r"\W*([^\W\d][^=:;,\t]*)[=:;,\t]\s*(\S.*?)\s*")
 _PLAIN = re.compile(r"\W*[^\W\d][^=:]*[=:]")  # sets anything
 _KEY_UNIT = re.compile(r"\s*(?:[\[(]\s*(?:->|to\b|in\b)?|->)\s*([^\[\]()]*?)\s*[\])]?$")
@@ -34,13 +34,13 @@ Settings = dict[str, Setting]  # by "factor", "unit", "dx" and "dy"
 
 
 def sets_something(line: str) -> bool:
-    """Whether a line of the header is a key and its value."""
+    """True if a line of the header is a key and its value."""
     return bool(_PLAIN.match(line)) or is_setting(line)
 
 
 def is_setting(line: str) -> bool:
-    """Whether a line of the header is one of those that `read_settings` knows."""
-    return bool(_known(line))
+    """True if `read_settings` reads this line of the header."""
+    return bool(_settings_in(line))
 
 
 def read_settings(header: list[str]) -> Settings:
@@ -48,14 +48,14 @@ def read_settings(header: list[str]) -> Settings:
 
     **Raises:** `ValueError` for a factor or a size that is not above 0.
     """
-    found: Settings = {}
+    settings: Settings = {}
     for at, line in enumerate(header, 1):
-        for name, setting in _known(line, f"line {at}, {line.strip()[:60]!r},").items():
-            found.setdefault(name, setting)
-    return found
+        for name, setting in _settings_in(line, f"line {at}, {line.strip()[:60]!r},").items():
+            settings.setdefault(name, setting)
+    return settings
 
 
-def _known(line: str, named: str = "") -> Settings:
+def _settings_in(line: str, named: str = "") -> Settings:
     parts = _SETTING.fullmatch(line.strip().strip('"'))
     if parts is None:
         return {}
@@ -78,25 +78,26 @@ def _known(line: str, named: str = "") -> Settings:
     return dict.fromkeys(names, setting)
 
 
-def height_scale(settings: Settings, own: str | None, given: Unit) -> float:
-    """What numbers are multiplied by to be heights in metres.
+def height_scale(settings: Settings, column_unit: str | None, user_unit: Unit) -> float:
+    """Factor that converts numbers to heights in metres.
 
-    `own` is the unit of their column and `given` that of the user: of heights after the factor.
+    `column_unit` is that of their column, `user_unit` that of the user, for heights after the
+    factor of the header.
 
     **Raises:** `ValueError` naming the line that is no length or contradicts another, and as
-    `scale`.
+    `scale` does.
     """
     factor, data = settings.get("factor"), settings.get("unit")
-    said = own or (data.unit if data else None)
+    said = column_unit or (data.unit if data else None)
     if factor is None or factor.number is None:
-        known = said is None or known_unit(said) is not None
-        if not known and given is not None and not known_unit(str(given).strip()):
-            return metres(given)
-        if not known and own is None and data:
+        is_length = said is None or known_unit(said) is not None
+        if not is_length and user_unit is not None and not known_unit(str(user_unit).strip()):
+            return metres(user_unit)
+        if not is_length and column_unit is None and data:
             of = f"the metres of one {said}"
             raise ValueError(f"{data.line} is no length: give {of} as unit (--unit 2.9e-8)")
-        return scale(said, given, "heights", "--unit")
-    if factor.unit is None and given is None:
+        return scale(said, user_unit, "heights", "--unit")
+    if factor.unit is None and user_unit is None:
         raise ValueError(
             f"{factor.line} does not say its unit: give that of the heights after it (--unit m)"
         )
@@ -105,18 +106,18 @@ def height_scale(settings: Settings, own: str | None, given: Unit) -> float:
             f"{factor.line} does not lead to a length: take it out of the header, and give the"
             " metres of one number as unit (--unit 2.9e-8)"
         )
-    metre = factor.number * scale(factor.unit, given, "heights", "--unit")
+    metre = factor.number * scale(factor.unit, user_unit, "heights", "--unit")
     if said and known_unit(said) and abs(metre - metres(said)) > 1e-6 * metre:
         raise ValueError(f"{factor.line} contradicts the heights' unit {said}: take one out")
     return metre
 
 
-def step(settings: Settings, axis: str, given: float | None, unit: Unit) -> float | None:
+def step(settings: Settings, axis: str, user_step: float | None, unit: Unit) -> float | None:
     """The size of a pixel along an axis [m]; None if the header has none.
 
-    Without a unit of its own it has `unit`, or is in metres if the factor leads to metres.
+    Without a unit of its own it is in `unit`, or in metres if the factor leads to metres.
 
-    **Raises:** `ValueError` naming the line if its unit is not known and no step is `given`.
+    **Raises:** `ValueError` naming the line if its unit is unknown and there is no `user_step`.
     """
     pixel, factor = settings.get(axis), settings.get("factor")
     if pixel is None or pixel.number is None:
@@ -127,7 +128,7 @@ def step(settings: Settings, axis: str, given: float | None, unit: Unit) -> floa
         return pixel.number * metres(unit)
     if pixel.unit is None and factor and factor.unit == "m" and pixel.number <= _LARGEST_BARE:
         return pixel.number
-    if given is None:
+    if user_step is None:
         raise ValueError(
             f"{pixel.line} has no unit of length: give it (--position-unit um), or {axis} in"
             f" metres (--{axis} 1e-6)"

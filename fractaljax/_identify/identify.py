@@ -27,9 +27,9 @@ from .warnings import height_warnings, quantisation_warnings, result_warnings, s
 
 
 class Identification(Record):
-    """The fractal parameters of a measurement, and how well they are known.
+    """The fractal parameters of a measurement, with their standard errors.
 
-    G is that of Eq. 13, as the contact law takes it.
+    G is that of Eq. 13, which the contact law uses.
     """
 
     D: float
@@ -58,12 +58,12 @@ class Identification(Record):
 
     @property
     def G_standard_error(self) -> float:
-        """Of G [m], to first order; where that of ln G is not small, use that one."""
+        """Standard error of G [m], to first order; use that of ln G where it is not small."""
         return self.G * self.ln_G_standard_error
 
     @property
     def surface(self) -> Surface:
-        """As a part of a scene. **Raises:** `ValueError` unless 2 < D < 3."""
+        """The surface, as a part of a scene. **Raises:** `ValueError` unless 2 < D < 3."""
         return Surface(self.D, self.G, self.gamma)
 
     def __repr__(self) -> str:
@@ -101,22 +101,22 @@ def identify(
     Points are dx [m] apart along the first axis, dy (default dx) along the second; NaN is missing.
     z may also be a `Measurement`, the path of a file that `read_measurement` reads without
     options but dx and dy, or a topography of SurfaceTopography: with `heights()`, a `unit`, and
-    `pixel_size` or `positions()`. They bring their dx and dy, which given ones must not contradict,
-    and their `resolution` and `stylus_radius`, which given ones replace.
-    The surface is taken to be that of Eq. 13, a profile a cut through it. Standard errors of a map
-    count what differs from place to place in it; those of a profile hold where nothing does.
-    What filling missing points does to the spectrum is found on surrogates and taken out.
+    `pixel_size` or `positions()`. These have dx and dy, which the arguments must not contradict,
+    and `resolution` and `stylus_radius`, which the arguments replace.
+    The surface is assumed to be that of Eq. 13, a profile a cut through it. Standard errors of a
+    map include its variation from place to place; those of a profile assume that there is none.
+    The effect of filled gaps on the spectrum is estimated on surrogates and removed.
 
     - `band`: lowest and highest frequency [1/m] of the fit; chosen by default.
     - `resolution` [m]: lateral resolution, or the cut-off wavelength of a Gaussian filter.
-    - `stylus_radius` [m] of the tip. Both limit a band that is chosen.
+    - `stylus_radius` [m] of the tip. It and `resolution` limit a band chosen by default.
     - `aliased`: whether waves finer than two points are sampled, and so aliased, or averaged out;
       decided from the spectrum by default.
     - `gamma` of Eq. 13, also the ratio of the ends of a bin: waves may come in steps of it.
 
     **Raises:** `ValueError` for heights that are too few, flat, complex, infinite or not (n,) or
     (n, m); distances that are missing, not above 0 or not those of z; a band that is empty or
-    outside the data, or that the instrument leaves empty; and as `read_measurement`.
+    outside the data, or that the instrument leaves empty; and as `read_measurement` does.
     """
     read = measured(z, dx, dy)
     z, dx, dy = read.z, read.dx, read.dx if read.dy is None else read.dy
@@ -129,7 +129,7 @@ def identify(
         lines = heights.segments
         length = dx * max(segment.size for segment in lines)
     else:
-        lines = [*heights.known.T]
+        lines = [*heights.despiked.T]
         length = min(z.shape[0] * dx, z.shape[1] * dy)
 
     def spectra_of(segments):
@@ -146,14 +146,14 @@ def identify(
         top = min(top, 1 / (PER_RESOLUTION * spacing("resolution", resolution)))
     if stylus_radius is not None:
         top = min(top, tip_limit(spectrum, length, ratio, spacing("stylus_radius", stylus_radius)))
-    limit, least = quantisation_limit(heights.known, steps), 2 * LOWEST / length
+    limit, least = quantisation_limit(heights.despiked, steps), 2 * LOWEST / length
     if band is None:
         usable = top if limit < least else min(top, limit)
         chosen = chosen_band(spectrum, length, ratio, usable)
-        wanted = min(top, HIGHEST[spectrum.kind] * spectrum.nyquist)
+        reach = min(top, HIGHEST[spectrum.kind] * spectrum.nyquist)
     else:
         chosen = given_band(band, spectrum, length, ratio, top)
-        wanted = chosen.high
+        reach = chosen.high
     if aliased is not None:
         chosen = chosen._replace(
             noise=chosen.noise._replace(aliased=bool(aliased), undecided=False)
@@ -176,8 +176,8 @@ def identify(
     warnings = [
         *chosen.warnings,
         *spectrum_warnings(law, chosen, spectra, ratio),
-        *height_warnings(heights.known, steps),
-        *quantisation_warnings(heights.known, limit, chosen.high, wanted, least),
+        *height_warnings(heights.despiked, steps),
+        *quantisation_warnings(heights.despiked, limit, chosen.high, reach, least),
         *result_warnings(law.D, errors, other, heights),
     ]
     with np.errstate(over="ignore"):
@@ -207,7 +207,7 @@ def identify(
 def _parameters(law: PowerLaw, gamma: float) -> tuple[float, float, np.ndarray]:
     """ln G, ln G by the profile formula, and the covariance of (D, ln G).
 
-    D = (7 - p)/2, and A f_N^p = m(p) G^(3-p)/2 of a profile, without m(p) of a map. The profile
+    D = (7 - p)/2, and A f_N^p = m(p) G^(3-p)/2 for a profile, without m(p) for a map. The profile
     formula is A f_N^p = G^(2(D_s-1))/(2 ln gamma), D_s = D - 1.
     """
     from scipy.special import digamma

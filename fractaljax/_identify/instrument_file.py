@@ -21,9 +21,9 @@ _MOST_UNPACKED, _MOST_POINTS = 2**31, 2**27  # bytes, and heights
 def read_instrument_file(
     path: Path, dx: float | None, dy: float | None, unit: Unit, channel: str | int | None
 ) -> Measurement:
-    """Read a file in a format known to SurfaceTopography; arguments as `read_measurement`.
+    """Read a file in a format known to SurfaceTopography; arguments as in `read_measurement`.
 
-    **Raises:** `ValueError` if the package is not installed, and as `read_measurement`.
+    **Raises:** `ValueError` if the package is not installed, and as `read_measurement` does.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the package and its dependencies
@@ -51,13 +51,13 @@ def read_instrument_file(
             source = reader.name()
     metre = scale(topography.unit, unit, "heights", "--unit")
     if x is not None:
-        z, own_dx = profile_on_grid(x * metre, z)
-        dx = agreed("dx", own_dx, dx)
+        z, step = profile_on_grid(x * metre, z)
+        dx = agreed("dx", step, dx)
     elif chosen.physical_sizes is not None:
         sizes = np.ravel(topography.physical_sizes)
-        own = [float(L) * metre / n for L, n in zip(sizes, z.shape, strict=True)]
-        dx = agreed("dx", own[0], dx)
-        dy = agreed("dy", own[1], dy) if z.ndim == 2 else dy
+        steps = [float(L) * metre / n for L, n in zip(sizes, z.shape, strict=True)]
+        dx = agreed("dx", steps[0], dx)
+        dy = agreed("dy", steps[1], dy) if z.ndim == 2 else dy
     instrument = topography.info.get("instrument") or {}
     words = [source, f"channel {chosen.name!r}", instrument.get("vendor"), instrument.get("name")]
     source = f"{path.name}: {', '.join(word for word in words if word)}"
@@ -65,7 +65,7 @@ def read_instrument_file(
 
 
 def _refuse_large_archive(path):
-    """Many formats are zip archives, which may unpack to more than fits in memory."""
+    """Refuse a zip archive, as many formats are, that unpacks to more than fits in memory."""
     if zipfile.is_zipfile(path):
         with _in_one_line("the archive is damaged"), zipfile.ZipFile(path) as packed:
             size = sum(member.file_size for member in packed.infolist())
@@ -75,27 +75,27 @@ def _refuse_large_archive(path):
 
 @contextlib.contextmanager
 def _in_one_line(what):
-    """Readers raise anything on a damaged file."""
+    """Turn any error of a reader into a `ValueError` of one line."""
     try:
         yield
     except Exception as error:
         raise ValueError(f"{what}: {one_line(error)}") from None
 
 
-def _channel(channels, default, asked):
+def _channel(channels, default, key):
     """The channel of this name or number from 0; else the default, or the first with heights."""
     names = ", ".join(f"{channel.index} {channel.name!r}" for channel in channels)
-    if asked is None:
-        found = [channel for channel in (default, *channels) if channel.is_height_channel]
-        if not found:
+    if key is None:
+        candidates = [channel for channel in (default, *channels) if channel.is_height_channel]
+        if not candidates:
             raise ValueError(f"no channel holds heights; channels are {names}")
-        return found[0]
+        return candidates[0]
     named = {name: c for c in reversed(channels) for name in (c.name, c.channel_id)}
-    chosen = ({str(c.index): c for c in channels} | named).get(str(asked))
+    chosen = ({str(c.index): c for c in channels} | named).get(str(key))
     if chosen is None:
-        raise ValueError(f"there is no channel {asked!r}; channels are {names}")
+        raise ValueError(f"there is no channel {key!r}; channels are {names}")
     if not chosen.is_height_channel:
-        raise ValueError(f"channel {asked!r} holds {chosen.data_unit}, not heights")
+        raise ValueError(f"channel {key!r} holds {chosen.data_unit}, not heights")
     return chosen
 
 

@@ -20,7 +20,7 @@ class Measurement(Record):
 
     @property
     def missing(self) -> int:
-        """How many heights are missing."""
+        """Number of missing heights."""
         return int(np.isnan(self.z).sum())
 
     @property

@@ -1,12 +1,13 @@
 """How much D and G of a map differ from place to place, beyond chance.
 
-The errors of a fit take the surface to be stationary and Gaussian. A real one is smoother here and
-rougher there. The map is cut into patches, and each gives its own ln A and p, to first order in its
-power. Their covariance S is compared with P, that of a stationary Gaussian surface. What S has
-beyond 1.3 P, the mean of the larger of two by chance, is the variance between patches.
+The standard errors of a fit assume a stationary Gaussian surface. A real one is smoother in some
+places and rougher in others. The map is cut into patches, each of which gives its own ln A and p,
+to first order in its power. Their covariance S is compared with P, the covariance for a stationary
+Gaussian surface. The excess of S over 1.3 P, the mean of the larger of two eigenvalues by chance,
+is the variance between patches.
 
-It is added to that of the map as it is, not divided by the number of patches. Real surfaces vary at
-all lengths, so that two maps side by side differ about as much as two patches of one do.
+It is added to the covariance of the map, not divided by the number of patches. Real surfaces vary
+at all lengths, so that two maps side by side differ about as much as two patches of one map.
 """
 
 import numpy as np
@@ -16,16 +17,16 @@ from .spectrum import Spectrum, map_spectra
 
 _ALONG = 4  # patches along each side
 _CHANCE = 1.3  # mean of the larger eigenvalue of a covariance of 16 draws of variance 1
-_FEWEST = 2  # bins that tell ln A from p
+_FEWEST = 2  # bins that ln A and p need
 
 
 def between_patches(
     z: np.ndarray, dx: float, dy: float, spectrum: Spectrum, law: PowerLaw, band, ratio: float
 ) -> np.ndarray:
-    """The covariance (2, 2) of (ln A, p) between patches of a map without gaps, beyond chance.
+    """Covariance (2, 2) of (ln A, p) between patches of a map without gaps, beyond chance.
 
-    It is that of the law's own weights. Waves too long for a patch are left out; 0 where nothing
-    else is in the band.
+    Bins count by their influence on `law`. Waves too long for a patch are left out; 0 where fewer
+    than two bins remain.
     """
     from scipy.linalg import eigh
 
@@ -33,13 +34,13 @@ def between_patches(
     cut = z[: _ALONG * n, : _ALONG * m].reshape(_ALONG, n, _ALONG, m).swapaxes(1, 2)
     spectra = [map_spectra(patch, dx, dy)[0] for patch in cut.reshape(-1, n, m)]
     bins = [Bins(each, band, ratio) for each in spectra]
-    known = np.isin(Bins(spectrum, band, ratio).which, bins[0].which)
-    if known.sum() < _FEWEST:
+    shared = np.isin(Bins(spectrum, band, ratio).which, bins[0].which)
+    if shared.sum() < _FEWEST:
         return np.zeros((2, 2))
     power = np.stack([each(each.power / law(each.f)) for each in bins])
-    influence = law.influence[:2, known]
-    found = np.cov(influence @ (power / power.mean(axis=0)).T)
+    influence = law.influence[:2, shared]
+    covariance = np.cov(influence @ (power / power.mean(axis=0)).T)
     chance = influence * bins[0].variance @ influence.T
-    excess, vectors = eigh(found, chance)
+    excess, vectors = eigh(covariance, chance)
     vectors = chance @ vectors
     return vectors * np.maximum(excess - _CHANCE, 0) @ vectors.T

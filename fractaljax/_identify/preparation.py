@@ -1,4 +1,4 @@
-"""Measured heights made ready for a spectrum: checks, spikes, gaps."""
+"""Prepare measured heights for a spectrum: checks, spikes, gaps."""
 
 import math
 from typing import NamedTuple
@@ -14,7 +14,7 @@ _ABSURD = 1e50  # m, and 1/m: squares of larger numbers lose their digits
 _ROUNDING = 1e-12  # of the largest height
 _SPIKE_ROUNDS = 3
 _SPIKE = 8.0  # robust standard deviations of a height from the mean of its neighbours
-_AROUND, _KINK = 4, 3.0  # points away, and how much further from them a kink is than from the next
+_AROUND, _KINK = 4, 3.0  # lag in points, and deviation at this lag over that at lag 1 of a kink
 
 
 class Heights(NamedTuple):
@@ -25,11 +25,11 @@ class Heights(NamedTuple):
     missing: int  # NaN in the input
     outliers: int  # spikes taken out
     unused: int  # points in segments that are too short
-    known: np.ndarray  # the input without spikes, NaN where missing
+    despiked: np.ndarray  # the input without spikes, NaN where missing
 
 
 def spacing(name: str, value: float) -> float:
-    """A length [m]. **Raises:** `ValueError` unless it is above 0, finite and within reason."""
+    """A length [m]. **Raises:** `TypeError`; `ValueError` if not above 0, finite and sensible."""
     try:
         number = float(value)
     except (TypeError, ValueError):
@@ -63,9 +63,9 @@ def checked(z: ArrayLike) -> np.ndarray:
 
 
 def prepared(z: np.ndarray) -> Heights:
-    """Spikes become gaps. Short gaps are interpolated, longer ones divide a profile.
+    """Take out spikes, interpolate short gaps, and split a profile at longer ones.
 
-    **Raises:** `ValueError` if too little is left, or nothing but a constant or a ramp.
+    **Raises:** `ValueError` if too few heights are left, or if they are constant or a ramp.
     """
     _refuse_flat(z)
     missing = int(np.isnan(z).sum())
@@ -76,8 +76,8 @@ def prepared(z: np.ndarray) -> Heights:
         if share > _MOST_MISSING:
             raise ValueError(f"z has too many gaps: {share:.0%} of the map are missing")
         return Heights([filled(z)], [np.isnan(z)], missing, outliers, 0, z)
-    known = np.flatnonzero(~np.isnan(z))
-    runs = np.split(known, np.flatnonzero(np.diff(known) > _SHORT + 1) + 1)
+    indices = np.flatnonzero(~np.isnan(z))
+    runs = np.split(indices, np.flatnonzero(np.diff(indices) > _SHORT + 1) + 1)
     measured = [z[run[0] : run[-1] + 1] for run in runs]
     sizes = np.array([segment.size for segment in measured])
     if sizes.max() < FEWEST:
@@ -92,9 +92,9 @@ def prepared(z: np.ndarray) -> Heights:
 
 
 def _refuse_flat(z):
-    known = np.nonzero(~np.isnan(z))
-    heights = z[known]
-    plane = np.stack([np.ones(heights.size), *(axis.astype(float) for axis in known)], 1)
+    positions = np.nonzero(~np.isnan(z))
+    heights = z[positions]
+    plane = np.stack([np.ones(heights.size), *(axis.astype(float) for axis in positions)], 1)
     residual = heights - plane @ np.linalg.lstsq(plane, heights, rcond=None)[0]
     smallest = _ROUNDING * np.abs(heights).max()
     if np.abs(residual).max() <= smallest:
@@ -103,26 +103,26 @@ def _refuse_flat(z):
 
 
 def _without_spikes(z):
-    """NaN for heights much further from the mean of their neighbours than most are.
+    """Heights, with NaN for those much further from the mean of their neighbours than most.
 
-    A kink, such as the cusp between two arcs of a tip, is no spike: it is four times as far from
+    A kink, such as the cusp between two arcs of a tip, is not a spike: it is four times as far from
     the mean of the points four steps away, a spike of one or two points at most twice.
     """
     from scipy import ndimage
 
     cross = ndimage.generate_binary_structure(z.ndim, 1)
     for _ in range(_SPIKE_ROUNDS):
-        known = ~np.isnan(z)
+        present = ~np.isnan(z)
         complete = filled(z)
-        away = _from_neighbours(complete)
-        size = np.where(known, np.abs(away), 0.0)
+        deviation = _from_neighbours(complete)
+        size = np.where(present, np.abs(deviation), 0.0)
         # Most of a quantised profile may be straight, so the median alone is too small a scale.
-        usual = max(1.4826 * np.median(size[known]), 0.3 * np.quantile(size[known], 0.9))
+        usual = max(1.4826 * np.median(size[present]), 0.3 * np.quantile(size[present], 0.9))
         # A spike shifts the means of its neighbours as well: only the largest counts.
         largest = ndimage.maximum_filter(size, footprint=cross, mode="constant")
         spikes = (size > _SPIKE * usual) & (size >= largest) & (usual > 0)
         if spikes.any():
-            spikes &= _from_neighbours(complete, _AROUND) * np.sign(away) < _KINK * size
+            spikes &= _from_neighbours(complete, _AROUND) * np.sign(deviation) < _KINK * size
         if not spikes.any():
             break
         z = np.where(spikes, np.nan, z)
@@ -131,19 +131,19 @@ def _without_spikes(z):
 
 def _from_neighbours(z, lag=1):
     """Height above the mean of the two points `lag` away, averaged over the axes; 0 at the ends."""
-    away = np.zeros(z.shape)
+    deviation = np.zeros(z.shape)
     for axis in range(z.ndim):
-        inner, lines = np.moveaxis(away, axis, 0)[lag:-lag], np.moveaxis(z, axis, 0)
+        inner, lines = np.moveaxis(deviation, axis, 0)[lag:-lag], np.moveaxis(z, axis, 0)
         inner -= (lines[2 * lag :] - 2 * lines[lag:-lag] + lines[: -2 * lag]) / 2
-    return away / z.ndim
+    return deviation / z.ndim
 
 
 def filled(z):
     """Gaps filled linearly along each axis, the mean of both in a map, level beyond the ends."""
 
     def fill(line):
-        known = np.flatnonzero(~np.isnan(line))
-        return np.interp(np.arange(line.size), known, line[known]) if known.size else line
+        indices = np.flatnonzero(~np.isnan(line))
+        return np.interp(np.arange(line.size), indices, line[indices]) if indices.size else line
 
     if not np.isnan(z).any():
         return z

@@ -1,32 +1,32 @@
-"""Quantised, held and interpolated heights: how far up in frequency a spectrum holds.
+"""Quantised, held and interpolated heights: the frequency up to which a spectrum is valid.
 
 Rounding to a step q adds q^2/12 to the variance. Where heights change by more than q from point to
-point this is white noise, q^2 dx/6 of a one-sided profile spectrum. Where they do not, it is at
-lower frequencies and looks like a rougher surface. Second differences tell, free of offset and
-tilt: of continuous heights no two are the same, of quantised heights a share q/(sqrt(2 pi) sigma)
-is, sigma being their standard deviation. At distances where it is small the steps do not count.
-Heights held over two points repeat in first differences instead.
+point this is white noise, q^2 dx/6 in a one-sided profile spectrum. Where they change by less, it
+is at lower frequencies and looks like a rougher surface. Second differences, free of offset and
+tilt, reveal it: no two are equal for continuous heights, a share q/(sqrt(2 pi) sigma) is for
+quantised ones, sigma being their standard deviation. The steps do not matter at lags where that
+share is small. Heights held over two points repeat in first differences instead.
 """
 
 import math
 
 import numpy as np
 
-_REPEATED = 0.2  # share of equal second differences below which D moves by less than its error
-_FIRST = 1.5  # by as much the share of first differences is larger
+_REPEATED = 0.2  # share of equal second differences below which D changes by less than its error
+_FIRST = 1.5  # the share of equal first differences is larger by this factor
 _INTERPOLATED = 0.05  # interpolated heights fall below this share at once
 _WINDOW = 0.01  # of the rms second difference: closer ones are equal
 _AROUND = 5  # windows that estimate the density of continuous heights
 FEWEST = 32  # differences
-_MOST = 2**16  # differences that are used
-_GROWTH = 1.25  # of the distances that are tried
-_HIGHEST = 0.25  # periods from point to point: half the Nyquist frequency
+_MOST = 2**16  # differences used
+_GROWTH = 1.25  # of the lags tried
+_HIGHEST = 0.25  # cycles per step: half the Nyquist frequency
 
 
 def quantisation_limit(z: np.ndarray, steps: tuple[float, ...]) -> float:
-    """Frequency [1/m] up to which steps of the heights do not count: infinite if they never do.
+    """Frequency [1/m] up to which quantisation does not matter: infinite if it never does.
 
-    z (n,) or (n, m) with NaN for gaps, `steps` [m] between points along its axes. 0 if they do
+    z (n,) or (n, m) with NaN for gaps, `steps` [m] between points along its axes. 0 if it matters
     everywhere.
     """
     limit = math.inf
@@ -46,8 +46,8 @@ def differences(z: np.ndarray, order: int, lag: int = 1) -> np.ndarray:
     """First or second differences along the first axis, without gaps, thinned if very many."""
     for _ in range(order):
         z = z[lag:] - z[:-lag]
-    found = z[np.isfinite(z)]
-    return found[:: -(-found.size // _MOST) or 1]
+    finite = z[np.isfinite(z)]
+    return finite[:: -(-finite.size // _MOST) or 1]
 
 
 def rounding(z: np.ndarray) -> float:
@@ -59,14 +59,15 @@ def _repeated(z, lag) -> float:
     """Share of the most frequent difference, beyond that of a continuous density."""
     shares = []
     for order, usual in ((2, 1.0), (1, _FIRST)):
-        found = np.sort(differences(z, order, lag))
-        if found.size < FEWEST:
+        ordered = np.sort(differences(z, order, lag))
+        if ordered.size < FEWEST:
             return 1.0
-        half = max(_WINDOW * found.std(), rounding(z))
+        half = max(_WINDOW * ordered.std(), rounding(z))
         inner, outer = (
-            np.searchsorted(found, found + width, "right") - np.searchsorted(found, found - width)
+            np.searchsorted(ordered, ordered + width, "right")
+            - np.searchsorted(ordered, ordered - width)
             for width in (half, _AROUND * half)
         )
         beyond = inner - (outer - inner) / (_AROUND - 1)
-        shares.append(float(beyond.max() / found.size / usual))
+        shares.append(float(beyond.max() / ordered.size / usual))
     return max(shares)

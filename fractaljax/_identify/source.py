@@ -1,4 +1,4 @@
-"""What `identify` takes: heights with their steps, a measurement, a file or a topography."""
+"""Inputs of `identify`: heights with their steps, a measurement, a file or a topography."""
 
 import os
 from typing import Any
@@ -13,7 +13,7 @@ from .units import agreed
 def measured(z: Any, dx: float | None, dy: float | None) -> Measurement:
     """Heights (n,) or (n, m) with their steps [m], checked.
 
-    **Raises:** `ValueError` as `identify`; `OSError` if a file cannot be read.
+    **Raises:** `ValueError` as `identify` does; `OSError` if a file cannot be read.
     """
     dx, dy = (
         None if step is None else spacing(name, step) for name, step in (("dx", dx), ("dy", dy))

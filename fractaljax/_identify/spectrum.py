@@ -51,7 +51,7 @@ class Spectrum(Record):
 
 
 def profile_spectrum(segments: list[np.ndarray], dx: float) -> Spectrum:
-    """Of contiguous segments of one profile: sine tapers (Riedel, Sidorenko 1995)."""
+    """Spectrum of contiguous segments of one profile, by sine tapers (Riedel, Sidorenko 1995)."""
     parts = [_segment_spectrum(z, dx) for z in segments]
     f, power, count, spread = (np.concatenate(column) for column in zip(*parts, strict=True))
     return _merged(f, power, count, count / f, spread, "profile", 0.5 / dx)
@@ -61,7 +61,7 @@ def _segment_spectrum(z, dx):
     n = z.size
     order, t = np.arange(1, _TAPERS + 1), (np.arange(n) + 0.5) / n
     tapers = np.sin(np.pi * order[:, None] * t) * math.sqrt(2 / n)
-    # Through the ends rather than by least squares: sine tapers leak any offset at the ends.
+    # The line goes through the ends, not by least squares: sine tapers leak any offset at the ends.
     z = z - np.linspace(z[0], z[-1], n)
     power = 2 * dx * (np.abs(np.fft.rfft(tapers * z)) ** 2).mean(axis=0)
     # Wide bins scatter as the square of the mean taper does, narrow ones by the taper's width.
@@ -72,7 +72,7 @@ def _segment_spectrum(z, dx):
 
 
 def _merged(f, power, count, weight, spread, kind, nyquist) -> Spectrum:
-    """Ordinates within two percent as one."""
+    """Merge ordinates within two percent of each other."""
     order = np.argsort(f, kind="stable")
     f, power, count, weight, spread = (x[order] for x in (f, power, count, weight, spread))
     start = np.flatnonzero(np.diff(np.floor(np.log(f / f[0]) / _NEAR + 0.5), prepend=-1))
@@ -101,7 +101,7 @@ def map_power(z: np.ndarray, dx: float, dy: float) -> tuple[np.ndarray, ...]:
 
 
 def _remove_plane(z):
-    """A map less its plane of least squares."""
+    """A map minus its least-squares plane."""
     x, y = (np.arange(n) - (n - 1) / 2 for n in z.shape)
     z = z - z.mean()
     along_x = x @ z.sum(axis=1) / (z.shape[1] * (x @ x))
@@ -110,10 +110,10 @@ def _remove_plane(z):
 
 
 def map_spectra(z: np.ndarray, dx: float, dy: float) -> tuple[Spectrum, ...]:
-    """Of a map without gaps: of all waves, of those nearer to x, and of those nearer to y.
+    """Spectra of a map without gaps: of all waves, of waves nearer to x, and nearer to y.
 
     Each is a sum over radial bins one frequency step wide, divided by their area. 2 pi |f| times
-    a mean over modes would not do: their number varies, and a discrete wave is in few of them.
+    a mean over modes would not work: their number varies, and a discrete wave is in few of them.
     """
     fx, fy, power, count = map_power(z, dx, dy)
     lengths = z.shape[0] * dx, z.shape[1] * dy

@@ -1,6 +1,6 @@
 """The structure function V(tau) = <(z(x + tau) - z(x))^2> of a profile: a second estimate.
 
-Of a spectrum C f^-p, 1 < p < 3, it is 2 C int_0^inf f^-p (1 - cos 2 pi f tau) df, which is
+For a spectrum C f^-p, 1 < p < 3, it is 2 C int_0^inf f^-p (1 - cos 2 pi f tau) df, which is
 
     V = pi C (2 pi tau)^(p-1)/(Gamma(p) sin(pi (p-1)/2))
 
@@ -31,7 +31,7 @@ class StructureFunction(Record):
     W: Float[np.ndarray, " lags"]  # m^2, of second differences
     D: float
     G: float  # m
-    D_standard_error: float  # approximate: ten blocks, each left out once
+    D_standard_error: float  # approximate, by the jackknife over ten blocks
 
 
 def second_differences(p: float, tau: np.ndarray, end: float | None = None) -> np.ndarray:
@@ -64,9 +64,9 @@ def structure_function(
     for z in lines:
         for j, lag in enumerate(lags[2 * lags < z.size - _BLOCKS]):
             squares = (z[2 * lag :] - 2 * z[lag:-lag] + z[: -2 * lag]) ** 2
-            edges, known = np.arange(_BLOCKS) * squares.size // _BLOCKS, ~np.isnan(squares)
-            sums[:, j] += np.add.reduceat(np.where(known, squares, 0), edges)
-            counts[:, j] += np.add.reduceat(known, edges, dtype=float)
+            edges, finite = np.arange(_BLOCKS) * squares.size // _BLOCKS, ~np.isnan(squares)
+            sums[:, j] += np.add.reduceat(np.where(finite, squares, 0), edges)
+            counts[:, j] += np.add.reduceat(finite, edges, dtype=float)
     tau = lags * dx
 
     def estimate(blocks):
@@ -85,7 +85,7 @@ def structure_function(
 
 
 def _fit(tau, W, end) -> tuple[float, float]:
-    """p and ln C by least squares of ln W over ln tau, each lag as long as its step."""
+    """p and ln C by least squares of ln W over ln tau, with equal weights."""
     from scipy.optimize import fminbound
 
     def difference(p):

@@ -17,7 +17,7 @@ _COMMENTS = ("#", "%", "//", "!")
 _GAPS = {"", "nan", "na", "n/a", "null", "none", "bad", "invalid"}
 _WORDS = {"true": 1.0, "false": 0.0}  # of flags
 _FIRST = ("t", "T", "f", "F")
-_BITS = re.compile(r"[01]\s*/\s*[01]")  # what stands for the unit of flags
+_BITS = re.compile(r"[01]\s*/\s*[01]")  # in place of a unit for flags
 _LONGEST_LINE = 2**23  # characters
 # No leading zeros: in 1,034.5 a comma separates thousands.
 _NUMBER = re.compile(r"[-+]?((0|[1-9]\d*)(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
@@ -34,7 +34,7 @@ class Table:
     titles: list[str] | None  # of the columns, without their units
     units: list[str | None]
     settings: Settings
-    words: dict[int, str]  # by column: the error of the first true or false, unless it has flags
+    words: dict[int, str]  # by column: error for its first true or false, if it is not flags
 
 
 def text_encoding(content: bytes) -> str | None:
@@ -109,7 +109,7 @@ def _cells(line: str, separator: str | None) -> list[str]:
 
 
 def _number(cell: str) -> float | None:
-    """A number, also of a flag, NaN for a gap, or None."""
+    """The number in a cell, 1 or 0 for a flag, NaN for a gap, or else None."""
     if _NUMBER.fullmatch(cell):
         return float(cell)
     if cell.lower() in _WORDS:
@@ -118,7 +118,7 @@ def _number(cell: str) -> float | None:
 
 
 def _is_data(line: str, separator: str | None) -> bool:
-    """Whether the line holds nothing but gaps and at least one number."""
+    """True if the line holds only numbers and gaps, and at least one number."""
     values = [_number(cell) for cell in _cells(line, separator)]
     present = separator is None or separator in line
     return present and None not in values and any(value == value for value in values)
@@ -137,7 +137,7 @@ def _refuse_damaged(header: list[str], separator: str | None):
 
 
 def _units(header: list[str], separator: str | None, columns: int) -> list[str | None]:
-    """From the last line that names the columns, or else the only unit in the header."""
+    """Units in the last line that names the columns, or else the only unit in the header."""
     lines = _plain(header)
     for line in reversed(lines):
         units = [_unit(cell.strip('"')) for cell in _cells(line, separator) if cell]
@@ -148,7 +148,7 @@ def _units(header: list[str], separator: str | None, columns: int) -> list[str |
 
 
 def _titles(header: list[str], separator: str | None, columns: int) -> list[str] | None:
-    """Those in the last line of the header, or above a line of nothing but units."""
+    """Titles in the last line of the header, or in the line above a line of units only."""
     for line in reversed([line for line in _plain(header) if line][-2:]):
         cells = [cell.strip('"') for cell in _cells(line, separator) if cell]
         titles = [_without_unit(cell) for cell in cells]
@@ -158,22 +158,22 @@ def _titles(header: list[str], separator: str | None, columns: int) -> list[str]
 
 
 def _plain(header: list[str]) -> list[str]:
-    """The lines that hold titles, units or words, without the signs of a comment."""
+    """The lines that hold titles, units or words, without comment signs."""
     lines = [line.strip().lstrip("".join(_COMMENTS)).strip() for line in header]
     return [line for line in lines if not is_setting(line)]
 
 
 def _without_unit(title: str) -> str:
-    found = _UNIT.search(title)
-    if found and (found[1] or known_unit(found[2])):
-        unit = 1 if found[1] else 2
-        title = title[: found.start(unit)].rstrip("([/_ ").removesuffix(" in").rstrip()
+    match = _UNIT.search(title)
+    if match and (match[1] or known_unit(match[2])):
+        unit = 1 if match[1] else 2
+        title = title[: match.start(unit)].rstrip("([/_ ").removesuffix(" in").rstrip()
     return "" if _BITS.fullmatch(title) or title == "-" else title.strip()
 
 
 def _unit(title: str) -> str | None:
     """The unit at the end of a title; in brackets, also an unknown one."""
-    found = _UNIT.search(title)
-    if found is None:
+    match = _UNIT.search(title)
+    if match is None:
         return None
-    return found[1] or (found[2] if known_unit(found[2]) else None)
+    return match[1] or (match[2] if known_unit(match[2]) else None)

@@ -18,7 +18,7 @@ _ANGSTROM = {"A": "Å"}  # as SurfaceTopography may spell it
 
 
 def is_topography(x: Any) -> bool:
-    """Whether `x` has the interface of a topography."""
+    """True if `x` has the interface of a topography."""
     return callable(getattr(x, "heights", None)) and hasattr(x, "unit")
 
 
@@ -36,22 +36,22 @@ def from_topography(topography: Any, dx: float | None, dy: float | None) -> Meas
     metre = metres(_ANGSTROM.get(topography.unit, topography.unit), " of z")
     z = np.ma.filled(np.ma.asarray(topography.heights(), float), np.nan) * metre
     if hasattr(topography, "pixel_size"):
-        own = [float(step) * metre for step in np.ravel(topography.pixel_size)]
+        steps = [float(step) * metre for step in np.ravel(topography.pixel_size)]
     elif z.ndim == 1 and callable(getattr(topography, "positions", None)):
         x = np.asarray(topography.positions(), float) * metre
         z, step = profile_on_grid(x, z)
-        own = [step]
+        steps = [step]
     else:
         raise ValueError("z must have a pixel_size, or be a profile with positions()")
     where = "of the topography"
-    dx = agreed("dx", own[0], dx, where)
-    dy = agreed("dy", own[1], dy, where) if z.ndim == 2 else dy
+    dx = agreed("dx", steps[0], dx, where)
+    dy = agreed("dy", steps[1], dy, where) if z.ndim == 2 else dy
     info = getattr(topography, "info", None) or {}
     return measurement(z, dx, dy, type(topography).__name__, **instrument_limits(info))
 
 
 def instrument_limits(info: Mapping[str, Any]) -> dict[str, float]:
-    """The lateral resolution and the tip radius [m] that a topography's `info` tells, if any."""
+    """The lateral resolution and the tip radius [m] in the `info` of a topography, if any."""
     parameters = (info.get("instrument") or {}).get("parameters") or {}
     return {
         name: float(parameters[key]["value"]) * metres(parameters[key]["unit"])

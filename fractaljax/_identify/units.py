@@ -1,4 +1,4 @@
-"""Units of length, and what a file says against what the user says."""
+"""Units of length, and the agreement of a file with the user."""
 
 import contextlib
 import math
@@ -17,15 +17,15 @@ def known_unit(word: str) -> str | None:
 
 
 def metres(unit: str | float, of: str = "") -> float:
-    """One `unit` in metres; `of` says what it is the unit of.
+    """One `unit` in metres; `of` names the quantity in an error.
 
     A number is a unit of so many metres.
 
     **Raises:** `ValueError` listing the known units.
     """
-    known = known_unit(str(unit).strip())
-    if known is not None:
-        return UNITS[known]
+    key = known_unit(str(unit).strip())
+    if key is not None:
+        return UNITS[key]
     with contextlib.suppress(ValueError):
         if 0 < float(unit) < math.inf:
             return float(unit)
@@ -33,24 +33,26 @@ def metres(unit: str | float, of: str = "") -> float:
     raise ValueError(f"the unit{of} must be {known_units}, got {unit!r}")
 
 
-def scale(own: str | None, given: Unit, what: str, option: str) -> float:
+def scale(file_unit: str | None, user_unit: Unit, what: str, option: str) -> float:
     """The unit of `what` in metres, from the file or from `option`.
 
-    **Raises:** `ValueError` if neither says it, if both differ, and as `metres`.
+    **Raises:** `ValueError` if neither gives it, if they differ, and as `metres` does.
     """
-    from_file, asked = (None if u is None else metres(u, f" of {what}") for u in (own, given))
-    unit = agreed(f"the unit of {what}", from_file, asked)
+    from_file, from_user = (
+        None if u is None else metres(u, f" of {what}") for u in (file_unit, user_unit)
+    )
+    unit = agreed(f"the unit of {what}", from_file, from_user)
     if unit is None:
         raise ValueError(f"the file does not say in which unit {what} are: give it ({option} um)")
     return unit
 
 
 def agreed(
-    name: str, own: float | None, given: float | None, where: str = "in the file"
+    name: str, stored: float | None, argument: float | None, where: str = "in the file"
 ) -> float | None:
-    """The file's own value, or the given one where it has none. They must not differ."""
-    if own is None or given is None:
-        return given if own is None else own
-    if abs(own - given) > 1e-6 * abs(own):
-        raise ValueError(f"{name} is {own:g} m {where}, got {given:g}")
-    return own
+    """The value stored in a file, or else the user's argument. They must not differ."""
+    if stored is None or argument is None:
+        return argument if stored is None else stored
+    if abs(stored - argument) > 1e-6 * abs(stored):
+        raise ValueError(f"{name} is {stored:g} m {where}, got {argument:g}")
+    return stored

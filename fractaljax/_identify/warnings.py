@@ -13,7 +13,7 @@ from .quantisation import FEWEST, differences, rounding
 from .spectrum import Spectrum
 from .structure_function import StructureFunction
 
-DISQUALIFYING = ("not fractal", "too few levels")  # begin warnings that leave D and G no meaning
+DISQUALIFYING = ("not fractal", "too few levels")  # of warnings that void D and G
 _SIGMAS = 3.0
 _DISAGREES = 0.05  # in D, where both standard errors are tiny
 _VAGUE = 2.0  # standard error of ln G
@@ -34,7 +34,7 @@ _JUMP = 10.0  # robust standard deviations of a difference of neighbours
 def spectrum_warnings(
     law: PowerLaw, band: Band, spectra: tuple[Spectrum, ...], ratio: float
 ) -> Iterator[str]:
-    """Of a spectrum and its fit; of a map, also of the spectra along x and along y."""
+    """Warnings about a spectrum and its fit; for a map, also about the spectra along x and y."""
     ends = band.low, band.high
     decades = math.log10(band.high / band.low)
     if decades < _FEW_DECADES - 1e-9:
@@ -80,7 +80,7 @@ def _anisotropy(x: PowerLaw, y: PowerLaw):
 
 
 def height_warnings(z: np.ndarray, steps: tuple[float, ...]) -> Iterator[str]:
-    """Sizes that no instrument measures, clipped heights and jumps.
+    """Warnings about sizes that no instrument measures, clipped heights and jumps.
 
     z (n,) or (n, m) with NaN for gaps, `steps` [m] between points along its axes.
     """
@@ -109,27 +109,27 @@ def height_warnings(z: np.ndarray, steps: tuple[float, ...]) -> Iterator[str]:
             change = change[np.isfinite(change).any(axis=1)]
             change = np.nanmean(change, axis=1)
         change = change[np.isfinite(change)]
-        away = np.abs(change - np.median(change)) if change.size else np.zeros(1)
-        usual = 1.4826 * np.median(away)
-        if away.max() > _JUMP * usual > 0:
+        jumps = np.abs(change - np.median(change)) if change.size else np.zeros(1)
+        usual = 1.4826 * np.median(jumps)
+        if jumps.max() > _JUMP * usual > 0:
             yield (
-                f"a jump of {away.max():.3g} m, {away.max() / usual:.2g} times the usual change: "
+                f"a jump of {jumps.max():.3g} m, {jumps.max() / usual:.2g} times the usual change: "
                 "are these two scans?"
             )
             return
 
 
 def quantisation_warnings(
-    z: np.ndarray, limit: float, high: float, wanted: float, lowest: float
+    z: np.ndarray, limit: float, high: float, reach: float, lowest: float
 ) -> Iterator[str]:
-    """Of heights z whose steps count above `limit` [1/m], in a band up to `high`.
+    """Warnings about heights z whose steps matter above `limit` [1/m], in a band up to `high`.
 
-    Without steps the band would reach `wanted`. No band is left where `limit` is below `lowest`.
+    Without steps the band would extend to `reach`. No band is left where `limit` is below `lowest`.
     """
-    known = z[~np.isnan(z)]
-    levels = np.unique(known)
+    finite = z[~np.isnan(z)]
+    levels = np.unique(finite)
     heights = "heights are quantised, clipped or interpolated"
-    if 2 * levels.size < known.size:
+    if 2 * levels.size < finite.size:
         heights = (
             f"heights have only {levels.size} levels (step {np.median(np.diff(levels)):.3g} m)"
         )
@@ -137,23 +137,23 @@ def quantisation_warnings(
         yield f"too few levels: {heights}, D and G are meaningless"
     elif limit < high * (1 - 1e-9):
         yield f"{heights}: D and G are in doubt, the band goes beyond {limit:.3g} 1/m"
-    elif limit < wanted * (1 - 1e-9):
+    elif limit < reach * (1 - 1e-9):
         yield f"{heights}: the band ends at {high:.3g} 1/m"
     elif limit == math.inf:
         yield from _held(z)
 
 
 def _held(z):
-    """Heights equal to or in line with their neighbours, more often than any other change."""
+    """Warning if heights are equal to or in line with their neighbours too often for chance."""
     for axis, order in itertools.product(range(z.ndim), (2, 1)):
-        found = np.abs(differences(np.moveaxis(z, axis, 0), order))
-        if found.size < FEWEST:
+        changes = np.abs(differences(np.moveaxis(z, axis, 0), order))
+        if changes.size < FEWEST:
             continue
-        exact = max(_EXACT * found.max(), rounding(z))
-        rest = np.sort(found[found > exact])
-        flat = 1 - rest.size / found.size
+        exact = max(_EXACT * changes.max(), rounding(z))
+        rest = np.sort(changes[changes > exact])
+        flat = 1 - rest.size / changes.size
         same = np.searchsorted(rest, rest + exact, "right") - np.arange(rest.size)
-        if flat - same.max(initial=0) / found.size > _STRAIGHT and rest.size < found.size - 3:
+        if flat - same.max(initial=0) / changes.size > _STRAIGHT and rest.size < changes.size - 3:
             alike = "in line with their neighbours" if order == 2 else "equal to their neighbour"
             yield f"{flat:.1%} of the heights are {alike}: clipped, held or interpolated"
             return
@@ -162,7 +162,7 @@ def _held(z):
 def result_warnings(
     D: float, errors: np.ndarray, other: StructureFunction, heights: Heights
 ) -> Iterator[str]:
-    """Of D, the standard errors of D and ln G, the second estimate, and lost heights."""
+    """Warnings about D, the standard errors, the second estimate, and lost heights."""
     if not 2 < D < 3:
         yield f"D = {D:.4g} is not between 2 and 3: no surface of this model"
     elif min(D - 2, 3 - D) < errors[0]:
@@ -175,6 +175,6 @@ def result_warnings(
             f"spectrum and structure function disagree: D = {D:.4g} and {other.D:.4g}, "
             f"{abs(D - other.D) / both:.2g} standard errors apart"
         )
-    lost = (heights.missing + heights.outliers) / heights.known.size
+    lost = (heights.missing + heights.outliers) / heights.despiked.size
     if lost > _MANY:
         yield f"{lost:.1%} of the heights are missing or outliers"

@@ -7,7 +7,7 @@ from scipy.special import i1
 
 import fractaljax as fj
 
-from .case import STATED, Case, Check, Curve, Found, Panel, closed, solved
+from .case import STATED, Case, Check, Curve, Found, Panel, closed, numerical
 
 
 def _belt(friction: fj.Friction, V: float, m=1.0, c=0.0, k=1.0, P=1.0) -> fj.Structure:
@@ -51,12 +51,12 @@ def _slip(force, V, m=1.0, c=0.0, k=1.0, until_stick=True):
 
 
 def _stick_slip(force, V, c=0.0, m=1.0, k=1.0):
-    """Period, share of sticking, least and largest x, and x, x' (2, n) of the cycle, by SciPy."""
-    found = _slip(force, V, m, c, k)
-    end, (last,) = found.t_events[2][0], found.y_events[2]
+    """Period, share of sticking, least and largest x, and x, x' (2, n) of SciPy's cycle."""
+    solution = _slip(force, V, m, c, k)
+    end, (last,) = solution.t_events[2][0], solution.y_events[2]
     stuck = ((force(0.0) - c * V) / k - last[0]) / V
-    extremes = found.y_events[0][:, 0]
-    orbit = np.append(found.sol(np.linspace(0, end, 49)), found.sol(0.0)[:, None], axis=1)
+    extremes = solution.y_events[0][:, 0]
+    orbit = np.append(solution.sol(np.linspace(0, end, 49)), solution.sol(0.0)[:, None], axis=1)
     return end + stuck, stuck / (end + stuck), extremes.min(), extremes.max(), orbit
 
 
@@ -64,8 +64,8 @@ def _grazing(force, low, high, c):
     """The belt speed at which the slip that follows a stick just comes up to the belt again."""
 
     def lacking(V):
-        found = _slip(force, V, c=c, until_stick=False)
-        return V - found.y_events[1][:, 1].max()
+        solution = _slip(force, V, c=c, until_stick=False)
+        return V - solution.y_events[1][:, 1].max()
 
     return brentq(lacking, low, high, xtol=1e-12)
 
@@ -74,10 +74,10 @@ def _cycle_checks(cycle, theirs) -> list[Check]:
     period, share, low, high, _ = theirs
     top = float(cycle.state[0])  # the cycle begins at the maximum of x
     return [
-        solved("period [s]", period, cycle.period, 1e-8),
-        solved("share of sticking [-]", share, cycle.stick_fraction[0], 1e-8),
-        solved("largest x [m]", high, top, 1e-8),
-        solved("least x [m]", low, top - float(cycle.amplitude[0]), 1e-8),
+        numerical("period [s]", period, cycle.period, 1e-8),
+        numerical("share of sticking [-]", share, cycle.stick_fraction[0], 1e-8),
+        numerical("largest x [m]", high, top, 1e-8),
+        numerical("least x [m]", low, top - float(cycle.amplitude[0]), 1e-8),
     ]
 
 
@@ -108,7 +108,7 @@ def _slope_at_hopf(branch, hopf, scale=1.0):
 
 
 def _amplitudes(branch, theirs, scale=1.0, label="half of peak to peak of x [m]") -> Panel:
-    """Our branch over V, stable and unstable, beside their curves."""
+    """Our branch over V, stable and unstable, with the published curves."""
     V, size = _sizes(branch, scale)
     stable = np.asarray(branch.stable)
     curves = list(theirs)
@@ -146,15 +146,15 @@ def _thomsen() -> Found:
     mu_s, mu_m, v_m, c, V = 0.4, 0.25, 0.5, 0.1, 0.42
     hopf = v_m * np.sqrt(1 - 2 * c * v_m / (3 * (mu_s - mu_m)))
     sticks, size = np.sqrt(4 / 5) * hopf, 2 * np.sqrt(hopf**2 - V**2)
-    found = []
+    branches = []
     for share in (1.0, 0.5, 0.25):  # of the friction range and of the damping
         law = fj.Stribeck(mu_m + share * (mu_s - mu_m), mu_m, v_m)
         cycle = fj.limit_cycle(_belt(law, V, c=share * c), [0.6, 0.0])
         branch = fj.continue_cycle(_belt(law, V, c=share * c), "V", (0.2, 0.5), start=cycle)
-        found.append((branch, float(cycle.amplitude[0]) / 2, _event(branch, "grazing")))
-    branch, amplitude, grazing = found[0]
-    second = (mu_s - mu_m) ** 2  # the order of what the approximation leaves out
-    falls = [(found[1][k] - x) / (found[2][k] - x) for k, x in ((1, size), (2, sticks))]
+        branches.append((branch, float(cycle.amplitude[0]) / 2, _event(branch, "grazing")))
+    branch, amplitude, grazing = branches[0]
+    second = (mu_s - mu_m) ** 2  # the order of the terms that the approximation neglects
+    falls = [(branches[1][k] - x) / (branches[2][k] - x) for k, x in ((1, size), (2, sticks))]
     half = "error {} over that at half the friction range and damping [-]"
     checks = [
         closed("fastest belt with cycles, v_b1 [m/s]", hopf, _event(branch, "Hopf"), 1e-9),
@@ -189,7 +189,7 @@ def _papangelo() -> Found:
             _slope_at_hopf(branch, hopf),
             1e-6,
         ),
-        solved("fastest belt with stick-slip [m/s]", grazing, _event(branch, "grazing"), 1e-9),
+        numerical("fastest belt with stick-slip [m/s]", grazing, _event(branch, "grazing"), 1e-9),
         *_cycle_checks(cycle, theirs),
     ]
     balance = _harmonic(drop, v_0, c, np.linspace(0.05, 1.8, 22))

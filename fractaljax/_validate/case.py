@@ -1,4 +1,4 @@
-"""What a published case is: numbers and curves of an article, and a function that computes ours."""
+"""A published case: numbers and curves of an article, and a function that computes ours."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -8,7 +8,7 @@ from jaxtyping import ArrayLike
 # Where a published number comes from.
 STATED = "stated"  # the article states it
 CLOSED = "closed form"  # it follows from the article's equations by hand
-SOLVED = "SciPy"  # it is SciPy's solution of the article's equations
+NUMERICAL = "SciPy"  # it is SciPy's solution of the article's equations
 CORRECTED = "corrected"  # what the article states is wrong: the note says both
 
 
@@ -24,7 +24,7 @@ class Check(NamedTuple):
 
     @property
     def difference(self) -> float | None:
-        """Ours less the published number, or less the nearer end of a range; 0 within it."""
+        """Ours minus the published number, or minus the nearer end of a range; 0 within it."""
         if self.ours is None:
             return None
         low, high = self.published if isinstance(self.published, tuple) else [self.published] * 2
@@ -32,14 +32,14 @@ class Check(NamedTuple):
 
     @property
     def agrees(self) -> bool | None:
-        """Whether they differ by no more than the tolerance; None where there is none of ours."""
+        """True if they differ by no more than the tolerance; None if ours is missing."""
         return None if self.difference is None else abs(self.difference) <= self.tolerance
 
 
 class Curve(NamedTuple):
     """A line of a picture: theirs as marks, or dashed if it is a bound; ours drawn through.
 
-    One without a label continues the one before it of its kind.
+    A curve without a label continues the previous one of its kind.
     """
 
     x: ArrayLike | Sequence[float]
@@ -59,19 +59,19 @@ class Panel(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What a case computes."""
+    """The numbers and graphs that a case computes."""
 
     checks: Sequence[Check]
     panels: Sequence[Panel]
 
 
 class Case(NamedTuple):
-    """A published case. `missing` says what it lacks to be run here, or nothing."""
+    """A published case. `missing` returns what it lacks to run here, an empty text if nothing."""
 
     name: str
     title: str
     citation: str
-    doi: str | None  # None where it has none, or we are not certain of it
+    doi: str | None  # None if it has none, or if it is uncertain
     run: Callable[[], Found]
     missing: Callable[[], str] = lambda: ""
 
@@ -82,11 +82,11 @@ def stated(quantity: str, published: float, ours: Any, digit: float, note: str =
 
 
 def closed(quantity: str, published: Any, ours: Any, rtol: float, note: str = "") -> Check:
-    """A closed form, which ours meets to the relative tolerance."""
+    """A closed form, which ours meets within the relative tolerance."""
     published = float(published)
     return Check(quantity, published, float(ours), rtol * abs(published), CLOSED, note)
 
 
-def solved(quantity: str, published: Any, ours: Any, rtol: float, note: str = "") -> Check:
-    """A solution of the article's equations by SciPy, met to the relative tolerance."""
-    return closed(quantity, published, ours, rtol, note)._replace(basis=SOLVED)
+def numerical(quantity: str, published: Any, ours: Any, rtol: float, note: str = "") -> Check:
+    """A number by SciPy from the article's equations, met within the relative tolerance."""
+    return closed(quantity, published, ours, rtol, note)._replace(basis=NUMERICAL)

@@ -29,29 +29,29 @@ def _hoffmann() -> Found:
     mu = np.linspace(0.0125, 1.5, 120)
     eigenvalues = jax.jit(jax.vmap(lambda mu: fj.stability(model.replace(mu=mu)).eigenvalues))
     s: Any = np.asarray(eigenvalues(jnp.asarray(mu)))
-    wanted: Any = _published(mu)
+    published: Any = _published(mu)
     at = [int(np.abs(mu - value).argmin()) for value in (0.5, 1.5)]
     below = np.unique(np.round(np.abs(s[at[0]].imag), 9))
-    exact = np.sort(wanted[at[0]].imag)
+    exact = np.sort(published[at[0]].imag)
     checks = [
         closed("critical friction mu [-]", 3 / 4, fj.critical_friction(model), 1e-9),
         closed("lower frequency at mu = 0.5 [rad/s]", exact[0], below[0], 1e-8),
         closed("higher frequency at mu = 0.5 [rad/s]", exact[1], below[1], 1e-8),
         closed(
-            "growth rate at mu = 1.5 [1/s]", wanted[at[1]].real.max(), s[at[1]].real.max(), 1e-9
+            "growth rate at mu = 1.5 [1/s]", published[at[1]].real.max(), s[at[1]].real.max(), 1e-9
         ),
     ]
     upper: Any = np.sort_complex(np.where(s.imag > 0, s, np.nan))[:, :2]
     panels = []
-    for name, found, exact in (
-        ("frequency [rad/s]", np.sort(upper.imag), np.sort(wanted.imag)),
-        ("growth rate [1/s]", np.sort(upper.real), np.sort(wanted.real)),
+    for name, computed, exact in (
+        ("frequency [rad/s]", np.sort(upper.imag), np.sort(published.imag)),
+        ("growth rate [1/s]", np.sort(upper.real), np.sort(published.real)),
     ):
         curves = []
         for k, labels in enumerate((("Hoffmann et al., in closed form", "fractaljax"), ("", ""))):
             curves += [
                 Curve(mu[3::4], exact[3::4, k], labels[0], False),
-                Curve(mu, found[:, k], labels[1], True),
+                Curve(mu, computed[:, k], labels[1], True),
             ]
         panels.append(Panel("friction coefficient mu [-]", name, curves))
     return Found(checks, panels)

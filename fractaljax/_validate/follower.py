@@ -1,4 +1,4 @@
-"""A follower load: Ziegler's double pendulum, and what damping does to it."""
+"""A follower load: Ziegler's double pendulum, and the effect of damping on it."""
 
 import jax
 import jax.numpy as jnp
@@ -41,7 +41,7 @@ def _critical(model, beta):
 
 
 def _undamped() -> float:
-    """The same without damping, where a mode counts once its growth exceeds rounding."""
+    """The load where squeal begins without damping: where growth exceeds rounding."""
     model, low, high = _pendulum(0.0), 1.0, 2.3
     for _ in range(30):
         middle = (low + high) / 2
@@ -53,21 +53,21 @@ def _undamped() -> float:
 def _ziegler() -> Found:
     beta = np.concatenate([[1.0, 4 + 5 * np.sqrt(2)], np.geomspace(0.05, 200.0, 41)])
     b = 0.01
-    found, heavy = _critical(_pendulum(b), beta), _critical(_pendulum(0.3), beta[:1])
+    loads, heavy = _critical(_pendulum(b), beta), _critical(_pendulum(0.3), beta[:1])
     checks = [
         closed("critical load, no damping [c/l]", _UNDAMPED, _undamped(), 1e-8),
-        closed("critical load, equal light dampers [c/l]", 41 / 28, found[0] - b**2 / 2, 1e-9),
+        closed("critical load, equal light dampers [c/l]", 41 / 28, loads[0] - b**2 / 2, 1e-9),
         closed("critical load, equal dampers of 0.3 [c/l]", _published(1.0, 0.3), heavy[0], 1e-9),
         closed(
             "critical load, dampers 4 + 5 sqrt(2) to 1 [c/l]",
             _UNDAMPED + beta[1] * b**2 / 2,
-            found[1],
+            loads[1],
             1e-9,
         ),
     ]
     curves = [
         Curve(beta[2::2], _published(beta[2::2], b), "Herrmann and Jong 1965, damped", False),
-        Curve(beta[2:], found[2:], "fractaljax", True),
+        Curve(beta[2:], loads[2:], "fractaljax", True),
         Curve(beta[2:], np.full(41, _UNDAMPED), "Ziegler 1952, no damping", False, True),
     ]
     axes = "ratio of the dampers, foot to elbow [-]", "critical load P l/c [-]"

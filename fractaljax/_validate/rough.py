@@ -1,4 +1,4 @@
-"""Rough contacts: exponents, ratios and areas that theory and boundary elements have found."""
+"""Rough contacts: exponents, ratios and areas from theory and boundary elements."""
 
 import functools
 
@@ -17,13 +17,13 @@ _MATERIAL = fj.Material(_E, nu=0.3, sigma_y=3.55e8, H=9.94e8)
 _L_S = 4 * _L / _N
 _SQ = 1e-6  # m
 _UNIT = _E * _SQ * _L  # N, the load scale of finite-size laws
-_LOADS = np.geomspace(1e-3, 1.0, 7)  # in it
+_LOADS = np.geomspace(1e-3, 1.0, 7)  # in _UNIT
 _DIMENSIONS = (2.1, 2.3, 2.5, 2.7, 2.9)
 _SEEDS = 12
 
 
 def _surface(D: float) -> fj.Surface:
-    """Of the root mean square height Sq."""
+    """Surface with the root mean square height Sq."""
     unit = fj.Surface(D, _L)
     return fj.Surface(D, _L * (_SQ / float(fj.roughness(unit, _L, _L_S).Sq)) ** (1 / (D - 2)))
 
@@ -35,7 +35,7 @@ def _law(surface, P, nu=0.3, area=_L**2, L_s=_L_S) -> fj.PerssonContact:
 
 @functools.cache
 def _pressed(D: float) -> fj.LawComparison:
-    """Boundary elements beside the laws."""
+    """Boundary elements compared with the laws."""
     options = {"area": _L**2, "L_s": _L_S, "n": _N, "seeds": _SEEDS, "progress": False}
     return fj.compare_laws(_surface(D), _MATERIAL, _UNIT * _LOADS, **options)
 

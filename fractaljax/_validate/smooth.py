@@ -9,8 +9,8 @@ from .case import Case, Curve, Found, Panel, closed
 _MATERIAL = fj.Material(E=1.154e11, nu=0.3, sigma_y=3.55e8, H=9.94e8)
 _E = float(_MATERIAL.E)
 
-# Of a square lattice of equal charges in a uniform background, which the images of a periodic cell
-# are: the energy (Bonsall and Maradudin, Phys. Rev. B 15, 1959, 1977) and the sum of 1/r^3.
+# The images of a periodic cell are a square lattice of equal charges in a uniform background: its
+# energy (Bonsall and Maradudin, Phys. Rev. B 15, 1959, 1977) and its sum of 1/r^3.
 _LATTICE, _LATTICE_CUBED = 3.900264920, 9.0336217
 
 
@@ -18,21 +18,23 @@ def _hertz() -> Found:
     n, L, R, a = 256, 1e-3, 0.1, 1.2e-4
     P = 4 * _E * a**3 / (3 * R)
     x = (np.arange(n) + 0.5) / n * L - L / 2
-    # The images flatten the ball: it is made so much rounder.
+    # The images flatten the ball, so it is made rounder to compensate.
     curvature = 1 / R - P * _LATTICE_CUBED / (2 * np.pi * _E * L**3)
     heights = -np.add.outer(x**2, x**2) / 2 * curvature
-    found = fj.boundary_element(heights, L / n, _MATERIAL, P)
+    contact = fj.boundary_element(heights, L / n, _MATERIAL, P)
     peak = 3 * P / (2 * np.pi * a**2)
     images = _LATTICE / (np.pi * _E * L)  # of the compliance
     ring = 2 * L / n / a  # the outline moves by whole points, one at either end of a diameter
     checks = [
-        closed("area of contact, pi a^2 [m^2]", np.pi * a**2, found.area, ring),
-        closed("largest pressure, 3 P/(2 pi a^2) [Pa]", peak, found.pressure.max(), 2e-3),
-        closed("stiffness K_n = 2 E a [N/m]", 2 * _E * a, 1 / (1 / found.K_n + images), ring),
-        closed("approach a^2/R [m]", a**2 / R, images * P - heights.mean() - found.mean_gap, 2e-3),
+        closed("area of contact, pi a^2 [m^2]", np.pi * a**2, contact.area, ring),
+        closed("largest pressure, 3 P/(2 pi a^2) [Pa]", peak, contact.pressure.max(), 2e-3),
+        closed("stiffness K_n = 2 E a [N/m]", 2 * _E * a, 1 / (1 / contact.K_n + images), ring),
+        closed(
+            "approach a^2/R [m]", a**2 / R, images * P - heights.mean() - contact.mean_gap, 2e-3
+        ),
     ]
     r = np.linspace(-1, 1, 49)
-    row = np.asarray(found.pressure)[n // 2]
+    row = np.asarray(contact.pressure)[n // 2]
     near = np.abs(x) < 1.5 * a
     curves = [
         Curve(r * a * 1e6, peak / 1e6 * np.sqrt(1 - r**2), "Hertz", False),
@@ -48,10 +50,10 @@ def _westergaard() -> Found:
     heights = height * np.cos(2 * np.pi * (np.arange(n) + 0.5) / n)[:, None] * np.ones(2)
     A = heights.size * dx**2
     shares = np.linspace(0.02, 0.98, 25)
-    found = [fj.boundary_element(heights, dx, _MATERIAL, share * closes * A) for share in shares]
-    area = np.array([float(one.area) for one in found]) / A
-    K_n = np.array([float(one.K_n) for one in found])
-    gap = np.array([float(one.mean_gap) for one in found])
+    contacts = [fj.boundary_element(heights, dx, _MATERIAL, share * closes * A) for share in shares]
+    area = np.array([float(one.area) for one in contacts]) / A
+    K_n = np.array([float(one.K_n) for one in contacts])
+    gap = np.array([float(one.mean_gap) for one in contacts])
 
     def touching(p):
         return 2 / np.pi * np.arcsin(np.sqrt(p))
@@ -65,7 +67,7 @@ def _westergaard() -> Found:
         closed(
             "largest pressure at p*/2 [Pa]",
             2 * closes * np.sqrt(0.5),
-            found[half].pressure.max(),
+            contacts[half].pressure.max(),
             3e-3,
         ),
         closed("stiffness K_n at p*/2 [N/m]", stiffness(0.5), K_n[half], 0.02),

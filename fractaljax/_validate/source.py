@@ -1,4 +1,4 @@
-"""The article that the model is from: its stiffness, the onset of its squeal, its limit cycles."""
+"""The article that the model comes from: stiffness, onset of squeal, limit cycles."""
 
 from typing import Any
 
@@ -19,7 +19,7 @@ from .case import (
     Found,
     Panel,
     closed,
-    solved,
+    numerical,
     stated,
 )
 
@@ -95,10 +95,10 @@ def _stiffness() -> Found:
         ),
         stated("K_t/K_n, kappa of section 3.3 [-]", 0.5, K_t[0] / K_n[0], 0.1),
         Check("K_n of section 2.5 [N/m]", 5.282e7, None, 5e3, STATED, lost),
-        solved("K_n, Eqs. 21, 26, 30 [N/m]", theirs[0][0], K_n[0], 1e-10),
-        solved("K_t, Eqs. 33, 36 [N/m]", theirs[0][1], K_t[0], 1e-10),
-        solved("K_n at D = 2.6 [N/m]", theirs[2][0], K_n[2], 1e-10),
-        solved("Q_e at D = 2.5, Eq. 34 [N]", limit, Q_e[1], 1e-6)._replace(
+        numerical("K_n, Eqs. 21, 26, 30 [N/m]", theirs[0][0], K_n[0], 1e-10),
+        numerical("K_t, Eqs. 33, 36 [N/m]", theirs[0][1], K_t[0], 1e-10),
+        numerical("K_n at D = 2.6 [N/m]", theirs[2][0], K_n[2], 1e-10),
+        numerical("Q_e at D = 2.5, Eq. 34 [N]", limit, Q_e[1], 1e-6)._replace(
             basis=CORRECTED, note="the limit of Eq. 33; Eq. 34 is printed without its plus sign"
         ),
     ]
@@ -110,14 +110,14 @@ def _stiffness() -> Found:
         ("fractal roughness G [m]", G, (_D, G), {"yscale": "log", "xscale": "log"}),
     ):
         printed = np.array([_as_printed(d, g)[:2] for d, g in np.broadcast(*surfaces)])
-        found = _ours(*surfaces)
+        ours = _ours(*surfaces)
         curves = []
         for k, name in enumerate(("K_n", "K_t")):
             shown = np.where(printed[::4, k] > 0, printed[::4, k], np.nan)
             equations = ("Eq. 30", "Eq. 36")[k]
             curves.append(Curve(x[::4], shown, f"{name}, {equations} by SciPy", False))
             curves.append(
-                Curve(x, np.where(found[k] > 0, found[k], np.nan), f"{name}, fractaljax", True)
+                Curve(x, np.where(ours[k] > 0, ours[k], np.nan), f"{name}, fractaljax", True)
             )
         panels.append(Panel(axis, "stiffness [N/m]", curves, options))
     return Found(checks, panels)
@@ -146,22 +146,22 @@ def _onset() -> Found:
     places = [(4e8, 0.15), (3.2e9, 0.15), (4e8, 0.5)]
     grid = [(K_n, k) for K_n in (4e8, 3.2e9) for k in kappa]
     K_n, ratio = np.array(places + grid).T
-    found = np.asarray(critical(jnp.asarray(K_n), jnp.asarray(K_n * ratio)))
+    critical_mu = np.asarray(critical(jnp.asarray(K_n), jnp.asarray(K_n * ratio)))
     checks = [
         closed(f"critical mu, K_n = {K_n:g} N/m, kappa = {k} [-]", _critical(K_n, k), mu, 1e-9)
-        for (K_n, k), mu in zip(places, found, strict=False)
+        for (K_n, k), mu in zip(places, critical_mu, strict=False)
     ]
     mu = _critical(4e8, 0.15)
     options: dict[str, Any] = {"xtol": 1e-13, "rtol": 1e-13}
-    moved = brentq(lambda k: _critical(3.2e9, k) - mu, 0.1, 0.3, **options)
+    theirs = brentq(lambda k: _critical(3.2e9, k) - mu, 0.1, 0.3, **options)
     ours = brentq(lambda k: float(fj.critical_friction(_scene(3.2e9, k))) - mu, 0.1, 0.3, **options)
     note = "the Hopf point is printed as unchanged at 0.15; that holds roughly, and at one mu only"
     checks.append(
-        closed("kappa of the same mu at 8 K_n [-]", moved, ours, 1e-9, note)._replace(
+        closed("kappa of the same mu at 8 K_n [-]", theirs, ours, 1e-9, note)._replace(
             basis=CORRECTED
         )
     )
-    first, second = found[3 : 3 + len(kappa)], found[3 + len(kappa) :]
+    first, second = critical_mu[3 : 3 + len(kappa)], critical_mu[3 + len(kappa) :]
     curves = [
         Curve(kappa[::3], _critical(4e8, kappa[::3]), "Eq. 43, K_n = 4e8 N/m", False),
         Curve(kappa, first, "fractaljax, K_n = 4e8 N/m", True),
@@ -182,7 +182,7 @@ _SMOOTH = 1e-6  # m/s: sgn(w) is tanh(w/_SMOOTH) for SciPy
 def _cycle_by_scipy(K_n):
     """Period, share of sticking, peak-to-peak x1 and x2, largest dx2/dt, and the orbit (4, n).
 
-    Of Eq. 44, by LSODA with a smooth sgn, after 80 periods from near the equilibrium.
+    Eq. 44 is solved by LSODA with a smooth sgn, over 80 periods from near the equilibrium.
     """
     K_t, (w_1, w_2), (xi_1, xi_2) = K_n / 2, (2000 * np.pi, 1600 * np.pi), (0.001, 0.007)
     drop = (_MU_S - _MU_M) / (2 * _V_M)
@@ -203,37 +203,39 @@ def _cycle_by_scipy(K_n):
     events = [lambda _, y: y[2], lambda _, y: y[3], slides]
     period = 2 * np.pi / np.sqrt(w_1**2 + w_2**2 + K_n) * 1.05
     options = {"method": "LSODA", "rtol": 1e-8, "atol": [1e-14, 1e-14, 1e-10, 1e-10]}
-    found = solve_ivp(
+    solution = solve_ivp(
         rate, (0, 80 * period), [9e-6, 0, 0, 0], events=events, max_step=period / 100, **options
     )
-    first, last = found.t_events[0][[-3, -1]]
+    first, last = solution.t_events[0][[-3, -1]]
     sizes = [
         np.ptp(states[(times >= first) & (times <= last), i])
-        for i, (times, states) in enumerate(zip(found.t_events[:2], found.y_events, strict=False))
+        for i, (times, states) in enumerate(
+            zip(solution.t_events[:2], solution.y_events, strict=False)
+        )
     ]
-    # Entries and exits alternate; of the last few stays the longest is that of sticking.
-    change = found.t_events[2]
+    # Entries and exits alternate; the longest of the last few stays is the sticking one.
+    change = solution.t_events[2]
     share = np.diff(change[: len(change) // 2 * 2])[::2][-4:].max() / (last - first)
-    orbit = found.y[:, (found.t >= first) & (found.t <= last)]
+    orbit = solution.y[:, (solution.t >= first) & (solution.t <= last)]
     return last - first, share, *sizes, orbit[3].max(), orbit
 
 
 def _cycles() -> Found:
     scene = fj.brake_scene()
     stiffnesses = (3e8, 4e8, 5e8)
-    found = [
+    cycles = [
         fj.limit_cycle(scene.replace(contact=fj.FixedContact(K_n, K_n / 2))) for K_n in stiffnesses
     ]
     theirs = [_cycle_by_scipy(K_n) for K_n in stiffnesses]
-    size = np.array([np.asarray(cycle.amplitude) for cycle in found])
-    share = [float(cycle.stick_fraction[0]) for cycle in found]
-    middle, cycle = theirs[1], found[1]
+    size = np.array([np.asarray(cycle.amplitude) for cycle in cycles])
+    share = [float(cycle.stick_fraction[0]) for cycle in cycles]
+    middle, cycle = theirs[1], cycles[1]
     rises = f"{share[0]:.3f}, {share[1]:.3f}, {share[2]:.3f} at K_n = 3e8, 4e8, 5e8 N/m: it rises, "
     slides = "printed as pure sliding, below 1; direction 2 reverses its sliding in every period"
     checks = [
-        solved("period at 4e8 N/m [s]", middle[0], cycle.period, 1e-4),
-        solved("peak to peak of x1 at 4e8 N/m [m]", middle[2], size[1, 0], 1e-4),
-        solved("peak to peak of x2 at 4e8 N/m [m]", middle[3], size[1, 1], 1e-4),
+        numerical("period at 4e8 N/m [s]", middle[0], cycle.period, 1e-4),
+        numerical("peak to peak of x1 at 4e8 N/m [m]", middle[2], size[1, 0], 1e-4),
+        numerical("peak to peak of x2 at 4e8 N/m [m]", middle[3], size[1, 1], 1e-4),
         Check(
             "x1 at 5e8 over x1 at 3e8 N/m (falls) [-]",
             (0.0, 1.0),
@@ -268,7 +270,7 @@ def _cycles() -> Found:
     panels = []
     for i, name in enumerate(("1, along the belt", "2, normal to the belt")):
         curves = []
-        for K_n, cycle, other in zip(stiffnesses, found, theirs, strict=True):
+        for K_n, cycle, other in zip(stiffnesses, cycles, theirs, strict=True):
             orbit, states = other[-1], np.asarray(cycle.orbit(512)[1])
             thinned = _even(orbit[[i, i + 2]], 36)
             label = f"K_n = {K_n:g} N/m"

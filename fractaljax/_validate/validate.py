@@ -28,40 +28,40 @@ class ValidatedCase:
     checks: tuple[Check, ...]
     panels: tuple[Panel, ...] = dataclasses.field(repr=False)  # the curves of its picture
     reason: str = ""  # why it did not run, or what ended it
-    failed: bool = False  # whether an error ended it
+    failed: bool = False  # True if an error ended it
 
     @property
     def agrees(self) -> bool:
-        """Whether no number differs by more than its tolerance, and no error ended the run."""
+        """True if no number differs by more than its tolerance, and no error ended the run."""
         return not self.failed and all(check.agrees is not False for check in self.checks)
 
     def rows(self) -> list[list[str]]:
         """The rows of the table, without the name of the case: one for each number."""
-        found = [_cells(check) for check in self.checks]
+        rows = [_cells(check) for check in self.checks]
         if self.reason:
             dashes = ["-"] * (len(_TITLES) - 3)
-            found.append([self.title, *dashes, "FAILS" if self.failed else "NOT RUN"])
-        return found
+            rows.append([self.title, *dashes, "FAILS" if self.failed else "NOT RUN"])
+        return rows
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Validation:
-    """Published cases beside ours, as `validate` returns them; printed as a table."""
+    """Published numbers beside ours, as `validate` returns them; printed as a table."""
 
     cases: dict[str, ValidatedCase]
 
     @property
     def agrees(self) -> bool:
-        """Whether all that ran agrees with what was published."""
+        """True if all cases that ran agree with the published numbers."""
         return all(case.agrees for case in self.cases.values())
 
     def rows(self) -> tuple[list[str], list[list[str]]]:
         """The titles and the rows of the table: one for each number."""
-        found = [[case.name, *row] for case in self.cases.values() for row in case.rows()]
-        return _TITLES, found
+        rows = [[case.name, *row] for case in self.cases.values() for row in case.rows()]
+        return _TITLES, rows
 
     def notes(self) -> Iterator[str]:
-        """What the table has no room for, a line each: misprints, and why a case did not run."""
+        """Notes below the table, a line each: misprints, and why a case did not run."""
         for case in self.cases.values():
             for check in case.checks:
                 if check.note:
@@ -70,7 +70,7 @@ class Validation:
                 yield f"{case.name}: {case.reason}"
 
     def summary(self) -> str:
-        """How many numbers agree, in a line."""
+        """How many checks agree, differ and did not run, in one line."""
         verdicts = [check.agrees for case in self.cases.values() for check in case.checks]
         lacking = sum(bool(case.reason) and not case.failed for case in self.cases.values())
         right, skipped = verdicts.count(True), lacking + verdicts.count(None)
@@ -92,15 +92,15 @@ class Validation:
 
 
 def validate(*cases: str, progress: bool = True) -> Validation:
-    """Compute what was published elsewhere, and print both with their difference.
+    """Compute published results, and compare the numbers in a table.
 
     `cases` are names of published cases, by default all. Each number has a tolerance, from the
     digits that were printed or the order of an approximation, and a basis: `stated` in the article,
     a `closed form` that follows from its equations, the solution of its equations by `SciPy`, or
     `corrected` where the article is wrong, with a note that says how. SI units unless the
-    quantity names another. A case that lacks its data says so and counts for nothing. The
+    quantity names another. A case without its data says so and is not counted. The
     4669-degree-of-freedom brake needs the folder of its matrices, in the environment variable
-    FRACTALJAX_BRAKE. All together take some three minutes.
+    FRACTALJAX_BRAKE. All cases together take about three minutes.
 
     `plot.validation(case)` draws our curves over theirs.
 
@@ -111,13 +111,13 @@ def validate(*cases: str, progress: bool = True) -> Validation:
     chosen = [known_case(name) for name in cases] or list(known_cases().values())
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise ValueError('validate needs 64 bits: jax.config.update("jax_enable_x64", True)')
-    found = {}
+    validated = {}
     with tqdm(total=len(chosen), unit="case", disable=not flag("progress", progress)) as bar:
         for case in chosen:
             bar.set_description(case.name)
-            found[case.name] = _run(case)
+            validated[case.name] = _run(case)
             bar.update()
-    return Validation(found)
+    return Validation(validated)
 
 
 @functools.cache
@@ -128,14 +128,14 @@ def known_cases() -> dict[str, Case]:
 
 
 def known_case(name: str) -> Case:
-    """The case of a name.
+    """The case with this name.
 
-    **Raises:** `ValueError` for an unknown one.
+    **Raises:** `ValueError` for an unknown name.
     """
-    known = known_cases()
-    if name not in known:
-        raise ValueError(f"no case {name!r}; the cases are {', '.join(known)}")
-    return known[name]
+    published = known_cases()
+    if name not in published:
+        raise ValueError(f"no case {name!r}; the cases are {', '.join(published)}")
+    return published[name]
 
 
 def _run(case: Case) -> ValidatedCase:
@@ -144,13 +144,13 @@ def _run(case: Case) -> ValidatedCase:
         return ValidatedCase(*head, (), (), f"not run: {reason}")
     try:
         checks, panels = case.run()
-    except RuntimeError as error:  # no convergence, no cycle: what a result says of itself
+    except RuntimeError as error:  # no convergence, or no cycle
         return ValidatedCase(*head, (), (), _reason(error), failed=True)
     return ValidatedCase(*head, tuple(checks), tuple(panels))
 
 
 def _reason(error: RuntimeError) -> str:
-    """The message of an error; of one from a compiled program, one line of JAX's long account."""
+    """The message of an error; the relevant line of JAX's if a compiled program raised it."""
     checked = re.search(r"EquinoxRuntimeError: (.+)", str(error))
     return checked[1] if checked else str(error).partition("\n")[0]
 
@@ -177,7 +177,7 @@ _VERDICTS = {True: "ok", False: "DIFFERS", None: "NOT RUN"}
 
 
 def _digits(number: float, tolerance: float) -> str:
-    """A number with the digits that its tolerance lets count, 4 to 13 of them."""
+    """A number with the 4 to 13 digits that its tolerance makes significant."""
     digits = 6
     if tolerance > 0 and number:
         digits = round(math.log10(abs(number) / tolerance)) + 2

@@ -45,7 +45,7 @@ def test_spikes_become_gaps_and_a_spacing_is_one_number():
     heights = prepared(z)
     assert heights.outliers == 3 and heights.missing == 0
     np.testing.assert_allclose(heights.segments[0][50], (z[49] + z[51]) / 2)
-    np.testing.assert_array_equal(np.flatnonzero(np.isnan(heights.known)), [50, 200, 300])
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(heights.despiked)), [50, 200, 300])
     assert spacing("dx", 5) == 5
     for wrong in (0, -1e-6, NAN, np.inf):
         with pytest.raises(ValueError, match="dx must be above 0 and finite, in m, got"):
@@ -62,7 +62,7 @@ def test_kinks_are_no_spikes():
     spikes = [300, 707, 1400, 1401]
     arcs[spikes] += [0.1, -0.2, 0.3, 0.3]
     found = prepared(arcs)
-    assert set(spikes) <= set(np.flatnonzero(np.isnan(found.known))) and found.outliers < 6
+    assert set(spikes) <= set(np.flatnonzero(np.isnan(found.despiked))) and found.outliers < 6
     both = np.add.outer(arcs[1500:1600], 0.5 * arcs[1550:1650])
     both[40, 50] += 0.5
     assert prepared(both).outliers == 1

@@ -200,6 +200,6 @@ def test_warnings_of_a_result(changes, line):
     given |= {"missing": 0, "outliers": 0} | changes
     other = SimpleNamespace(D=given["other"], D_standard_error=given["other_error"])
     lost = {name: given[name] for name in ("missing", "outliers")}
-    heights = SimpleNamespace(known=np.zeros(1000), **lost)
+    heights = SimpleNamespace(despiked=np.zeros(1000), **lost)
     found = [*result_warnings(given["D"], np.array(given["errors"]), other, heights)]  # pyright: ignore
     assert [each[: len(line or "")] for each in found] == [line] * (line is not None)
