@@ -24,19 +24,19 @@ from .shooting import (
     return_jacobian,
 )
 
-_SAMPLES = 512  # of an orbit, to see where friction is stiff
-_LENGTH = 0.25  # of segments at rtol 1e-9, in scaled time
-_MEMORY = 64  # evaluations from which states between are extrapolated, the nearest of them
-_CLOSINGS = 4  # attempts at that
-_FAR = 0.3  # gap beyond which an evaluation is not among them
-_BETWEEN = -0.9, 3.0  # how far beyond an evaluation, in distances from another, a cubic serves
-_STALE = 1.3  # growth of a phase after which it is cut anew
+_SAMPLES = 512  # of an orbit, which show where friction is stiff
+_LENGTH = 0.25  # longest segment at rtol 1e-9, in scaled time
+_MEMORY = 64  # last evaluations kept; states between are extrapolated from the nearest
+_CLOSINGS = 4  # most attempts at closing the gaps
+_FAR = 0.3  # gap from which on an evaluation is not kept
+_BETWEEN = -0.9, 3.0  # where a cubic through two evaluations serves, in their distance
+_STALE = 1.3  # growth of a phase after which its segments are cut anew
 _SYMBOLS = {1: "+", -1: "-", 0: "0", OPEN: "o"}
 
 
 class Phase(NamedTuple):
     s: tuple[int, ...]  # contact state
-    guard: int  # that ends it
+    guard: int  # the one that ends it
 
 
 class Solution(NamedTuple):
@@ -51,7 +51,7 @@ class Solution(NamedTuple):
 
     @property
     def times(self) -> np.ndarray:
-        """When each phase begins, and the period, in scaled time."""
+        """Start time of each phase, and the period, in scaled time."""
         k = len(self.lifted.y)
         return np.concatenate([[0], np.cumsum(self.u[k : k + len(self.phases)])])
 
@@ -70,14 +70,14 @@ class Family:
         self.template = compiled_system(x, None)
         self.n = self.template.n
         self.h, self.rtol = _LENGTH * (rtol / 1e-9) ** 0.125, rtol
-        self.segments = 0  # so far: no fewer later, since another number is compiled anew
+        self.segments = 0  # most so far; never fewer, since another number compiles anew
 
     def sampled(self, orbit: Solution, times, places: int):
-        """States (2n, places) of an orbit at times, and by how much segments should be shorter."""
+        """States (2n, places) of an orbit at times, and how much shorter segments should be."""
         period = orbit.u[2 * self.n : -1].sum()
         wrapped = jnp.asarray(np.mod(times, period))
-        given = orbit.x, self.window, orbit.chain, orbit.lifted, orbit.u
-        return resampled(*given, wrapped, self.h, places=places)
+        arguments = orbit.x, self.window, orbit.chain, orbit.lifted, orbit.u
+        return resampled(*arguments, wrapped, self.h, places=places)
 
     def linearised(self, q) -> tuple[np.ndarray, np.ndarray]:
         """The sliding equilibrium (2n,) and the Jacobian (2n, 2n) of the field there."""
@@ -85,13 +85,13 @@ class Family:
         return np.asarray(y), np.asarray(A)
 
     def eigenvalue(self, q, frequency) -> complex:
-        """The eigenvalue of the equilibrium nearest to that frequency, in scaled units."""
+        """The eigenvalue of the equilibrium nearest to a frequency, in scaled units."""
         values = np.linalg.eigvals(self.linearised(q)[1])
         return complex(values[np.argmin(np.abs(values - 1j * frequency))])
 
     def hopf_near(self, q, frequency) -> tuple[float, float] | None:
-        """Quantity and frequency of the Hopf point near those."""
-        import scipy.optimize  # not before it is used: it takes its time
+        """Quantity and frequency of the Hopf point near the given ones, or None."""
+        import scipy.optimize  # imported here because it is slow to import
 
         try:
             at: Any = scipy.optimize.newton(
@@ -103,7 +103,7 @@ class Family:
         return (float(at), value.imag) if abs(value.real) < 1e-10 else None
 
     def maximum(self, orbit: Solution, period) -> float:
-        """The time of the largest t.x, roughly."""
+        """The approximate time of the largest t.x."""
         times = np.linspace(0, period, _SAMPLES, endpoint=False)
         y, _ = self.sampled(orbit, times, _SAMPLES)
         return float(times[np.argmax(np.asarray(_along(self.template, y))[0])])
@@ -112,16 +112,16 @@ class Family:
 class Shooting:
     """The equations of one itinerary for NumPy: unknowns z are u without padding, scaled."""
 
-    gap = 1e-7  # between segments, above which a zero is none
-    apart = 1e-3  # gap that Newton's method may close, and between which a cubic serves
-    linear = 1e-10  # distance within which an evaluation's derivatives say what another would
+    gap = 1e-7  # between segments, above which a zero is not accepted
+    closable = 1e-3  # gap that Newton's method may close, and up to which a cubic serves
+    linear = 1e-10  # distance within which an evaluation is extrapolated linearly
     closed = 1e-8  # gap between the segments of a solution
 
     def __init__(self, family: Family, old: Solution, phases, times):
-        """`phases` begin at `times` (m,) on an old orbit; the last one ends after those."""
+        """`phases` begin at `times` (m + 1,) on an old orbit; the last time is their end."""
         self.family, self.phases, self.x = family, tuple(phases), old.x
         n, m = family.n, len(self.phases)
-        self.quantity = 2 * n + m  # its place among the unknowns
+        self.quantity = 2 * n + m  # its index among the unknowns
         chain, moments, N = self._mesh(old, np.asarray(times, float))
         y, _ = family.sampled(old, moments, N)
         h = np.diff(times)
@@ -131,8 +131,8 @@ class Shooting:
         blank = jnp.zeros((2 * n, len(u), N), y.dtype)
         self.memory = [Lifted(jnp.asarray(u), y, blank)]
         self.keys, self.gaps = self.key(u, old.r)[None], np.array([_FAR])  # of the memory
-        self.known: dict[bytes, Any] = {}  # of the last points
-        self.spectra: dict[bytes, np.ndarray] = {}  # of the last two
+        self.evaluations: dict[bytes, Any] = {}  # at the last points
+        self.spectra: dict[bytes, np.ndarray] = {}  # at the last two points
         self.last: tuple[Any, ...] | None = None  # point without gaps, its residual and Jacobian
         size = 1 + float(np.abs(np.asarray(y)).max())
         period = float(h.sum())
@@ -147,7 +147,7 @@ class Shooting:
         return Shooting(self.family, old, phases, times)
 
     def _curves(self) -> Continuation:
-        """Both ways along the solutions, as long as the quantities stay in their windows."""
+        """Continuation along the solutions, both ways, with the quantities in their windows."""
         inside = np.arange(len(self.begin)) >= self.quantity
         return Continuation(
             self.equations,
@@ -163,16 +163,16 @@ class Shooting:
         )
 
     def _mesh(self, old, times):
-        """The chain of segments, equal in each phase where friction counts, and their starts."""
+        """The chain of segments, of equal weight within a phase, their start times and number."""
         starts, lengths = times[:-1], np.diff(times)
         span = times[-1] - times[0]
         clock = np.linspace(0, span, _SAMPLES + 1)
         if self.family.template.scales is not None:
             # Where a law falls within a small part of the velocity the old segments are short.
             phase, begin = np.asarray(old.chain.phase), np.asarray(old.chain.begin)
-            known = old.times[phase] + begin * np.diff(old.times)[phase]
-            known = np.clip(np.mod(known - times[0], old.times[-1]), 0, span)
-            clock = np.sort(np.concatenate([clock, known]))
+            old_starts = old.times[phase] + begin * np.diff(old.times)[phase]
+            old_starts = np.clip(np.mod(old_starts - times[0], old.times[-1]), 0, span)
+            clock = np.sort(np.concatenate([clock, old_starts]))
         _, density = self.family.sampled(old, times[0] + clock, len(clock))
         density = np.maximum(1, np.asarray(density))
         steps = np.maximum(density[1:], density[:-1]) * np.diff(clock)
@@ -205,7 +205,7 @@ class Shooting:
         return chain, np.array(moments + [times[0]] * rest), N
 
     def _orders(self):
-        """Orders of the zeros of the guards (k, M) where a phase begins and where it ends."""
+        """Orders of the guards' zeros (k, M) at the start and at the end of each phase."""
         system = self.family.template
         faces = len(self.phases[0].s)
         count = 1 + 2 * faces + sum(system.opens)
@@ -236,11 +236,11 @@ class Shooting:
         return u
 
     def key(self, u, r=0.0) -> np.ndarray:
-        """What an evaluation is remembered by."""
+        """The key by which the memory holds an evaluation."""
         return u
 
     def durations(self, z) -> np.ndarray:
-        """Of the phases, scaled, which must be above zero."""
+        """Scaled durations of the phases, which must be above zero."""
         return z[2 * self.family.n : self.quantity]
 
     def lengths(self, z) -> np.ndarray:
@@ -249,14 +249,14 @@ class Shooting:
         return z[of_phases] * self.scale[of_phases]
 
     def times(self, z) -> np.ndarray:
-        """When each phase begins, and the last ends."""
+        """Start time of each phase, and the end of the last."""
         return np.concatenate([[0], np.cumsum(self.lengths(z))])
 
     def mechanism(self, z) -> Any:
         return self.x
 
     def stale(self, z) -> bool:
-        """Whether a phase has grown so much that it must be cut anew."""
+        """True if a phase has grown so much that it must be cut anew."""
         h = self.lengths(z)
         return bool((h > _STALE * self.length + 1e-2).any())
 
@@ -267,20 +267,20 @@ class Shooting:
     # --- equations ---
 
     def _nearest(self, key) -> int:
-        """The evaluation that says best where the states are: nearby, and then without gaps."""
+        """Index of the evaluation that predicts the states best: near, and with small gaps."""
         return int(np.argmin(np.abs(self.keys - key).max(axis=1) ** 2 + self.gaps**2))
 
     def extrapolated(self, key, u) -> Lifted:
         """The states at u, by a cubic through two evaluations where these lie in line with it."""
         i = self._nearest(key)
         near, ways, way = self.memory[i], self.keys[i] - self.keys, key - self.keys[i]
-        apart = np.abs(way).max()
-        if not self.apart or apart < self.linear or self.gaps[i] > self.apart:
+        distance = np.abs(way).max()
+        if not self.closable or distance < self.linear or self.gaps[i] > self.closable:
             return near
         shares = ways @ way / np.maximum((ways**2).sum(axis=1), 1e-300)
         off = np.abs(way - shares[:, None] * ways).max(axis=1)
-        fits = (shares > _BETWEEN[0]) & (shares < _BETWEEN[1]) & (self.gaps < self.apart)
-        fits &= off < 0.3 * apart
+        fits = (shares > _BETWEEN[0]) & (shares < _BETWEEN[1]) & (self.gaps < self.closable)
+        fits &= off < 0.3 * distance
         if not fits.any():
             return near
         k = int(np.argmin(np.where(fits, np.abs(shares), np.inf)))
@@ -297,10 +297,10 @@ class Shooting:
         return Lifted(u, last + change + shares[k] ** 2 * (square + shares[k] * cube), near.D)
 
     def evaluated(self, z):
-        """Residual and Jacobian of the orbit at z, by the unknowns before they are scaled."""
+        """Residual and Jacobian of the orbit at z, the latter by the unscaled unknowns."""
         key = z.tobytes()
-        if key in self.known:
-            return self.known[key]
+        if key in self.evaluations:
+            return self.evaluations[key]
         if self.last is not None and np.abs(z - self.last[0]).max() < self.linear:
             at, residual, jacobian = self.last
             return residual + jacobian @ ((z - at) * self.scale), jacobian
@@ -312,28 +312,28 @@ class Shooting:
         )
         rows = np.arange(2 * self.family.n + self.m)
         for _ in range(_CLOSINGS):
-            given = x, window, self.chain, states, u
-            residual, jacobian, states, gap = condensed(*given)
+            arguments = x, window, self.chain, states, u
+            residual, jacobian, states, gap = condensed(*arguments)
             residual, gap = np.asarray(residual)[rows], float(gap)
-            # Newton's method closes gaps as well, whose squares the residual is uncertain by.
-            if not gap > self.gap or (gap < self.apart and 10 * gap**2 < np.abs(residual).max()):
+            # Newton's method closes gaps as well; the residual is uncertain by their squares.
+            if not gap > self.gap or (gap < self.closable and 10 * gap**2 < np.abs(residual).max()):
                 break
         if gap < _FAR:
             self.memory = [*self.memory[-_MEMORY:], states]
             self.keys = np.concatenate([self.keys[-_MEMORY:], at[None]])
             self.gaps = np.append(self.gaps[-_MEMORY:], gap)
-        found = residual, np.asarray(jacobian)[np.ix_(rows, self.active)]
-        self.known = dict([*self.known.items()][-_MEMORY:]) | {key: found}
+        evaluation = residual, np.asarray(jacobian)[np.ix_(rows, self.active)]
+        self.evaluations = dict([*self.evaluations.items()][-_MEMORY:]) | {key: evaluation}
         if gap <= self.gap and self.linear:
-            self.last = z, *found
-        return found
+            self.last = z, *evaluation
+        return evaluation
 
     def equations(self, z):
         residual, jacobian = self.evaluated(z)
         return residual, jacobian * self.scale
 
     def solution(self, z) -> Solution:
-        """The orbit at z, without gaps even where the evaluation of z has been one with gaps."""
+        """The orbit at z, its gaps closed even where the evaluation at z left some."""
         u, x = self.full(z), self.mechanism(z)
         key = self.key(u, z[-1])
         i = self._nearest(key)
@@ -353,7 +353,7 @@ class Shooting:
         return self.spectra[key]
 
     def lowest(self, z) -> tuple[float, Place]:
-        """The least reduced guard on the orbit, and where."""
+        """The least reduced guard on the orbit, and its place."""
         x, _, chain, lifted, u, _ = self.solution(z)
         value, place = lowest(x, self.family.window, chain, lifted, u, *self.orders)
         return float(value), jax.tree.map(lambda a: np.asarray(a)[()], place)
@@ -370,7 +370,7 @@ class Shooting:
 def bucket(count: int, least: int) -> int:
     """The next `least` times a power of four: few shapes, hence few compilations.
 
-    Beyond 256 a power of two: an evaluation takes so long there that half of it pays for another.
+    Beyond 256 a power of two: there half an evaluation pays for another compilation.
     """
     size = least
     while size < count:
@@ -381,7 +381,7 @@ def bucket(count: int, least: int) -> int:
 def multipliers_of(return_jacobian) -> np.ndarray:
     """Floquet multipliers by size, and 1 last, from the Jacobian of the return map.
 
-    That has a zero in the place of the 1.
+    This Jacobian has the eigenvalue 0 in place of the multiplier 1.
     """
     values = np.linalg.eigvals(return_jacobian).astype(complex)
     order = np.argsort(-np.abs(values))

@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from .follow import Follower
 
 _NEW = (1e-3, 1e-4, 1e-2)  # durations of a phase that appears, as a share of the period
-_NARROW = 3e-8  # share of a step within which the end of an itinerary is found
+_NARROW = 3e-8  # share of a step within which the end of an itinerary is located
 _SHORT = 1e-6  # duration of a phase that vanishes, as a share of the period
 
 
 class ItineraryChange:
-    """The end of an itinerary between z and `reached`, and the ways on for the branch."""
+    """The end of an itinerary between z and `reached`, and how the branch may go on there."""
 
     def __init__(self, branch: "Follower", shooting: Shooting, z, reached):
         self.branch, self.family, self.shooting = branch, branch.family, shooting
@@ -36,29 +36,29 @@ class ItineraryChange:
         self.vanishing = p if vanishes else None
 
     def onward(self):
-        """Where to go on from here; None if nowhere."""
+        """Where the branch goes on from here; None if nowhere."""
         p = self.vanishing
         candidates = itertools.chain(() if p is None else self._vanishing(p), self._touching())
         return next((candidate for candidate in candidates if candidate is not None), None)
 
     def note_grazing(self) -> None:
-        """That beyond which no cycle goes on."""
-        shooting, p, found = self.shooting, self.vanishing, None
+        """Record the grazing beyond which no cycle goes on."""
+        shooting, p, grazing = self.shooting, self.vanishing, None
         if p is None:
             at = self._touch()
             if at is not None:
-                found = at, ("touch", shooting.lowest(at)[1])
+                grazing = at, ("touch", shooting.lowest(at)[1])
         else:
             at = self._without_duration(self.inside, p)
             if at is not None:
-                found = at, ("vanish", p)
-        if found is not None:
-            self.branch.record(shooting, found[0])
-            self.branch.note("grazing", shooting, found[0], shooting.itinerary(), "", found[1])
+                grazing = at, ("vanish", p)
+        if grazing is not None:
+            self.branch.record(shooting, grazing[0])
+            self.branch.note("grazing", shooting, grazing[0], shooting.itinerary(), "", grazing[1])
 
     def _bracket(self, z, reached) -> tuple[np.ndarray, np.ndarray]:
         """Points inside and outside the itinerary, close to each other where it ends."""
-        import scipy.optimize  # not before it is used: it takes its time
+        import scipy.optimize  # imported here because it is slow to import
 
         shooting, inside, outside = self.shooting, {0.0: z}, {1.0: reached}
 
@@ -73,10 +73,10 @@ class ItineraryChange:
 
         share: Any = scipy.optimize.brentq(along, 0.0, 1.0, xtol=_NARROW)
         along(min(share + _NARROW, 1.0))
-        # Rounding may hide on which side a point is: further and further inside.
-        away = _NARROW
-        while away < share and along(share - away) <= 0:
-            away *= 4
+        # Rounding may hide the side on which a point is: retreat further and further inside.
+        retreat = _NARROW
+        while retreat < share and along(share - retreat) <= 0:
+            retreat *= 4
         last = min(outside)
         return inside[max(share for share in inside if share < last)], outside[last]
 
@@ -86,14 +86,14 @@ class ItineraryChange:
         return self.branch.root(shooting, *ends, lambda z: shooting.lowest(z)[0])
 
     def _without_duration(self, z, p: int) -> np.ndarray | None:
-        """The point of the curve near z at which phase p has none."""
+        """The point of the curve near z at which phase p has no duration."""
         shooting, at = self.shooting, z.copy()
         at[shooting.index(p)] = 0
-        found = shooting.curves.corrected(at, shooting.index(p))
-        return None if found is None else found[0]
+        corrected = shooting.curves.corrected(at, shooting.index(p))
+        return None if corrected is None else corrected[0]
 
     def _vanishing(self, p: int) -> Iterator[Any]:
-        """Ways on where phase p, nearly of no duration inside, is left out or changes places."""
+        """Continuations where phase p, nearly vanished inside, is left out or changes places."""
         shooting, z = self.shooting, self.inside
         phases, m = shooting.phases, shooting.m
         old, new = phases[p - 1], phases[(p + 1) % m]
@@ -116,7 +116,7 @@ class ItineraryChange:
             # A slip to and fro before a stick: without it the stick begins at its limit.
             kept, edges = _without(phases, times, p, old.guard)
             yield self._merged(shooting.again(solution, kept, edges))
-        # Otherwise the phase can be brought to no duration at all.
+        # Otherwise the duration of the phase can be brought to zero.
         at = self._without_duration(z, p)
         if at is None:
             return
@@ -135,7 +135,7 @@ class ItineraryChange:
             yield self._direct(at, kept, edges, p, condition)
 
     def _touching(self) -> Iterator[Any]:
-        """Ways on where a guard touches zero between two switches, or at one."""
+        """Continuations where a guard touches zero between two switches, or at one."""
         shooting = self.shooting
         at = self._touch() if shooting.durations(self.outside).min() > 0 else None
         if at is None:
@@ -192,11 +192,11 @@ class ItineraryChange:
         return [tuple(state if i == face else j for i, j in enumerate(phase.s))]
 
     def _merged(self, new: Shooting):
-        """On from where an excursion vanishes: located as the grazing of the orbit without it."""
-        found = new.curves.corrected(new.begin)
-        if found is None or np.linalg.norm(found[0] - new.begin) > 0.2:
+        """Continuation where an excursion vanishes, at the grazing of the orbit without it."""
+        corrected = new.curves.corrected(new.begin)
+        if corrected is None or np.linalg.norm(corrected[0] - new.begin) > 0.2:
             return None
-        start, tangent = found[0], new.curves.tangent(found[1])
+        start, tangent = corrected[0], new.curves.tangent(corrected[1])
 
         def ahead(length):
             point = new.curves.corrected(start + length * tangent)
@@ -218,7 +218,7 @@ class ItineraryChange:
         return None
 
     def _inserted(self, at, phases, edges, index, kind, condition):
-        """On with a new phase of no duration at an event."""
+        """Continuation with a new phase, which has no duration at the event itself."""
         shooting = self.shooting
         solution = shooting.solution(at)
         period = edges[-1] - edges[0]
@@ -226,28 +226,28 @@ class ItineraryChange:
             new = shooting.again(solution, phases, edges)
             begin = new.begin.copy()
             begin[new.index(index)] = share * period / new.scale[new.index(index)]
-            found = new.curves.corrected(begin, new.index(index))
-            if found is None or np.linalg.norm(found[0] - new.begin) > 0.2:
+            corrected = new.curves.corrected(begin, new.index(index))
+            if corrected is None or np.linalg.norm(corrected[0] - new.begin) > 0.2:
                 continue
-            if new.admissibility(found[0]) <= 0:
+            if new.admissibility(corrected[0]) <= 0:
                 continue
-            tangent = new.curves.tangent(found[1])
+            tangent = new.curves.tangent(corrected[1])
             self._change(kind, shooting, at, shooting, new, condition)
-            self.branch.record(new, found[0])
+            self.branch.record(new, corrected[0])
             forward = tangent[new.index(index)] > 0
-            return self.branch.accurate(new, found[0], tangent if forward else -tangent)
+            return self.branch.accurate(new, corrected[0], tangent if forward else -tangent)
         return None
 
     def _direct(self, at, phases, edges, p: int, condition):
-        """On without phase p, which has vanished between two others."""
+        """Continuation without phase p, which has vanished between two others."""
         shooting = self.shooting
         new = shooting.again(shooting.solution(at), phases, edges)
-        found = new.curves.corrected(new.begin)
-        if found is None or np.linalg.norm(found[0] - new.begin) > 1e-3:
+        corrected = new.curves.corrected(new.begin)
+        if corrected is None or np.linalg.norm(corrected[0] - new.begin) > 1e-3:
             return None
-        tangent = new.curves.tangent(found[1])
+        tangent = new.curves.tangent(corrected[1])
         for direction in (tangent, -tangent):
-            beside = new.curves.corrected(found[0] + 1e-4 * direction)
+            beside = new.curves.corrected(corrected[0] + 1e-4 * direction)
             if beside is None or new.admissibility(beside[0]) <= 0:
                 continue
             if self._switches(new, beside[0], p):
@@ -256,7 +256,7 @@ class ItineraryChange:
         return None
 
     def _switches(self, shooting: Shooting, z, p: int) -> bool:
-        """Whether the motion goes over into phase p by itself where the one before it ends."""
+        """True if the motion enters phase p by itself where the phase before it ends."""
         p = p % shooting.m
         solution, last = shooting.solution(z), shooting.phases[p - 1]
         moment = np.array([solution.times[p]])
@@ -284,5 +284,5 @@ def _after(time, begin, times) -> float:
 
 
 def _face(guard: int, faces: int) -> int:
-    """The face or, beyond those, the joint of a guard."""
+    """The face of a guard or, for guards beyond the faces, its joint."""
     return (guard - 1) // 2 if guard <= 2 * faces else guard - faces

@@ -8,16 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-SMALL = 6  # unknowns up to which elimination is no loop, which runs faster
-_ELIMINATED = 16  # unknowns up to which elimination is no library's
-_SUMMED = 8  # rows up to which products of matrices are sums
-_QUICK = 512  # bytes of an array up to which XLA on a CPU runs a loop's operations one by one
+SMALL = 6  # unknowns up to which elimination is written out, which runs faster
+_ELIMINATED = 16  # unknowns up to which elimination is not left to a library
+_SUMMED = 8  # rows up to which a product of matrices is written as a sum
+_QUICK = 512  # bytes of an array up to which XLA on a CPU runs a loop's operations in turn
 
 
 def together(size: int, count: int) -> int:
-    """How many items of so many bytes an inner loop takes of `count`: 2^k, which divides that.
+    """How many of `count` items of `size` bytes an inner loop takes: a 2^k that divides `count`.
 
-    A loop with larger arrays takes twice as long, for XLA would run its operations side by side.
+    A loop with larger arrays takes twice as long, as XLA then runs its operations side by side.
     """
     most = max(1, _QUICK // size)
     return min(1 << (most.bit_length() - 1), count & -count)
@@ -38,9 +38,9 @@ def row_numbers(x) -> Array:
 
 
 def first_least(x) -> tuple[Array, Array]:
-    """Which row of x (k, ...) holds the least value (...), and that; k where it is not a number.
+    """The row of x (k, ...) with the least value, and that value (...); row k where it is NaN.
 
-    What `argmin` says, in reductions that XLA turns into vector instructions.
+    The same as `argmin`, in reductions that XLA turns into vector instructions.
     """
     least = jnp.min(x, axis=0)
     return jnp.min(jnp.where(x == least[None], row_numbers(x), len(x)), axis=0), least
@@ -52,8 +52,10 @@ def solve(W, b) -> Array:
         return b / W[0]
     if len(b) == 2:
         entries = W.reshape(4, *W.shape[2:])
-        own, other = entries[::3], entries[1:3]
-        return (own[::-1] * b - other * b[::-1]) / (own * own[::-1] - other * other[::-1])
+        diagonal, off_diagonal = entries[::3], entries[1:3]
+        return (diagonal[::-1] * b - off_diagonal * b[::-1]) / (
+            diagonal * diagonal[::-1] - off_diagonal * off_diagonal[::-1]
+        )
     if len(b) <= _ELIMINATED:
         return _by_elimination(W, b)
     W, b = jnp.moveaxis(W, (0, 1), (-2, -1)), jnp.moveaxis(b, 0, -1)
@@ -61,7 +63,7 @@ def solve(W, b) -> Array:
 
 
 def _by_elimination(W, b) -> Array:
-    """`solve` in operations that XLA compiles into one loop with others, unlike a library's."""
+    """`solve` in operations that XLA fuses into one loop with others, unlike a library's."""
     lanes = jnp.broadcast_shapes(W.shape[2:], b.shape[1:])
     W, b = jnp.broadcast_to(W, (*W.shape[:2], *lanes)), jnp.broadcast_to(b, (len(b), *lanes))
     numbers = row_numbers(b)
@@ -75,7 +77,7 @@ def _by_elimination(W, b) -> Array:
         A = jnp.where(chosen, jax.lax.dynamic_index_in_dim(A, k, 0), A)
         return _eliminated(k, A, row)
 
-    def solved(W):
+    def solver(W):
         return lambda _, b: jax.lax.fori_loop(
             0, len(b), step, jnp.concatenate([W, b[:, None]], axis=1)
         )[:, -1]
@@ -83,11 +85,11 @@ def _by_elimination(W, b) -> Array:
     def times(x):
         return jnp.sum(W * x[None], axis=1)
 
-    return jax.lax.custom_linear_solve(times, b, solved(W), solved(jnp.swapaxes(W, 0, 1)))
+    return jax.lax.custom_linear_solve(times, b, solver(W), solver(jnp.swapaxes(W, 0, 1)))
 
 
 def solve_positive(W, b) -> Array:
-    """`solve` of a symmetric positive definite W: elimination, which then needs no pivots."""
+    """`solve` for a symmetric positive definite W, by elimination without pivots."""
     if len(b) < 3:
         return solve(W, b)
     if len(b) > SMALL:
@@ -102,7 +104,7 @@ def solve_positive(W, b) -> Array:
 
 
 def _eliminated(k, A, row) -> Array:
-    """A after the unknown k is eliminated by that row, which becomes its row k."""
+    """A after `row` has eliminated unknown k, and has become row k."""
     row = (row / row[k][None])[None]
     return jnp.where(row_numbers(A) == k, row, A - A[:, k, None] * row)
 
@@ -121,7 +123,7 @@ def _positive_inverse_jvp(primals, tangents):
 
 
 def chosen(lanes: Bool[Array, " g"], new: Any, old: Any) -> Any:
-    """The arrays of `new` in these lanes, in others those of `old`."""
+    """The arrays of `new` in these lanes, and of `old` in the others."""
 
     def where(new, old):
         return jnp.where(lanes.reshape((1,) * (new.ndim - 1) + (-1,)), new, old)
@@ -132,7 +134,7 @@ def chosen(lanes: Bool[Array, " g"], new: Any, old: Any) -> Any:
 def product(A, B, *, written_out: bool = False) -> Array:
     """A @ B of each lane; a small one as a sum, which compiles into one loop with the rest.
 
-    `written_out` it is quicker where it stands alone: XLA leaves large reductions to a library.
+    `written_out` is quicker where it stands alone: XLA leaves large reductions to a library.
     """
     if len(A) <= _SUMMED and written_out:
         terms = (A[:, k, None] * B[k][None] for k in range(len(B)))
@@ -140,7 +142,7 @@ def product(A, B, *, written_out: bool = False) -> Array:
     if len(A) <= _SUMMED:
         return jnp.sum(A[:, :, None] * B[None], axis=1)
     if A[0, 0].size == B[0, 0].size == 1:
-        # Of one lane the library's product, which takes no other axes as they lie.
+        # For one lane the library's product, which would have to move any other axes.
         lanes = jnp.broadcast_shapes(A.shape[2:], B.shape[2:])
         return (A.reshape(A.shape[:2]) @ B.reshape(B.shape[:2])).reshape(len(A), B.shape[1], *lanes)
     return jnp.einsum("ij...,jk...->ik...", A, B)
@@ -149,7 +151,7 @@ def product(A, B, *, written_out: bool = False) -> Array:
 def log_spectral_radius(matrix, squarings: int) -> Array:
     """ln of the largest modulus of the eigenvalues of matrices (k, k, ...), by squaring them.
 
-    At most the logarithm of the size of the last power over 2^squarings too large.
+    Too large by at most the logarithm of the size of the last power over 2^squarings.
     """
 
     def square(_, carry):

@@ -42,7 +42,7 @@ _RESULTS = (
 )
 
 
-# Apart from the cycle's program, which another contact law then does not compile again.
+# Kept out of the cycle's program, which another contact law then does not compile again.
 @exported_jit
 def posed(mechanism: Mechanism, excitation) -> tuple[HybridSystem, Float[Array, ""]]:
     """The scaled system, and its growth rate at the equilibrium."""
@@ -58,24 +58,24 @@ def solved(
 ) -> LimitCycle:
     frozen, growth = jax.lax.stop_gradient((system, growth))
     equilibrium, y = frozen.equilibrium(), scaled_start(frozen, start)
-    h = 0.25 if system.fastest is None else 0.2  # a finer mesh would take a second solution
+    h = 0.25 if system.fastest is None else 0.2  # a finer mesh saves a second solution
     h = jnp.asarray(h * (rtol / 1e-9) ** 0.125, y.dtype)
     max_returns = max_returns.astype(y.dtype)
-    found = search.find(
+    attractor = search.find(
         frozen, y, equilibrium, growth, max_returns, h, jnp.asarray(rtol, y.dtype), segments
     )
-    found = jax.lax.stop_gradient(found)
+    attractor = jax.lax.stop_gradient(attractor)
 
-    y, duration = orbit(system, found.segments)
-    closed = Segments(y, duration, found.segments.s, found.segments.guard)
+    y, duration = orbit(system, attractor.segments)
+    closed = Segments(y, duration, attractor.segments.s, attractor.segments.guard)
     period = jnp.sum(duration)
-    error = found.error
+    error = attractor.error
     status = CycleResult.exhausted
     for outcome, result in enumerate(_RESULTS):
-        status = CycleResult.where(found.status == outcome, result, status)
-    exists = found.status == CONVERGED
+        status = CycleResult.where(attractor.status == outcome, result, status)
+    exists = attractor.status == CONVERGED
     rounding_of_growth = 1e3 * jnp.finfo(y.dtype).eps
-    unstable = exists & (found.growth > 100 * error + rounding_of_growth)
+    unstable = exists & (attractor.growth > 100 * error + rounding_of_growth)
     status = CycleResult.where(unstable, CycleResult.unstable, status)
     status = CycleResult.where(exists & ~(error <= rtol), CycleResult.inaccurate, status)
 
@@ -86,7 +86,7 @@ def solved(
         period=only(period) / system.omega,
         state=only(system.own(y[:, 0]) * system.units),
         error=only(error),
-        returns=found.period_returns,
+        returns=attractor.period_returns,
         regularisation_error=only(jnp.zeros_like(error)),
         result=status,
         of_scene=of_scene,
@@ -96,9 +96,9 @@ def solved(
 
 
 def refined(cycle: LimitCycle, arguments: tuple, count: int, static: dict) -> LimitCycle:
-    """A cycle found with `count` segments, again with as many as a long period needs.
+    """A cycle solved with `count` segments, solved again with as many as a long period needs.
 
-    Known only of one cycle outside of a compiled program.
+    Only for one cycle, outside of a compiled program.
     """
     if concrete(cycle.period) is None or cycle.period.ndim:
         return cycle
@@ -113,7 +113,7 @@ def refined(cycle: LimitCycle, arguments: tuple, count: int, static: dict) -> Li
 
 
 def checked(mechanism, start, excitation, rtol, max_returns, segments=None):
-    """Options of a search: `max_returns` as a number, how many segments, and what is static."""
+    """Options of a search: `max_returns` as a number, segment count, and what is static."""
     n, joints = degrees_of_freedom(mechanism), joints_of(mechanism)
     if excitation is not None:
         require_kind("excitation", excitation, Excitation)
@@ -156,8 +156,8 @@ def limit_cycle(
       `jax.vmap` takes many, and a member that fails marks only itself. All wait for the slowest:
       on a CPU `jax.lax.map(..., batch_size=32)` is quicker.
     - `start`: (2n,), [x, v] in m and m/s; by default the sliding equilibrium, displaced by V/omega
-      along t, where omega^2 is the sum of the squared eigenfrequencies of a scene, and of a
-      structure the root of the sum of their fourth powers.
+      along t, where omega^2 is the sum of the squared eigenfrequencies for a scene, and the root
+      of the sum of their fourth powers for a structure.
     - `excitation`: a harmonic force. The returns are then its periods, at each of which its time is
       0 again: the section is stroboscopic, `state` is that at the time 0, `period` is `returns`
       periods of the excitation (above 1 the motion is subharmonic), and none of the 2n
@@ -170,10 +170,10 @@ def limit_cycle(
       as Kvaerno5, for a small eps. `max_steps` bounds its steps in one period.
     - `rtol`: relative tolerance of period and states, 1e-9 by default and at least 9.1e-13; in
       float32 both are 4.9e-4. It sets the number of segments.
-    - `max_returns`: returns of the coarse run after which it gives up.
-    - `segments`: most pieces that the orbit is cut into, 64 by default, 256 for more than 8 degrees
-      of freedom or more than one joint, and 512 where a joint follows its load curve; one return
-      takes some 35, more where the highest frequency is far above that of the motion.
+    - `max_returns`: returns of the coarse run after which the search gives up.
+    - `segments`: most segments that the orbit is cut into, 64 by default, 256 for more than 8
+      degrees of freedom or more than one joint, and 512 where a joint follows its load curve; one
+      return takes some 35, more where the highest frequency is far above that of the motion.
       Outside of compiled programs a longer period gets more; inside, the result says that it
       needs them.
     - `throw`: raise unless the result is `converged`. Otherwise `result` says what was found, and
@@ -184,8 +184,8 @@ def limit_cycle(
     Under a trace (`jit`, `vmap`) everything is NaN instead.
     """
     start = None if start is None else start_state(start, degrees_of_freedom(mechanism))
-    given = mechanism, start, excitation
-    returns, count, static = checked(*given, rtol, max_returns, segments)
+    inputs = mechanism, start, excitation
+    returns, count, static = checked(*inputs, rtol, max_returns, segments)
     arguments = *posed(mechanism, excitation), start, returns
     cycle = solved(*arguments, segments=count, **static)
     if segments is None:
@@ -195,5 +195,5 @@ def limit_cycle(
 
         eps = number("regularisation", regularisation, above=0)
         steps = whole("max_steps", max_steps, 1)
-        cycle = regularised_cycle(*given, eps, cycle, solver, static["rtol"], steps)
+        cycle = regularised_cycle(*inputs, eps, cycle, solver, static["rtol"], steps)
     return raise_unless(CycleResult.converged, cycle) if throw else cycle

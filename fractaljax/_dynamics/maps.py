@@ -1,4 +1,4 @@
-"""Derivatives of segments: of their ends by the states at their starts and by durations."""
+"""Derivatives of the ends of segments by the states at their starts and by durations."""
 
 import functools
 from collections.abc import Callable
@@ -14,9 +14,9 @@ from .lanes import product
 from .runge_kutta import runge_kutta, stability_polynomial
 from .segments import Segments, chosen_guard, next_start, tableau
 
-_POWERS = 4  # of a matrix in a polynomial of it
-_FEW = 512  # segments of all lanes that are taken at once
-_TOGETHER, _LEAST = 128, 8  # of more, how many of all lanes, and of each at least, at a time
+_POWERS = 4  # of a matrix, to evaluate a polynomial of it
+_FEW = 512  # segments, over all lanes, up to which all are taken at once
+_TOGETHER, _LEAST = 128, 8  # if more, segments at a time: over all lanes, least of each
 
 
 class Maps(eqx.Module):
@@ -36,13 +36,13 @@ def exact_maps(system: HybridSystem, segments: Segments) -> Maps:
 
 
 def coarse_maps(system: HybridSystem, segments: Segments) -> Maps:
-    """Derivatives less exact, which Newton's method converges with as well.
+    """Approximate derivatives, with which Newton's method converges as well.
 
     They take a tenth of the time.
     """
-    given = functools.partial(_polynomial_maps, system)
+    polynomial_maps = functools.partial(_polynomial_maps, system)
     size = segments_together(segments) if system.fastest is None else 1
-    _, A, b = in_blocks(given, unmoved, size, segments, next_start(segments.y))
+    _, A, b = in_blocks(polynomial_maps, unmoved, size, segments, next_start(segments.y))
     return Maps(A, b, _guard_slopes(system, segments))
 
 
@@ -59,7 +59,7 @@ def unmoved(segments: Segments, *_) -> tuple[Array, Array, Array]:
 
 
 def in_blocks(function: Callable, unused: Callable, size: int, segments: Segments, *more) -> Any:
-    """function(segments, ...) in blocks of that size; of those without a used segment `unused`."""
+    """function(segments, ...) in blocks of `size`; `unused` for blocks without a used segment."""
     length, lanes = len(segments.duration), segments.duration.ndim - 1
     if size >= length:
         return function(segments, *more)
@@ -69,10 +69,10 @@ def in_blocks(function: Callable, unused: Callable, size: int, segments: Segment
         x = jnp.pad(x, [(0, -length % size), *[(0, 0)] * (x.ndim - 1)], constant_values=UNUSED)
         return x.reshape(-1, size, *x.shape[1:])
 
-    def block(given):
-        given = jax.tree.map(lambda x: jnp.moveaxis(x, 0, axis_of(x, lanes)), given)
+    def block(arguments):
+        arguments = jax.tree.map(lambda x: jnp.moveaxis(x, 0, axis_of(x, lanes)), arguments)
         return jax.lax.cond(
-            jnp.any(given[0].used), lambda: function(*given), lambda: unused(*given)
+            jnp.any(arguments[0].used), lambda: function(*arguments), lambda: unused(*arguments)
         )
 
     def joined(x):
@@ -88,7 +88,7 @@ def _maps(system: HybridSystem, segments: Segments) -> tuple[Array, Array, Array
     y, s = segments.y, segments.s
 
     def field(columns):
-        # The state and its tangents side by side: one array, one compiled loop a stage.
+        # The state and its tangents side by side: one array, one compiled loop per stage.
         along, slope = jax.linearize(lambda y: system.field(y, s), columns[:, 0])
         tangents = _of_each(slope, columns[:, 1:])
         return jnp.concatenate([along[:, None], tangents], axis=1)
@@ -100,7 +100,7 @@ def _maps(system: HybridSystem, segments: Segments) -> tuple[Array, Array, Array
 
 
 def _polynomial_maps(system: HybridSystem, segments: Segments, ends):
-    """As `_maps`, of segments with known ends: A is the stability polynomial of the mean Jacobian.
+    """As `_maps`, for known ends: A is the stability polynomial of the mean Jacobian.
 
     Exact if the field is affine. (In powers of its fourth power, by Paterson and Stockmeyer.)
     """
@@ -117,13 +117,13 @@ def _polynomial_maps(system: HybridSystem, segments: Segments, ends):
     A = None
     for first in reversed(range(0, len(coefficients), _POWERS)):
         block = coefficients[first : first + _POWERS]
-        own = sum(c * power for c, power in zip(block, powers, strict=False))
-        A = own if A is None else times(A, powers[-1]) + own
+        terms = sum(c * power for c, power in zip(block, powers, strict=False))
+        A = terms if A is None else times(A, powers[-1]) + terms
     return ends, A, b
 
 
 def _of_each(slope: Callable, tangents) -> Array:
-    """The slope along each of tangents (2n, k, ...)."""
+    """The slope along each of the tangents (2n, k, ...)."""
     return jax.vmap(slope, in_axes=1, out_axes=1)(tangents)
 
 
@@ -142,6 +142,6 @@ def _guard_slopes(system: HybridSystem, segments: Segments) -> Array:
 
 
 def axis_of(x, lanes: int) -> int:
-    """The axis of segments in x (..., N, ...) of so many axes of lanes; of matrices the first."""
+    """The axis of segments in x (..., N, ...) with `lanes` axes of lanes; the first of matrices."""
     before = x.ndim - 1 - lanes
     return before if before < 2 else 0

@@ -1,7 +1,7 @@
 """The periodic orbit of a known itinerary, by multiple shooting over short segments.
 
-A segment keeps one contact state. Those of one phase, from one switch to the next, have fixed
-shares of its duration, and the phase ends where its guard vanishes. So no event is searched for,
+A segment keeps one contact state. The segments of one phase, from one switch to the next, have
+fixed shares of its duration, and the phase ends where its guard vanishes. No event is searched for,
 and the equations are smooth in states and durations. Newton's method solves them by chaining the
 affine maps of all segments.
 """
@@ -22,32 +22,32 @@ from .maps import Maps, axis_of, coarse_maps, exact_maps, in_blocks, segments_to
 from .segments import Segments, chosen_guard, flow, next_start
 
 _ITERATIONS = 20
-_SHORTEST = 1e-12  # duration, in scaled time, that a segment counts with at least
+_SHORTEST = 1e-12  # least duration, in scaled time, that a segment is counted with
 _HOPELESS = 8  # iterations after which steps must be small, relative to the orbit
 
 
 def _chain(body: Callable, carry, arrays: tuple, lanes: int, count=None) -> tuple[Any, Array]:
     """`jax.lax.scan` over segments.
 
-    With `count` over so many: that takes no longer than it must, but has no reverse mode.
+    With `count`, over the first `count` only: quicker, but without reverse mode.
     """
     front = [jnp.moveaxis(x, axis_of(x, lanes), 0) for x in arrays]
     if count is None:
-        carry, found = jax.lax.scan(body, carry, tuple(front))
-        return carry, jnp.moveaxis(found, 0, found.ndim - 1 - lanes)
+        carry, stacked = jax.lax.scan(body, carry, tuple(front))
+        return carry, jnp.moveaxis(stacked, 0, stacked.ndim - 1 - lanes)
 
     def at(k):
         return tuple(jax.lax.dynamic_index_in_dim(x, k, keepdims=False) for x in front)
 
     def step(k, so_far):
-        carry, found = so_far
+        carry, stacked = so_far
         carry, one = body(carry, at(k))
-        return carry, jax.lax.dynamic_update_index_in_dim(found, one, k, 0)
+        return carry, jax.lax.dynamic_update_index_in_dim(stacked, one, k, 0)
 
     one = jax.eval_shape(body, carry, at(0))[1]
     blank = jnp.zeros((len(front[0]), *one.shape), one.dtype)
-    carry, found = jax.lax.fori_loop(0, count, step, (carry, blank))
-    return carry, jnp.moveaxis(found, 0, found.ndim - 1 - lanes)
+    carry, stacked = jax.lax.fori_loop(0, count, step, (carry, blank))
+    return carry, jnp.moveaxis(stacked, 0, stacked.ndim - 1 - lanes)
 
 
 @functools.partial(jax.jit, static_argnames="constant")  # traced once for all places of a program
@@ -57,9 +57,9 @@ def corrections(
     """Changes of states and durations that close the gaps and bring the guards to zero.
 
     They solve dy_next = A dy + b dt + gap on every segment of the chain, with the same stretch
-    dt/duration in a phase, and c dy_next = -guard at its end. Of the first state the component
-    `constant`, which repeats whatever it is, does not change. Returns them and the product of all
-    maps (2n, 2n), the Jacobian of the return map. No segment from `count` on is used.
+    dt/duration in a phase, and c dy_next = -guard at its end. The component `constant` of the first
+    state, which repeats whatever it is, does not change. Returns them and the product of all maps
+    (2n, 2n), the Jacobian of the return map. No segment from `count` on is used.
     """
     n, used, lanes = len(gap), segments.used, segments.duration.ndim - 1
     ends = used & (segments.guard != NONE)
@@ -67,8 +67,8 @@ def corrections(
     def through(W, segment):
         """The affine map from the first state to this end, and what the phase's stretch adds.
 
-        The columns of W are the derivatives by the first state, the shift, and those by the
-        stretch of the phase so far, which is known at its end: r dy_first + d.
+        The columns of W are the derivatives by the first state, the shift, and the derivatives by
+        the stretch of the phase so far, which is known at its end: r dy_first + d.
         """
         A, gap, b, c, guard, last = segment
         W = product(A, W) + shifts[None] * gap[:, None] + stretches[None] * b[:, None]
@@ -123,33 +123,33 @@ class PeriodicOrbit(eqx.Module):
 
     @classmethod
     def none(cls, segments: Segments) -> "PeriodicOrbit":
-        """None yet; of the shapes that belong to those segments."""
+        """No orbit yet, in the shapes of those segments."""
         y = segments.y
         zero = jnp.zeros_like(y[0, 0])
         jacobian = jnp.zeros((len(y), *y[:, 0].shape), y.dtype)
         return cls(segments, zero > 0, zero + jnp.inf, jnp.zeros_like(y), jacobian)
 
     def where(self, lanes: Bool[Array, " g"], other: "PeriodicOrbit") -> "PeriodicOrbit":
-        """Itself in these lanes, in others the other."""
+        """This orbit in these lanes, `other` elsewhere."""
         return chosen(lanes, self, other)
 
 
 def solve_periodic_orbits(
-    system: HybridSystem, segments: Segments, wanted, reach, rtol: ArrayLike = 0
+    system: HybridSystem, segments: Segments, active, reach, rtol: ArrayLike = 0
 ) -> PeriodicOrbit:
-    """The periodic orbits near the segments of g lanes, of those that are `wanted` (g,).
+    """The periodic orbits near the segments of g lanes, in the lanes that are `active` (g,).
 
-    They are solved together: a lane that has converged waits for the others. One gives up where
+    They are solved together: a lane that has converged waits for the others. A lane gives up if
     its first state would move further than `reach` (g,). A relative error of less than `rtol` (g,)
     may be left, and where the error is below `rtol` it is corrected.
     """
     y, s, guard, used = segments.y, segments.s, segments.guard, segments.used
-    # Those of other lanes may be anything.
-    duration = jnp.where(wanted[None], segments.duration, 0)
+    # Durations in other lanes may be anything.
+    duration = jnp.where(active[None], segments.duration, 0)
     if system.excited:
         y = y.at[:, :1].set(system.with_excitation(system.own(y[:, :1]), 0.0))
     start = y[:, 0]
-    many = jnp.max(jnp.sum(used & wanted[None], axis=0))
+    many = jnp.max(jnp.sum(used & active[None], axis=0))
     eps, big = jnp.finfo(y.dtype).eps, jnp.finfo(y.dtype).max
     size = 1 + jnp.max(jnp.abs(y), axis=(0, 1))
     longest_step = jnp.ones_like(size)
@@ -160,28 +160,28 @@ def solve_periodic_orbits(
     tolerance = jnp.maximum(1e3 * eps, 1e-2 * rtol) * size
     together = segments_together(segments)
     A = jnp.zeros((y.shape[1], len(y), *y[:, 0].shape), y.dtype)
-    nothing = Maps(A, jnp.zeros_like(y), jnp.zeros_like(y))
-    far = jnp.where(wanted, big, jnp.inf).astype(y.dtype)
+    no_maps = Maps(A, jnp.zeros_like(y), jnp.zeros_like(y))
+    far = jnp.where(active, big, jnp.inf).astype(y.dtype)
 
     def running(carry):
         return carry[-1] <= _ITERATIONS
 
     def body(carry):
-        found, local, change, before, count = carry
-        y, h = found.segments.y, found.segments.duration
+        orbits, local, change, before, count = carry
+        y, h = orbits.segments.y, orbits.segments.duration
         # Each step is this much shorter than the last one, and the next one may be.
         left = change * jnp.clip(change / before, 1e-3, 1)
         going = (left > tolerance) & (change < jnp.inf)
-        # The last iteration is with half the steps: what these change is the error.
+        # The last iteration has steps of half the length: the change is the error.
         ends_here = ~jnp.any(going) | (count == _ITERATIONS)
         # Near the orbit the maps serve again, while they do well.
         slow = change > before / 8
         stale = going & ((change > 1e-3 * size) | slow)
         # Where a law bends much within a segment, rough maps converge slowly or not at all.
         exact = ends_here | jnp.any(going & slow)
-        renewals = [lambda: local, lambda: coarse_maps(system, found.segments)]
+        renewals = [lambda: local, lambda: coarse_maps(system, orbits.segments)]
         if not system.affine:  # where coarse ones are exact
-            renewals.append(lambda: exact_maps(system, found.segments))
+            renewals.append(lambda: exact_maps(system, orbits.segments))
         last = len(renewals) - 1
         renewal = jnp.where(exact, last, jnp.where(jnp.any(stale), 1, 0))
         local = jax.lax.switch(renewal, renewals)
@@ -193,11 +193,11 @@ def solve_periodic_orbits(
 
             return jax.lax.fori_loop(0, parts, half, (some.y, some.y))
 
-        ends, middle = in_blocks(flows, lambda none: (none.y, none.y), together, found.segments)
+        ends, middle = in_blocks(flows, lambda none: (none.y, none.y), together, orbits.segments)
         target = next_start(y)
         off = chosen_guard(system, target, s, guard)
         dy, dt, jacobian = corrections(
-            local, found.segments, ends - target, off, system.constant, many
+            local, orbits.segments, ends - target, off, system.constant, many
         )
         largest, longest = jnp.max(jnp.abs(dy), axis=(0, 1)), jnp.max(jnp.abs(dt), axis=0)
         error = jnp.maximum(
@@ -205,9 +205,9 @@ def solve_periodic_orbits(
             largest / jnp.max(jnp.abs(y), axis=(0, 1)),
         )
         new = jnp.maximum(largest, longest)
-        moved = jnp.max(jnp.abs(y[:, 0] + dy[:, 0] - start), axis=0)
+        displacement = jnp.max(jnp.abs(y[:, 0] + dy[:, 0] - start), axis=0)
         hopeless = (count >= _HOPELESS) & (new > 1e-2 * size)
-        new = jnp.where((moved <= reach) & (new < big) & ~hopeless, new, jnp.inf)
+        new = jnp.where((displacement <= reach) & (new < big) & ~hopeless, new, jnp.inf)
         converged = left <= 10 * tolerance
         accurate = converged & (error <= rtol)
         moves = jnp.where(ends_here, accurate, going) & (new < jnp.inf)
@@ -217,20 +217,20 @@ def solve_periodic_orbits(
         y = jnp.where(used[None], y, y[:, :1])
         h = jnp.where(moves[None], h + share * dt, h)
         middle = jnp.where(used[None], middle, y)
-        found = PeriodicOrbit(Segments(y, h, s, guard), converged, error, middle, jacobian)
+        orbits = PeriodicOrbit(Segments(y, h, s, guard), converged, error, middle, jacobian)
         change, before = jnp.where(going, jnp.stack([new, change]), jnp.stack([change, before]))
-        return found, local, change, before, jnp.where(ends_here, _ITERATIONS, count) + 1
+        return orbits, local, change, before, jnp.where(ends_here, _ITERATIONS, count) + 1
 
     none = PeriodicOrbit.none(Segments(y, duration, s, guard))
-    found, *_ = jax.lax.while_loop(running, body, (none, nothing, far, far, 0))
-    return found
+    orbits, *_ = jax.lax.while_loop(running, body, (none, no_maps, far, far, 0))
+    return orbits
 
 
 @jax.custom_jvp
 def orbit(system: HybridSystem, segments: Segments) -> tuple[Array, Array]:
     """States and durations of a periodic orbit as functions of the system.
 
-    Derivatives of every order are implicit: those of the equations that the orbit solves.
+    Derivatives of every order are implicit, from the equations that the orbit solves.
     """
     return segments.y, segments.duration
 
@@ -239,13 +239,15 @@ def orbit(system: HybridSystem, segments: Segments) -> tuple[Array, Array]:
 def _orbit_jvp(primals, tangents):
     system, segments = primals
     y, duration = orbit(system, segments)
-    given = system, Segments(y, duration, segments.s, segments.guard)
-    return (y, duration), _moved(given, tangents[0])
+    point = system, Segments(y, duration, segments.s, segments.guard)
+    return (y, duration), _orbit_tangent(point, tangents[0])
 
 
-def _moved(given: tuple[HybridSystem, Segments], tangent: HybridSystem) -> tuple[Array, Array]:
-    """Changes of an orbit's states and durations where its system changes."""
-    system, segments = given
+def _orbit_tangent(
+    point: tuple[HybridSystem, Segments], tangent: HybridSystem
+) -> tuple[Array, Array]:
+    """Changes of an orbit's states and durations with a change of its system."""
+    system, segments = point
 
     def equations(system):
         end = next_start(segments.y)
@@ -258,5 +260,5 @@ def _moved(given: tuple[HybridSystem, Segments], tangent: HybridSystem) -> tuple
     def solution(gap, off):
         return corrections(local, segments, gap, off, system.constant)[:2]
 
-    # Linear, hence its own derivative: without the constant parts that no scan can transpose.
+    # Linear, hence its own derivative, without the constant parts that no scan can transpose.
     return jax.jvp(solution, (jnp.zeros_like(gap), jnp.zeros_like(off)), (gap, off))[1]

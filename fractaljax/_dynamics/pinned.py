@@ -1,9 +1,9 @@
 """The equations of a cycle that is held at an event, with two quantities of the mechanism free.
 
-To those of `itinerary.py` comes one condition: a fold, a multiplier on the unit circle, a guard
-that touches zero, or a phase of no duration. Newton's method finds zeros of the exact equations. In
-its Jacobian the row of the condition and the column of the second quantity are differences, good to
-some digits.
+One condition joins the equations of `itinerary.py`: a fold, a multiplier on the unit circle, a
+guard that touches zero, or a phase of no duration. Newton's method solves the exact equations. In
+its Jacobian the row of the condition and the column of the second quantity are finite differences,
+accurate to some digits.
 """
 
 import functools
@@ -32,17 +32,17 @@ _NEAR = 1e-6  # scaled time within which a moment is that of a switch
 
 
 class Event(NamedTuple):
-    """What is held."""
+    """The event at which the cycle is held."""
 
     condition: str  # "fold", "multiplier", "touch" or "vanish"
     place: Any = None  # of "touch"
-    phase: Phase | None = None  # that has no duration, of "vanish"
+    phase: Phase | None = None  # the one of no duration, of "vanish"
     side: int = 0  # -1 where that is at the start of a phase, 1 at its end
     multiplier: complex | None = None  # by default the one nearest to the unit circle
 
     @classmethod
     def of(cls, condition: str, detail: Any, solution: Solution) -> "Event":
-        """From what vanishes at an event of a branch."""
+        """The event where `condition` vanishes on a branch, with its `detail`."""
         if condition == "vanish":
             return cls(condition, phase=solution.phases[detail])
         if condition != "touch":
@@ -58,7 +58,7 @@ class Pinned(Shooting):
     """The equations of one itinerary held at an event; the second quantity comes last in z."""
 
     gap = 1e-11  # differences of the Jacobian need more than the orbit does
-    apart = linear = 0.0
+    closable = linear = 0.0
 
     def __init__(self, family: Family, second: Window, event: Event, old: Solution, phases, times):
         self.second, self.event, self.borders = second, event, None
@@ -87,12 +87,12 @@ class Pinned(Shooting):
 
     def stale(self, z) -> bool:
         place = self.event.place
-        away = place is not None and not -0.2 < place.theta < 1.2
-        return away or super().stale(z)
+        outside = place is not None and not -0.2 < place.theta < 1.2
+        return outside or super().stale(z)
 
     def durations(self, z) -> np.ndarray:
-        found = super().durations(z)
-        return found if self.held is None else np.delete(found, self.held)
+        of_phases = super().durations(z)
+        return of_phases if self.held is None else np.delete(of_phases, self.held)
 
     def equations(self, z):
         residual, jacobian = self._orbit(z)
@@ -113,8 +113,8 @@ class Pinned(Shooting):
             row, along = np.zeros(len(z) - 1), 0.0
             for left, right in pairs:
                 # left . dJ right, by the symmetry of second derivatives, is left . dJ along right.
-                away = z + _STEP * np.append(right, [0.0, 0.0])
-                row = row + left @ (self._orbit(away)[1] - jacobian) / _STEP
+                displaced = z + _STEP * np.append(right, [0.0, 0.0])
+                row = row + left @ (self._orbit(displaced)[1] - jacobian) / _STEP
                 along += left @ (other_jacobian - jacobian)[:, :-1] @ right / step
         rows = np.column_stack([jacobian, column])
         return np.append(residual, value), np.vstack([rows, np.append(row, along)])
@@ -125,7 +125,7 @@ class Pinned(Shooting):
         return residual, jacobian * self.scale[:-1]
 
     def _fold(self, jacobian):
-        """What vanishes at a fold: the last element of the inverse of the bordered Jacobian."""
+        """The last element of the inverse of the bordered Jacobian, which vanishes at a fold."""
         A = jacobian[:, :-1]
         if self.borders is None:
             left, _, right = np.linalg.svd(A)
@@ -137,12 +137,12 @@ class Pinned(Shooting):
         return right[-1], [(-left[:-1], right[:-1])]
 
     def _multiplier(self, jacobian):
-        """The modulus of the multiplier less 1."""
+        """The modulus of the multiplier, less 1."""
         plain, k = jacobian / self.scale[:-1], 2 * self.family.n
         values, vectors = np.linalg.eig(return_jacobian(plain, k, np))
         last = self.event.multiplier
-        away = np.abs(np.abs(values) - 1) if last is None else np.abs(values - last)
-        i = int(np.argmin(away))
+        distance = np.abs(np.abs(values) - 1) if last is None else np.abs(values - last)
+        i = int(np.argmin(distance))
         value, right, left = values[i], vectors[:, i], np.linalg.inv(vectors)[i]
         self.event = self.event._replace(multiplier=complex(value))
         S, T, Q = plain[k:, k:-1], plain[k:, :k], plain[:k, k:-1]
@@ -153,12 +153,12 @@ class Pinned(Shooting):
     # --- a phase that has no duration ---
 
     def _hold(self, lengths) -> None:
-        """Which phase that is here; guards that are zero there are not looked at beside it."""
+        """Find the phase of no duration; guards that are zero there are ignored beside it."""
         alike = [phase == self.event.phase for phase in self.phases]
-        found = np.flatnonzero(np.array(alike) & (lengths <= 1e-9 * lengths.sum()))
-        if not len(found):
+        matches = np.flatnonzero(np.array(alike) & (lengths <= 1e-9 * lengths.sum()))
+        if not len(matches):
             return
-        self.held = p = int(found[0])
+        self.held = p = int(matches[0])
         last, following = p - 1, (p + 1) % self.m
         before = np.array(self.orders[0])
         before[:, p] = -1
@@ -169,7 +169,7 @@ class Pinned(Shooting):
     # --- a guard that touches zero ---
 
     def _touch(self, z, keep=False):
-        """The guard where it is least, and its gradient by the scaled unknowns but the second."""
+        """The least value of the guard, and its gradient by the scaled unknowns but the second."""
         if self.event.place is None:
             return np.nan, np.full(len(z) - 1, np.nan)
         self.evaluated(z)
@@ -177,11 +177,11 @@ class Pinned(Shooting):
         place, inside = self.event.place, self.event.side == 0
         value, row, theta = _touching(x, self.family.window, chain, lifted, u, place, inside)
         if keep and inside:
-            self.event = self.event._replace(place=_moved(place, float(theta)))
+            self.event = self.event._replace(place=_at_share(place, float(theta)))
         return float(value), np.asarray(row)[self.active] * self.scale[:-1]
 
     def _locate(self, old: Solution, times) -> None:
-        """Where the touching guard is on this mesh, from where it was on the old orbit."""
+        """Locate the touching guard on this mesh, from its place on the old orbit."""
         was, self.event = self.event.place, self.event._replace(place=None)
         if was is None:
             return
@@ -199,7 +199,7 @@ class Pinned(Shooting):
                 return
 
     def _place_in(self, p: int, share: float, was: Place) -> None:
-        """The place at that share of phase p; its guard is not looked at there any more."""
+        """Set the place at that share of phase p, where its guard is then ignored."""
         used = np.asarray(self.chain.share) > 0
         mine, side = np.flatnonzero(used & (np.asarray(self.chain.phase) == p)), self.event.side
         begin, length = np.asarray(self.chain.begin)[mine], np.asarray(self.chain.share)[mine]
@@ -215,7 +215,7 @@ class Pinned(Shooting):
         self.orders = jnp.asarray(before), jnp.asarray(after)
 
 
-def _moved(place: Place, theta: float) -> Place:
+def _at_share(place: Place, theta: float) -> Place:
     return Place(place.guard, place.segment, jnp.asarray(theta), place.before, place.after)
 
 

@@ -1,4 +1,4 @@
-"""The last steps of many coarse runs, and how a stretch of them is cut into segments."""
+"""The last steps of many coarse runs, and the cutting of a stretch of them into segments."""
 
 from collections.abc import Callable
 
@@ -12,16 +12,16 @@ from .hybrid import NONE, SECTION, UNUSED, HybridSystem
 from .lanes import together
 from .segments import Segments, cumulative, flow
 
-_PHASES = 256  # most of one contact state in an orbit
+_PHASES = 256  # most phases in an orbit
 # The last rows of a record: the guard that ended a step, and sums over the steps up to its end,
-# less those of the whole run: time, weight, switches with returns, and returns.
+# less the sums of the whole run: time, weight, switches with returns, and returns.
 _ROWS = GUARD, TIME, WEIGHT, ENDED, RETURNED = range(-5, 0)
 
 
 def first_reached(reaches: Callable[[Array], Array], shape: tuple[int, ...], count: int) -> Array:
-    """The first of `count` numbers that `reaches` accepts, as it does all after it; the last else.
+    """The first of `count` numbers that `reaches` accepts, with all after it; the last if none.
 
-    `reaches` takes numbers of that shape.
+    `reaches` takes arrays of numbers of that shape.
     """
 
     def halve(_, bounds):
@@ -42,9 +42,9 @@ class Steps(eqx.Module):
 
     @classmethod
     def along(cls, system: HybridSystem, segments: Segments, h) -> "Steps":
-        """The segments of orbits as steps 1, 2, ...; of step 0 all is zero.
+        """The segments of orbits as steps 1, 2, ...; step 0 is all zero.
 
-        Of a system whose steps follow the motion the weight is by the errors, and h on average.
+        If the system's steps follow the motion, weights follow the errors, and are h on average.
         """
         used = segments.used
         time = jnp.where(used, segments.duration, 0)
@@ -73,7 +73,7 @@ class Steps(eqx.Module):
         return self.steps.shape[1]
 
     def row(self, row, number, lane) -> Array:
-        """A row of the steps of those numbers in those lanes, or of `slice` several."""
+        """A row, or a `slice` of rows, of the steps of those numbers in those lanes."""
         place = jax.lax.rem(self.oldest + number + self.length, self.length)
         row = row if isinstance(row, slice) else row % len(self.steps)
         kept = self.steps.at[row, place, lane]
@@ -83,8 +83,8 @@ class Steps(eqx.Module):
 class Record(Steps):
     """The last steps of coarse runs in B lanes, numbered from the oldest.
 
-    What changes the array anywhere but in the loop that steps would copy it, which takes longer
-    than the steps.
+    A change of the array outside the stepping loop would copy it, which takes longer than the
+    steps.
     """
 
     y: Float[Array, "2n B"]  # state after the last step
@@ -96,7 +96,7 @@ class Record(Steps):
 
     @classmethod
     def begin(cls, system: HybridSystem, y, length: int) -> "Record":
-        """Of runs from y, with room for so many steps."""
+        """The record of runs from y, with room for `length` steps."""
         s, lanes = system.contact_state(y), y.shape[1]
         steps = jnp.zeros((len(y) + len(s) + len(_ROWS), length, lanes), y.dtype)
         none = jnp.zeros(lanes, int)
@@ -105,11 +105,11 @@ class Record(Steps):
         return cls(steps, none[0], y, s, none + NONE, sums, reach, none)
 
     def past(self, row, number, lane) -> Array:
-        """A row of sums as of now, which are zero after the last step."""
+        """A row of the sums relative to now: zero after the last step."""
         return self.row(row, number, lane) - self.sums[row - TIME, lane]
 
     def advance(self, system: HybridSystem, h, count: int) -> "Record":
-        """After `count` more steps, no longer than h; the length is a multiple of `count`."""
+        """The record after `count` more steps, at most h long; `count` divides its length."""
 
         rows, _, lanes = self.steps.shape
         block = together(rows * lanes * self.steps.dtype.itemsize, count)
@@ -135,17 +135,17 @@ class Record(Steps):
         motion = self.y, self.s, self.guard, self.sums, self.reach, some
         motion, steps = jax.lax.fori_loop(0, count // block, body, (motion, self.steps))
         y, s, guard, sums, reach, _ = motion
-        known = jnp.minimum(self.count + count, self.length)
+        valid = jnp.minimum(self.count + count, self.length)
         oldest = (self.oldest + count) % self.length
-        return Record(steps, oldest, y, s, guard, sums, reach, known)
+        return Record(steps, oldest, y, s, guard, sums, reach, valid)
 
     def moved(self, y, where) -> "Record":
-        """With the states y, where steps from before are not of the same motion."""
-        known = jnp.where(where, 0, self.count)
-        return eqx.tree_at(lambda record: (record.y, record.count), self, (y, known))
+        """The record with states y; no earlier step is valid `where` these are another motion."""
+        valid = jnp.where(where, 0, self.count)
+        return eqx.tree_at(lambda record: (record.y, record.count), self, (y, valid))
 
     def returns(self, count: int) -> tuple[Array, Array]:
-        """The steps (count, B) that ended at the last returns, newest first, and which exist."""
+        """The steps (count, B) that ended at the last returns, newest first, and if they exist."""
         k, lane = jnp.arange(count)[:, None], jnp.arange(len(self.guard))[None]
         at = first_reached(
             lambda number: self.past(RETURNED, number, lane) >= -k,
@@ -163,7 +163,7 @@ class Record(Steps):
 
 
 class Stretch(eqx.Module):
-    """Steps of g lanes: of their coarse runs, or of orbits that were found near these."""
+    """Steps of g lanes: of their coarse runs, or of orbits near these."""
 
     run: Record
     lane: Int[Array, " g"]  # of the run
@@ -176,8 +176,8 @@ class Stretch(eqx.Module):
         return self.run.length
 
     def row(self, row, number) -> Array:
-        """A row of the steps of those numbers (g, k), or of `slice` several."""
-        # Both are looked up: what is done with a row compiles once, not once for each.
+        """A row, or a `slice` of rows, of the steps of those numbers (g, k)."""
+        # Both are looked up: the use of a row compiles once, not once for each.
         of_run = self.run.row(row, number, self.lane[:, None])
         number = jnp.minimum(number, self.orbit.length - 1)
         of_orbit = self.orbit.row(row, number, jnp.arange(len(number))[:, None])
@@ -194,7 +194,7 @@ class Phases(eqx.Module):
 
     @classmethod
     def between(cls, steps: Stretch, first, last, most: int) -> "Phases":
-        """At most so many, from after step `first` (g,) to step `last` (g,)."""
+        """At most `most` phases, from after step `first` (g,) to step `last` (g,)."""
         first, last = first[:, None], last[:, None]
         p = jnp.arange(most)[None]
         before = steps.row(ENDED, first)
@@ -211,12 +211,12 @@ class Phases(eqx.Module):
 def cut(system: HybridSystem, steps: Stretch, first, last, h, length: int) -> Segments:
     """The steps after `first` (g,) up to `last` (g,) in at most `length` segments.
 
-    Those of a phase have equal weight, at most h (g,) where so few suffice. Unused ones have no
-    duration.
+    Segments of a phase have equal weight, at most h (g,) where so few suffice. Unused segments have
+    no duration.
     """
     n = 2 * system.n
     phases = Phases.between(steps, first, last, min(length, _PHASES))
-    # How many segments each phase has.
+    # The number of segments of each phase.
     free = jnp.maximum(length - jnp.sum(phases.exists, axis=-1), 1)
     h = jnp.maximum(h, jnp.sum(phases.weight, axis=-1) / free)[:, None]
     count = jnp.ceil(jnp.maximum(phases.weight / h - 1e-6, 1))
@@ -238,8 +238,8 @@ def cut(system: HybridSystem, steps: Stretch, first, last, h, length: int) -> Se
     at = jnp.clip(at, low, high)
     both = slice(TIME, ENDED)
     time, begin = steps.row(both, at - 1)
-    duration, own = steps.row(both, at) - jnp.stack([time, begin])
-    after = jnp.clip((weight - begin) / jnp.where(own > 0, own, 1), 0, 1) * duration
+    duration, step_weight = steps.row(both, at) - jnp.stack([time, begin])
+    after = jnp.clip((weight - begin) / jnp.where(step_weight > 0, step_weight, 1), 0, 1) * duration
     end = steps.row(TIME, last[:, None])
     duration = jnp.diff(jnp.where(used, time + after, end), axis=-1, append=end)
     guard = steps.row(GUARD, high).astype(int)

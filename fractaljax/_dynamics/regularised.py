@@ -25,7 +25,7 @@ from .scaled import scaled_start
 _SETTLING = 64  # slowest periods of the transient
 _LONGEST = 4  # most returns in one period
 _SAME = 1e-5  # scaled: states no further apart repeat
-_TOLERANCE = 1e-3  # of the relative difference from the exact law's cycle
+_TOLERANCE = 1e-3  # largest relative difference from the exact law's cycle
 DENSE = diffrax.SaveAt(t0=True, steps=True, dense=True)
 
 
@@ -81,31 +81,31 @@ class SmoothOrbit(eqx.Module):
 
 
 def _settle(system: HybridSystem, eps, y, solver, rtol, max_steps):
-    """State and period where the motion from y nearly repeats, the number of returns in between.
+    """State and period where the motion from y nearly repeats, and the returns in that period.
 
-    Also whether each was reached within `max_steps` steps.
+    The last result is True if all were reached within `max_steps` steps.
     """
     K = jnp.diag(system.K) if system.K.ndim == 1 else system.K
     K = K[:-1, :-1] if system.excited else K
     flexibility = jnp.max(jnp.sum(jnp.abs(jnp.linalg.inv(K)), axis=1))
     slowest = 2 * jnp.pi * jnp.sqrt(flexibility)
-    away = system.section_direction
+    direction = system.section_direction
     run = functools.partial(solve, system, eps, solver=solver, adjoint=diffrax.ForwardMode())
     maximum = diffrax.Event(
         lambda t, y, args, **_: system.section(y), optimistix.Newton(rtol, rtol), False
     )
 
     def next_return(y, _):
-        found = run(y, 8 * slowest, rtol=rtol, max_steps=max_steps, event=maximum)
-        y = found.ys[0]
-        # Exactly on the section, so that it is not met at once again.
-        y = y.at[system.n :].add(-system.section(y) * away / jnp.sum(away**2))
-        return y, (y, found.ts[0], found.result != diffrax.RESULTS.max_steps_reached)
+        solution = run(y, 8 * slowest, rtol=rtol, max_steps=max_steps, event=maximum)
+        y = solution.ys[0]
+        # Exactly on the section, so that it is not crossed again at once.
+        y = y.at[system.n :].add(-system.section(y) * direction / jnp.sum(direction**2))
+        return y, (y, solution.ts[0], solution.result != diffrax.RESULTS.max_steps_reached)
 
     def next_period(y, _):
-        found = run(y, system.excitation_period, rtol=rtol, max_steps=max_steps)
-        y = system.with_excitation(system.own(found.ys[0]), 0.0)
-        reached = found.result == diffrax.RESULTS.successful
+        solution = run(y, system.excitation_period, rtol=rtol, max_steps=max_steps)
+        y = system.with_excitation(system.own(solution.ys[0]), 0.0)
+        reached = solution.result == diffrax.RESULTS.successful
         return y, (y, system.excitation_period, reached)
 
     steps, settling = _SETTLING * max_steps, _SETTLING * slowest
@@ -114,8 +114,8 @@ def _settle(system: HybridSystem, eps, y, solver, rtol, max_steps):
         next_return = next_period
     settled = run(y, settling, rtol=max(rtol, 1e-7), max_steps=steps)
     _, (ends, times, within) = jax.lax.scan(next_return, settled.ys[0], length=1 + _LONGEST)
-    apart = jnp.max(jnp.abs(ends[1:] - ends[:1]), axis=1)
-    returns = 1 + jnp.argmax(apart <= 2 * jnp.min(apart) + _SAME)
+    gaps = jnp.max(jnp.abs(ends[1:] - ends[:1]), axis=1)
+    returns = 1 + jnp.argmax(gaps <= 2 * jnp.min(gaps) + _SAME)
     followed = (settled.result == diffrax.RESULTS.successful) & jnp.all(within)
     return (ends[0], jnp.cumsum(times[1:])[returns - 1]), returns, followed
 
@@ -133,7 +133,7 @@ def extremes(times, states, rates) -> Float[Array, "2 2n"]:
 
 
 def share_below_zero(times, values, rates) -> Float[Array, ""]:
-    """The share of the time in which a quantity, given with its rate at the steps, is negative."""
+    """The share of the time in which a quantity is negative, from its values and rates."""
     h = jnp.diff(times)
     starts, ends = values[:-1] < 0, values[1:] < 0
     sign = jnp.where(starts, -1, 1)
@@ -194,7 +194,7 @@ def regularised_cycle(
     near = jnp.max(jnp.abs(y - guess[0])) < 0.2 * (1 + jnp.max(jnp.abs(guess[0])))
     # An equilibrium is periodic as well, with any period.
     moves = jnp.max(jnp.abs(field(0.0, y, (system, eps)))) > 1e-4
-    found = (root.result == optimistix.RESULTS.successful) & near & (period > 0) & moves
+    exists = (root.result == optimistix.RESULTS.successful) & near & (period > 0) & moves
 
     solution = solve(system, eps, y, period, rtol=rtol, saveat=DENSE, **options)
     times, states = nodes(solution)
@@ -233,12 +233,12 @@ def regularised_cycle(
     held = [jnp.any(system.L[faces[-1]] != 0) & (len(faces) > 1) for faces in system.faces]
     jumps = jnp.any(opens & jnp.stack(held) & (below > 0))
     lost = CycleResult.where(followed, CycleResult.not_periodic, CycleResult.too_stiff)
-    status = CycleResult.where(found, status, lost)
+    status = CycleResult.where(exists, status, lost)
     status = CycleResult.where(jumps & followed, CycleResult.jumps, status)
-    found = found & ~jumps
+    exists = exists & ~jumps
 
     def only(value):
-        return jnp.where(found, value, jnp.nan)
+        return jnp.where(exists, value, jnp.nan)
 
     return LimitCycle(
         period=only(numbers[0]),

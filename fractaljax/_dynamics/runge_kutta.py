@@ -40,11 +40,11 @@ def runge_kutta(tableau, field: Callable, y, h, *, error: bool = False) -> Any:
 
 def stability_polynomial(tableau) -> np.ndarray:
     """Coefficients, from that of z^0 on, of a step's factor for dy/dt = a y, where z = a h."""
-    rows, power, found = _matrix(tableau), np.ones(len(tableau.b_sol)), [1.0]
+    rows, power, coefficients = _matrix(tableau), np.ones(len(tableau.b_sol)), [1.0]
     for _ in rows:
-        found.append(float(tableau.b_sol @ power))
+        coefficients.append(float(tableau.b_sol @ power))
         power = rows @ power
-    return np.array(found)
+    return np.array(coefficients)
 
 
 def _matrix(tableau) -> np.ndarray:

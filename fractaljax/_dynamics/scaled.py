@@ -1,4 +1,4 @@
-"""A scene or structure as a hybrid system in scaled units, where its motion begins, how exactly."""
+"""A scene or structure as a hybrid system in scaled units, its start, and its tolerance."""
 
 import itertools
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ _SQUARINGS = 10  # of the matrix whose spectral radius bounds all rates
 
 
 def degrees_of_freedom(mechanism: Mechanism) -> int:
-    """n of a structure; a scene has two.
+    """The number n of degrees of freedom of a structure; 2 for a scene.
 
     **Raises:** `TypeError` for anything else; `ValueError` for one that holds a batch, or has two
     joints that slide in one direction at one V.
@@ -51,7 +51,7 @@ def _require_determinate(structure: Structure) -> None:
 
 
 def _stick_as_one(structure: Structure, joint: Joint, other: Joint) -> bool:
-    """Whether one joint sticks along its t exactly when the other does, along its t or its n."""
+    """True if one joint sticks along its t exactly when the other does, along its t or its n."""
     V, W = (None if j.V is None else concrete(jnp.asarray(j.V)) for j in (joint, other))
     if V is None or W is None:
         return False
@@ -141,18 +141,18 @@ def _of_structure(structure: Structure) -> HybridSystem:
         faces[-1] = (len(rows) - 2, len(rows) - 1)
     laws, sharing = _shared([joint.friction for joint in structure.joints], faces)
     if not structure.joints:
-        # A face without load, on a belt too fast for any motion: nothing ever rubs or switches.
+        # A face without load, on a belt too fast for any motion: it never rubs or switches.
         unit = jnp.eye(n, dtype=dtype)[0]
         rows, weights, offsets = [unit], [0 * unit], [0 * unit[0]]
         speeds, faces, curves = [jnp.asarray(_BEYOND * _UNIT, dtype)], [(0,)], [None]
         laws, sharing = (Coulomb(jnp.ones((), dtype)),), ((0,),)
     T, L, V, P = jnp.stack(rows), jnp.stack(weights), jnp.stack(speeds), jnp.stack(offsets)
-    given = jnp.zeros(n, dtype) if structure.F is None else structure.F
-    # M^-1 of everything at once.
-    solved = jnp.linalg.solve(
-        structure.M, jnp.concatenate([K, structure.C, T.T, given[:, None]], axis=1)
+    force = jnp.zeros(n, dtype) if structure.F is None else structure.F
+    # M^-1 times everything at once.
+    by_mass = jnp.linalg.solve(
+        structure.M, jnp.concatenate([K, structure.C, T.T, force[:, None]], axis=1)
     )
-    K, C, B, F = jnp.split(solved, [n, 2 * n, 2 * n + len(rows)], axis=1)
+    K, C, B, F = jnp.split(by_mass, [n, 2 * n, 2 * n + len(rows)], axis=1)
     # Between the highest eigenfrequency and n^(1/4) times it.
     omega = jnp.sum(K * K.T) ** 0.25
     opens = tuple(bool(joint.preload) and joint.normal is not None for joint in structure.joints)
@@ -189,7 +189,7 @@ def _fastest(K, C) -> Float[Array, ""]:
 
 
 def _shared(laws: Sequence[Friction], faces: Sequence[tuple[int, ...]]):
-    """Laws of one kind as one over the faces of their joints, and which joints these are.
+    """Laws of one kind stacked over the faces of their joints, and the joints of each kind.
 
     Programs grow with the kinds, not with the joints.
     """
@@ -215,14 +215,14 @@ def start_state(start: ArrayLike | Sequence[float], n: int) -> Float[Array, " 2n
 
 
 def scaled_start(system: HybridSystem, start: Array | None) -> Float[Array, " 2n"]:
-    """The start in scaled units, constant: by default the equilibrium with one displacement.
+    """The start in scaled units, constant: by default the displaced equilibrium.
 
-    It is V/omega along the tangential direction of the first joint. An excitation begins at t = 0.
+    It is displaced by V/omega along the first joint's t. An excitation begins at t = 0.
     """
     if start is None:
-        away = system.section_direction
-        away = jnp.concatenate([away / jnp.sum(away**2), jnp.zeros_like(away)])
-        y = system.own(system.equilibrium() + away)
+        kick = system.section_direction
+        kick = jnp.concatenate([kick / jnp.sum(kick**2), jnp.zeros_like(kick)])
+        y = system.own(system.equilibrium() + kick)
     else:
         y = start / system.units
     return jax.lax.stop_gradient(system.with_excitation(y, 0.0))

@@ -24,11 +24,11 @@ from .record import Record, Steps, Stretch, cut
 from .segments import Segments
 
 _OPTIONS = SearchOptions()
-_MESHES = 6  # on which a candidate is solved, each finer, until it is accurate
+_MESHES = 6  # most on which a candidate is solved, each finer, until accurate
 
 
 class Attractor(eqx.Module):
-    """What the run ended in; scenes, where there are many, are the last axis."""
+    """What the run ended in; scenes, if there are many, are the last axis."""
 
     segments: Segments
     status: Int[Array, "..."]
@@ -39,7 +39,7 @@ class Attractor(eqx.Module):
 
 
 def _no_segments(y, faces: int, length: int) -> Segments:
-    """Unused ones, of orbits of the lanes of states y (2n, B)."""
+    """Unused segments, for orbits in the lanes of states y (2n, B)."""
     shape = (length, y.shape[1])
     return Segments(
         y=jnp.zeros((len(y), *shape), y.dtype),
@@ -49,67 +49,71 @@ def _no_segments(y, faces: int, length: int) -> Segments:
     )
 
 
-def _solved(system, record, lane, wanted, given: Candidates, *, length, options):
-    """The orbits near the steps of lanes (g,): segments, error and growth, whether accepted.
+def _solve_candidates(system, record, lane, active, candidates: Candidates, *, length, options):
+    """The orbits near the steps of lanes (g,): segments, error and growth, and if accepted.
 
-    One of a shorter period is not: the same number of segments resolves that period better.
+    An orbit of a shorter period is not: the same segments resolve that period better alone.
     """
-    scale = 1 + jnp.max(jnp.abs(given.y), axis=0)
+    scale = 1 + jnp.max(jnp.abs(candidates.y), axis=0)
 
-    def unsettled(found):
-        return found.converged & ~(found.error <= given.rtol)
+    def unsettled(orbits):
+        return orbits.converged & ~(orbits.error <= candidates.rtol)
 
     def going(carry):
-        found, _, tries = carry
-        return (tries == 0) | ((tries < _MESHES) & jnp.any(unsettled(found)))
+        orbits, _, tries = carry
+        return (tries == 0) | ((tries < _MESHES) & jnp.any(unsettled(orbits)))
 
     def mesh(orbit, h, of_run):
         # The orbit's phases have other lengths and weights than those of the run.
         steps = Stretch(record, lane, Steps.along(system, orbit, h), of_run)
-        first = jnp.where(of_run, given.first, 0)
-        last = jnp.where(of_run, given.last, jnp.sum(orbit.used, axis=0))
+        first = jnp.where(of_run, candidates.first, 0)
+        last = jnp.where(of_run, candidates.last, jnp.sum(orbit.used, axis=0))
         return cut(system, steps, first, last, h, length)
 
     def solve(carry):
-        found, h, tries = carry
+        orbits, h, tries = carry
         of_run = tries == 0
-        segments = mesh(found.segments, h, of_run)
-        own = wanted & (of_run | unsettled(found))
-        new = solve_periodic_orbits(system, segments, own, options.reach * scale, given.rtol)
-        # The method is of order 8; where the motion is not as smooth, halves do.
-        known = new.error > 0  # a number
-        finer = 0.9 * (given.rtol / jnp.where(known, new.error, 1)) ** 0.125
-        finer = jnp.where(known, finer, 0.8)
-        return new.where(own, found), h * jnp.clip(finer, 0.5, 0.8), tries + 1
+        segments = mesh(orbits.segments, h, of_run)
+        pending = active & (of_run | unsettled(orbits))
+        new = solve_periodic_orbits(
+            system, segments, pending, options.reach * scale, candidates.rtol
+        )
+        # The method is of order 8; where the motion is less smooth, halving is enough.
+        has_error = new.error > 0  # False for NaN
+        finer = 0.9 * (candidates.rtol / jnp.where(has_error, new.error, 1)) ** 0.125
+        finer = jnp.where(has_error, finer, 0.8)
+        return new.where(pending, orbits), h * jnp.clip(finer, 0.5, 0.8), tries + 1
 
-    nothing = PeriodicOrbit.none(_no_segments(given.y, len(record.s), length))
-    found, *_ = jax.lax.while_loop(going, solve, (nothing, given.h, 0))
-    orbit, n = found.segments, system.n
-    near = jnp.max(jnp.abs(orbit.y[:, 0] - given.y), axis=0) < 0.2 * scale
+    no_orbits = PeriodicOrbit.none(_no_segments(candidates.y, len(record.s), length))
+    orbits, *_ = jax.lax.while_loop(going, solve, (no_orbits, candidates.h, 0))
+    orbit, n = orbits.segments, system.n
+    near = jnp.max(jnp.abs(orbit.y[:, 0] - candidates.y), axis=0) < 0.2 * scale
     moves = jnp.max(jnp.abs(orbit.y[n:]), axis=(0, 1)) > 1e-4
-    growth = growth_of(system, found)
-    ok = wanted & found.converged & near & moves & (growth < HARDLY)
-    ok = ok & admissible(system, orbit, found.middle)
-    ok = ok & ~has_shorter_period(orbit, given.returns)
-    return orbit, jnp.stack([found.error, growth]), ok
+    growth = growth_of(system, orbits)
+    ok = active & orbits.converged & near & moves & (growth < HARDLY)
+    ok = ok & admissible(system, orbit, orbits.middle)
+    ok = ok & ~has_shorter_period(orbit, candidates.returns)
+    return orbit, jnp.stack([orbits.error, growth]), ok
 
 
-def _in_groups(system, record, ready, gap, given, orbit, error, *, options, length):
-    """The orbits of all lanes, new where found; those that are ready are solved in groups."""
+def _in_groups(system, record, ready, gap, candidates, orbit, error, *, options, length):
+    """The orbits of all lanes, new where accepted; lanes that are ready are solved in groups."""
     lanes = len(ready)
     size = min(lanes, options.group)
 
-    def solved(lane, wanted, given):
+    def solve_lanes(lane, active, candidates):
         # The systems of several lanes, each for all of its segments.
         batched = system.omega.ndim > 0
-        own = jax.tree.map(lambda x: x[..., None, lane], system) if batched else system
-        return _solved(own, record, lane, wanted, given, length=length, options=options)
+        lane_system = jax.tree.map(lambda x: x[..., None, lane], system) if batched else system
+        return _solve_candidates(
+            lane_system, record, lane, active, candidates, length=length, options=options
+        )
 
     if size == lanes:
-        *new, ok = solved(jnp.arange(lanes), ready, given)
+        *new, ok = solve_lanes(jnp.arange(lanes), ready, candidates)
         return *chosen(ok, tuple(new), (orbit, error)), ok
 
-    # Similar ones together, so that few wait for others.
+    # Similar lanes together, so that few wait for others.
     order = jnp.argsort(jnp.where(ready, gap, jnp.inf))
     order = jnp.pad(order, (0, -lanes % size), constant_values=lanes)
 
@@ -117,18 +121,18 @@ def _in_groups(system, record, ready, gap, given, orbit, error, *, options, leng
         return carry[-1] < jnp.sum(ready)
 
     def solve(carry):
-        orbit, error, found, start = carry
+        orbit, error, accepted, start = carry
         lane = jax.lax.dynamic_slice(order, (start,), (size,))
-        own = jnp.minimum(lane, lanes - 1)
-        wanted = ready[own] & (lane < lanes)
-        *new, ok = solved(own, wanted, jax.tree.map(lambda x: x[..., own], given))
+        members = jnp.minimum(lane, lanes - 1)
+        active = ready[members] & (lane < lanes)
+        *new, ok = solve_lanes(members, active, jax.tree.map(lambda x: x[..., members], candidates))
         lane = jnp.where(ok, lane, lanes)  # beyond the last one nothing is written
 
         def written(new, old):
             return old.at[..., lane].set(new, mode="drop")
 
         orbit, error = jax.tree.map(written, tuple(new), (orbit, error))
-        return orbit, error, found.at[lane].set(True, mode="drop"), start + size
+        return orbit, error, accepted.at[lane].set(True, mode="drop"), start + size
 
     carry = orbit, error, jnp.zeros(lanes, bool), 0
     return jax.lax.while_loop(going, solve, carry)[:3]
@@ -142,7 +146,7 @@ def _find(
     bound = system.bound(start, equilibrium)
     none, far = jnp.zeros(lanes, int), jnp.full(lanes, jnp.inf, start.dtype)
     zero = jnp.zeros(lanes, start.dtype)
-    known = Progress(
+    progress = Progress(
         status=none + RUNNING,
         period_returns=none,
         distance=far,
@@ -162,37 +166,47 @@ def _find(
         return jnp.any(carry[1].status == RUNNING)
 
     def body(carry):
-        record, known, orbit, error, rounds = carry
+        record, progress, orbit, error, rounds = carry
         # A run that takes long to settle may be near the boundary of two basins.
-        counted = passed(system, rounds, jnp.max(known.returns), options)
+        counted = passed(system, rounds, jnp.max(progress.returns), options)
         finer = sum(counted >= after for after in options.finer_after)
         h_run = (options.step / 2.0**finer).astype(start.dtype)
         record = record.advance(system, h_run, options.round_steps)
         limits = equilibrium, bound, growth, max_returns, h, rtol
-        told = look(system, record, known, orbit, rounds, *limits)
+        assessment = look(system, record, progress, orbit, rounds, *limits)
 
-        def solved():
+        def solve_ready():
             return _in_groups(
                 system,
                 record,
-                told.ready,
-                told.gap,
-                told.given,
+                assessment.ready,
+                assessment.gap,
+                assessment.given,
                 orbit,
                 error,
                 options=options,
                 length=length,
             )
 
-        # XLA moves what does not change out of a loop, to where it is done even if the loop is not.
-        none = orbit, error, jnp.zeros_like(told.ready)
-        orbit, error, found = jax.lax.cond(jnp.any(told.ready), solved, lambda: none)
-        known = concluded(told, known, orbit, found, options.accepted)
-        return record.moved(told.y, told.extrapolates), known, orbit, error, rounds + 1
+        # XLA moves loop-invariant work out of a loop, where it is done even if the loop is not.
+        none = orbit, error, jnp.zeros_like(assessment.ready)
+        orbit, error, accepted = jax.lax.cond(jnp.any(assessment.ready), solve_ready, lambda: none)
+        progress = concluded(assessment, progress, orbit, accepted, options.accepted)
+        return (
+            record.moved(assessment.y, assessment.extrapolates),
+            progress,
+            orbit,
+            error,
+            rounds + 1,
+        )
 
-    _, known, orbit, error, _ = jax.lax.while_loop(running, body, (record, known, orbit, error, 0))
+    _, progress, orbit, error, _ = jax.lax.while_loop(
+        running, body, (record, progress, orbit, error, 0)
+    )
     error, growth = error
-    return Attractor(orbit, known.status, known.period_returns, error, growth, known.returns)
+    return Attractor(
+        orbit, progress.status, progress.period_returns, error, growth, progress.returns
+    )
 
 
 def find(
@@ -214,14 +228,14 @@ def find(
     """
     search = functools.partial(_find, length=length, options=options)
 
-    def lanes_first(found):
-        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), found)
+    def lanes_first(attractors):
+        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), attractors)
 
     @custom_vmap
     def one(arguments):
         system, *rest = arguments
-        found = search(system, *(x[..., None] for x in rest))
-        return jax.tree.map(lambda x: x[0], lanes_first(found))
+        attractor = search(system, *(x[..., None] for x in rest))
+        return jax.tree.map(lambda x: x[0], lanes_first(attractor))
 
     @one.def_vmap
     def rule(axis_size, in_batched, arguments):
@@ -234,7 +248,7 @@ def find(
             arguments,
             in_batched[0],
         )
-        found = lanes_first(search(*arguments))
-        return found, jax.tree.map(lambda _: True, found)
+        attractors = lanes_first(search(*arguments))
+        return attractors, jax.tree.map(lambda _: True, attractors)
 
     return one((system, start, equilibrium, growth, max_returns, h, rtol))

@@ -13,7 +13,7 @@ from .hybrid import UNUSED, HybridSystem
 from .lanes import row_numbers
 from .runge_kutta import runge_kutta
 
-_BLOCK = 8  # of sums; XLA leaves larger ones to a library
+_BLOCK = 8  # terms of a sum; XLA leaves longer sums to a library
 
 
 class Segments(eqx.Module):
@@ -29,13 +29,13 @@ class Segments(eqx.Module):
 
     @property
     def used(self) -> Bool[Array, "N ..."]:
-        """Which segments are not padding of zero duration."""
+        """True for segments that are not padding of zero duration."""
         return self.guard != UNUSED
 
 
 def tableau():
     """The coefficients of the segments' steps."""
-    # Imported late: a question of stability does not wait for diffrax.
+    # Imported late, so that a stability analysis does not wait for diffrax.
     import diffrax
 
     return diffrax.Dopri8.tableau
@@ -67,7 +67,7 @@ def chosen_guard(system: HybridSystem, y, s, guard) -> Array:
 
 
 def cumulative(x) -> Array:
-    """The sums of x (..., k) up to each place, which compile faster than those of jnp.cumsum."""
+    """The cumulative sums of x (..., k), which compile faster than jnp.cumsum."""
     k = x.shape[-1]
     if k <= _BLOCK or k % _BLOCK:
         at = jnp.arange(k)

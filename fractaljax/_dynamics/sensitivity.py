@@ -1,7 +1,7 @@
 """Derivatives of the places of a branch's events by every other quantity of the mechanism.
 
 An event solves the equations of the orbit and one condition more. Implicit differentiation gives
-how the quantity at which it lies moves with the mechanism; nothing is followed again.
+how the quantity at the event moves with the mechanism; no branch is followed again.
 """
 
 import functools
@@ -65,7 +65,7 @@ def _hopf(kind, x, event):
 
 
 def _orbit(kind, x, event):
-    """What vanishes as a function of x at fixed unknowns, its weights, and their normalisation."""
+    """The vanishing function of x at fixed unknowns, its weights, and their normalisation."""
     window, chain, lifted, u, details = event
     frozen = jax.lax.stop_gradient(x)
     _, jacobian, lifted, _ = equations(frozen, window, chain, lifted, u)
@@ -107,6 +107,6 @@ def _orbit(kind, x, event):
 def _eigenvectors(jacobian, k: int):
     """Left and right eigenvector and value of the multiplier nearest to the unit circle."""
     values, right = jnp.linalg.eig(return_jacobian(jacobian, k))
-    # Those of sticking and of the section are 0.
+    # Multipliers of sticking and of the section are 0.
     i = jnp.argmin(jnp.abs(jnp.abs(values) - 1))
     return jnp.linalg.inv(right)[i], right[:, i], values[i]

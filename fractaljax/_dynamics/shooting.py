@@ -27,7 +27,7 @@ from .segments import Segments, chosen_guard, flow, next_start, tableau
 
 
 class Window(eqx.Module):
-    """The range of a quantity as 0 to 1, linear or logarithmic."""
+    """The range of a quantity, mapped to 0 to 1 on a linear or logarithmic scale."""
 
     low: Float[Array, ""]  # of the quantity or its logarithm
     high: Float[Array, ""]
@@ -36,20 +36,20 @@ class Window(eqx.Module):
 
     @classmethod
     def over(cls, name: str, low: float, high: float) -> "Window":
-        """Of a quantity from low to high; logarithmic over a decade or more."""
+        """The window of a quantity from low to high; logarithmic over a decade or more."""
         scale, ends = is_logarithmic(low, high), jnp.array([low, high])
         ends = jnp.log(ends) if scale else ends
         return cls(ends[0], ends[1], name, scale)
 
     def value(self, q) -> Any:
         """The quantity at q."""
-        found = self.low + q * (self.high - self.low)
-        return jnp.exp(found) if self.logarithmic else found
+        coordinate = self.low + q * (self.high - self.low)
+        return jnp.exp(coordinate) if self.logarithmic else coordinate
 
     def place(self, value) -> Any:
         """The q of a value."""
-        found = jnp.log(value) if self.logarithmic else value
-        return (found - self.low) / (self.high - self.low)
+        coordinate = jnp.log(value) if self.logarithmic else value
+        return (coordinate - self.low) / (self.high - self.low)
 
     def system(self, x: Mechanism, q) -> HybridSystem:
         """The hybrid system of x with the quantity at q."""
@@ -63,12 +63,12 @@ class Chain(eqx.Module):
     guard: Int[Array, " N"]  # that ends the segment: a number, NONE within a phase, or UNUSED
     phase: Int[Array, " N"]  # which phase it belongs to
     begin: Float[Array, " N"]  # its start, as a share of the phase
-    share: Float[Array, " N"]  # its duration, as a share of the phase; 0 of padding
-    used: Float[Array, " M"]  # 1 of a phase, 0 of padding
+    share: Float[Array, " N"]  # its duration, as a share of the phase; 0 for padding
+    used: Float[Array, " M"]  # 1 for a phase, 0 for padding
 
     @property
     def ends(self) -> Array:
-        """Which segments end a phase."""
+        """True for segments that end a phase."""
         return (self.guard != NONE) & (self.guard != UNUSED)
 
 
@@ -96,7 +96,7 @@ def _mix(system, rate, e):
 def equations(x: Mechanism, window: Window, chain: Chain, lifted: Lifted, u):
     """Residual (2n + M,) and Jacobian (2n + M, 2n + M + 1) at u, and the next `Lifted`.
 
-    Also the largest gap between segments. Of a phase that is padding the equation is h = 0.
+    Also the largest gap between segments. For a padding phase the equation is h = 0.
     """
     system, rate = jax.jvp(lambda q: window.system(x, q), (u[-1],), (jnp.ones_like(u[-1]),))
     y, s, n = lifted.at(u), chain.s, system.n
@@ -162,18 +162,18 @@ def _chained(chain: Chain, A, b, Q, gap, k: int):
 
     start = jnp.eye(len(A), k, dtype=A.dtype), jnp.zeros(len(A), A.dtype)
     lanes = tuple(jnp.moveaxis(x, -1, 0) for x in (A, b, Q, gap))
-    _, found = jax.lax.scan(step, start, (*lanes, of_phase))
-    return tuple(jnp.moveaxis(x, 0, -1) for x in found)
+    _, stacked = jax.lax.scan(step, start, (*lanes, of_phase))
+    return tuple(jnp.moveaxis(x, 0, -1) for x in stacked)
 
 
 def _of_phases(chain: Chain, values) -> Array:
-    """The values (..., N) at the ends of the phases (..., M); 0 of padding."""
+    """The values (..., N) at the ends of the phases (..., M); 0 for padding."""
     place = jax.nn.one_hot(chain.phase, len(chain.used), dtype=values.dtype)
     return jnp.where(chain.ends, values, 0) @ place
 
 
 class Place(NamedTuple):
-    """Where on an orbit a guard is looked at."""
+    """A place on an orbit at which a guard is evaluated."""
 
     guard: Int[Array, ""]
     segment: Int[Array, ""]
@@ -183,13 +183,13 @@ class Place(NamedTuple):
 
 
 _NODES = 5
-_TINY = 1e-12  # scaled time from a switch that is none
+_TINY = 1e-12  # scaled time from a switch that counts as zero
 
 
 def reduced_guard(system: HybridSystem, chain: Chain, y, h, at: Place, theta) -> Array:
     """The guard over (time since the start of its phase)^before (time to its end)^after.
 
-    So the zeros that a guard has where a phase begins and ends are not counted.
+    This removes the zeros that a guard has where a phase begins and ends.
     """
     k = at.segment
     state, s = y[:, k], chain.s[:, k]
@@ -214,7 +214,7 @@ def lowest(x: Mechanism, window: Window, chain: Chain, lifted: Lifted, u, before
     """The least reduced guard anywhere on the orbit, and where it is.
 
     `before` and `after` (k, M) are the orders of the zeros of the guards where phases begin and
-    end; -1 before a phase leaves a guard out. Below zero the orbit does not keep to its itinerary.
+    end; `before` = -1 leaves a guard out. Below zero the orbit does not keep to its itinerary.
     """
     system = window.system(x, u[-1])
     y, n = lifted.at(u), system.n
@@ -254,11 +254,11 @@ def lowest(x: Mechanism, window: Window, chain: Chain, lifted: Lifted, u, before
     refined = descended(guard_at, place.theta, (1 / 4, 1 / 32, 1 / 256, 1 / 2048), first, last)
     refined = jnp.where(fixed, place.theta, refined)
     value = reduced[guard, node, segment]
-    found = jnp.where(
+    least = jnp.where(
         fixed, value, jnp.minimum(value, reduced_guard(system, chain, y, h, place, refined))
     )
-    theta = jnp.where(found < value, refined, place.theta)
-    return found, Place(guard, segment, theta, *orders)
+    theta = jnp.where(least < value, refined, place.theta)
+    return least, Place(guard, segment, theta, *orders)
 
 
 def descended(
@@ -266,16 +266,16 @@ def descended(
 ) -> Array:
     """The minimum of a function of one variable near theta, between two ends.
 
-    That of the parabola through three points around the last one, time and again.
+    Each step goes to the vertex of the parabola through three points around the last one.
     """
 
     def vertex(theta, spacing):
         theta = jnp.clip(theta, first + spacing, last - spacing)
         low, here, high = jax.vmap(function)(theta + spacing * jnp.arange(-1, 2))
         bend = low + high - 2 * here
-        moved = (low - high) / (2 * jnp.where(bend > 0, bend, 1))
-        moved = jnp.where(bend > 0, jnp.clip(moved, -1, 1), jnp.sign(low - high))
-        return theta + spacing * moved, None
+        offset = (low - high) / (2 * jnp.where(bend > 0, bend, 1))
+        offset = jnp.where(bend > 0, jnp.clip(offset, -1, 1), jnp.sign(low - high))
+        return theta + spacing * offset, None
 
     return jax.lax.scan(vertex, theta, jnp.array(spacings, theta.dtype))[0]
 
@@ -284,7 +284,7 @@ def descended(
 def resampled(x, window: Window, chain: Chain, lifted: Lifted, u, times, longest, *, places: int):
     """States (2n, places) at times since the start of the orbit.
 
-    And by how much shorter than `longest` segments should be there.
+    Also by what factor segments should be shorter than `longest` there.
     """
     system = window.system(x, u[-1])
     h = durations(chain, u, system.n)
@@ -298,7 +298,7 @@ def resampled(x, window: Window, chain: Chain, lifted: Lifted, u, times, longest
 
 @exported_jit
 def measured(x, window: Window, chain: Chain, lifted: Lifted, u):
-    """Least, largest and section's states (3, 2n) in SI units, 1/omega, and the error."""
+    """Least, largest and section states (3, 2n) in SI units, 1/omega, and the error."""
     system = window.system(x, u[-1])
     y, h = lifted.at(u), durations(chain, u, system.n)
     segments = Segments(y, h, chain.s, chain.guard)

@@ -81,7 +81,7 @@ class Trajectory(Record):
         return _states(self, self._inside(number("times", jnp.asarray(times))))
 
     def _continuous(self) -> HybridSystem:
-        """The system that moves, whose states between the times are known.
+        """The system of a simulation that holds its states between the times.
 
         **Raises:** `ValueError` for a simulation with `saveat`.
         """
@@ -104,23 +104,23 @@ class Trajectory(Record):
         return (system.own(y) * scale[:, None]).T
 
     def _step(self, times) -> Int[Array, " k"]:
-        """The steps in which these times are."""
-        known = jax.lax.stop_gradient((self.times, times))
-        return jnp.clip(jnp.searchsorted(*known, side="right") - 1, 0, len(self.times) - 1)
+        """The steps that contain these times."""
+        frozen = jax.lax.stop_gradient((self.times, times))
+        return jnp.clip(jnp.searchsorted(*frozen, side="right") - 1, 0, len(self.times) - 1)
 
     def _inside(self, times) -> Array:
         if times.ndim != 1:
             raise ValueError(f"times must have shape (k,), got {times.shape}")
         first, last = self.times[0], self.times[-1]
-        # The end is known up to rounding: t1 itself is inside.
+        # The end is exact up to rounding: t1 itself is inside.
         rounding = 8 * jnp.finfo(last.dtype).eps * jnp.maximum(jnp.abs(first), jnp.abs(last))
         outside = (times < first) | (times > last + rounding)
-        found, given = concrete(outside), concrete(times)
-        if found is None or given is None:
+        is_outside, requested = concrete(outside), concrete(times)
+        if is_outside is None or requested is None:
             return nan_where(outside, times)
-        if found.any():
-            wanted = f"times must be from t0 to the end of the simulation, {float(last)!r}"
-            raise ValueError(f"{wanted}, got {given[found][0].item()!r}")
+        if is_outside.any():
+            message = f"times must be from t0 to the end of the simulation, {float(last)!r}"
+            raise ValueError(f"{message}, got {requested[is_outside][0].item()!r}")
         return times
 
     def switches(self) -> list[tuple[float, int, int, int]]:
@@ -141,7 +141,7 @@ class Trajectory(Record):
 
 
 class _Steps(eqx.Module):
-    """What the first pass finds."""
+    """The steps of the first pass."""
 
     duration: Float[Array, " n"]
     s: Float[Array, "f n"]
@@ -216,7 +216,7 @@ def _repeat(system: HybridSystem, y, t0, end, steps: _Steps) -> Trajectory:
 
 @eqx.filter_jit
 def _states(trajectory: Trajectory, times) -> Array:
-    """`Trajectory.at` of checked times."""
+    """`Trajectory.at` for checked times."""
     return trajectory._at(trajectory._continuous(), times)
 
 
@@ -333,7 +333,7 @@ def simulate(
         frozen = jax.lax.stop_gradient((system, y, end))
         steps = _find_steps(*frozen, h, rtol, max_steps=n)
         if concrete(steps.count) is not None:
-            # The second pass, in one of few lengths, so that little is compiled.
+            # The second pass has one of few lengths, so that little is compiled.
             used = min(n, 1 << max(int(steps.count) - 1, 15).bit_length())
             shorter = steps.duration[:used], steps.s[:, :used], steps.guard[:used]
             steps = eqx.tree_at(lambda x: (x.duration, x.s, x.guard), steps, shorter)
@@ -354,7 +354,7 @@ def _scaled(mechanism, excitation, start, t0, t1):
 
 
 def _times(t0, t1) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Both, the second above the first."""
+    """t0 and t1 as numbers, t1 above t0."""
     t0 = scalar("t0", t0)
     start = concrete(t0)
     if start is not None:
@@ -370,9 +370,9 @@ def _checked(saveat, t0, t1) -> Float[Array, " k"]:
         raise ValueError(f"saveat must have shape (k,) with k at least 1, got {saveat.shape}")
     ends = jnp.concatenate([t0[None], saveat, t1[None]])
     bad = jnp.any(ends[1:] < ends[:-1])
-    found = concrete(bad)
-    if found is None:
+    unordered = concrete(bad)
+    if unordered is None:
         return nan_where(bad, saveat)
-    if found:
+    if unordered:
         raise ValueError(f"saveat must be in order from t0 to t1, got {brief(np.asarray(saveat))}")
     return saveat

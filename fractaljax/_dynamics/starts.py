@@ -1,4 +1,4 @@
-"""Where the starts of a basin lie: in a box, in a ball or an ellipsoid, or as they are given."""
+"""The starts of a basin: in a box, in a ball or an ellipsoid, or an explicit list."""
 
 from typing import Any
 
@@ -20,15 +20,15 @@ def _centre(system: HybridSystem) -> tuple[Array, Array]:
 
 
 def starts_of(system, n, low, high, starts, seed, radius) -> Float[np.ndarray, "k 2n"]:
-    """The starts [m, m/s] in a box, in a ball, or as they are given."""
+    """The starts [m, m/s] in a box, in a ball, or as listed."""
     box, listed = low is not None or high is not None, np.ndim(starts) > 0
     if box + listed + (radius is not None) != 1:
         raise ValueError("give one of: low and high, radius, or starts of shape (k, 2n)")
     if listed:
-        given = np.asarray(number("starts", jnp.asarray(starts, dtype=float)))
-        if given.ndim != 2 or given.shape[1] != 2 * n or not len(given):
-            raise ValueError(f"starts must have shape (k, {2 * n}), got {given.shape}")
-        return given
+        points = np.asarray(number("starts", jnp.asarray(starts, dtype=float)))
+        if points.ndim != 2 or points.shape[1] != 2 * n or not len(points):
+            raise ValueError(f"starts must have shape (k, {2 * n}), got {points.shape}")
+        return points
     count = whole("starts", starts, 1, _MOST_STARTS)
     if radius is not None:
         centre, axes = ellipsoid(system, kick_size("radius", radius, n))
@@ -43,11 +43,11 @@ def starts_of(system, n, low, high, starts, seed, radius) -> Float[np.ndarray, "
     return corners[0] + share * (corners[1] - corners[0])
 
 
-def kick_size(name: str, given: Any, n: int) -> float | list[float]:
+def kick_size(name: str, size: Any, n: int) -> float | list[float]:
     """A radius in units of V/omega and V, or the semi-axes (2n,) [m, m/s] of an ellipsoid."""
-    if not isinstance(given, (list, tuple)) and not np.ndim(given):
-        return float(scalar(name, given, above=0))
-    axes = [float(scalar(name, axis, above=0)) for axis in given]
+    if not isinstance(size, (list, tuple)) and not np.ndim(size):
+        return float(scalar(name, size, above=0))
+    axes = [float(scalar(name, axis, above=0)) for axis in size]
     if len(axes) != 2 * n:
         raise ValueError(f"{name} must have {2 * n} semi-axes, got {len(axes)}")
     return axes
@@ -76,7 +76,7 @@ def _sobol(count: int, dimensions: int, seed: int) -> np.ndarray:
         return np.zeros((count, 0))
     sobol: Any = qmc.Sobol  # SciPy 1.15 renamed `seed`, and takes both names
     points = sobol(dimensions, seed=seed)
-    # The first ones of a power of two, for which Sobol's points are balanced.
+    # The first of a power of two, for which Sobol's points are balanced.
     return points.random_base2((count - 1).bit_length())[:count]
 
 

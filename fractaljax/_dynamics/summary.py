@@ -21,11 +21,11 @@ _CONTACT_STATES = {
 def cycle_table(mechanism: Scene | Structure, cycle: LimitCycle) -> str:
     """The result of the search for one limit cycle, its numbers and its switches."""
     lacking = stiffness_remarks(mechanism)
-    found = {"result": str(CycleResult[cycle.result])}
-    found |= verdict(stability(mechanism), without_joint=bool(lacking))
+    outcome = {"result": str(CycleResult[cycle.result])}
+    outcome |= verdict(stability(mechanism), without_joint=bool(lacking))
     if not np.isfinite(cycle.period):
-        return "\n".join([*lacking, table([""], [found])])
-    whole = found | {
+        return "\n".join([*lacking, table([""], [outcome])])
+    whole = outcome | {
         "period [ms]": f"{cycle.period * 1e3:.6g}",
         "frequency [Hz]": f"{cycle.frequency:.6g}",
         "returns in a period": f"{cycle.returns}",
