@@ -67,7 +67,7 @@ class Continuation:
         By steps of least length, with the coordinate `fixed` held.
         """
         free = np.arange(len(u)) != (-1 if fixed is None else fixed)
-        best, least, found = np.inf, np.inf, None
+        best, least, zero = np.inf, np.inf, None
         for _ in range(_NEWTON_STEPS):
             residual, jacobian = self.equations(u)
             if not (np.isfinite(residual).all() and np.isfinite(jacobian).all()):
@@ -79,12 +79,12 @@ class Continuation:
                 break  # down to rounding
             if rank < len(residual) or size > 4 * self.longest:
                 return None
-            best, least, found = size, left, (u, jacobian)
+            best, least, zero = size, left, (u, jacobian)
             if size <= self.settled and left <= self.small:
                 break
             u = u.copy()
             u[free] += step
-        return found if best <= self.tolerance and found and self.valid(found[0]) else None
+        return zero if best <= self.tolerance and zero and self.valid(zero[0]) else None
 
     def curve(self, u: np.ndarray, jacobian: np.ndarray) -> Curve:
         """The whole curve through a zero u, along its tangent."""
@@ -143,10 +143,10 @@ class Continuation:
             share, fixed, side = self._way_out(u, target)
             target = u + share * length * ahead
             target[fixed] = side
-        found = self.corrected(target, fixed)
-        if found is None:
+        zero = self.corrected(target, fixed)
+        if zero is None:
             return None
-        reached, turned = found[0], sign * self.tangent(found[1])
+        reached, turned = zero[0], sign * self.tangent(zero[1])
         if not self.oriented and turned @ ahead < 0:
             turned = -turned
         angle = np.arccos(np.clip(turned @ ahead, -1, 1))
@@ -196,7 +196,7 @@ def trace(curves: Continuation, values: Values, lines: int) -> tuple[list[Curve]
     `values` gives residuals (k,) and gradients (k, 2) at points (k, 2). Also returned: whether the
     residual is negative at (0, 0), and the number of crossings from which no curve was found.
     """
-    found, failed = [], []
+    branches, failed = [], []
     seeds, negative = _crossings(values, lines)
     for seed in seeds:
         edges = np.flatnonzero((seed == 0) | (seed == 1))
@@ -206,13 +206,13 @@ def trace(curves: Continuation, values: Values, lines: int) -> tuple[list[Curve]
             continue
         # In the same direction: the other side of a narrow tongue is another curve.
         along = curves.tangent(start[1])
-        if any((passing(curve, seed, curves.shortest) @ along > 0).any() for curve in found):
+        if any((passing(curve, seed, curves.shortest) @ along > 0).any() for curve in branches):
             continue
         curve = curves.curve(*start)
         if len(curve.points) > 1:
-            found.append(curve)
-    missed = [p for p in failed if not any(len(passing(c, p, curves.shortest)) for c in found)]
-    return found, negative, len(missed)
+            branches.append(curve)
+    missed = [p for p in failed if not any(len(passing(c, p, curves.shortest)) for c in branches)]
+    return branches, negative, len(missed)
 
 
 def _crossings(values, lines):
@@ -252,15 +252,15 @@ def _crossings(values, lines):
 
 def _beyond(values, first, last, axis, sign):
     """Points (k, 2) between `first` and `last` where the value has the other sign; else NaN."""
-    found = np.full_like(first, np.nan)
+    points = np.full_like(first, np.nan)
     for _ in range(_BISECTIONS):
         middle = (first + last) / 2
         value, slope = values(middle)
         other = (value < 0) != (sign < 0)
-        found[other] = middle[other]
+        points[other] = middle[other]
         falls = (sign * slope[:, axis] < 0)[:, None]
         first, last = np.where(falls, middle, first), np.where(falls, last, middle)
-    return found
+    return points
 
 
 def passing(curve, p, shortest):

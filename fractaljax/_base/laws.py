@@ -15,10 +15,10 @@ def register(law: str, kind: type[Part], laws: dict[str, Any]) -> None:
 
     **Raises:** `ValueError` if another kind has it.
     """
-    known = laws.get(law, kind)
+    registered = laws.get(law, kind)
     # A cell of a notebook that is run again makes its class anew.
-    if (known.__module__, known.__qualname__) != (kind.__module__, kind.__qualname__):
-        raise ValueError(f"the law {law!r} is {known.__name__} already")
+    if (registered.__module__, registered.__qualname__) != (kind.__module__, kind.__qualname__):
+        raise ValueError(f"the law {law!r} is {registered.__name__} already")
     laws[law] = kind
 
 
@@ -30,22 +30,22 @@ def make_arrays(law: Part) -> None:
     for field in dataclasses.fields(law):
         value, static = getattr(law, field.name), field.metadata.get("static", False)
         plain = isinstance(value, (int, float, np.number, np.ndarray))
-        given = "unit" in field.metadata or (plain and not isinstance(value, bool))
-        if given and value is not None and not static:
+        numeric = "unit" in field.metadata or (plain and not isinstance(value, bool))
+        if numeric and value is not None and not static:
             object.__setattr__(law, field.name, number(quantity_name(field), value))
 
 
 def refuse(law: Part, bad: Bool[Array, "..."]) -> None:
     """NaN for the numbers of a traced law where it is `bad`."""
-    found = refused_where(bad, law)
+    poisoned = refused_where(bad, law)
     for field in dataclasses.fields(law):
         if not field.metadata.get("static", False):
-            object.__setattr__(law, field.name, getattr(found, field.name))
+            object.__setattr__(law, field.name, getattr(poisoned, field.name))
 
 
 def refused_where(bad: Bool[Array, "..."], tree: Any) -> Any:
     """As `nan_where`; of a batch, the numbers that members do not share, or all if any is bad."""
-    own = any(np.shape(x) == bad.shape for x in jax.tree.leaves(tree))
-    if not own:
+    batched = any(np.shape(x) == bad.shape for x in jax.tree.leaves(tree))
+    if not batched:
         return nan_where(bad.any(), tree)
     return jax.tree.map(lambda x: nan_where(bad, x) if np.shape(x) == bad.shape else x, tree)

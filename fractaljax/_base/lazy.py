@@ -18,13 +18,15 @@ class _Lazy(ModuleType):
             raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
         place, there = self._places[name]
         home = importlib.import_module(place, self.__name__)
-        known = vars(home)
+        attributes = vars(home)
         # What is not there is a module itself.
-        found = (
-            known[there] if there in known else importlib.import_module(f".{there}", home.__name__)
+        value = (
+            attributes[there]
+            if there in attributes
+            else importlib.import_module(f".{there}", home.__name__)
         )
-        self.__dict__[name] = found
-        return found
+        self.__dict__[name] = value
+        return value
 
     def __setattr__(self, name: str, value: Any) -> None:
         # Python binds every module that it imports in its package: `plot.cycle` is a function.

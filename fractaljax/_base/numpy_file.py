@@ -55,17 +55,17 @@ def read_members(content: bytes, most: int) -> dict[str, bytes]:
     members = {}
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as packed:
-            found = packed.infolist()
-            size = sum(member.file_size for member in found)  # `read` never exceeds it
+            entries = packed.infolist()
+            size = sum(member.file_size for member in entries)  # `read` never exceeds it
             if size > most:
                 raise ValueError(f"it unpacks to {size} bytes, at most {most} are read")
-            names = [member.filename.removesuffix(".npy") for member in found]
+            names = [member.filename.removesuffix(".npy") for member in entries]
             if len(set(names)) < len(names):
                 raise ValueError(f"it holds two arrays of one name: {', '.join(names)}")
             end = content.rfind(b"PK\5\6")  # the end record holds the number of members
             if int.from_bytes(content[end + 10 : end + 12], "little") != len(names):
                 raise ValueError("it is damaged: an array is lost")
-            for name, member in zip(names, found, strict=True):
+            for name, member in zip(names, entries, strict=True):
                 if member.flag_bits & 1:
                     raise ValueError(f"{name} is encrypted")
                 members[name] = packed.read(member)

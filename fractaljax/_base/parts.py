@@ -46,7 +46,7 @@ def number(
         ("at most", operator.le, at_most),
     ]
     domain = [(word, holds, bound) for word, holds, bound in domain if math.isfinite(bound)]
-    wanted = " and ".join(f"{word} {bound:g}" for word, _, bound in domain) or "finite"
+    requirement = " and ".join(f"{word} {bound:g}" for word, _, bound in domain) or "finite"
 
     def outside(x):
         inside = (holds(x, bound) for _, holds, bound in domain)
@@ -57,7 +57,7 @@ def number(
         return nan_where(outside(array), array)
     bad = values[outside(values)]
     if bad.size:
-        raise ValueError(f"{name} must be {wanted}, got {bad.flat[0].item()!r}")
+        raise ValueError(f"{name} must be {requirement}, got {bad.flat[0].item()!r}")
     return array
 
 
@@ -101,12 +101,12 @@ def ordered(name: str, value: Numbers, other_name: str, other: Numbers) -> Numbe
 
 def whole(name: str, value: Any, least: int, most: float = math.inf) -> int:
     """`value` as an int, refused unless it is a whole number from `least` to `most`."""
-    found = value if isinstance(value, int) else np.asarray(value).tolist()
-    plain = isinstance(found, (int, float)) and not isinstance(found, bool)
-    if not (plain and least <= found <= most and found % 1 == 0):
-        bound = f"at most {most}" if plain and found > most else f"at least {least}"
+    native = value if isinstance(value, int) else np.asarray(value).tolist()
+    plain = isinstance(native, (int, float)) and not isinstance(native, bool)
+    if not (plain and least <= native <= most and native % 1 == 0):
+        bound = f"at most {most}" if plain and native > most else f"at least {least}"
         raise ValueError(f"{name} must be a whole number of {bound}, got {brief(value)}")
-    return int(found)
+    return int(native)
 
 
 def flag(name: str, value: Any) -> bool:
@@ -160,19 +160,19 @@ def nan_where(bad: Bool[ArrayLike, "..."], tree: Any) -> Any:
 def refused(tree: Any) -> Bool[Array, ""] | None:
     """Whether a traced number in it was refused, and is NaN; None if nothing is traced."""
     traced = [x for x in jax.tree.leaves(tree) if isinstance(x, Tracer) and concrete(x) is None]
-    found = [jnp.isnan(x).any() for x in traced if eqx.is_inexact_array(x)]
-    return functools.reduce(operator.or_, found) if found else None
+    nans = [jnp.isnan(x).any() for x in traced if eqx.is_inexact_array(x)]
+    return functools.reduce(operator.or_, nans) if nans else None
 
 
-def raise_unless(wanted: Any, outcome: Any) -> Any:
+def raise_unless(expected: Any, outcome: Any) -> Any:
     """`outcome` if its `result` is the member `wanted`; else `RuntimeError` with its message.
 
     Of a traced one the numbers become NaN, and `result` stays.
     """
     result = outcome.result
     if concrete(result._value) is None:
-        return nan_where(result != wanted, outcome)
-    if bool(result != wanted):
+        return nan_where(result != expected, outcome)
+    if bool(result != expected):
         raise RuntimeError(result._enumeration[result])
     return outcome
 
@@ -231,13 +231,13 @@ class Part(Record):
 
 def quantities(part: Part) -> dict[str, tuple[str, ...]]:
     """Every named quantity and sub-part below `part`, with the attribute path that leads to it."""
-    found = {}
+    paths = {}
     for field in dataclasses.fields(part):
         value = getattr(part, field.name)
-        found[quantity_name(field)] = (field.name,)
+        paths[quantity_name(field)] = (field.name,)
         if isinstance(value, Part):
-            found |= {name: (field.name, *path) for name, path in quantities(value).items()}
-    return found
+            paths |= {name: (field.name, *path) for name, path in quantities(value).items()}
+    return paths
 
 
 def leaf(part: Part, path: tuple[str, ...]) -> Any:

@@ -57,13 +57,13 @@ def quick_compilation() -> dict[str, Any]:
         "xla_cpu_use_fusion_emitters": False,
         "xla_disable_hlo_passes": "while-loop-invariant-code-motion,simplify-while-loops",
     }
-    known = {}
+    supported = {}
     if jax.default_backend() == "cpu":
         for name, value in options.items():
             with contextlib.suppress(jax.errors.JaxRuntimeError):
                 jax.jit(jnp.negative, compiler_options={name: value})(0.0)
-                known[name] = value
-    return known
+                supported[name] = value
+    return supported
 
 
 def exported_jit(function: Callable, static_argnames: str | tuple[str, ...] = ()) -> Callable:
@@ -116,8 +116,8 @@ def _write(file: Path, program: Callable, kinds) -> None:
 
     def flat(*leaves):
         nonlocal skeleton
-        found, values = program(*leaves), []
-        skeleton = json.dumps(_described(found, values))
+        result, values = program(*leaves), []
+        skeleton = json.dumps(_described(result, values))
         return values
 
     arguments = [jax.ShapeDtypeStruct(*kind[:2], weak_type=kind[2]) for kind in kinds]

@@ -94,8 +94,8 @@ def boundary_element(
         rtol = 1e-9 if heights.dtype == jnp.float64 else 1e-5
     rtol = float(scalar("rtol", rtol, above=0, below=1))
     plastic, throw = flag("plastic", plastic), flag("throw", throw)
-    found = _boundary_element(heights, dx, material, P, plastic, rtol)
-    return raise_unless(BoundaryElementResult.converged, found) if throw else found
+    solution = _boundary_element(heights, dx, material, P, plastic, rtol)
+    return raise_unless(BoundaryElementResult.converged, solution) if throw else solution
 
 
 @functools.partial(jax.jit, static_argnums=(4, 5))
@@ -196,25 +196,25 @@ def _solve(h, mean, rtol, start=None) -> _Solution:
         curvature = jnp.sum(direction * response)
         # A single point in contact has no direction, but others must still join it.
         length = jnp.where(curvature > 0, jnp.sum(gradient * direction) / curvature, 1)
-        moved = pressure - length * direction
+        trial = pressure - length * direction
         grown = jnp.any(wrong)
         pull = jax.lax.cond(
             grown,
             lambda: length * jnp.where(wrong, _precondition(jnp.where(wrong, gap, 0)), 0),
             lambda: jnp.zeros_like(gap),
         )
-        clipped = jnp.maximum(moved - pull, 0)
-        changed = grown | jnp.any(moved < 0)
-        following = jnp.where(changed, clipped * (mean / jnp.mean(clipped)), moved)
+        clipped = jnp.maximum(trial - pull, 0)
+        changed = grown | jnp.any(trial < 0)
+        following = jnp.where(changed, clipped * (mean / jnp.mean(clipped)), trial)
         u = jax.lax.cond(changed, lambda: _displacement(following), lambda: u - length * response)
         residual = conditions(following, u)[-1]
         product = jnp.where(grown & (residual > before), jnp.inf, new)
         return following, u, direction, gradient, product, residual, count + 1
 
     start = jnp.full_like(h, mean) if start is None else start * (mean / jnp.mean(start))
-    u, nothing = _displacement(start), jnp.zeros_like(h)
+    u, zeros = _displacement(start), jnp.zeros_like(h)
     infinite = jnp.full_like(mean, jnp.inf)
-    state = start, u, nothing, nothing, infinite, conditions(start, u)[-1], 0
+    state = start, u, zeros, zeros, infinite, conditions(start, u)[-1], 0
     pressure, u, *_, residual, _ = jax.lax.while_loop(go_on, iterate, state)
     return _Solution(pressure, conditions(pressure, u)[3], residual)
 
@@ -261,8 +261,8 @@ def _solve_plastic(h, mean, limit, rtol) -> _Solution:
         u_following = _displacement(following)
         ahead = following + momentum * (following - pressure)
         u_ahead = u_following + momentum * (u_following - u)
-        found = conditions(following, u_following, -shift * softest)
-        return following, u_following, ahead, u_ahead, *found, count + 1
+        mean_gap, residual = conditions(following, u_following, -shift * softest)
+        return following, u_following, ahead, u_ahead, mean_gap, residual, count + 1
 
     elastic = _solve(h, mean, rtol)
     yields = jnp.any(elastic.pressure > limit)
@@ -359,8 +359,8 @@ def _contact_jvp(rtol, primals, tangents):
     dmean_gap = jnp.mean(w * dh) - compliance * dmean
 
     def beside(step):
-        found = _solve(h, mean * (1 + step), rtol, start=pressure)
-        return _flat_punch(found.pressure > 0, rtol, h.dtype)
+        solution = _solve(h, mean * (1 + step), rtol, start=pressure)
+        return _flat_punch(solution.pressure > 0, rtol, h.dtype)
 
     (w_more, c_more), (w_less, c_less) = beside(_LOAD_STEP), beside(-_LOAD_STEP)
     width = 2 * _LOAD_STEP * mean

@@ -118,8 +118,8 @@ class LoadTable(eqx.Module):
         starts = jax.lax.stop_gradient(self.table[0])
         groups = starts.reshape(-1, _ROWS, *starts.shape[1:])
         group = jnp.maximum(jnp.sum(groups[:, 0] <= e[None], axis=0) - 1, 0)
-        own = jnp.take_along_axis(groups, group[None, None], axis=0)[0]
-        return group * _ROWS + jnp.maximum(jnp.sum(own <= e[None], axis=0) - 1, 0)
+        starts_in_group = jnp.take_along_axis(groups, group[None, None], axis=0)[0]
+        return group * _ROWS + jnp.maximum(jnp.sum(starts_in_group <= e[None], axis=0) - 1, 0)
 
 
 @jax.jit
@@ -168,18 +168,18 @@ def load_curve(
     is smooth; by default it is everywhere. Above 1024 P, or where load and stiffness have grown by
     e^14, the curve goes on straight.
     """
-    own, dtype = stiffness(P), P.dtype
+    stiffness_at_P, dtype = stiffness(P), P.dtype
 
     def relative(log_n):
         """ln of K_n(n P)/K_n(P) for any shape."""
         at = jax.vmap(stiffness)(jnp.exp(log_n.ravel()) * P)
-        return jnp.log(at / own).reshape(log_n.shape)
+        return jnp.log(at / stiffness_at_P).reshape(log_n.shape)
 
     if borders is None:
         logs = jax.lax.stop_gradient(_borders(relative, jnp.asarray(opening_exponent, dtype)))
     else:
-        given = jnp.log(jnp.asarray(borders, dtype) / P)
-        logs = jnp.sort(jnp.append(given, 0))
+        log_borders = jnp.log(jnp.asarray(borders, dtype) / P)
+        logs = jnp.sort(jnp.append(log_borders, 0))
         logs = jnp.append(logs, logs[-1] + math.log(_MOST))
     power = 1 / (1 - jnp.asarray(opening_exponent, dtype))
     share = jnp.asarray((_NODES + 1) / 2, dtype)
@@ -207,8 +207,8 @@ def _polynomials(x) -> Array:
         one, two = carry
         return (two, 2 * x * two - one), one
 
-    _, found = jax.lax.scan(following, (jnp.ones_like(x), x), length=_DEGREE + 2)
-    return found.T
+    _, rows = jax.lax.scan(following, (jnp.ones_like(x), x), length=_DEGREE + 2)
+    return rows.T
 
 
 def _borders(relative, exponent) -> Array:
@@ -220,14 +220,14 @@ def _borders(relative, exponent) -> Array:
     x = jnp.linspace(0, math.log(_FAINTEST), 4 * _SAMPLES, dtype=dtype)
     other = jnp.abs(jnp.diff(relative(x)) / jnp.diff(x) - exponent) > _POWER
     last = jnp.min(jnp.where(other, x[1:], 0))
-    found = []
+    sides = []
     for end, count in ((jnp.minimum(last, math.log(_LEAST)), _BELOW), (math.log(_MOST), _ABOVE)):
         x = jnp.linspace(0, end, _SAMPLES, dtype=dtype)
         grown = jnp.abs(jnp.diff(x)) + jnp.abs(jnp.diff(relative(x)))
         grown = jnp.append(jnp.zeros(1, dtype), jnp.cumsum(grown))
         most = grown[-1] if count == _BELOW else jnp.minimum(grown[-1], _STEEPEST)
-        found.append(jnp.interp(most * jnp.arange(1, count + 1) / count, grown, x))
-    below, above = found
+        sides.append(jnp.interp(most * jnp.arange(1, count + 1) / count, grown, x))
+    below, above = sides
     return jnp.concatenate([below[::-1], jnp.zeros(1, dtype), above])
 
 

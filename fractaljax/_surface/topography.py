@@ -78,11 +78,11 @@ def topography(
     dtype = surface.D.dtype
     require_memory(f"a topography of {n} x {n} points", dtype.itemsize * n * (3 * n + 4 * _BLOCK))
     L = scalar("L", L, above=0)
-    gamma, ratio = _known("gamma", surface.gamma), n / 2
+    gamma, ratio = _require_concrete("gamma", surface.gamma), n / 2
     if L_s is not None:
         L_s = scalar("L_s", L_s, above=0)
         with np.errstate(over="ignore"):
-            ratio = _known("L", L) / _known("L_s", L_s)
+            ratio = _require_concrete("L", L) / _require_concrete("L_s", L_s)
         L = ordered("L", L, "L_s", L_s)
         number("L/L_s", ratio)
     count = int(frequency_count(gamma, ratio, np))
@@ -124,7 +124,7 @@ def _require_key(key) -> None:
         raise kind(f"key must be one key of jax.random, got {got}") from None
 
 
-def _known(name: str, value: jax.Array) -> np.ndarray:
+def _require_concrete(name: str, value: jax.Array) -> np.ndarray:
     values = concrete(value)
     if values is None:
         raise TypeError(

@@ -60,8 +60,8 @@ class Program:
         """`place` gives the scene at a point, from the whole and the values there by name."""
 
         def point(scene, values):
-            moved = place(scene, dict(zip(names, values, strict=True)))
-            return jax.tree.map(jnp.asarray, measure(moved))
+            scene_at_point = place(scene, dict(zip(names, values, strict=True)))
+            return jax.tree.map(jnp.asarray, measure(scene_at_point))
 
         values = [jax.ShapeDtypeStruct((), axis.dtype) for axis in grid]
         # `shapes` is the pytree of the measure at one point.
@@ -141,7 +141,7 @@ class Digest:
 
     def __init__(self, program: ClosedJaxpr):
         self.outside: list[tuple[str, Any]] = []
-        self._known: dict[int, bytes] = {}
+        self._digests: dict[int, bytes] = {}
         settings = [str(getattr(jax.config, name)) for name in _SETTINGS]
         self.digest = _sha(repr((settings, self._plain(program, ""))).encode())
 
@@ -176,8 +176,8 @@ class Digest:
 
     def _jaxpr(self, jaxpr: Jaxpr) -> bytes:
         # Parts of a program are shared: each is read once.
-        if id(jaxpr) in self._known:
-            return self._known[id(jaxpr)]
+        if id(jaxpr) in self._digests:
+            return self._digests[id(jaxpr)]
         numbers: dict[Any, int] = {}
 
         def new(variable):
@@ -201,8 +201,8 @@ class Digest:
             lines.append((name, *map(old, equation.invars), self._plain(parameters, name)))
             lines.append([new(v) for v in equation.outvars])
         lines.append([old(v) for v in jaxpr.outvars])
-        self._known[id(jaxpr)] = found = _sha(repr(lines).encode())
-        return found
+        self._digests[id(jaxpr)] = digest = _sha(repr(lines).encode())
+        return digest
 
 
 def _aval(x):

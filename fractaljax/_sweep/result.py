@@ -62,8 +62,8 @@ class Sweep(Record):
         }
 
         def labelled(name, leaf):
-            own = [f"{name}_{i}" for i in range(np.ndim(leaf) - len(self.names))]
-            return xarray.DataArray(leaf, coords, [*self.names, *own])
+            dimensions = [f"{name}_{i}" for i in range(np.ndim(leaf) - len(self.names))]
+            return xarray.DataArray(leaf, coords, [*self.names, *dimensions])
 
         if self._single:
             return labelled("dim", self.values)

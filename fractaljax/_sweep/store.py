@@ -95,10 +95,10 @@ class Store:
                     _add(group, name, values.dtype, values.shape, values.shape, [name], words)
                     group[name][:] = values
                 for name, leaf in leaves.items():
-                    own = [f"{name}_{i}" for i in range(len(leaf.shape))]
-                    own = _distinct(own, [*names, *leaves])
+                    dimensions = [f"{name}_{i}" for i in range(len(leaf.shape))]
+                    dimensions = _distinct(dimensions, [*names, *leaves])
                     shape, chunks = (first + leaf.shape for first in (blocks.shape, blocks.block))
-                    _add(group, name, leaf.dtype, shape, chunks, [*names, *own])
+                    _add(group, name, leaf.dtype, shape, chunks, [*names, *dimensions])
                 words = {"long_name": "checksum of the batch of the point; 0: not computed yet"}
                 _add(group, _COMPUTED, np.uint64, blocks.shape, blocks.block, names, words)
                 with warnings.catch_warnings():
@@ -117,15 +117,15 @@ class Store:
 
     def _compare(self, path, about) -> list[str]:
         """Refuse the store of another sweep; the names of the arrays in this one."""
-        found = describe(path) or {}
-        others = versions_differ(found.get(_VERSIONS, {}))
-        differs = [words for key, words in _MEANINGS.items() if found.get(key) != about[key]]
+        stored = describe(path) or {}
+        others = versions_differ(stored.get(_VERSIONS, {}))
+        differs = [words for key, words in _MEANINGS.items() if stored.get(key) != about[key]]
         if differs:
             note = f" (it was {others})" if others else ""
             raise ValueError(f"out {path} holds another sweep: {', '.join(differs)} differ{note}")
         if others:
             warnings.warn(f"out {path} was {others}: digits may differ", stacklevel=4)
-        return found[_NAMES]
+        return stored[_NAMES]
 
     def there(self) -> set[int]:
         """The numbers of the batches that are there now, with every file of theirs."""
@@ -148,13 +148,13 @@ class Store:
 
     def read(self, k: int) -> list[np.ndarray]:
         """The arrays of batch k. **Raises:** `ValueError` for one that is damaged or missing."""
-        index, wanted = self._blocks.index(k), self._sum(k)
+        index, checksum = self._blocks.index(k), self._sum(k)
         try:
             arrays = [np.asarray(kept[index]) for kept in self._leaves]
             reason = "it is damaged, or no batch of this sweep"
         except Exception as error:  # whatever a codec makes of damaged bytes
             arrays, reason = None, one_line(error)
-        if arrays is None or wanted != self._checksum(k, arrays):
+        if arrays is None or checksum != self._checksum(k, arrays):
             raise self._damaged(k, reason)
         return arrays
 
@@ -238,13 +238,13 @@ def describe(path: str | os.PathLike) -> dict[str, Any] | None:
     if not file.exists():
         return None
     try:
-        found = json.loads(file.read_bytes())["attributes"][_ABOUT]
+        about = json.loads(file.read_bytes())["attributes"][_ABOUT]
         kinds = {_VERSIONS: dict, _NAMES: list, "key": str, "axes": list, "batch": int}
-        if {name: type(value) for name, value in found.items()} != kinds | {"arrays": list}:
+        if {name: type(value) for name, value in about.items()} != kinds | {"arrays": list}:
             raise ValueError("other keys than those of a sweep")
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{file} does not describe a sweep: {one_line(error)}") from None
-    return found
+    return about
 
 
 def description(
@@ -277,18 +277,18 @@ def leaf_names(measure: Any, shapes: Any, axes: Mapping[str, Any]) -> list[str]:
     leaves = jax.tree_util.tree_leaves_with_path(shapes)
     names = [jax.tree_util.keystr(place, simple=True, separator=".") for place, _ in leaves]
     if names == [""]:
-        own = getattr(getattr(measure, "func", measure), "__name__", "").strip("_")
-        names = [own if own.isidentifier() else "value"]
+        function_name = getattr(getattr(measure, "func", measure), "__name__", "").strip("_")
+        names = [function_name if function_name.isidentifier() else "value"]
     return _distinct(names, ["zarr.json", _COMPUTED, *axis_names(axes)])
 
 
 def _distinct(names, taken: Sequence[str]) -> list[str]:
     """Names of files that differ from one another and from those taken, on any system."""
-    used, found = {name.casefold() for name in taken}, []
+    used, distinct = {name.casefold() for name in taken}, []
     for name in names:
         name = re.sub(r"[^\w.+-]", "_", name.replace("/", "_over_"))
         while name.casefold() in used:
             name += "_"
         used.add(name.casefold())
-        found.append(name)
-    return found
+        distinct.append(name)
+    return distinct

@@ -137,8 +137,8 @@ def run(
         raise ValueError("out must name a folder that all processes share, got None")
     arrays = [np.empty((*shape, *leaf.shape), leaf.dtype) for leaf in leaves]
 
-    def put(k, found):
-        for array, leaf in zip(arrays, found, strict=True):
+    def put(k, batch):
+        for array, leaf in zip(arrays, batch, strict=True):
             array[parts.index(k)] = leaf
 
     share = range(jax.process_index(), parts.number, jax.process_count())
@@ -153,10 +153,10 @@ def run(
     shown = progress and jax.process_index() == 0
     with contextlib.closing(computed), _bar(sum(map(parts.size, share)), shown) as bar:
         bar.update(sum(parts.size(k) for k in share if k in kept))
-        for k, found in computed:
+        for k, batch in computed:
             if store:
-                store.write(k, found)
-            put(k, found)
+                store.write(k, batch)
+            put(k, batch)
             bar.update(parts.size(k))
     if store:
         if jax.process_count() > 1:
@@ -198,16 +198,16 @@ def _each(x: Any) -> int:
     return _POINTS_EACH
 
 
-def _batch_size(asked: int | None, points: int, devices: int, each: int) -> int:
-    if asked is None:
+def _batch_size(batch_size: int | None, points: int, devices: int, each: int) -> int:
+    if batch_size is None:
         return devices * min(each, -(-points // devices))
-    if isinstance(asked, bool) or not isinstance(asked, int) or asked < 1:
-        raise ValueError(f"batch_size must be an integer of at least 1, got {asked!r}")
-    if asked % devices:
+    if isinstance(batch_size, bool) or not isinstance(batch_size, int) or batch_size < 1:
+        raise ValueError(f"batch_size must be an integer of at least 1, got {batch_size!r}")
+    if batch_size % devices:
         raise ValueError(
-            f"batch_size must be a multiple of the number of devices, {devices}, got {asked}"
+            f"batch_size must be a multiple of the number of devices, {devices}, got {batch_size}"
         )
-    return asked
+    return batch_size
 
 
 def _bar(points: int, shown: bool):

@@ -82,9 +82,9 @@ class Job:
             return batches.end(k, begun)
 
 
-def _arrived(token: str, found: dict[str, Any], content: bytes) -> Job:
+def _arrived(token: str, jax_settings: dict[str, Any], content: bytes) -> Job:
     job = Job.__new__(Job)
-    job._token, job._settings, job._bytes, job._batches = token, found, content, None
+    job._token, job._settings, job._bytes, job._batches = token, jax_settings, content, None
     return job
 
 
