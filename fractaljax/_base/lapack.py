@@ -1,7 +1,7 @@
 """LAPACK under `vmap`: one problem after the other.
 
-Two calls of LAPACK on batches, run at once, wait for one another for ever on two cores (jaxlib
-0.10). One after the other they are about as fast.
+Two concurrent calls of LAPACK on batches deadlock on two cores (jaxlib 0.10). Sequential calls are
+about as fast.
 """
 
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 
 def one_by_one(function: Callable) -> Callable:
-    """A function of LAPACK's, without derivatives, that `vmap` runs for one at a time."""
+    """A LAPACK function, without derivatives, that `vmap` calls for one member at a time."""
     sequential: Any = sequential_vmap(function)
     return sequential
 

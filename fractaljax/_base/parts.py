@@ -15,7 +15,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-Numbers = Float[Array, "..."]  # of one scene, or of a batch of any shape
+Numbers = Float[Array, "..."]  # for one scene, or for a batch of any shape
 _PartT = TypeVar("_PartT", bound="Part")
 
 
@@ -33,8 +33,8 @@ def number(
 ) -> Numbers:
     """`value` as a floating-point array of any shape, checked against its domain.
 
-    `above` and `below` are strict. NaN and infinity are always refused. A concrete value raises
-    with its name, the bound and the value; a traced one becomes NaN (`nan_where`).
+    `above` and `below` are strict. NaN and infinity are always refused. A concrete value raises an
+    error with its name, the bound and the value; a traced one becomes NaN (`nan_where`).
 
     **Raises:** `TypeError` unless `value` is real and numeric; `ValueError` outside the domain.
     """
@@ -70,7 +70,7 @@ def _floating(name: str, value: Any) -> Numbers:
             raise TypeError
         # An explicit dtype strips weak types, which would compile every caller twice.
         keeps = hasattr(value, "dtype") and jnp.issubdtype(dtype, jnp.floating)
-        # A value known at trace time stays known.
+        # A value that is concrete at trace time stays concrete.
         traced = isinstance(value, Tracer)
         with contextlib.nullcontext() if traced else jax.ensure_compile_time_eval():
             return jnp.asarray(value, dtype=dtype if keeps else float)
@@ -120,7 +120,7 @@ def flag(name: str, value: Any) -> bool:
 
 
 def require_kind(name: str, value: Any, kind: type) -> None:
-    """Refuse what is not an instance of `kind`."""
+    """Refuse a value that is not an instance of `kind`."""
     if not isinstance(value, kind):
         article = "an" if kind.__name__[0] in "AEIOU" else "a"
         raise TypeError(f"{name} must be {article} {kind.__name__}, got {brief(value)}")
@@ -134,21 +134,21 @@ def concrete(array: jax.Array) -> np.ndarray | None:
 
 
 def is_traced(tree: Any) -> bool:
-    """True if any number in it is known only to a program that is being traced."""
+    """True if any number in the tree belongs to a program that is being traced."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def nan_where(bad: Bool[ArrayLike, "..."], tree: Any) -> Any:
-    """`tree` with NaN for its numbers where they are `bad`; one by one if that has their shape.
+    """`tree` with NaN for its numbers where they are `bad`; elementwise if the shapes agree.
 
-    So a traced value is refused. Raising would take a callback to the host, at which a GPU stops
-    whenever the program runs, and one bad member would end a whole batch.
+    This is how a traced value is refused. Raising would take a callback to the host, which stalls
+    a GPU at every run of the program, and one bad member would end a whole batch.
     """
 
     def spoilt(x):
         if not eqx.is_inexact_array(x):
             return x
-        # A product, so that derivatives are NaN too: those of a choice would be 0.
+        # A product, so that derivatives are NaN too: those of `jnp.where` would be 0.
         factor = jnp.where(bad, jnp.nan, 1).astype(x.real.dtype)
         if jnp.iscomplexobj(x):
             return jax.lax.complex(x.real * factor, x.imag * factor)
@@ -158,16 +158,16 @@ def nan_where(bad: Bool[ArrayLike, "..."], tree: Any) -> Any:
 
 
 def refused(tree: Any) -> Bool[Array, ""] | None:
-    """Whether a traced number in it was refused, and is NaN; None if nothing is traced."""
+    """True if a traced number in the tree was refused, and is NaN; None if none is traced."""
     traced = [x for x in jax.tree.leaves(tree) if isinstance(x, Tracer) and concrete(x) is None]
     nans = [jnp.isnan(x).any() for x in traced if eqx.is_inexact_array(x)]
     return functools.reduce(operator.or_, nans) if nans else None
 
 
 def raise_unless(expected: Any, outcome: Any) -> Any:
-    """`outcome` if its `result` is the member `wanted`; else `RuntimeError` with its message.
+    """`outcome` if its `result` is the member `expected`; else `RuntimeError` with its message.
 
-    Of a traced one the numbers become NaN, and `result` stays.
+    The numbers of a traced outcome become NaN, and its `result` stays.
     """
     result = outcome.result
     if concrete(result._value) is None:
@@ -187,7 +187,7 @@ def brief(value: Any) -> str:
 
 
 def one_line(error: Exception) -> str:
-    """An error of another package in one line."""
+    """The message of another package's error, in one line."""
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
@@ -197,15 +197,15 @@ def one_line(error: Exception) -> str:
 def quantity(unit: str, meaning: str, *, log: bool = False, name: str | None = None) -> Any:
     """A numeric field of a part, with its unit and its meaning for files and tables.
 
-    `log` marks a scale: it is designed and swept on a logarithmic axis. `name` is that of the
-    quantity, and of the argument of `__init__`, where the attribute has another.
+    `log` marks a scale, which is designed and swept on a logarithmic axis. `name` is the name of
+    the quantity and of the argument of `__init__`, if the attribute has another.
     """
     named = {} if name is None else {"name": name}
     return eqx.field(metadata={"unit": unit, "meaning": meaning, "log": log, **named})
 
 
 def quantity_name(field: dataclasses.Field) -> str:
-    """The name under which files, tables and `replace` know a field of a part."""
+    """The name of a field of a part in files, tables and `replace`."""
     return field.metadata.get("name", field.name)
 
 
@@ -246,9 +246,9 @@ def leaf(part: Part, path: tuple[str, ...]) -> Any:
 
 
 def rebuild(part: _PartT, changes: Mapping[str, Any]) -> _PartT:
-    """`part` built anew, checks included, with named quantities changed wherever they live.
+    """`part` rebuilt and checked, with named quantities changed wherever they are in it.
 
-    Where a part is itself among the changes, the quantities in it are changed in the new part.
+    If a whole part is among the changes, the quantities in it are changed in the new part.
     """
     arguments, changed = {}, False
     for field in dataclasses.fields(part):

@@ -65,14 +65,14 @@ def _value(value: Any) -> str:
 
 
 def _quoted(text: str) -> str:
-    # JSON and TOML escape alike, but for DEL.
+    # JSON and TOML escape alike, except for DEL.
     return json.dumps(text, ensure_ascii=False).replace("\x7f", r"\u007f")
 
 
 def part_table(part: Part, laws: Laws) -> dict[str, Any]:
-    """The table of a part: numbers with unit and meaning, and its own parts as tables in it.
+    """The table of a part: numbers with unit and meaning, and its sub-parts as nested tables.
 
-    **Raises:** `ValueError` for a part of a kind that `laws` does not have.
+    **Raises:** `ValueError` for a part of a kind that `laws` lacks.
     """
     table = {}
     for field in dataclasses.fields(part):
@@ -89,7 +89,7 @@ def part_table(part: Part, laws: Laws) -> dict[str, Any]:
 
 
 def law_table(name: str, part: Part, laws: Laws) -> dict[str, Any]:
-    """The table of a part that is one of several laws, by the name of its kind; errors as there."""
+    """The table of a law, with the name of its kind; errors as `part_table`."""
     return _law(name, type(part), laws[name]) | part_table(part, laws)
 
 
@@ -114,7 +114,7 @@ def read_toml(content: bytes) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def naming(path: str | os.PathLike) -> Iterator[None]:
-    """Errors in the content of a file become one `ValueError` that begins with its name."""
+    """Turn errors in the content of a file into one `ValueError` that begins with its name."""
     try:
         yield
     except RecursionError:
@@ -124,7 +124,7 @@ def naming(path: str | os.PathLike) -> Iterator[None]:
 
 
 def table_at(document: Mapping[str, Any], key: str, inside: str = "") -> dict[str, Any]:
-    """The table `key` of `document`, whose own name in the file is `inside` ("joints.", say)."""
+    """The table `key` of `document`, which the file has under the prefix `inside` ("joints.")."""
     if key not in document:
         raise ValueError(f"the table [{inside}{key}] is missing")
     if not isinstance(document[key], dict):
@@ -133,7 +133,7 @@ def table_at(document: Mapping[str, Any], key: str, inside: str = "") -> dict[st
 
 
 def refuse_unknown(where: str, keys: Collection[str], allowed: Collection[str]) -> None:
-    """Refuse a key in `given` that is not in `known`; `where` names the table."""
+    """Refuse a key in `keys` that is not in `allowed`; `where` names the table."""
     for key in keys:
         if key not in allowed:
             raise ValueError(f"{where} has the unknown key {key!r}; known are {', '.join(allowed)}")

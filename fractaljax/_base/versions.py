@@ -18,7 +18,7 @@ def version_text() -> str:
 
 
 def versions_differ(recorded: Mapping[str, str]) -> str | None:
-    """The versions in `found` that differ from these, as text; None if none does."""
+    """The versions in `recorded` that differ from the current ones, as text; None if none does."""
     others = [
         f"{name} {recorded[name]}"
         for name, current in versions().items()
@@ -28,7 +28,7 @@ def versions_differ(recorded: Mapping[str, str]) -> str | None:
 
 
 def untested_jax() -> str | None:
-    """A note where JAX is newer than the newest with which this version was tested."""
+    """A note if JAX is newer than the newest with which this version was tested; else None."""
     if jax.__version_info__[:2] <= NEWEST_TESTED_JAX:
         return None
     newest = ".".join(map(str, NEWEST_TESTED_JAX))
