@@ -48,7 +48,7 @@ class Sweep(Record):
         return getattr(self.values, name)
 
     def to_xarray(self) -> "DataArray | Dataset":
-        """A `DataArray` with units on its axes; of a pytree a `Dataset`, one variable a leaf.
+        """A `DataArray` with units on its axes; for a pytree a `Dataset`, one variable per leaf.
 
         **Raises:** `ImportError` unless xarray is installed.
         """
