@@ -1,7 +1,7 @@
 """Curves of zeros by pseudo-arclength continuation: n - 1 smooth equations in n unknowns.
 
-A step along the cubic through the last two points and their tangents, then Newton steps back onto
-the curve the shortest way: a fold is a point like any other. In two unknowns `trace` finds all
+Each step goes along the cubic through the last two points and their tangents, then back onto the
+curve by Newton steps of least length: a fold is a regular point. In two unknowns `trace` finds all
 curves in the unit square that cross a lattice.
 """
 
@@ -47,14 +47,14 @@ class Continuation:
     equations: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
     low: np.ndarray  # (n,) of the box, perhaps infinite
     high: np.ndarray
-    valid: Callable[[np.ndarray], bool] = lambda u: True  # whether a zero belongs to the curve
+    valid: Callable[[np.ndarray], bool] = lambda u: True  # True if a zero belongs to the curve
     tolerance: float = 1e-12  # distance from the zero
     oriented: bool = True
-    longest: float = 1 / 64  # steps
+    longest: float = 1 / 64  # length of a step
     shortest: float = 1e-7
-    settled: float = 0.0  # Newton step after which none is made to see whether it shrinks further
-    small: float = np.inf  # largest residual there: it may be large however close the zero is
-    most: int = 5000  # points each way
+    settled: float = 0.0  # Newton step at which the iteration stops at once
+    small: float = np.inf  # largest residual there, which may be large even close to the zero
+    most: int = 5000  # number of points each way
 
     def tangent(self, jacobian: np.ndarray) -> np.ndarray:
         """The unit vector t (n,) with Jacobian t = 0 and det [t; Jacobian] > 0."""
@@ -64,7 +64,7 @@ class Continuation:
     def corrected(self, u: np.ndarray, fixed: int | None = None):
         """The zero that Newton's method finds from u, and the Jacobian there; None if it fails.
 
-        By steps of least length, with the coordinate `fixed` held.
+        The steps are of least length, with the coordinate `fixed` held.
         """
         free = np.arange(len(u)) != (-1 if fixed is None else fixed)
         best, least, zero = np.inf, np.inf, None
@@ -111,9 +111,9 @@ class Continuation:
         return points, CurveEnd.stuck
 
     def steps(self, u, ahead, sign=1):
-        """Each next point, the direction there, and whether it is on the edge, where the last is.
+        """Each next point, the direction there, and True for a point on the edge, the last one.
 
-        They end before the edge where Newton's method fails however short the step.
+        The points end before the edge where Newton's method fails however short the step.
         """
         length, leaves, before = self.longest / 4, False, None
         while not leaves:
@@ -130,9 +130,9 @@ class Continuation:
                 length = min(1.5 * length, self.longest)
 
     def _step(self, u, ahead, length, sign, before):
-        """The next point, its direction, the angle to it, whether on the edge; None if too long.
+        """The next point, its direction, the angle to it, True on the edge; None if too long.
 
-        `before` are the last point and the direction there, None at the first one.
+        `before` is the previous point with its direction, None at the first point.
         """
         target, fixed = u + length * ahead, None
         if before is not None and self._inside(target):
@@ -158,7 +158,7 @@ class Continuation:
         return bool(((u >= self.low) & (u <= self.high)).all())
 
     def _way_out(self, u, target):
-        """Share of the way to a target outside at which it leaves the box, coordinate and side."""
+        """Share of the way to an outside target at which it leaves the box, coordinate and side."""
         return min(
             ((side - u[i]) / (target[i] - u[i]), i, side)
             for i in range(len(u))
@@ -170,7 +170,7 @@ class Continuation:
         )
 
     def passes(self, start, ahead, step) -> bool:
-        """Whether a step passes the start of the curve, both relative to where it begins."""
+        """True if a step passes the start of the curve, both relative to the step's first point."""
         along = start @ ahead
         aside = np.linalg.norm(start - along * ahead)
         near = aside < 0.1 * np.linalg.norm(step) + self.shortest
@@ -178,7 +178,7 @@ class Continuation:
 
 
 def cubic(first, ahead, last, turned, share: float) -> np.ndarray:
-    """A point of the cubic through two points and their unit tangents, some share of the way."""
+    """The point of the cubic through two points and their unit tangents at a share of the way."""
     way = last - first
     size, y = np.linalg.norm(way), share - 1
     of_square, of_cube = size * (2 * turned + ahead) - 3 * way, size * (turned + ahead) - 2 * way
@@ -193,7 +193,7 @@ Values = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 def trace(curves: Continuation, values: Values, lines: int) -> tuple[list[Curve], bool, int]:
     """The curves of one equation in the unit square that cross one of `lines` lines each way.
 
-    `values` gives residuals (k,) and gradients (k, 2) at points (k, 2). Also returned: whether the
+    `values` gives residuals (k,) and gradients (k, 2) at points (k, 2). Also returned: True if the
     residual is negative at (0, 0), and the number of crossings from which no curve was found.
     """
     branches, failed = [], []

@@ -34,10 +34,10 @@ BOUNDARY_ELEMENTS = "boundary elements"
 
 
 class LawCurve(Record):
-    """What one law gives at the loads of a comparison (k,); SI units."""
+    """The results of one law at the loads of a comparison (k,); SI units."""
 
     K_n: Float[Array, " k"]  # normal stiffness [N/m]
-    K_t: Float[Array, " k"] | None  # tangential stiffness [N/m]; None of boundary elements
+    K_t: Float[Array, " k"] | None  # tangential stiffness [N/m]; None for boundary elements
     alpha: Float[Array, " k"]  # d ln K_n/d ln P, NaN where K_n is 0 or infinite
     real_area: Float[Array, " k"] | None  # [m^2]; None where the law has none
     scatter: Float[Array, " k"] | None = None  # standard deviation of ln K_n over seeds
@@ -55,7 +55,7 @@ class LawComparison(Record):
     curves: dict[str, LawCurve]  # by the name of the law
 
     def rows(self) -> tuple[list[str], list[list[str]]]:
-        """The titles and the rows of the table: one for each load and law."""
+        """The titles and the rows of the table, one row for each load and law."""
         titles = ["P [N]", "law", "K_n [N/m]", "scatter", "K_t/K_n", "d ln K_n/d ln P", "A_r/A"]
         rows = []
         for i, P in enumerate(np.asarray(self.loads).tolist()):
@@ -93,18 +93,18 @@ def compare_laws(
 ) -> LawComparison:
     """Stiffness and real area of a joint by every contact law, and by boundary elements.
 
-    At loads (k,) [N] on the nominal area [m^2]: the source's `FractalContact`,
-    `AsperityContact`, `PerssonContact`, and other `laws` by name, each with P replaced by the
-    loads. Boundary elements press `seeds` periodic surfaces of the same D and G, of n x n points,
-    drawn from `key`: K_n and real area are means over the seeds, K_n a geometric one, and alpha is
-    the slope of that mean from load to load. They are elastic and without friction.
+    The laws are the source's `FractalContact`, `AsperityContact`, `PerssonContact`, and other
+    `laws` by name, each with P replaced by the loads (k,) [N], on the nominal area [m^2].
+    Boundary elements press `seeds` periodic surfaces of the same D and G, of n x n
+    points, drawn from `key`: K_n is the geometric mean over the seeds, the real area their mean,
+    and alpha the slope of that K_n from load to load. They are elastic and frictionless.
 
     Wavelengths run from L, by default the side of the area, down to L_s [m], by default 4 L/n; no
     wave is longer than the side. On a larger area than L^2 surfaces lie side by side. `mu_s` and
-    `mu_m` are the friction that laws with yield take, by default the reference brake's. With no
-    `seeds` there are no boundary elements.
+    `mu_m` are the friction coefficients for laws with yield, by default the reference brake's.
+    With `seeds` = 0 there are no boundary elements.
 
-    **Raises:** `ValueError` unless loads rise and are above 0, area > 0, 2 L/n <= L_s <= L,
+    **Raises:** `ValueError` unless loads increase and are above 0, area > 0, 2 L/n <= L_s <= L,
     n >= 8, seeds >= 0, mu_s > 0 and 0 <= mu_m <= 0.9; `RuntimeError` if boundary elements do not
     converge.
     """

@@ -1,6 +1,6 @@
 """The fractal contact law: from a surface under load to the stiffness of the joint.
 
-Equation numbers are those of the source paper. Areas are carried as logarithms, since a_e spans
+Equation numbers are those of the source paper. Areas are kept as logarithms, since a_e spans
 hundreds of decades as D -> 2. Every integral over the elastic contacts is one function,
 `area_moment`. The equations take any shape.
 """
@@ -77,7 +77,7 @@ def tangential_stiffness(E, nu, slip_ratio: Numbers, J_half: Numbers) -> Numbers
 
 
 class _LoadBalance(NamedTuple):
-    """The solved load balance and the stiffness that follows, no more than those need."""
+    """The solution of the load balance, and the stiffness that follows from it."""
 
     log_a_l: Numbers
     log_a_e: Numbers
@@ -200,7 +200,7 @@ def contact_load(
 ) -> Float[Array, "..."]:
     """Eqs. 26 to 28: the normal load P [N] at the real contact area A_r [m^2]; any shape.
 
-    The inverse of `contact_state`: its A_r under this load is the one given.
+    The inverse of `contact_state`, whose A_r under this load is the given one.
 
     **Raises:** `ValueError` unless A_r > 0 and 0 <= mu_m <= 0.9.
     """
