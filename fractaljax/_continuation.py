@@ -1,7 +1,7 @@
 """Curves of zeros by pseudo-arclength continuation: n - 1 smooth equations in n unknowns.
 
-A step along the cubic through the last two points and their tangents, then Newton steps back onto
-the curve the shortest way: a fold is a point like any other. In two unknowns `trace` finds all
+Each step goes along the cubic through the last two points and their tangents, then back onto the
+curve by Newton steps of least length: a fold is a regular point. In two unknowns `trace` finds all
 curves in the unit square that cross a lattice.
 """
 
@@ -47,14 +47,14 @@ class Continuation:
     equations: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
     low: np.ndarray  # (n,) of the box, perhaps infinite
     high: np.ndarray
-    valid: Callable[[np.ndarray], bool] = lambda u: True  # whether a zero belongs to the curve
+    valid: Callable[[np.ndarray], bool] = lambda u: True  # True if a zero belongs to the curve
     tolerance: float = 1e-12  # distance from the zero
     oriented: bool = True
-    longest: float = 1 / 64  # steps
+    longest: float = 1 / 64  # length of a step
     shortest: float = 1e-7
-    settled: float = 0.0  # Newton step after which none is made to see whether it shrinks further
-    small: float = np.inf  # largest residual there: it may be large however close the zero is
-    most: int = 5000  # points each way
+    settled: float = 0.0  # Newton step at which the iteration stops at once
+    small: float = np.inf  # largest residual there, which may be large even close to the zero
+    most: int = 5000  # number of points each way
 
     def tangent(self, jacobian: np.ndarray) -> np.ndarray:
         """The unit vector t (n,) with Jacobian t = 0 and det [t; Jacobian] > 0."""
@@ -64,10 +64,10 @@ class Continuation:
     def corrected(self, u: np.ndarray, fixed: int | None = None):
         """The zero that Newton's method finds from u, and the Jacobian there; None if it fails.
 
-        By steps of least length, with the coordinate `fixed` held.
+        The steps are of least length, with the coordinate `fixed` held.
         """
         free = np.arange(len(u)) != (-1 if fixed is None else fixed)
-        best, least, found = np.inf, np.inf, None
+        best, least, zero = np.inf, np.inf, None
         for _ in range(_NEWTON_STEPS):
             residual, jacobian = self.equations(u)
             if not (np.isfinite(residual).all() and np.isfinite(jacobian).all()):
@@ -79,12 +79,12 @@ class Continuation:
                 break  # down to rounding
             if rank < len(residual) or size > 4 * self.longest:
                 return None
-            best, least, found = size, left, (u, jacobian)
+            best, least, zero = size, left, (u, jacobian)
             if size <= self.settled and left <= self.small:
                 break
             u = u.copy()
             u[free] += step
-        return found if best <= self.tolerance and found and self.valid(found[0]) else None
+        return zero if best <= self.tolerance and zero and self.valid(zero[0]) else None
 
     def curve(self, u: np.ndarray, jacobian: np.ndarray) -> Curve:
         """The whole curve through a zero u, along its tangent."""
@@ -111,9 +111,9 @@ class Continuation:
         return points, CurveEnd.stuck
 
     def steps(self, u, ahead, sign=1):
-        """Each next point, the direction there, and whether it is on the edge, where the last is.
+        """Each next point, the direction there, and True for a point on the edge, the last one.
 
-        They end before the edge where Newton's method fails however short the step.
+        The points end before the edge where Newton's method fails however short the step.
         """
         length, leaves, before = self.longest / 4, False, None
         while not leaves:
@@ -130,9 +130,9 @@ class Continuation:
                 length = min(1.5 * length, self.longest)
 
     def _step(self, u, ahead, length, sign, before):
-        """The next point, its direction, the angle to it, whether on the edge; None if too long.
+        """The next point, its direction, the angle to it, True on the edge; None if too long.
 
-        `before` are the last point and the direction there, None at the first one.
+        `before` is the previous point with its direction, None at the first point.
         """
         target, fixed = u + length * ahead, None
         if before is not None and self._inside(target):
@@ -143,10 +143,10 @@ class Continuation:
             share, fixed, side = self._way_out(u, target)
             target = u + share * length * ahead
             target[fixed] = side
-        found = self.corrected(target, fixed)
-        if found is None:
+        zero = self.corrected(target, fixed)
+        if zero is None:
             return None
-        reached, turned = found[0], sign * self.tangent(found[1])
+        reached, turned = zero[0], sign * self.tangent(zero[1])
         if not self.oriented and turned @ ahead < 0:
             turned = -turned
         angle = np.arccos(np.clip(turned @ ahead, -1, 1))
@@ -158,7 +158,7 @@ class Continuation:
         return bool(((u >= self.low) & (u <= self.high)).all())
 
     def _way_out(self, u, target):
-        """Share of the way to a target outside at which it leaves the box, coordinate and side."""
+        """Share of the way to an outside target at which it leaves the box, coordinate and side."""
         return min(
             ((side - u[i]) / (target[i] - u[i]), i, side)
             for i in range(len(u))
@@ -170,7 +170,7 @@ class Continuation:
         )
 
     def passes(self, start, ahead, step) -> bool:
-        """Whether a step passes the start of the curve, both relative to where it begins."""
+        """True if a step passes the start of the curve, both relative to the step's first point."""
         along = start @ ahead
         aside = np.linalg.norm(start - along * ahead)
         near = aside < 0.1 * np.linalg.norm(step) + self.shortest
@@ -178,7 +178,7 @@ class Continuation:
 
 
 def cubic(first, ahead, last, turned, share: float) -> np.ndarray:
-    """A point of the cubic through two points and their unit tangents, some share of the way."""
+    """The point of the cubic through two points and their unit tangents at a share of the way."""
     way = last - first
     size, y = np.linalg.norm(way), share - 1
     of_square, of_cube = size * (2 * turned + ahead) - 3 * way, size * (turned + ahead) - 2 * way
@@ -193,10 +193,10 @@ Values = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 def trace(curves: Continuation, values: Values, lines: int) -> tuple[list[Curve], bool, int]:
     """The curves of one equation in the unit square that cross one of `lines` lines each way.
 
-    `values` gives residuals (k,) and gradients (k, 2) at points (k, 2). Also returned: whether the
+    `values` gives residuals (k,) and gradients (k, 2) at points (k, 2). Also returned: True if the
     residual is negative at (0, 0), and the number of crossings from which no curve was found.
     """
-    found, failed = [], []
+    branches, failed = [], []
     seeds, negative = _crossings(values, lines)
     for seed in seeds:
         edges = np.flatnonzero((seed == 0) | (seed == 1))
@@ -206,13 +206,13 @@ def trace(curves: Continuation, values: Values, lines: int) -> tuple[list[Curve]
             continue
         # In the same direction: the other side of a narrow tongue is another curve.
         along = curves.tangent(start[1])
-        if any((passing(curve, seed, curves.shortest) @ along > 0).any() for curve in found):
+        if any((passing(curve, seed, curves.shortest) @ along > 0).any() for curve in branches):
             continue
         curve = curves.curve(*start)
         if len(curve.points) > 1:
-            found.append(curve)
-    missed = [p for p in failed if not any(len(passing(c, p, curves.shortest)) for c in found)]
-    return found, negative, len(missed)
+            branches.append(curve)
+    missed = [p for p in failed if not any(len(passing(c, p, curves.shortest)) for c in branches)]
+    return branches, negative, len(missed)
 
 
 def _crossings(values, lines):
@@ -252,15 +252,15 @@ def _crossings(values, lines):
 
 def _beyond(values, first, last, axis, sign):
     """Points (k, 2) between `first` and `last` where the value has the other sign; else NaN."""
-    found = np.full_like(first, np.nan)
+    points = np.full_like(first, np.nan)
     for _ in range(_BISECTIONS):
         middle = (first + last) / 2
         value, slope = values(middle)
         other = (value < 0) != (sign < 0)
-        found[other] = middle[other]
+        points[other] = middle[other]
         falls = (sign * slope[:, axis] < 0)[:, None]
         first, last = np.where(falls, middle, first), np.where(falls, last, middle)
-    return found
+    return points
 
 
 def passing(curve, p, shortest):

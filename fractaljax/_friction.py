@@ -16,7 +16,7 @@ from ._base.singular import safe_divide
 
 LAWS: dict[str, type["Friction"]] = {}  # by their names in files
 
-_FASTEST = 100.0  # m/s: a law is followed up to there for its least value
+_FASTEST = 100.0  # m/s: the least value of a law is sought up to this speed
 SPEEDS = np.concatenate([[0.0], np.geomspace(1e-6, _FASTEST, 161)])  # [m/s]
 _BISECTIONS = 60
 
@@ -39,8 +39,7 @@ class _FromLaw:
 class Friction(Part):
     """A friction law mu(speed), at speeds of at least 0 [m/s].
 
-    A law of your own declares its numbers as fields and writes `mu`, differentiable at 0 from
-    above:
+    A custom law declares its numbers as fields and defines `mu`, differentiable at 0 from above:
 
         class Falling(fj.Friction, law="falling"):
             mu_s: jax.Array = fj.quantity("-", "static friction coefficient")
@@ -50,20 +49,20 @@ class Friction(Part):
                 return self.mu_s / (1 + self.c * speed)
 
     Slope, sign and the scaling of `critical_friction` follow from it. `law` is its name in TOML
-    files, which a law without one cannot be written to; `fj.quantity` puts unit and meaning there
-    and makes a number known to sweeps and designs.
+    files, without which it cannot be written to one; `fj.quantity` adds unit and meaning there and
+    makes a number available to sweeps and designs.
 
     mu_s is mu(0). mu_m, which Eq. 19 takes as dynamic friction, is the least value of mu up to
     100 m/s, and at least 0; the source means the minimum of its Eq. 38. A field or a property of
     either name replaces it.
 
-    **Raises:** `ValueError` unless mu(0) > 0 and a field mu_s is mu(0), and for a name of a law
-    that another has. Of a traced law every number is NaN instead.
+    **Raises:** `ValueError` unless mu(0) > 0 and a field mu_s is mu(0), and for a name that
+    another law has. For a traced law every number is NaN instead.
     """
 
     velocity_dependent: ClassVar[bool] = True  # if False, neither slope nor speed is traced
     lowest: ClassVar[str] = "mu_m"  # the quantity that holds mu_m
-    # Fields that, times a factor, make the law that times as large; without them it is `Scaled`.
+    # Fields that scale the law as a whole; a law without them is wrapped in `Scaled`.
     amplitudes: ClassVar[tuple[str, ...]] = ()
 
     mu_s = _FromLaw(lambda law: law.mu(jnp.zeros((), _dtype(law))))
@@ -87,7 +86,7 @@ class Friction(Part):
             raise ValueError(f"mu_s must be mu(0) = {static}, got {stored}")
 
     def _refuse_traced(self) -> None:
-        """NaN for the numbers of a traced law of the user's where its mu(0) is wrong."""
+        """Set the numbers of a traced user-defined law to NaN where its mu(0) is wrong."""
         static = self.mu(jnp.zeros((), _dtype(self)))
         stored = jnp.asarray(self.mu_s)
         bad = ~(static > 0) | ~jnp.isclose(
@@ -200,7 +199,7 @@ class ExponentialStribeck(Friction, law="exponential"):
     """Friction that decays from mu_s towards mu_d, with a viscous part.
 
     mu(v) = mu_d + (mu_s - mu_d) exp(-v/v_0) + viscous v. Its mu_m is mu_d without a viscous part,
-    else the minimum, at v = v_0 ln((mu_s - mu_d)/(viscous v_0)) or at 0. In use for belt models:
+    else the minimum, at v = v_0 ln((mu_s - mu_d)/(viscous v_0)) or at 0. Used in belt models:
     Papangelo, Ciavarella and Hoffmann (2017).
 
     **Raises:** `ValueError` unless mu_s > 0, 0 <= mu_d <= mu_s, v_0 > 0 and viscous >= 0.
@@ -260,7 +259,7 @@ class HyperbolicStribeck(Friction, law="hyperbolic"):
 
 @final
 class Scaled(Friction, law="scaled"):
-    """A friction law times a factor: what scaling makes of a law that names no `amplitudes`.
+    """A friction law times a factor: the scaled form of a law that names no `amplitudes`.
 
     **Raises:** `TypeError` unless `of` is a `Friction`; `ValueError` unless factor > 0.
     """

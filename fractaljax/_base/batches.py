@@ -1,4 +1,4 @@
-"""A compiled program on any number of points: batches of one shape, the last one padded."""
+"""A compiled program at any number of points, in batches of one shape, the last one padded."""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,10 +8,10 @@ import numpy as np
 
 
 def in_batches(program: Callable[..., Any], batch: int, *arrays: np.ndarray) -> Any:
-    """What a program gives for arrays (n, ...), of which it is shown (batch, ...) at a time.
+    """Evaluate a program on arrays (n, ...), `batch` rows at a time.
 
-    Its results, a pytree of arrays (batch, ...), are put together to NumPy arrays (n, ...). Rows
-    must not depend on one another: the last row is repeated to fill up a batch.
+    Its results, a pytree of arrays (batch, ...), are concatenated to NumPy arrays (n, ...). Rows
+    must be independent of one another: the last row is repeated to fill up a batch.
     """
     if not len(arrays[0]):
         whole = [jax.ShapeDtypeStruct((batch, *x.shape[1:]), x.dtype) for x in arrays]

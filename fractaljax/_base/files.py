@@ -1,4 +1,4 @@
-"""Files read within bounds, and written whole or not at all."""
+"""Bounded reading and atomic writing of files."""
 
 import contextlib
 import errno
@@ -12,20 +12,20 @@ from typing import Any
 def read_bounded(path: str | os.PathLike, most: int = 10_000_000) -> bytes:
     """The content of a file, or of a pipe, of at most `most` bytes.
 
-    **Raises:** `OSError` if it cannot be read; `ValueError` if there is more: /dev/zero never ends.
+    **Raises:** `OSError` if it cannot be read; `ValueError` if it is larger: /dev/zero never ends.
     """
     with open(path, "rb") as file:
-        size = os.fstat(file.fileno()).st_size  # 0 of a pipe
+        size = os.fstat(file.fileno()).st_size  # 0 for a pipe
         content = file.read(size + 1) if size <= most else None
         if content is not None and len(content) > size:
-            content += file.read(most + 1 - len(content))  # which takes that memory at once
+            content += file.read(most + 1 - len(content))  # allocates as much at once
     if content is None or len(content) > most:
         raise ValueError(f"the file is larger than {most / 1e6:g} MB, the most that is read")
     return content
 
 
 def write_whole(path: str | os.PathLike, content: bytes, *, durable: bool = True) -> None:
-    """Write a file through a temporary neighbour, so that it is there whole or not at all.
+    """Write a file atomically, through a temporary file beside it.
 
     A file that is not `durable` may be lost or damaged by a power cut shortly afterwards.
 
@@ -35,11 +35,11 @@ def write_whole(path: str | os.PathLike, content: bytes, *, durable: bool = True
 
 
 def write_together(files: Mapping[Any, bytes], *, durable: bool = True) -> list[Path]:
-    """Write files {path: content} that belong together; returns the paths of those replaced.
+    """Write files {path: content} that belong together; return the paths that were replaced.
 
-    All are on the disk before the first takes its place, in the order given, and an error leaves
-    all as they were. A process killed meanwhile may leave some missing (under hidden names), but
-    never new files beside old ones.
+    All are on the disk before the first is moved into place, in order, and an error restores all
+    of them. A process killed meanwhile may leave some missing (under hidden names), but never new
+    files beside old ones.
 
     **Raises:** `OSError` naming the file.
     """
@@ -75,7 +75,7 @@ def write_together(files: Mapping[Any, bytes], *, durable: bool = True) -> list[
 
 
 def left_behind(target: Path, file: Path) -> bool:
-    """Whether `file` is the start of `target` that a killed `write_whole` left."""
+    """True if `file` is a partial copy of `target` that a killed `write_whole` left."""
     return file.name.startswith(f".{target.name}-")
 
 

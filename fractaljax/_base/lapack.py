@@ -1,7 +1,7 @@
 """LAPACK under `vmap`: one problem after the other.
 
-Two calls of LAPACK on batches, run at once, wait for one another for ever on two cores (jaxlib
-0.10). One after the other they are about as fast.
+Two concurrent calls of LAPACK on batches deadlock on two cores (jaxlib 0.10). Sequential calls are
+about as fast.
 """
 
 from collections.abc import Callable
@@ -14,12 +14,12 @@ from jaxtyping import Array, Float
 
 
 def one_by_one(function: Callable) -> Callable:
-    """A function of LAPACK's, without derivatives, that `vmap` runs for one at a time."""
-    found: Any = sequential_vmap(function)
-    return found
+    """A LAPACK function, without derivatives, that `vmap` calls for one member at a time."""
+    sequential: Any = sequential_vmap(function)
+    return sequential
 
 
-_solved = one_by_one(jnp.linalg.solve)
+_lapack_solve = one_by_one(jnp.linalg.solve)
 
 
 def solve(A: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
@@ -28,6 +28,6 @@ def solve(A: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array, "n .
     return jax.lax.custom_linear_solve(
         lambda x: A @ x,
         b,
-        solve=lambda _, b: _solved(fixed, b),
-        transpose_solve=lambda _, b: _solved(fixed.T, b),
+        solve=lambda _, b: _lapack_solve(fixed, b),
+        transpose_solve=lambda _, b: _lapack_solve(fixed.T, b),
     )

@@ -1,4 +1,4 @@
-"""What laws of the user's own have in common: a name in files, arrays of numbers, and refusal."""
+"""User-defined laws: their names in files, their numbers as arrays, and their refusal."""
 
 import dataclasses
 from typing import Any
@@ -11,41 +11,41 @@ from .parts import Part, nan_where, number, quantity_name
 
 
 def register(law: str, kind: type[Part], laws: dict[str, Any]) -> None:
-    """Let `law` be the name of this kind in TOML files.
+    """Register `law` as the name of this kind in TOML files.
 
-    **Raises:** `ValueError` if another kind has it.
+    **Raises:** `ValueError` if another kind has that name.
     """
-    known = laws.get(law, kind)
-    # A cell of a notebook that is run again makes its class anew.
-    if (known.__module__, known.__qualname__) != (kind.__module__, kind.__qualname__):
-        raise ValueError(f"the law {law!r} is {known.__name__} already")
+    registered = laws.get(law, kind)
+    # A notebook cell that is run again creates its class anew.
+    if (registered.__module__, registered.__qualname__) != (kind.__module__, kind.__qualname__):
+        raise ValueError(f"the law {law!r} is {registered.__name__} already")
     laws[law] = kind
 
 
 def make_arrays(law: Part) -> None:
-    """Make arrays of the numbers that a generated `__init__` has stored as they were given.
+    """Convert to arrays the numbers that a generated `__init__` has stored unchanged.
 
-    **Raises:** as `number`, for a quantity that is none.
+    **Raises:** as `number`, for a quantity that is not a number.
     """
     for field in dataclasses.fields(law):
         value, static = getattr(law, field.name), field.metadata.get("static", False)
         plain = isinstance(value, (int, float, np.number, np.ndarray))
-        given = "unit" in field.metadata or (plain and not isinstance(value, bool))
-        if given and value is not None and not static:
+        numeric = "unit" in field.metadata or (plain and not isinstance(value, bool))
+        if numeric and value is not None and not static:
             object.__setattr__(law, field.name, number(quantity_name(field), value))
 
 
 def refuse(law: Part, bad: Bool[Array, "..."]) -> None:
-    """NaN for the numbers of a traced law where it is `bad`."""
-    found = refused_where(bad, law)
+    """Set the numbers of a traced law to NaN where it is `bad`."""
+    poisoned = refused_where(bad, law)
     for field in dataclasses.fields(law):
         if not field.metadata.get("static", False):
-            object.__setattr__(law, field.name, getattr(found, field.name))
+            object.__setattr__(law, field.name, getattr(poisoned, field.name))
 
 
 def refused_where(bad: Bool[Array, "..."], tree: Any) -> Any:
-    """As `nan_where`; of a batch, the numbers that members do not share, or all if any is bad."""
-    own = any(np.shape(x) == bad.shape for x in jax.tree.leaves(tree))
-    if not own:
+    """As `nan_where`, for batched numbers only; if there are none, for all if any member is bad."""
+    batched = any(np.shape(x) == bad.shape for x in jax.tree.leaves(tree))
+    if not batched:
         return nan_where(bad.any(), tree)
     return jax.tree.map(lambda x: nan_where(bad, x) if np.shape(x) == bad.shape else x, tree)

@@ -1,4 +1,4 @@
-"""Packages whose names are imported when they are used, so that each user waits for those alone."""
+"""Packages that import each of their names on first use, so that a user waits for those alone."""
 
 import ast
 import importlib
@@ -9,37 +9,39 @@ from typing import Any
 
 
 class _Lazy(ModuleType):
-    """A package whose stub says where each of its names is."""
+    """A package whose stub tells where each of its names is defined."""
 
-    _places: dict[str, tuple[str, str]]  # module and name there
+    _places: dict[str, tuple[str, str]]  # module and the name in it
 
     def __getattr__(self, name: str) -> Any:
         if name not in self._places:
             raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
         place, there = self._places[name]
         home = importlib.import_module(place, self.__name__)
-        known = vars(home)
-        # What is not there is a module itself.
-        found = (
-            known[there] if there in known else importlib.import_module(f".{there}", home.__name__)
+        attributes = vars(home)
+        # A name that it lacks is a module in it.
+        value = (
+            attributes[there]
+            if there in attributes
+            else importlib.import_module(f".{there}", home.__name__)
         )
-        self.__dict__[name] = found
-        return found
+        self.__dict__[name] = value
+        return value
 
     def __setattr__(self, name: str, value: Any) -> None:
-        # Python binds every module that it imports in its package: `plot.cycle` is a function.
+        # Python binds each imported module in its package, but `plot.cycle` is a function.
         if not (name in self._places and isinstance(value, ModuleType)):
             super().__setattr__(name, value)
 
     def __reduce__(self):
-        return importlib.import_module, (self.__name__,)  # functions that name it can travel
+        return importlib.import_module, (self.__name__,)  # functions that name it can be pickled
 
     def __dir__(self) -> list[str]:
         return sorted({*super().__dir__(), *self._places})
 
 
 def make_lazy(package: str) -> None:
-    """Let a package have the names that its stub, `__init__.pyi`, imports; checkers read it too."""
+    """Give a package the names that its stub, `__init__.pyi`, imports; checkers read it too."""
     module = sys.modules[package]
     stub = ast.parse(Path(str(module.__file__)).with_suffix(".pyi").read_text(encoding="utf-8"))
     places = {}

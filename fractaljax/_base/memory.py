@@ -1,4 +1,4 @@
-"""Memory, checked before it is allocated: XLA would end the process."""
+"""Memory, checked before it is allocated: XLA would abort the process."""
 
 import os
 from decimal import Decimal

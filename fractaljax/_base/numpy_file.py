@@ -1,4 +1,4 @@
-"""NumPy's files of real numbers, from sources that are not trusted."""
+"""NumPy files of real numbers from untrusted sources."""
 
 import io
 import math
@@ -15,7 +15,7 @@ def read_npy(content: bytes, name: str) -> np.ndarray:
 
     The header is compared with the size of the content before any memory is allocated.
 
-    **Raises:** `ValueError`, calling the array `name`, unless the file is sound and holds real
+    **Raises:** `ValueError` that names the array `name`, unless the file is intact and holds real
     numbers.
     """
     file = io.BytesIO(content)
@@ -24,7 +24,7 @@ def read_npy(content: bytes, name: str) -> np.ndarray:
         first = npy.read_magic(file) == (1, 0)
         header = npy.read_array_header_1_0 if first else npy.read_array_header_2_0
         shape, columns_first, dtype = header(file)
-    except Exception as error:  # of many kinds, even those of Python's tokenizer
+    except Exception as error:  # of many kinds, even from Python's tokenizer
         raise _unsound(error) from None
     if dtype.kind not in "iuf":
         raise ValueError(f"{name} must be real numbers, got {dtype}")
@@ -50,28 +50,28 @@ def read_members(content: bytes, most: int) -> dict[str, bytes]:
     """The .npy files in the bytes of a .npz file, by name, of at most `most` bytes in total.
 
     **Raises:** `ValueError` if the archive is damaged, encrypted, too large or holds two arrays of
-    one name.
+    the same name.
     """
     members = {}
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as packed:
-            found = packed.infolist()
-            size = sum(member.file_size for member in found)  # `read` never exceeds it
+            entries = packed.infolist()
+            size = sum(member.file_size for member in entries)  # `read` never exceeds it
             if size > most:
                 raise ValueError(f"it unpacks to {size} bytes, at most {most} are read")
-            names = [member.filename.removesuffix(".npy") for member in found]
+            names = [member.filename.removesuffix(".npy") for member in entries]
             if len(set(names)) < len(names):
                 raise ValueError(f"it holds two arrays of one name: {', '.join(names)}")
             end = content.rfind(b"PK\5\6")  # the end record holds the number of members
             if int.from_bytes(content[end + 10 : end + 12], "little") != len(names):
                 raise ValueError("it is damaged: an array is lost")
-            for name, member in zip(names, found, strict=True):
+            for name, member in zip(names, entries, strict=True):
                 if member.flag_bits & 1:
                     raise ValueError(f"{name} is encrypted")
                 members[name] = packed.read(member)
     except ValueError:
         raise
-    except Exception as error:  # each decompressor has its own kind
+    except Exception as error:  # each decompressor raises its own kind
         raise _unsound(error) from None
     return members
 

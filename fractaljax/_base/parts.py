@@ -15,7 +15,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-Numbers = Float[Array, "..."]  # of one scene, or of a batch of any shape
+Numbers = Float[Array, "..."]  # for one scene, or for a batch of any shape
 _PartT = TypeVar("_PartT", bound="Part")
 
 
@@ -33,8 +33,8 @@ def number(
 ) -> Numbers:
     """`value` as a floating-point array of any shape, checked against its domain.
 
-    `above` and `below` are strict. NaN and infinity are always refused. A concrete value raises
-    with its name, the bound and the value; a traced one becomes NaN (`nan_where`).
+    `above` and `below` are strict. NaN and infinity are always refused. A concrete value raises an
+    error with its name, the bound and the value; a traced one becomes NaN (`nan_where`).
 
     **Raises:** `TypeError` unless `value` is real and numeric; `ValueError` outside the domain.
     """
@@ -46,7 +46,7 @@ def number(
         ("at most", operator.le, at_most),
     ]
     domain = [(word, holds, bound) for word, holds, bound in domain if math.isfinite(bound)]
-    wanted = " and ".join(f"{word} {bound:g}" for word, _, bound in domain) or "finite"
+    requirement = " and ".join(f"{word} {bound:g}" for word, _, bound in domain) or "finite"
 
     def outside(x):
         inside = (holds(x, bound) for _, holds, bound in domain)
@@ -57,7 +57,7 @@ def number(
         return nan_where(outside(array), array)
     bad = values[outside(values)]
     if bad.size:
-        raise ValueError(f"{name} must be {wanted}, got {bad.flat[0].item()!r}")
+        raise ValueError(f"{name} must be {requirement}, got {bad.flat[0].item()!r}")
     return array
 
 
@@ -70,7 +70,7 @@ def _floating(name: str, value: Any) -> Numbers:
             raise TypeError
         # An explicit dtype strips weak types, which would compile every caller twice.
         keeps = hasattr(value, "dtype") and jnp.issubdtype(dtype, jnp.floating)
-        # A value known at trace time stays known.
+        # A value that is concrete at trace time stays concrete.
         traced = isinstance(value, Tracer)
         with contextlib.nullcontext() if traced else jax.ensure_compile_time_eval():
             return jnp.asarray(value, dtype=dtype if keeps else float)
@@ -101,12 +101,12 @@ def ordered(name: str, value: Numbers, other_name: str, other: Numbers) -> Numbe
 
 def whole(name: str, value: Any, least: int, most: float = math.inf) -> int:
     """`value` as an int, refused unless it is a whole number from `least` to `most`."""
-    found = value if isinstance(value, int) else np.asarray(value).tolist()
-    plain = isinstance(found, (int, float)) and not isinstance(found, bool)
-    if not (plain and least <= found <= most and found % 1 == 0):
-        bound = f"at most {most}" if plain and found > most else f"at least {least}"
+    native = value if isinstance(value, int) else np.asarray(value).tolist()
+    plain = isinstance(native, (int, float)) and not isinstance(native, bool)
+    if not (plain and least <= native <= most and native % 1 == 0):
+        bound = f"at most {most}" if plain and native > most else f"at least {least}"
         raise ValueError(f"{name} must be a whole number of {bound}, got {brief(value)}")
-    return int(found)
+    return int(native)
 
 
 def flag(name: str, value: Any) -> bool:
@@ -120,7 +120,7 @@ def flag(name: str, value: Any) -> bool:
 
 
 def require_kind(name: str, value: Any, kind: type) -> None:
-    """Refuse what is not an instance of `kind`."""
+    """Refuse a value that is not an instance of `kind`."""
     if not isinstance(value, kind):
         article = "an" if kind.__name__[0] in "AEIOU" else "a"
         raise TypeError(f"{name} must be {article} {kind.__name__}, got {brief(value)}")
@@ -134,21 +134,21 @@ def concrete(array: jax.Array) -> np.ndarray | None:
 
 
 def is_traced(tree: Any) -> bool:
-    """True if any number in it is known only to a program that is being traced."""
+    """True if any number in the tree belongs to a program that is being traced."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def nan_where(bad: Bool[ArrayLike, "..."], tree: Any) -> Any:
-    """`tree` with NaN for its numbers where they are `bad`; one by one if that has their shape.
+    """`tree` with NaN for its numbers where they are `bad`; elementwise if the shapes agree.
 
-    So a traced value is refused. Raising would take a callback to the host, at which a GPU stops
-    whenever the program runs, and one bad member would end a whole batch.
+    This is how a traced value is refused. Raising would take a callback to the host, which stalls
+    a GPU at every run of the program, and one bad member would end a whole batch.
     """
 
     def spoilt(x):
         if not eqx.is_inexact_array(x):
             return x
-        # A product, so that derivatives are NaN too: those of a choice would be 0.
+        # A product, so that derivatives are NaN too: those of `jnp.where` would be 0.
         factor = jnp.where(bad, jnp.nan, 1).astype(x.real.dtype)
         if jnp.iscomplexobj(x):
             return jax.lax.complex(x.real * factor, x.imag * factor)
@@ -158,21 +158,21 @@ def nan_where(bad: Bool[ArrayLike, "..."], tree: Any) -> Any:
 
 
 def refused(tree: Any) -> Bool[Array, ""] | None:
-    """Whether a traced number in it was refused, and is NaN; None if nothing is traced."""
+    """True if a traced number in the tree was refused, and is NaN; None if none is traced."""
     traced = [x for x in jax.tree.leaves(tree) if isinstance(x, Tracer) and concrete(x) is None]
-    found = [jnp.isnan(x).any() for x in traced if eqx.is_inexact_array(x)]
-    return functools.reduce(operator.or_, found) if found else None
+    nans = [jnp.isnan(x).any() for x in traced if eqx.is_inexact_array(x)]
+    return functools.reduce(operator.or_, nans) if nans else None
 
 
-def raise_unless(wanted: Any, outcome: Any) -> Any:
-    """`outcome` if its `result` is the member `wanted`; else `RuntimeError` with its message.
+def raise_unless(expected: Any, outcome: Any) -> Any:
+    """`outcome` if its `result` is the member `expected`; else `RuntimeError` with its message.
 
-    Of a traced one the numbers become NaN, and `result` stays.
+    The numbers of a traced outcome become NaN, and its `result` stays.
     """
     result = outcome.result
     if concrete(result._value) is None:
-        return nan_where(result != wanted, outcome)
-    if bool(result != wanted):
+        return nan_where(result != expected, outcome)
+    if bool(result != expected):
         raise RuntimeError(result._enumeration[result])
     return outcome
 
@@ -187,7 +187,7 @@ def brief(value: Any) -> str:
 
 
 def one_line(error: Exception) -> str:
-    """An error of another package in one line."""
+    """The message of another package's error, in one line."""
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
@@ -197,15 +197,15 @@ def one_line(error: Exception) -> str:
 def quantity(unit: str, meaning: str, *, log: bool = False, name: str | None = None) -> Any:
     """A numeric field of a part, with its unit and its meaning for files and tables.
 
-    `log` marks a scale: it is designed and swept on a logarithmic axis. `name` is that of the
-    quantity, and of the argument of `__init__`, where the attribute has another.
+    `log` marks a scale, which is designed and swept on a logarithmic axis. `name` is the name of
+    the quantity and of the argument of `__init__`, if the attribute has another.
     """
     named = {} if name is None else {"name": name}
     return eqx.field(metadata={"unit": unit, "meaning": meaning, "log": log, **named})
 
 
 def quantity_name(field: dataclasses.Field) -> str:
-    """The name under which files, tables and `replace` know a field of a part."""
+    """The name of a field of a part in files, tables and `replace`."""
     return field.metadata.get("name", field.name)
 
 
@@ -231,13 +231,13 @@ class Part(Record):
 
 def quantities(part: Part) -> dict[str, tuple[str, ...]]:
     """Every named quantity and sub-part below `part`, with the attribute path that leads to it."""
-    found = {}
+    paths = {}
     for field in dataclasses.fields(part):
         value = getattr(part, field.name)
-        found[quantity_name(field)] = (field.name,)
+        paths[quantity_name(field)] = (field.name,)
         if isinstance(value, Part):
-            found |= {name: (field.name, *path) for name, path in quantities(value).items()}
-    return found
+            paths |= {name: (field.name, *path) for name, path in quantities(value).items()}
+    return paths
 
 
 def leaf(part: Part, path: tuple[str, ...]) -> Any:
@@ -246,9 +246,9 @@ def leaf(part: Part, path: tuple[str, ...]) -> Any:
 
 
 def rebuild(part: _PartT, changes: Mapping[str, Any]) -> _PartT:
-    """`part` built anew, checks included, with named quantities changed wherever they live.
+    """`part` rebuilt and checked, with named quantities changed wherever they are in it.
 
-    Where a part is itself among the changes, the quantities in it are changed in the new part.
+    If a whole part is among the changes, the quantities in it are changed in the new part.
     """
     arguments, changed = {}, False
     for field in dataclasses.fields(part):

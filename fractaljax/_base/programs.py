@@ -1,7 +1,7 @@
-"""Programs that a command keeps on disk, and options with which JAX compiles others sooner.
+"""Programs that a command keeps on disk, and options with which JAX compiles others faster.
 
-JAX's persistent cache saves the compilation of a program, after a trace has found what to compile.
-`jax.export` saves the trace, too: a second run of a command starts with the numbers.
+JAX's persistent cache saves the compilation of a program, which is still traced to look it up.
+`jax.export` saves the trace, too: a second run of a command starts computing at once.
 """
 
 import contextlib
@@ -36,7 +36,7 @@ TRACED_UNDER = (
     "jax_numpy_dtype_promotion",
 )
 _TRUSTED = "fractaljax", "equinox"  # packages whose classes a kept program may hold
-_MOST_BYTES = 300_000_000  # of all files in the folder; those not used for longest go
+_MOST_BYTES = 300_000_000  # in the folder; the least recently used files are removed
 _CACHE = "jax_compilation_cache_dir"
 _CHECKSUMS = "checksums.json"
 
@@ -46,28 +46,28 @@ _programs: dict[Any, Callable] = {}
 
 @functools.cache
 def quick_compilation() -> dict[str, Any]:
-    """Options with which a program of yours may compile sooner on a CPU.
+    """Compiler options with which a program may compile faster on a CPU.
 
     `jax.jit(function, compiler_options=fj.quick_compilation())`, for the outermost program. Each is
-    an option of XLA, which promises none of them: one that the installed XLA does not know is left
-    out, so that the dictionary may be empty. The program may run up to two thirds longer.
+    an option of XLA, which guarantees none of them: one that the installed XLA lacks is left out,
+    so that the dictionary may be empty. The program may run up to two thirds longer.
     """
     options = {
         "xla_backend_optimization_level": 1,
         "xla_cpu_use_fusion_emitters": False,
         "xla_disable_hlo_passes": "while-loop-invariant-code-motion,simplify-while-loops",
     }
-    known = {}
+    supported = {}
     if jax.default_backend() == "cpu":
         for name, value in options.items():
             with contextlib.suppress(jax.errors.JaxRuntimeError):
                 jax.jit(jnp.negative, compiler_options={name: value})(0.0)
-                known[name] = value
-    return known
+                supported[name] = value
+    return supported
 
 
 def exported_jit(function: Callable, static_argnames: str | tuple[str, ...] = ()) -> Callable:
-    """`jax.jit`, whose exported program is kept on disk within `kept_programs`."""
+    """`jax.jit` whose exported program is kept on disk inside `kept_programs`."""
     jitted = jax.jit(function, static_argnames=static_argnames)
     static = (static_argnames,) if isinstance(static_argnames, str) else static_argnames
     signature = inspect.signature(function)
@@ -95,9 +95,9 @@ def _traced(jitted: Callable, tree, fixed: dict[str, Any], *leaves) -> Any:
 
 
 def _find(folder: Path, key, program: Callable) -> Callable | None:
-    """The program from its file, which is written if there is none; None where it cannot be."""
+    """The program from its file, which is written first if missing; None if that fails."""
     function, fixed, tree, kinds = key
-    with contextlib.suppress(ValueError):  # a class whose code the file's name would not know
+    with contextlib.suppress(ValueError):  # a class whose code the file's name does not cover
         arguments = jax.tree.unflatten(tree, [_Leaf()] * tree.num_leaves)
         stated = json.dumps(_described((_place(function), fixed, arguments), []))
         name = f"{_surroundings()} {stated} {kinds}"
@@ -116,8 +116,8 @@ def _write(file: Path, program: Callable, kinds) -> None:
 
     def flat(*leaves):
         nonlocal skeleton
-        found, values = program(*leaves), []
-        skeleton = json.dumps(_described(found, values))
+        result, values = program(*leaves), []
+        skeleton = json.dumps(_described(result, values))
         return values
 
     arguments = [jax.ShapeDtypeStruct(*kind[:2], weak_type=kind[2]) for kind in kinds]
@@ -148,16 +148,16 @@ class _Leaf:
 
 
 def _described(x: Any, leaves: list) -> Any:
-    """A tree as JSON in which numbers stand for leaves, which are appended in that order.
+    """A tree as JSON with indices for its leaves, which are appended to `leaves` in that order.
 
-    **Raises:** `ValueError` for what is of other packages, or has no name.
+    **Raises:** `ValueError` for objects of other packages or without a name.
     """
     if isinstance(x, type):
         return {"type": _place(x)}
     if isinstance(x, eqx.Module):
         fields = {f.name: _described(getattr(x, f.name), leaves) for f in dataclasses.fields(x)}
         return {"class": _place(type(x)), "fields": fields}
-    if isinstance(x, tuple) and (names := getattr(x, "_fields", None)):  # a named one
+    if isinstance(x, tuple) and (names := getattr(x, "_fields", None)):  # a named tuple
         fields = {name: _described(getattr(x, name), leaves) for name in names}
         return {"named": _place(type(x)), "fields": fields}
     if isinstance(x, tuple | list | dict):
@@ -170,7 +170,7 @@ def _described(x: Any, leaves: list) -> Any:
         return {"leaf": len(leaves) - 1}
     if x is None or type(x) in (bool, int, float, str):
         return {"value": x}
-    if isinstance(x, jax.sharding.Mesh):  # of the one device that there is
+    if isinstance(x, jax.sharding.Mesh):  # of the only device
         return {"mesh": x.axis_names}
     if hasattr(x, "key"):  # a program of a sweep
         return {"key": x.key().hex()}
@@ -198,7 +198,7 @@ def _rebuilt(described: dict[str, Any], leaves: list) -> Any:
 
 
 def _place(named: Any) -> str:
-    """Where a class or a function is."""
+    """The module and the qualified name of a class or a function."""
     place = f"{named.__module__}:{named.__qualname__}"
     if named.__module__.partition(".")[0] not in _TRUSTED or "<" in place:
         raise ValueError(f"cannot be kept: {place}")
@@ -214,7 +214,7 @@ def _class_at(place: str) -> type:
 
 @functools.cache
 def _surroundings() -> str:
-    """What decides on a program besides its arguments: sources, versions and settings."""
+    """What determines a program besides its arguments: sources, versions and settings."""
     sources = hashlib.sha256()
     for file in sorted(Path(__file__).parents[1].rglob("*.py")):
         sources.update(file.read_bytes())
@@ -228,9 +228,9 @@ def _surroundings() -> str:
 
 @contextlib.contextmanager
 def kept_programs() -> Iterator[None]:
-    """Keep programs in the user's cache folder, or in JAX_COMPILATION_CACHE_DIR; never an error.
+    """Keep programs in the user's cache folder, or in JAX_COMPILATION_CACHE_DIR; never raise.
 
-    Only a folder that nobody else can write is used: what it holds is executed.
+    Only a folder that no one else can write to is used, since its content is executed.
     """
     global _folder
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
@@ -263,8 +263,8 @@ def kept_programs() -> Iterator[None]:
 
 
 def _is_private(path: Path) -> bool:
-    """True if a file or folder is the user's own, and nobody else may write it."""
-    if not hasattr(os, "getuid"):  # Windows keeps the folders of users apart
+    """True if a file or folder belongs to the user and no one else may write to it."""
+    if not hasattr(os, "getuid"):  # Windows separates the folders of users
         return path.exists()
     about = path.stat()
     return about.st_uid == os.getuid() and not about.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
@@ -281,7 +281,7 @@ def _cache_folder() -> Path:
 
 
 def _checksums(folder: Path) -> dict[str, str]:
-    """Checksums of what JAX keeps in the folder: it has none of its own."""
+    """Checksums of the files that JAX keeps in the folder, for which it has none itself."""
     entries = (x for x in folder.iterdir() if x.name.endswith("-cache"))
     return {x.name: hashlib.sha256(x.read_bytes()).hexdigest() for x in entries}
 
@@ -292,7 +292,7 @@ def _write_checksums(folder: Path) -> None:
 
 
 def _drop_damaged(folder: Path) -> None:
-    """Remove the executables that are not as a command left them: they could end the process."""
+    """Remove executables changed since a command wrote them: they could crash the process."""
     try:
         expected = json.loads((folder / _CHECKSUMS).read_text())
     except (OSError, ValueError):

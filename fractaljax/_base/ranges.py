@@ -1,4 +1,4 @@
-"""Ranges of a quantity, the axis they are sampled and shown on, and points that fill them."""
+"""Ranges of a quantity, their axes, and points that fill them evenly."""
 
 from typing import Any
 
@@ -6,14 +6,14 @@ import numpy as np
 
 
 def is_logarithmic(low: float, high: float) -> bool:
-    """Whether a range has a logarithmic axis: it is positive and spans a decade or more."""
+    """True if a range has a logarithmic axis: it is positive and spans a decade or more."""
     return low > 0 and high >= 10 * low
 
 
 def within(low: float, high: float, at: Any) -> Any:
     """The value at a fraction `at` of a range, 0 at its low end and 1 at its high end.
 
-    Both ends are met to the last bit, since an end may be that of a domain.
+    Both ends are exact to the last bit, since an end may be the limit of a domain.
     """
     if is_logarithmic(low, high):
         return low ** (1 - at) * high**at
@@ -21,7 +21,7 @@ def within(low: float, high: float, at: Any) -> Any:
 
 
 def low_discrepancy(count: int, dimensions: int) -> np.ndarray:
-    """Points (count, dimensions) that fill the unit cube evenly: a lattice of one generator.
+    """Points (count, dimensions) that fill the unit cube evenly: a rank-1 lattice.
 
     Its steps are powers of 1/g with g^dimensions = g + 1, as in R. Roberts' sequence; in the plane
     it is the Fibonacci lattice.

@@ -4,7 +4,7 @@ _ABREAST = 5  # columns that fit on a line
 
 
 def table(titles: list[str], columns: list[dict[str, str]]) -> str:
-    """Columns with the same rows as aligned text, row names at the left; more than five as rows."""
+    """Columns with common row names as aligned text; more than five columns become rows."""
     if len(titles) > _ABREAST:
         cells = (
             [title, *(c[name] for name in columns[0])]
@@ -16,7 +16,7 @@ def table(titles: list[str], columns: list[dict[str, str]]) -> str:
 
 
 def aligned(lines: list[list[str]]) -> str:
-    """Rows of as many cells as aligned text."""
+    """Rows with equal numbers of cells as aligned text."""
     widths = [max(len(cell) for cell in cells) for cells in zip(*lines, strict=True)]
     return "\n".join(
         "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()

@@ -65,14 +65,14 @@ def _value(value: Any) -> str:
 
 
 def _quoted(text: str) -> str:
-    # JSON and TOML escape alike, but for DEL.
+    # JSON and TOML escape alike, except for DEL.
     return json.dumps(text, ensure_ascii=False).replace("\x7f", r"\u007f")
 
 
 def part_table(part: Part, laws: Laws) -> dict[str, Any]:
-    """The table of a part: numbers with unit and meaning, and its own parts as tables in it.
+    """The table of a part: numbers with unit and meaning, and its sub-parts as nested tables.
 
-    **Raises:** `ValueError` for a part of a kind that `laws` does not have.
+    **Raises:** `ValueError` for a part of a kind that `laws` lacks.
     """
     table = {}
     for field in dataclasses.fields(part):
@@ -89,14 +89,14 @@ def part_table(part: Part, laws: Laws) -> dict[str, Any]:
 
 
 def law_table(name: str, part: Part, laws: Laws) -> dict[str, Any]:
-    """The table of a part that is one of several laws, by the name of its kind; errors as there."""
+    """The table of a law, with the name of its kind; errors as `part_table`."""
     return _law(name, type(part), laws[name]) | part_table(part, laws)
 
 
 def _law(name: str, kind: type[Part], kinds: Mapping[str, type[Part]]) -> dict[str, Any]:
     if kind not in kinds.values():
-        known = ", ".join(known.__name__ for known in kinds.values())
-        raise ValueError(f"a file holds as {name} one of {known}, got {kind.__name__}")
+        choices = ", ".join(choice.__name__ for choice in kinds.values())
+        raise ValueError(f"a file holds as {name} one of {choices}, got {kind.__name__}")
     law = next(law for law in kinds if kinds[law] is kind)
     return {"law": Noted(law, "or " + ", ".join(f'"{other}"' for other in kinds if other != law))}
 
@@ -114,7 +114,7 @@ def read_toml(content: bytes) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def naming(path: str | os.PathLike) -> Iterator[None]:
-    """Errors in the content of a file become one `ValueError` that begins with its name."""
+    """Turn errors in the content of a file into one `ValueError` that begins with its name."""
     try:
         yield
     except RecursionError:
@@ -124,7 +124,7 @@ def naming(path: str | os.PathLike) -> Iterator[None]:
 
 
 def table_at(document: Mapping[str, Any], key: str, inside: str = "") -> dict[str, Any]:
-    """The table `key` of `document`, whose own name in the file is `inside` ("joints.", say)."""
+    """The table `key` of `document`, which the file has under the prefix `inside` ("joints.")."""
     if key not in document:
         raise ValueError(f"the table [{inside}{key}] is missing")
     if not isinstance(document[key], dict):
@@ -132,11 +132,11 @@ def table_at(document: Mapping[str, Any], key: str, inside: str = "") -> dict[st
     return document[key]
 
 
-def refuse_unknown(where: str, given: Collection[str], known: Collection[str]) -> None:
-    """Refuse a key in `given` that is not in `known`; `where` names the table."""
-    for key in given:
-        if key not in known:
-            raise ValueError(f"{where} has the unknown key {key!r}; known are {', '.join(known)}")
+def refuse_unknown(where: str, keys: Collection[str], allowed: Collection[str]) -> None:
+    """Refuse a key in `keys` that is not in `allowed`; `where` names the table."""
+    for key in keys:
+        if key not in allowed:
+            raise ValueError(f"{where} has the unknown key {key!r}; known are {', '.join(allowed)}")
 
 
 def read_part(kind: type[Part], table: Mapping[str, Any], laws: Laws, name: str = "") -> Any:
@@ -148,18 +148,18 @@ def read_part(kind: type[Part], table: Mapping[str, Any], laws: Laws, name: str 
     where, inside = (f"[{name}]", f"{name}.") if name else ("the file", "")
     fields = {quantity_name(field): field.type for field in dataclasses.fields(kind)}
     refuse_unknown(where, table, fields)
-    given, parameters = dict(table), inspect.signature(kind.__init__).parameters
+    arguments, parameters = dict(table), inspect.signature(kind.__init__).parameters
     for key, inner in fields.items():
         if key in laws or (isinstance(inner, type) and issubclass(inner, Part)):
             below = table_at(table, key, inside)
             if key in laws:
-                given[key] = read_law(key, below, laws, f"{inside}{key}")
+                arguments[key] = read_law(key, below, laws, f"{inside}{key}")
             else:
-                given[key] = read_part(cast(type[Part], inner), below, laws, f"{inside}{key}")
+                arguments[key] = read_part(cast(type[Part], inner), below, laws, f"{inside}{key}")
         elif key not in table and parameters[key].default is inspect.Parameter.empty:
             raise ValueError(f"{where} lacks the key {key!r}")
     try:
-        return kind(**given)
+        return kind(**arguments)
     except (ValueError, TypeError) as error:
         raise type(error)(f"{where} {error}" if name else str(error)) from None
 

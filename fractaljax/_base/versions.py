@@ -17,16 +17,18 @@ def version_text() -> str:
     return ", ".join(f"{name} {version}" for name, version in versions().items())
 
 
-def versions_differ(found: Mapping[str, str]) -> str | None:
-    """The versions in `found` that differ from these, as text; None if none does."""
+def versions_differ(recorded: Mapping[str, str]) -> str | None:
+    """The versions in `recorded` that differ from the current ones, as text; None if none does."""
     others = [
-        f"{name} {found[name]}" for name, own in versions().items() if found.get(name, own) != own
+        f"{name} {recorded[name]}"
+        for name, current in versions().items()
+        if recorded.get(name, current) != current
     ]
     return f"written by {', '.join(others)}, read by {version_text()}" if others else None
 
 
 def untested_jax() -> str | None:
-    """A note where JAX is newer than the newest with which this version was tested."""
+    """A note if JAX is newer than the newest with which this version was tested; else None."""
     if jax.__version_info__[:2] <= NEWEST_TESTED_JAX:
         return None
     newest = ".".join(map(str, NEWEST_TESTED_JAX))

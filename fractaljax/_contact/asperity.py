@@ -1,12 +1,13 @@
 """The revised asperity law: each asperity begins elastic and ends plastic, on a base of its own.
 
 In the source's law (Majumdar and Bhushan's) a contact is as flat as its base allows, so that it
-turns from plastic to elastic as it grows. Here a base and what is pressed of it are two things
-(Morag and Etsion, Wear 262, 624, 2007, doi:10.1016/j.wear.2006.07.007). A base whose contact would
-be `a` if flattened elastically has the height delta(a) of Eq. 16 and the tip radius R(a) = a/(pi
-delta) of Eq. 17. Of the bases that touch there are n(a) (Eq. 25), from that of the shortest
-wavelength up, and their interferences omega are spread evenly from 0 to delta(a). With omega_1 at
-first yield (Eq. 20) and y = omega/omega_1, an asperity carries the mean pressure p on the area A
+turns from plastic to elastic as it grows. Here the base differs from the part of it that is
+pressed (Morag and Etsion, Wear 262, 624, 2007, doi:10.1016/j.wear.2006.07.007). A base whose
+contact would be `a` if flattened elastically has the height delta(a) of Eq. 16 and the tip radius
+R(a) = a/(pi delta) of Eq. 17. The bases that touch have the size distribution n(a) (Eq. 25), from
+the shortest wavelength up, and their interferences omega are uniform from 0 to delta(a). With
+omega_1 at first yield (Eq. 20) and y = omega/omega_1, an asperity carries the mean pressure p on
+the area A
 
     y < 1         A = pi R omega        p = 1.1 k_mu sigma_y y^(1/2)
     1 < y < 54    A = pi R omega f(y)   p from 1.1 k_mu sigma_y to H as ln y
@@ -34,14 +35,14 @@ from .fractal import critical_pressure_ratio, friction_correction, log_critical_
 from .material import Material
 from .persson import mindlin_ratio
 
-_LOG_PLASTIC = math.log(54)  # of omega over that at first yield, from where all is plastic
+_LOG_PLASTIC = math.log(54)  # ln y from which all is plastic
 _BASES = np.polynomial.legendre.leggauss(32)  # in each piece of ln a
 _DEPTHS = np.polynomial.legendre.leggauss(24)  # between first yield and full plasticity
 _NEWTON_STEPS = 6  # reach the last digit over the whole domain (tested)
 
 
 class Sums(eqx.Module):
-    """What all spots of a joint have together."""
+    """Totals over all spots of a joint."""
 
     area: Numbers  # [m^2]
     load: Numbers  # [N]
@@ -53,14 +54,14 @@ class AsperityContact(Contact):
     """The revised asperity law: elastic, then elastic-plastic, then plastic asperities.
 
     The bases of the asperities follow the island law of the source down to the shortest wavelength
-    L_s [m]; see the module. K_n > 0 at every load, about P at small loads and P^((D-1)/(4-D))
-    above, D < 2.5; K_t = (2 - 2 nu)/(2 - nu) K_n (Mindlin), or `stiffness_ratio` K_n if that is
-    given. With `domain_extension` the island law has Wang and Komvopoulos' factor psi(D) (J.
-    Tribol. 116, 812, 1994); the source is psi = 1.
+    L_s [m]; see the module. K_n > 0 at every load; it grows about as P at small loads and as
+    P^((D-1)/(4-D)) above, D < 2.5; K_t = (2 - 2 nu)/(2 - nu) K_n (Mindlin), or `stiffness_ratio`
+    K_n if that is given. With `domain_extension` the island law has Wang and Komvopoulos' factor
+    psi(D) (J. Tribol. 116, 812, 1994); the source has psi = 1.
 
-    Asperities do not feel each other and the law knows no nominal area: it is 1.2 to 4 times as
-    stiff as boundary elements where less than a third of the area touches, and it does not know
-    when all does. It has no load curve: K_n ~ P as the load vanishes, so that the joint would not
+    Asperities do not interact and the law has no nominal area: it is 1.2 to 4 times as stiff as
+    boundary elements where less than a third of the area touches, and has no limit of full
+    contact. It has no load curve: K_n ~ P as the load vanishes, so that the joint would not
     open at a finite gap.
 
     **Raises:** `ValueError` unless P > 0, L_s > 0 and stiffness_ratio >= 0.
@@ -114,7 +115,7 @@ class AsperityContact(Contact):
         log_a_e = log_critical_area(self.surface, self.material, k_mu) - log_a_s
         beta = critical_pressure_ratio(self.material, k_mu)
         count = jnp.exp((3 - D) / 2 * log_domain_extension(D)) if self.domain_extension else 1.0
-        # All in units of the smallest base, and of what it carries at the pressure H.
+        # All in units of the smallest base, and of its load at the pressure H.
         a_s = jnp.exp(log_a_s)
         borders = [log_a_e - _LOG_PLASTIC / (D - 2), log_a_e]
 
@@ -122,7 +123,7 @@ class AsperityContact(Contact):
             return mean_spot((D - 2) * (log_a_e - log_a), beta)
 
         def log_load(x):
-            """Of ln(a_l - 1): near linear, with slopes from a half to 1."""
+            """ln load over x = ln(a_l - 1): nearly linear, with slopes from 1/2 to 1."""
             log_a_l = jnp.logaddexp(x, 0)
             sums = base_sums(log_a_l, D, borders, spot)
             return jnp.log(sums.load) + (D - 1) / 2 * log_a_l, (sums, log_a_l)
@@ -146,8 +147,8 @@ def base_sums(
 ) -> Sums:
     """The sums over all bases, areas in units of the smallest: integral of spot(ln a) n(a) da.
 
-    From a = 1 to the largest a_l, with n(a) of Eq. 25, and over a_l^((D-1)/2). `spot` gives what
-    each base has over a, a and a^(1/2), and is smooth between the `borders` in ln a.
+    It runs from a = 1 to the largest a_l, with n(a) of Eq. 25 over a_l^((D-1)/2). `spot` gives
+    area, load and stiffness of a base over a, a and a^(1/2), smooth between the `borders` in ln a.
     """
     zero = jnp.zeros_like(log_a_l)
     ends = jnp.stack([zero, *(jnp.clip(x, zero, log_a_l) for x in borders), log_a_l])
@@ -165,9 +166,9 @@ def base_sums(
 
 
 def mean_spot(log_Y: Float[Array, " k"], beta: Numbers) -> Sums:
-    """A spot of a base, in the mean over its interferences: y from 0 to Y, at full flattening.
+    """The mean spot of a base over its interferences: y from 0 to Y, at full flattening.
 
-    Area, load and stiffness over the base's a, H a and 2 E (a/pi)^(1/2); `beta` is the mean
+    Area, load and stiffness are over the base's a, H a and 2 E (a/pi)^(1/2); `beta` is the mean
     pressure at first yield over H.
     """
     node, weight = jnp.asarray(_DEPTHS, log_Y.dtype)
@@ -194,7 +195,7 @@ def mean_spot(log_Y: Float[Array, " k"], beta: Numbers) -> Sums:
 
 
 def log_domain_extension(D: Numbers) -> Numbers:
-    """ln psi, psi^((3-D)/2) - (1 + psi^(-(D-1)/2))^(-(3-D)/(D-1)) = (3-D)/(D-1).
+    """ln psi from psi^((3-D)/2) - (1 + psi^(-(D-1)/2))^(-(3-D)/(D-1)) = (3-D)/(D-1).
 
     psi falls from (3 + 5^(1/2))/2 at D = 2 to e - 1 at D = 3.
     """
@@ -207,7 +208,7 @@ def log_domain_extension(D: Numbers) -> Numbers:
 
 
 def _root(f: Callable[[Numbers], Numbers], start: Numbers) -> Numbers:
-    """The root of a rising function, with its implicit derivatives of every order."""
+    """The root of an increasing function, with its implicit derivatives of every order."""
 
     def newton(f, start):
         def step(_, x):

@@ -1,13 +1,13 @@
 """Boundary elements: a rough surface pressed on an elastic half-space, periodic in x and y.
 
-Lengths are in units of the grid spacing dx and pressures in units of E in here, so that heights and
-mean pressure are all that a solution depends on. With S the half-space's displacement under a
-pressure, 2/|q| of each wave (Johnson, Contact Mechanics, 1985), the pressure p and the mean gap g
-of heights h without their mean meet
+Here lengths are in units of the grid spacing dx and pressures in units of E, so that a solution
+depends on heights and mean pressure only. With S the half-space's displacement under a pressure,
+2/|q| for each wave (Johnson, Contact Mechanics, 1985), the pressure p and the mean gap g of heights
+h less their mean satisfy
 
     S p + g = h  where p > 0,    S p + g >= h  where p = 0,    mean(p) = given.
 
-They are solved for by constrained conjugate gradients (Polonsky and Keer, Wear 231, 206, 1999,
+The solver is constrained conjugate gradients (Polonsky and Keer, Wear 231, 206, 1999,
 doi:10.1016/S0043-1648(99)00113-1), preconditioned by |q| (Vollebergt, Appl. Math. Model. 38, 3509,
 2014, doi:10.1016/j.apm.2013.12.004).
 """
@@ -26,7 +26,7 @@ from .._base.parts import Record, flag, number, raise_unless, require_kind, scal
 from .material import Material
 
 _ITERATIONS = 2000
-_LOAD_STEP = 0.05  # of the load, to either side, over which the derivative of K_n is taken
+_LOAD_STEP = 0.05  # relative load step, to either side, of the derivative of K_n
 
 
 class BoundaryElementResult(eqx.Enumeration):
@@ -64,12 +64,12 @@ def boundary_element(
     rtol: float | None = None,
     throw: bool = True,
 ) -> BoundaryElement:
-    """A surface of heights [m] on a grid of spacing dx [m], pressed on a flat one by P [N].
+    """Press a surface of heights [m] on a grid of spacing dx [m] on a flat one by P [N].
 
-    Both are periodic, of area nx ny dx^2, and without friction. E of the material is that of the
-    pair (Eq. 2). The stiffness is that of the contact as it stands, K_n = -dP/d(mean gap): that of
-    a flat punch of the same outline, from one more linear system. With `plastic` no pressure
-    exceeds H, and K_n is that of a small vibration, in which plastic contacts unload elastically.
+    Both are periodic, of area nx ny dx^2, and frictionless. E of the material is that of the pair
+    (Eq. 2). K_n = -dP/d(mean gap) is the stiffness of the current contact: that of a flat punch of
+    the same outline, from one more linear system. With `plastic` no pressure exceeds H, and K_n
+    is that of a small vibration, in which plastic contacts unload elastically.
 
     `rtol` bounds the largest gap in contact and overlap outside, over the rms height; by default
     1e-9, and 1e-5 in float32.
@@ -94,8 +94,8 @@ def boundary_element(
         rtol = 1e-9 if heights.dtype == jnp.float64 else 1e-5
     rtol = float(scalar("rtol", rtol, above=0, below=1))
     plastic, throw = flag("plastic", plastic), flag("throw", throw)
-    found = _boundary_element(heights, dx, material, P, plastic, rtol)
-    return raise_unless(BoundaryElementResult.converged, found) if throw else found
+    solution = _boundary_element(heights, dx, material, P, plastic, rtol)
+    return raise_unless(BoundaryElementResult.converged, solution) if throw else solution
 
 
 @functools.partial(jax.jit, static_argnums=(4, 5))
@@ -141,7 +141,7 @@ def _filtered(field, factor):
 
 
 def _displacement(pressure):
-    """S p: of each wave 2/|q|; of the mean 0, which the mean gap stands for."""
+    """S p: 2/|q| times each wave, and 0 for the mean, which the mean gap represents."""
     q = _wavenumbers(pressure.shape)
     return _filtered(pressure, np.divide(2, q, out=np.zeros_like(q), where=q > 0))
 
@@ -167,7 +167,7 @@ def _solve(h, mean, rtol, start=None) -> _Solution:
     """Constrained conjugate gradients."""
 
     def conditions(pressure, displacement):
-        """(gap, points in contact, points that overlap, mean gap, residual) of a pressure."""
+        """(gap, points in contact, points that overlap, mean gap, residual) for a pressure."""
         free = pressure > 0
         gap = displacement - h
         mean_gap = -_mean(gap, free)
@@ -176,7 +176,7 @@ def _solve(h, mean, rtol, start=None) -> _Solution:
         residual = jnp.max(jnp.where(free | wrong, jnp.abs(gap), 0)) / _rms(h)
         return gap, free, wrong, mean_gap, residual
 
-    def projected(field, free):  # on those that leave the load as it is
+    def projected(field, free):  # onto steps that keep the load
         return jnp.where(free, field - _mean(field, free), 0)
 
     def go_on(state):
@@ -189,40 +189,40 @@ def _solve(h, mean, rtol, start=None) -> _Solution:
         gradient = jnp.where(free, gap, 0)
         step = projected(_precondition(gradient), free)
         new = jnp.sum(gradient * step)
-        # Polak and Ribiere's factor; the first direction, and after the set has grown, has none.
+        # Polak and Ribiere's factor; 0 at the first step, and after the contact has grown.
         beta = jnp.maximum((new - jnp.sum(old * step)) / product, 0)
         direction = projected(step + beta * direction, free)
         response = _displacement(direction)
         curvature = jnp.sum(direction * response)
         # A single point in contact has no direction, but others must still join it.
         length = jnp.where(curvature > 0, jnp.sum(gradient * direction) / curvature, 1)
-        moved = pressure - length * direction
+        trial = pressure - length * direction
         grown = jnp.any(wrong)
         pull = jax.lax.cond(
             grown,
             lambda: length * jnp.where(wrong, _precondition(jnp.where(wrong, gap, 0)), 0),
             lambda: jnp.zeros_like(gap),
         )
-        clipped = jnp.maximum(moved - pull, 0)
-        changed = grown | jnp.any(moved < 0)
-        following = jnp.where(changed, clipped * (mean / jnp.mean(clipped)), moved)
+        clipped = jnp.maximum(trial - pull, 0)
+        changed = grown | jnp.any(trial < 0)
+        following = jnp.where(changed, clipped * (mean / jnp.mean(clipped)), trial)
         u = jax.lax.cond(changed, lambda: _displacement(following), lambda: u - length * response)
         residual = conditions(following, u)[-1]
         product = jnp.where(grown & (residual > before), jnp.inf, new)
         return following, u, direction, gradient, product, residual, count + 1
 
     start = jnp.full_like(h, mean) if start is None else start * (mean / jnp.mean(start))
-    u, nothing = _displacement(start), jnp.zeros_like(h)
+    u, zeros = _displacement(start), jnp.zeros_like(h)
     infinite = jnp.full_like(mean, jnp.inf)
-    state = start, u, nothing, nothing, infinite, conditions(start, u)[-1], 0
+    state = start, u, zeros, zeros, infinite, conditions(start, u)[-1], 0
     pressure, u, *_, residual, _ = jax.lax.while_loop(go_on, iterate, state)
     return _Solution(pressure, conditions(pressure, u)[3], residual)
 
 
 def _solve_plastic(h, mean, limit, rtol) -> _Solution:
-    """Projected gradients with the momentum of Nesterov, from the elastic solution.
+    """Projected gradients with Nesterov's momentum, from the elastic solution.
 
-    Conjugate gradients lose their way once no point in contact is below the limit.
+    Conjugate gradients fail once no point in contact is below the limit.
     """
     q = _wavenumbers(h.shape)
     softest, stiffest = float(2 / np.min(q[q > 0])), float(2 / np.max(q))
@@ -230,7 +230,7 @@ def _solve_plastic(h, mean, limit, rtol) -> _Solution:
     momentum = (1 - root) / (1 + root)
 
     def within(field):
-        """(p, shift): the nearest pressure of the given load from 0 to the limit."""
+        """(p, shift): the nearest pressure from 0 to the limit with the given load."""
 
         def halve(_, bracket):
             low, high = bracket
@@ -261,8 +261,8 @@ def _solve_plastic(h, mean, limit, rtol) -> _Solution:
         u_following = _displacement(following)
         ahead = following + momentum * (following - pressure)
         u_ahead = u_following + momentum * (u_following - u)
-        found = conditions(following, u_following, -shift * softest)
-        return following, u_following, ahead, u_ahead, *found, count + 1
+        mean_gap, residual = conditions(following, u_following, -shift * softest)
+        return following, u_following, ahead, u_ahead, mean_gap, residual, count + 1
 
     elastic = _solve(h, mean, rtol)
     yields = jnp.any(elastic.pressure > limit)
@@ -274,7 +274,7 @@ def _solve_plastic(h, mean, limit, rtol) -> _Solution:
 
 
 def _conjugate_gradients(right, load, contact, rtol):
-    """p with S p + g = right in contact for some g, p = 0 outside, of the sum `load`."""
+    """p with S p + g = right in contact for some g, p = 0 outside, and the sum `load`."""
 
     def go_on(state):
         *_, product, count = state
@@ -300,7 +300,7 @@ def _conjugate_gradients(right, load, contact, rtol):
     whole = jnp.where(contact, right - _displacement(p), 0)
     residual = _projected(whole)
     step = _projected(_precondition(residual))
-    # Not of the first residual, which may be nothing but rounding.
+    # Not relative to the first residual, which may be pure rounding error.
     tolerance = max(rtol, 4 * float(jnp.finfo(p.dtype).eps))
     enough = tolerance**2 * (jnp.sum(whole * _precondition(whole)) + jnp.sum(p**2))
     state = p, residual, step, jnp.sum(residual * step), 0
@@ -308,7 +308,7 @@ def _conjugate_gradients(right, load, contact, rtol):
 
 
 def _on_contact(right, load, contact, rtol) -> Any:
-    """(p, g) with S p + g = right in contact and p = right outside, of the sum `load` inside."""
+    """(p, g) with S p + g = right in contact, p = right outside, and the sum `load` inside."""
 
     def operator(solution):
         p, g = solution
@@ -325,10 +325,10 @@ def _on_contact(right, load, contact, rtol) -> Any:
 
 
 def _flat_punch(contact, rtol, dtype):
-    """(w, c): a flat punch of the contact's outline, of mean pressure 1, sinks in by c."""
+    """(w, c): pressure w, of mean 1, and indentation c of a flat punch of the contact's outline."""
     load = jnp.asarray(contact.size, dtype)
     w = _conjugate_gradients(jnp.zeros(contact.shape, dtype), load, contact, rtol)
-    # The least there is of this energy, so its error is the square of that of w.
+    # The minimum of this energy, so its error is the square of the error of w.
     return w, jnp.sum(w * _displacement(w)) / w.size
 
 
@@ -359,8 +359,8 @@ def _contact_jvp(rtol, primals, tangents):
     dmean_gap = jnp.mean(w * dh) - compliance * dmean
 
     def beside(step):
-        found = _solve(h, mean * (1 + step), rtol, start=pressure)
-        return _flat_punch(found.pressure > 0, rtol, h.dtype)
+        solution = _solve(h, mean * (1 + step), rtol, start=pressure)
+        return _flat_punch(solution.pressure > 0, rtol, h.dtype)
 
     (w_more, c_more), (w_less, c_less) = beside(_LOAD_STEP), beside(-_LOAD_STEP)
     width = 2 * _LOAD_STEP * mean
@@ -372,7 +372,7 @@ def _contact_jvp(rtol, primals, tangents):
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
 def _plastic(h, mean, limit, rtol):
-    """As `_contact`, of a surface that yields at the pressure `limit`."""
+    """As `_contact`, for a surface that yields at the pressure `limit`."""
     pressure, mean_gap, residual = _solve_plastic(h, mean, limit, rtol)
     return pressure, mean_gap, _flat_punch(pressure > 0, rtol, h.dtype)[1], residual
 

@@ -34,10 +34,10 @@ BOUNDARY_ELEMENTS = "boundary elements"
 
 
 class LawCurve(Record):
-    """What one law gives at the loads of a comparison (k,); SI units."""
+    """The results of one law at the loads of a comparison (k,); SI units."""
 
     K_n: Float[Array, " k"]  # normal stiffness [N/m]
-    K_t: Float[Array, " k"] | None  # tangential stiffness [N/m]; None of boundary elements
+    K_t: Float[Array, " k"] | None  # tangential stiffness [N/m]; None for boundary elements
     alpha: Float[Array, " k"]  # d ln K_n/d ln P, NaN where K_n is 0 or infinite
     real_area: Float[Array, " k"] | None  # [m^2]; None where the law has none
     scatter: Float[Array, " k"] | None = None  # standard deviation of ln K_n over seeds
@@ -55,9 +55,9 @@ class LawComparison(Record):
     curves: dict[str, LawCurve]  # by the name of the law
 
     def rows(self) -> tuple[list[str], list[list[str]]]:
-        """The titles and the rows of the table: one for each load and law."""
+        """The titles and the rows of the table, one row for each load and law."""
         titles = ["P [N]", "law", "K_n [N/m]", "scatter", "K_t/K_n", "d ln K_n/d ln P", "A_r/A"]
-        found = []
+        rows = []
         for i, P in enumerate(np.asarray(self.loads).tolist()):
             for law, curve in self.curves.items():
                 cells = [f"{P:.6g}", law, f"{curve.K_n[i]:.4g}"]
@@ -66,8 +66,8 @@ class LawComparison(Record):
                 cells += [_shown(ratio, i, ".3f"), _shown(curve.alpha, i, ".3f")]
                 share = None if curve.real_area is None else curve.real_area / self.area
                 cells.append(_shown(share, i, ".3g"))
-                found.append(cells)
-        return titles, found
+                rows.append(cells)
+        return titles, rows
 
     def __repr__(self) -> str:
         titles, rows = self.rows()
@@ -93,18 +93,18 @@ def compare_laws(
 ) -> LawComparison:
     """Stiffness and real area of a joint by every contact law, and by boundary elements.
 
-    At loads (k,) [N] on the nominal area [m^2]: the source's `FractalContact`,
-    `AsperityContact`, `PerssonContact`, and other `laws` by name, each with P replaced by the
-    loads. Boundary elements press `seeds` periodic surfaces of the same D and G, of n x n points,
-    drawn from `key`: K_n and real area are means over the seeds, K_n a geometric one, and alpha is
-    the slope of that mean from load to load. They are elastic and without friction.
+    The laws are the source's `FractalContact`, `AsperityContact`, `PerssonContact`, and other
+    `laws` by name, each with P replaced by the loads (k,) [N], on the nominal area [m^2].
+    Boundary elements press `seeds` periodic surfaces of the same D and G, of n x n
+    points, drawn from `key`: K_n is the geometric mean over the seeds, the real area their mean,
+    and alpha the slope of that K_n from load to load. They are elastic and frictionless.
 
     Wavelengths run from L, by default the side of the area, down to L_s [m], by default 4 L/n; no
     wave is longer than the side. On a larger area than L^2 surfaces lie side by side. `mu_s` and
-    `mu_m` are the friction that laws with yield take, by default the reference brake's. With no
-    `seeds` there are no boundary elements.
+    `mu_m` are the friction coefficients for laws with yield, by default the reference brake's.
+    With `seeds` = 0 there are no boundary elements.
 
-    **Raises:** `ValueError` unless loads rise and are above 0, area > 0, 2 L/n <= L_s <= L,
+    **Raises:** `ValueError` unless loads increase and are above 0, area > 0, 2 L/n <= L_s <= L,
     n >= 8, seeds >= 0, mu_s > 0 and 0 <= mu_m <= 0.9; `RuntimeError` if boundary elements do not
     converge.
     """
@@ -124,29 +124,29 @@ def compare_laws(
         ordered("L_s", L_s * (1 + 1e-9), "2 L/n", 2 * L / n)
     mu_m = scalar("mu_m", mu_m, at_least=0, at_most=MU_M_MAX)
     mu_s = ordered("mu_s", scalar("mu_s", mu_s, above=0), "mu_m", mu_m)
-    known: dict[str, Contact] = {
+    all_laws: dict[str, Contact] = {
         "fractal": FractalContact(surface, material, loads[0]),
         "asperity": AsperityContact(surface, material, loads[0], L_s),
         "Persson": PerssonContact(surface, material, loads[0], area, L, L_s),
     }
     for name, law in (laws or {}).items():
         require_kind(f"laws[{name!r}]", law, Contact)
-        known[name] = law
-    curves = {name: _curve(law, loads, mu_s, mu_m) for name, law in known.items()}
+        all_laws[name] = law
+    curves = {name: _curve(law, loads, mu_s, mu_m) for name, law in all_laws.items()}
     if seeds:
         from tqdm import tqdm
 
         keys = jax.random.split(jax.random.key(0) if key is None else key, seeds)
         cells, total, quiet = area / L**2, seeds * len(loads), not flag("progress", progress)
-        found = []
+        samples = []
         with tqdm(total=total, desc=BOUNDARY_ELEMENTS, unit="load", disable=quiet) as bar:
             for each in keys:
                 heights = topography(surface, L, n, key=each, L_s=L_s, periodic=True)
                 for P in loads / cells:
                     pressed = boundary_element(heights, L / n, material, P)
-                    found.append((pressed.K_n * cells, pressed.area * cells))
+                    samples.append((pressed.K_n * cells, pressed.area * cells))
                     bar.update()
-        curves[BOUNDARY_ELEMENTS] = _over_seeds(np.reshape(found, (seeds, -1, 2)), loads)
+        curves[BOUNDARY_ELEMENTS] = _over_seeds(np.reshape(samples, (seeds, -1, 2)), loads)
     return LawComparison(surface, material, loads, area, L, L_s, curves)
 
 
@@ -158,9 +158,9 @@ def _shown(values, i, form):
 @eqx.filter_jit
 def _curve(law: Contact, loads, mu_s, mu_m) -> LawCurve:
     def at(P):
-        moved = rebuild(law, {"P": P})
-        K_n, K_t = moved.stiffness(mu_s, mu_m)
-        return K_n, (K_t, moved.real_area(mu_m))
+        loaded = rebuild(law, {"P": P})
+        K_n, K_t = loaded.stiffness(mu_s, mu_m)
+        return K_n, (K_t, loaded.real_area(mu_m))
 
     def one(P):
         K_n, slope, (K_t, real_area) = jax.jvp(at, (P,), (jnp.ones_like(P),), has_aux=True)
@@ -170,10 +170,10 @@ def _curve(law: Contact, loads, mu_s, mu_m) -> LawCurve:
     return jax.vmap(one)(loads)
 
 
-def _over_seeds(found, loads) -> LawCurve:
+def _over_seeds(samples, loads) -> LawCurve:
     """The curve of boundary elements from K_n and real area (seeds, k, 2)."""
-    stiff = np.isfinite(found[..., 0]).all(0)  # not in full contact
-    log_K_n = np.log(np.where(stiff, found[..., 0], np.nan))
+    stiff = np.isfinite(samples[..., 0]).all(0)  # not in full contact
+    log_K_n = np.log(np.where(stiff, samples[..., 0], np.nan))
     slope = np.full(len(loads), np.nan)
     if len(loads) > 1:
         slope = np.gradient(log_K_n.mean(0), np.log(loads))
@@ -181,6 +181,6 @@ def _over_seeds(found, loads) -> LawCurve:
         K_n=jnp.asarray(np.where(stiff, np.exp(log_K_n.mean(0)), np.inf)),
         K_t=None,
         alpha=jnp.asarray(slope),
-        real_area=jnp.asarray(found[..., 1].mean(0)),
-        scatter=jnp.asarray(log_K_n.std(0, ddof=1)) if len(found) > 1 else None,
+        real_area=jnp.asarray(samples[..., 1].mean(0)),
+        scatter=jnp.asarray(log_K_n.std(0, ddof=1)) if len(samples) > 1 else None,
     )

@@ -1,4 +1,4 @@
-"""What every contact law gives, and what a joint asks of it."""
+"""The interface of contact laws, and the state of a joint that they share."""
 
 import abc
 from collections.abc import Callable, Sequence
@@ -19,7 +19,7 @@ MU_M_MAX = 0.9  # Eq. 19 ends there
 class Contact(Part):
     """A contact law: the stiffness of a joint.
 
-    A law of your own declares its numbers as fields and writes `stiffness`, differentiable:
+    A custom law declares its numbers as fields and defines a differentiable `stiffness`:
 
         class Hertz(fj.Contact, law="hertz"):
             k: jax.Array = fj.quantity("N/m", "normal stiffness under P_0", log=True)
@@ -32,27 +32,27 @@ class Contact(Part):
                 return K_n, self.stiffness_ratio * K_n
 
     `Hertz(k=4e8, P_0=1900, stiffness_ratio=0.5, P=1900)` is the contact of a scene or a joint like
-    any other. `law` is its name in TOML files, which a law without one cannot be written to;
-    `fj.quantity` puts unit and meaning there and makes a number known to sweeps and designs.
+    any other. `law` is its name in TOML files, without which it cannot be written to one;
+    `fj.quantity` adds unit and meaning there and makes a number available to sweeps and designs.
 
     P is the normal load, which a preloaded joint needs. With `opening_exponent` beside it, 1/3
-    here, the joint follows the load curve that `stiffness` gives. A field `stiffness_ratio`, or K_n
-    and K_t, lets "K_t/K_n" be set.
+    here, the joint follows the load curve implied by `stiffness`. A field `stiffness_ratio`, or K_n
+    and K_t, allows "K_t/K_n" to be set.
 
-    **Raises:** `ValueError` unless P > 0, and K_n >= 0 and K_t >= 0 are finite, of a law that
+    **Raises:** `ValueError` unless P > 0, and K_n >= 0 and K_t >= 0 are finite, for a law that
     depends on friction once a `Scene` or a `Joint` has both; `TypeError` unless they are two real
-    numbers; `ValueError` for a name of a law that another has. Of a traced law every number is NaN
+    numbers; `ValueError` for a name that another law has. For a traced law every number is NaN
     instead.
     """
 
-    has_surface: ClassVar[bool] = False  # its stiffness is that of a `Surface`
+    has_surface: ClassVar[bool] = False  # its stiffness follows from a `Surface`
     fractal: ClassVar[bool] = False  # the source's law: there is a `ContactState`
     yields: ClassVar[bool] = False  # friction lowers its pressure at yield: Eq. 19, to mu_m = 0.9
 
     def __init_subclass__(cls, law: str | None = None, **options: Any) -> None:
         super().__init_subclass__(**options)
         if law is not None:
-            from .laws import CONTACTS  # the package's own, which are made of this class
+            from .laws import CONTACTS  # the built-in laws, which are subclasses of this class
 
             register(law, cls, CONTACTS)
 
@@ -70,16 +70,16 @@ class Contact(Part):
 
     @property
     def of_the_package(self) -> bool:
-        """Whether it is no law of the user's own: its `__init__` checks its numbers."""
+        """True for a built-in law, whose `__init__` checks its numbers."""
         return type(self).__module__.rpartition(".")[0] == __name__.rpartition(".")[0]
 
     @property
     def depends_on_friction(self) -> bool:
-        """Whether the stiffness does."""
+        """True if the stiffness depends on friction."""
         if self.yields:
             return True
         both = jnp.ones(2)
-        try:  # what does not follow a batch of friction is no batch
+        try:  # raises if the result follows a batch of friction
             alone = jax.vmap(lambda *friction: _of_each(self, *friction), out_axes=None)
             jax.eval_shape(alone, both, both)
         except (ValueError, TypeError):
@@ -106,13 +106,13 @@ class Contact(Part):
         return None
 
     def load_curve(self, mu_s: ScalarLike, mu_m: ScalarLike) -> LoadCurve | None:
-        """N/P over K_n(P) u/P; None for a law that has no load curve."""
+        """N/P as a function of K_n(P) u/P; None for a law without a load curve."""
         return None if self.opening_exponent is None else _load_curve(self, mu_s, mu_m)
 
     def load(
         self, u: ArrayLike | Sequence[float], mu_s: ScalarLike = 0.0, mu_m: ScalarLike = 0.0
     ) -> Numbers:
-        """Normal force N [N] at the approach u [m] from the pressed rest, of any shape.
+        """Normal force N [N] at the approach u [m] from rest under the load P; any shape.
 
         dN/du = K_n(N) with N(0) = P, and 0 where the joint is open. The friction coefficients
         matter where the stiffness depends on them.
@@ -132,7 +132,7 @@ class Contact(Part):
 
 
 def refused_stiffness(law: Contact, mu_s: ArrayLike, mu_m: ArrayLike) -> Array | None:
-    """Where a traced law has K_n or K_t below 0 or not finite; None if all is known, and right.
+    """True where a traced law has K_n or K_t negative or not finite; None for a concrete law.
 
     **Raises:** `TypeError` and `ValueError` as `Contact`.
     """
@@ -178,9 +178,9 @@ def on_the_same_joint(law: Contact, contact: Contact) -> Contact:
 
 
 def partial_slip(K_n: Callable[[Numbers], Numbers], P: Numbers, Q: Numbers, mu_s) -> Numbers:
-    """K_t over the ratio at Q = 0: K_n(P - Q/mu_s) under a tangential load Q, 0 in gross slip.
+    """K_t over K_t/K_n at Q = 0: K_n(P - Q/mu_s) under a tangential load Q, 0 in gross slip.
 
-    Slip reduces the stuck contacts to those of that load (Ciavarella, J. Appl. Mech. 65, 998, 1998,
+    The contacts that still stick are those of that load (Ciavarella, J. Appl. Mech. 65, 998, 1998,
     doi:10.1115/1.2791944; Jaeger, Arch. Appl. Mech. 68, 583, 1998).
     """
     stuck = P - Q / mu_s

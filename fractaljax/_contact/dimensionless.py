@@ -1,6 +1,6 @@
 """Eqs. 31 and 37: the stiffness of a fractal joint over E sqrt(A_a), A_a being its nominal area.
 
-Areas are given over A_a: A_r* = A_r/A_a, a_e* = a_e/A_a. Any shape.
+Areas are relative to A_a: A_r* = A_r/A_a, a_e* = a_e/A_a; any shape.
 """
 
 import jax.numpy as jnp

@@ -1,6 +1,6 @@
 """The fractal contact law: from a surface under load to the stiffness of the joint.
 
-Equation numbers are those of the source paper. Areas are carried as logarithms, since a_e spans
+Equation numbers are those of the source paper. Areas are kept as logarithms, since a_e spans
 hundreds of decades as D -> 2. Every integral over the elastic contacts is one function,
 `area_moment`. The equations take any shape.
 """
@@ -76,8 +76,8 @@ def tangential_stiffness(E, nu, slip_ratio: Numbers, J_half: Numbers) -> Numbers
     return factor * positive_cbrt(1 - slip_ratio) * J_half
 
 
-class _Solved(NamedTuple):
-    """The solved load balance and the stiffness that follows, no more than those need."""
+class _LoadBalance(NamedTuple):
+    """The solution of the load balance, and the stiffness that follows from it."""
 
     log_a_l: Numbers
     log_a_e: Numbers
@@ -124,8 +124,8 @@ class FractalContact(Contact):
         self.stiffness_ratio = stiffness_ratio
 
     def stiffness(self, mu_s, mu_m):
-        solved = self._solve(mu_s, mu_m)
-        return solved.K_n, solved.K_t
+        balance = self._solve(mu_s, mu_m)
+        return balance.K_n, balance.K_t
 
     def real_area(self, mu_m):
         """Eq. 28."""
@@ -135,25 +135,25 @@ class FractalContact(Contact):
     @jax.jit
     def state(self, mu_s: ScalarLike, mu_m: ScalarLike) -> ContactState:
         """Everything about the joint; Q_e and slip_ratio are None if `stiffness_ratio` is given."""
-        solved, D = self._solve(mu_s, mu_m), self.surface.D
-        a_l, slip_ratio = jnp.exp(solved.log_a_l), solved.slip_ratio
+        balance, D = self._solve(mu_s, mu_m), self.surface.D
+        a_l, slip_ratio = jnp.exp(balance.log_a_l), balance.slip_ratio
         regime = Regime.elastic_plastic
         if slip_ratio is not None:
             regime = Regime.where(slip_ratio >= 1, Regime.gross_slip, regime)
         return ContactState(
-            K_n=solved.K_n,
-            K_t=solved.K_t,
+            K_n=balance.K_n,
+            K_t=balance.K_t,
             a_l=a_l,
-            a_e=exp_or_inf(solved.log_a_e),
+            a_e=exp_or_inf(balance.log_a_e),
             A_r=(D - 1) / (3 - D) * a_l,
-            Q_e=solved.Q_e,
-            plastic_share=solved.plastic_share,
-            log_area_ratio=solved.log_area_ratio,
+            Q_e=balance.Q_e,
+            plastic_share=balance.plastic_share,
+            log_area_ratio=balance.log_area_ratio,
             slip_ratio=slip_ratio,
-            regime=Regime.where(solved.log_area_ratio <= 0, Regime.fully_plastic, regime),
+            regime=Regime.where(balance.log_area_ratio <= 0, Regime.fully_plastic, regime),
         )
 
-    def _solve(self, mu_s, mu_m) -> _Solved:
+    def _solve(self, mu_s, mu_m) -> _LoadBalance:
         D, P, material = self.surface.D, self.P, self.material
         k_mu = friction_correction(mu_m)
         beta = critical_pressure_ratio(material, k_mu)
@@ -175,7 +175,7 @@ class FractalContact(Contact):
         else:
             K_t = self.stiffness_ratio * K_n
         log_a_l = log_a_plastic + (t - s)
-        return _Solved(log_a_l, log_a_e, t, plastic_share, K_n, K_t, Q_e, slip_ratio)
+        return _LoadBalance(log_a_l, log_a_e, t, plastic_share, K_n, K_t, Q_e, slip_ratio)
 
 
 def contact_state(
@@ -200,7 +200,7 @@ def contact_load(
 ) -> Float[Array, "..."]:
     """Eqs. 26 to 28: the normal load P [N] at the real contact area A_r [m^2]; any shape.
 
-    The inverse of `contact_state`: its A_r under this load is the one given.
+    The inverse of `contact_state`, whose A_r under this load is the given one.
 
     **Raises:** `ValueError` unless A_r > 0 and 0 <= mu_m <= 0.9.
     """

@@ -7,7 +7,7 @@ from .fractal import FractalContact
 from .measured import MeasuredContact
 from .persson import PerssonContact
 
-CONTACTS: dict[str, type[Contact]] = {  # those of the user's own follow
+CONTACTS: dict[str, type[Contact]] = {  # user-defined laws are added
     "fractal": FractalContact,
     "asperity": AsperityContact,
     "persson": PerssonContact,

@@ -1,4 +1,4 @@
-"""The load balance of a fractal joint: the load is given, the largest contact area a_l is not.
+"""The load balance of a fractal joint, which determines the largest contact area a_l.
 
 Eq. 26 (Eq. 27 at D = 2.5) over the load of an all-plastic joint with a_l = a_e depends only on
 t = ln(a_l/a_e), D and beta = P_e(a_e)/(H a_e):
@@ -24,7 +24,7 @@ _HALLEY_STEPS = 3
 def _bounded(t, D):
     """t up to where the square of e^(rt) would overflow.
 
-    Beyond that plastic contacts carry nothing that counts, and s is linear in t.
+    Beyond that the load on plastic contacts is negligible, and s is linear in t.
     """
     r, largest = (5 - 2 * D) / 2, 0.35 * math.log(jnp.finfo(D.dtype).max)
     return jnp.minimum(t, largest / jnp.maximum(r, 1e-6))

@@ -18,16 +18,16 @@ from numpy.polynomial import chebyshev
 from .._base.parts import Numbers
 
 _LEAST, _MOST = 1 / 256, 1024.0  # loads over P between which pieces lie; one more begins at 0
-_FAINTEST = 1e-16  # load over P from which on K_n is searched for where it ends to be a power
-_POWER = 0.005  # within which its exponent then is the one at no load
+_FAINTEST = 1e-16  # least load over P at which K_n is compared with its power law
+_POWER = 0.005  # tolerance of its exponent, against that at vanishing load
 _BELOW, _ABOVE = 16, 8  # pieces on either side of P
 _STEEPEST = 14.0  # e-folds of load and stiffness above P, beyond which the curve is straight
 _SAMPLES = 128  # of the stiffness, on either side, for the borders of the pieces
 _DEGREE = 16  # of the series of e in each piece
-_NEWTON = 10  # steps to its inverse
-_POWERS = 7  # of the table
-_ROWS, _FIRST = 32, 128  # of it in each piece, and in the first one
-_FINEST = 1e-4  # of the first piece: rows there are no finer
+_NEWTON = 10  # Newton steps to its inverse
+_POWERS = 7  # degree of the polynomials of the table
+_ROWS, _FIRST = 32, 128  # rows of the table in each piece, and in the first one
+_FINEST = 1e-4  # share of the first piece: its rows are no finer
 _SETTLING = 16  # Newton steps to an equilibrium
 
 
@@ -46,8 +46,8 @@ _TO_POWERS = np.linalg.inv(np.vander(_ROW_NODES))  # highest first
 class LoadCurve(eqx.Module):
     """N/P of a joint as a function of e = K_n(P) u/P: 1 with slope 1 at 0, 0 where it is open.
 
-    Pieces of n = N/P, in each of which the approach is a Chebyshev series: of ln n, but in the
-    first one, from n = 0, of n^(1/power), in which it is smooth.
+    In each piece of n = N/P the approach is a Chebyshev series in ln n, but in the first one, from
+    n = 0, a series in n^(1/power), in which it is smooth.
     """
 
     power: Float[Array, ""]  # N/P begins as that power of the distance e + opening
@@ -91,10 +91,10 @@ class LoadCurve(eqx.Module):
 
 
 class LoadTable(eqx.Module):
-    """A load curve for motions, which ask for it at every step: rows of polynomials of e.
+    """A load curve for motions, which evaluate it at every step: rows of polynomials in e.
 
     Rows follow the load, not the approach, which may change by far more below P than near it.
-    Leaves may have further axes, of lanes.
+    Leaves may have further axes for lanes.
     """
 
     opening: Float[Array, ""]  # the joint opens at e = -opening
@@ -114,19 +114,19 @@ class LoadTable(eqx.Module):
         return jnp.where(e <= -self.opening, 0, value)  # NaN stays NaN
 
     def _row(self, e) -> Array:
-        """The row of e: its group of rows, and its place in that."""
+        """The row of e, by its group of rows and its place in the group."""
         starts = jax.lax.stop_gradient(self.table[0])
         groups = starts.reshape(-1, _ROWS, *starts.shape[1:])
         group = jnp.maximum(jnp.sum(groups[:, 0] <= e[None], axis=0) - 1, 0)
-        own = jnp.take_along_axis(groups, group[None, None], axis=0)[0]
-        return group * _ROWS + jnp.maximum(jnp.sum(own <= e[None], axis=0) - 1, 0)
+        starts_in_group = jnp.take_along_axis(groups, group[None, None], axis=0)[0]
+        return group * _ROWS + jnp.maximum(jnp.sum(starts_in_group <= e[None], axis=0) - 1, 0)
 
 
 @jax.jit
 def tabulated(curve: LoadCurve) -> LoadTable:
     """The table of a load curve.
 
-    It departs from it by less than 1e-11 of P or N, or by 1e-9 of P below it where K_n(P) is a
+    It deviates by less than 1e-11 of P or N, or by 1e-9 of P at loads below P where K_n(P) is a
     million times that of small loads, in full contact.
     """
     at = jax.lax.stop_gradient(_borders_of_rows(curve))
@@ -166,24 +166,24 @@ def load_curve(
     `opening_exponent` is alpha in K_n ~ N^alpha as N vanishes, from 0 to below 1: otherwise the
     approach at which the joint opens would be infinite. `borders` are loads [N] between which K_n
     is smooth; by default it is everywhere. Above 1024 P, or where load and stiffness have grown by
-    e^14, the curve goes on straight.
+    e^14, the curve continues as a straight line.
     """
-    own, dtype = stiffness(P), P.dtype
+    stiffness_at_P, dtype = stiffness(P), P.dtype
 
     def relative(log_n):
         """ln of K_n(n P)/K_n(P) for any shape."""
         at = jax.vmap(stiffness)(jnp.exp(log_n.ravel()) * P)
-        return jnp.log(at / own).reshape(log_n.shape)
+        return jnp.log(at / stiffness_at_P).reshape(log_n.shape)
 
     if borders is None:
         logs = jax.lax.stop_gradient(_borders(relative, jnp.asarray(opening_exponent, dtype)))
     else:
-        given = jnp.log(jnp.asarray(borders, dtype) / P)
-        logs = jnp.sort(jnp.append(given, 0))
+        log_borders = jnp.log(jnp.asarray(borders, dtype) / P)
+        logs = jnp.sort(jnp.append(log_borders, 0))
         logs = jnp.append(logs, logs[-1] + math.log(_MOST))
     power = 1 / (1 - jnp.asarray(opening_exponent, dtype))
     share = jnp.asarray((_NODES + 1) / 2, dtype)
-    # Pieces of ln n, but the first one, from n = 0, of n^(1/power): there e(n) is smooth.
+    # The variable is ln n, but in the first piece n^(1/power): there e(n) is smooth from n = 0.
     spans = jnp.diff(logs)[:, None]
     first, others = logs[0] + power * jnp.log(share), logs[:-1, None] + spans * share[None]
     least = math.log(jnp.finfo(dtype).tiny) / 4
@@ -193,7 +193,7 @@ def load_curve(
     slopes = slopes @ jnp.asarray(_TO_SERIES.T, dtype)
     approach = slopes @ jnp.asarray(_INTEGRAL.T, dtype)
     widths, below = jnp.sum(approach, axis=1), logs <= 0
-    # From P both ways: where K_n(P) is far above that of small loads, far from it e is large.
+    # Sums from P both ways: e is large far from P if K_n(P) is far above that of small loads.
     down = jnp.cumsum(jnp.where(below, widths, 0)[::-1])[::-1]
     up = jnp.cumsum(jnp.where(below, 0, widths))
     ends, opening = up - jnp.append(down[1:], 0), down[0]
@@ -207,35 +207,35 @@ def _polynomials(x) -> Array:
         one, two = carry
         return (two, 2 * x * two - one), one
 
-    _, found = jax.lax.scan(following, (jnp.ones_like(x), x), length=_DEGREE + 2)
-    return found.T
+    _, rows = jax.lax.scan(following, (jnp.ones_like(x), x), length=_DEGREE + 2)
+    return rows.T
 
 
 def _borders(relative, exponent) -> Array:
-    """ln n at the borders of the pieces: in each of them load and stiffness grow as much.
+    """ln n at the borders of the pieces, in each of which load and stiffness grow equally.
 
-    Below the first one K_n is a power of the load, with the exponent that it has at no load.
+    Below the first border K_n is a power of the load, with its exponent at vanishing load.
     """
     dtype = exponent.dtype
     x = jnp.linspace(0, math.log(_FAINTEST), 4 * _SAMPLES, dtype=dtype)
     other = jnp.abs(jnp.diff(relative(x)) / jnp.diff(x) - exponent) > _POWER
     last = jnp.min(jnp.where(other, x[1:], 0))
-    found = []
+    sides = []
     for end, count in ((jnp.minimum(last, math.log(_LEAST)), _BELOW), (math.log(_MOST), _ABOVE)):
         x = jnp.linspace(0, end, _SAMPLES, dtype=dtype)
         grown = jnp.abs(jnp.diff(x)) + jnp.abs(jnp.diff(relative(x)))
         grown = jnp.append(jnp.zeros(1, dtype), jnp.cumsum(grown))
         most = grown[-1] if count == _BELOW else jnp.minimum(grown[-1], _STEEPEST)
-        found.append(jnp.interp(most * jnp.arange(1, count + 1) / count, grown, x))
-    below, above = found
+        sides.append(jnp.interp(most * jnp.arange(1, count + 1) / count, grown, x))
+    below, above = sides
     return jnp.concatenate([below[::-1], jnp.zeros(1, dtype), above])
 
 
 def loaded_equilibrium(curves: Sequence[LoadCurve | LoadTable], e: Array, W: Array) -> Array:
     """e (m,) of joints with load curves at rest: e = `e` + W (1 + e - N/P), W (m, m).
 
-    `e` is that with linear springs, W what a missing load adds. N/P is convex, so Newton's method
-    comes down to the root from there.
+    `e` is the one with linear springs, W the response to a missing load. N/P is convex, so Newton's
+    method descends to the root from there.
     """
 
     def residual(at):

@@ -1,4 +1,4 @@
-"""A contact law read off a measurement."""
+"""A contact law interpolated from a measurement."""
 
 from collections.abc import Sequence
 from typing import final
@@ -18,12 +18,12 @@ class MeasuredContact(Contact):
 
     ln K_n is a monotone cubic of ln P between `loads` [N] (Fritsch and Carlson, SIAM J. Numer.
     Anal. 17, 238, 1980), with the `stiffnesses` [N/m] measured there; beyond the first and the last
-    load, the power law that it has there. The table is structure: it has no derivatives. The joint
-    has a load curve if that power is from 0 to below 1 at the first load; else it would not open
-    at a finite gap.
+    load it continues as the power law of that end. The table is structure: it has no derivatives.
+    The joint has a load curve if that power is from 0 to below 1 at the first load; else it would
+    not open at a finite gap.
 
     **Raises:** `ValueError` unless P > 0, stiffness_ratio >= 0, and the table has two rows or more,
-    loads above 0 that rise, and as many stiffnesses above 0; `TypeError` for a traced table.
+    increasing loads above 0, and as many stiffnesses above 0; `TypeError` for a traced table.
     """
 
     loads: tuple[float, ...] = eqx.field(static=True, metadata={"note": "N, of the measurement"})
@@ -52,7 +52,7 @@ class MeasuredContact(Contact):
 
     @property
     def opening_exponent(self):
-        """That of the power law below the first load."""
+        """The exponent of the power law below the first load."""
         slope = float(self._curve().derivative()(np.log(self.loads[0])))
         return slope if 0 <= slope < 1 else None
 

@@ -29,8 +29,9 @@ from .._surface.surface import Surface, frequency_count
 from .contact import Contact, partial_slip
 from .material import Material
 
-# Of the elastic energy in the middle range, of the finite-size law, how the two join, and how K_n
-# falls short towards full contact: fitted to boundary elements, D = 2.1 to 2.9 (tested).
+# Factors of the elastic energy in the middle range and of the finite-size law, the exponent that
+# joins the two, and the correction towards full contact: fitted to boundary elements, D = 2.1 to
+# 2.9 (tested).
 _GAMMA_P = 0.45
 _FINITE_SIZE, _FINITE_SIZE_D = 1.05, 1.24
 _JOIN = 2.4
@@ -42,7 +43,7 @@ _NEGLIGIBLE = 40.0  # e^-40 is below rounding
 
 
 def mindlin_ratio(nu: Numbers) -> Numbers:
-    """K_t/K_n = (2 - 2 nu)/(2 - nu) of a contact that nowhere slips."""
+    """K_t/K_n = (2 - 2 nu)/(2 - nu) of a contact without slip."""
     return (2 - 2 * nu) / (2 - nu)
 
 
@@ -50,7 +51,7 @@ class _Band(NamedTuple):
     """The surface's waves as a power law of ln q over a band x = ln(q/q_low), 0 to `width`."""
 
     L: Numbers  # longest wavelength that the nominal area has room for [m]
-    q: Numbers  # the least wavenumber [rad/m]
+    q: Numbers  # the smallest wavenumber [rad/m]
     m: Numbers  # mean square height per ln q there [m^2]; it falls as e^((r - 2) x)
     width: Numbers
     r: Numbers  # the mean square gradient up to x is q^2 m (e^(r x) - 1)/r
@@ -60,8 +61,8 @@ class _Band(NamedTuple):
 class PerssonContact(Contact):
     """A rough surface on an elastic half-space: K_n by Persson's theory, K_t by Mindlin's ratio.
 
-    `area` is the nominal area of the joint [m^2]; wavelengths run from L down to L_s [m], as those
-    of `topography` do, and none is longer than the side of the area. K_n follows P^(1/(1+H)) at
+    `area` is the nominal area of the joint [m^2]; wavelengths run from L down to L_s [m], as in
+    `topography`, and none is longer than the side of the area. K_n follows P^(1/(1+H)) at
     small loads, then P, then rises to full contact. K_t = (2 - 2 nu)/(2 - nu) K_n (Mindlin, J.
     Appl. Mech. 16, 259, 1949; for rough surfaces Campana, Persson and Mueser, J. Phys. Condens.
     Matter 23, 085001, 2011), or `stiffness_ratio` K_n if that is given. Under a tangential load Q
@@ -70,8 +71,8 @@ class PerssonContact(Contact):
 
     Within 35 % of boundary elements wherever less than half of the area touches, and within a
     factor of two up to nearly full contact. Too soft where the whole contact is smaller than
-    2 L_s^2: there a single smooth summit carries. Differentiable in everything but L_s, since Eq.
-    13 has whole waves.
+    2 L_s^2, and a single smooth summit carries the load. Differentiable in everything but L_s,
+    since Eq. 13 has a whole number of waves.
 
     **Raises:** `ValueError` unless P > 0, area > 0, 0 < L_s <= L, stiffness_ratio >= 0, Q >= 0.
     """
@@ -144,7 +145,7 @@ class PerssonContact(Contact):
         return jnp.sum(loads * compliance * weight) / 2 * jnp.log(end)
 
     def _band(self) -> _Band:
-        """Eq. 13's waves, the first and the last with half a step of gamma beyond them."""
+        """The band of Eq. 13's waves, with half a step of gamma beyond the first and the last."""
         D, G, log_gamma = self.surface.D, self.surface.G, jnp.log(self.surface.gamma)
         L = jnp.maximum(jnp.minimum(self.L, jnp.sqrt(self.area)), self.L_s)
         half_step = jnp.exp(log_gamma / 2)
@@ -165,7 +166,7 @@ class PerssonContact(Contact):
         """1/K_n [m/N] under the load P."""
         E, A, D, r = self.material.E, self.area, self.surface.D, band.r
         strain = self._strain(P, band) ** 2
-        # From where the exponential is negligible beside what it is at the end, in ln x.
+        # In ln x, from where the exponential is negligible against its value at the end.
         last = strain / boxcox(band.width, r)
         first = strain / (_NEGLIGIBLE + last)
         low = jnp.log(jnp.log1p(r * first) / r)

@@ -2,8 +2,8 @@
 
 Since sqrt(x^2 + y^2) cos(atan2(y, x) - a) = x cos a + y sin a, each wave of Eq. 13 is
 cos(k_x x + phi) cos(k_y y) - sin(k_x x + phi) sin(k_y y), and the double sum over a grid is a
-product of matrices. It is taken a block of waves at a time to bound memory. Phases are counted in
-cycles, so that whole cycles can be dropped exactly.
+product of matrices. It is computed a block of waves at a time to bound memory. Phases are
+counted in cycles, so that whole cycles can be dropped exactly.
 """
 
 import functools
@@ -58,11 +58,12 @@ def topography(
     resolves), with M directions each. `key` draws the phases: the same key gives the same surface,
     and a smaller L_s adds waves without moving the others.
 
-    `periodic` makes opposite edges meet, as contact by FFT wants. The vector gamma^n (cos a, sin a)
-    of each wave is rounded to whole waves k per L along x and y, none shorter than L_s, and its
-    amplitude follows its own wavelength: |k|^(D-3) in place of gamma^((D-3)n). The phases are the
-    same. With M = 10, `roughness` stays right to 0.3 percent in Sdq, and in Sq to 1 percent at
-    gamma = 1.5, 8 at gamma = 2. A derivative in gamma leaves the waves in place.
+    `periodic` makes opposite edges meet, as contact solvers by FFT require. The vector
+    gamma^n (cos a, sin a) of each wave is rounded to whole waves k per L along x and y, none
+    shorter than L_s, and its amplitude follows its own wavelength: |k|^(D-3) in place of
+    gamma^((D-3)n). The phases are the same. With M = 10, `roughness` stays right to 0.3 percent in
+    Sdq, and in Sq to 1 percent at gamma = 1.5, 8 at gamma = 2. A derivative in gamma leaves the
+    waves in place.
 
     Differentiable in D, G, gamma and L; `jit` and `vmap` work over D, G and key. The number of
     waves is structure: gamma must be known at trace time, and so must L and L_s if L_s is given.
@@ -78,11 +79,11 @@ def topography(
     dtype = surface.D.dtype
     require_memory(f"a topography of {n} x {n} points", dtype.itemsize * n * (3 * n + 4 * _BLOCK))
     L = scalar("L", L, above=0)
-    gamma, ratio = _known("gamma", surface.gamma), n / 2
+    gamma, ratio = _require_concrete("gamma", surface.gamma), n / 2
     if L_s is not None:
         L_s = scalar("L_s", L_s, above=0)
         with np.errstate(over="ignore"):
-            ratio = _known("L", L) / _known("L_s", L_s)
+            ratio = _require_concrete("L", L) / _require_concrete("L_s", L_s)
         L = ordered("L", L, "L_s", L_s)
         number("L/L_s", ratio)
     count = int(frequency_count(gamma, ratio, np))
@@ -106,7 +107,7 @@ def topography(
 def random_phases(key: PRNGKeyArray, count: int, M: int) -> Float[Array, "count M"]:
     """The phases of Eq. 13 in cycles, phi_mn/(2 pi): uniform on [0, 1), a row for each n.
 
-    **Raises:** `TypeError` unless `key` is a key of `jax.random`, `ValueError` for many.
+    **Raises:** `TypeError` unless `key` is a key of `jax.random`, `ValueError` for several.
     """
     _require_key(key)
     rows = math.ceil(count / _ROWS) * _ROWS  # whole blocks, so that more rows change none
@@ -124,7 +125,7 @@ def _require_key(key) -> None:
         raise kind(f"key must be one key of jax.random, got {got}") from None
 
 
-def _known(name: str, value: jax.Array) -> np.ndarray:
+def _require_concrete(name: str, value: jax.Array) -> np.ndarray:
     values = concrete(value)
     if values is None:
         raise TypeError(
@@ -138,7 +139,7 @@ def _known(name: str, value: jax.Array) -> np.ndarray:
 def _sum(surface, L, key, directions, coarse, fine, lengths, n):
     """Eq. 13 on the grid (n, n), with phases by `key`; coarse and fine (2, n_max + 1, M).
 
-    `lengths` (n_max + 1, M) stand for gamma^n, which moves no wave then, unless they are None.
+    `lengths` (n_max + 1, M) replace gamma^n, which then moves no wave, unless they are None.
     """
     D, G, gamma, dtype = surface.D, surface.G, surface.gamma, surface.D.dtype
     count, M = coarse.shape[1:]

@@ -1,4 +1,4 @@
-"""One batch of a sweep after another, on the devices of this process, by one compiled program."""
+"""The batches of a sweep, one after another, on the devices of this process by one program."""
 
 import functools
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ class Batches:
         self._fixed = jax.device_put((scene, [jnp.asarray(v) for v in grid]), everywhere)
 
     def begin(self, k: int) -> list[jax.Array]:
-        """The leaves of block k, (its points or more, ...): JAX may still be computing them."""
+        """Start block k: its leaves (points or more, ...), which JAX may still be computing."""
         # Every block has the points of the longest, for one compiled shape.
         points = -(-self._blocks.most // self._mesh.size) * self._mesh.size
         places = [axis.astype(np.int32) for axis in self._blocks.points(k, points)]
@@ -41,7 +41,7 @@ class Batches:
 
 
 def mesh_of(devices: Sequence[Any] | None) -> Mesh:
-    """Devices, by default all of this process, that share the points of a batch."""
+    """The mesh of devices, by default all of this process, that share the points of a batch."""
     chosen = jax.local_devices() if devices is None else list(devices)
     if not chosen:
         raise ValueError("devices must name at least one device, got none")
@@ -58,7 +58,7 @@ def _batch(point: Program, mesh: Mesh, scene, axes, places) -> list[jax.Array]:
     program = jax.vmap(one, (None, None, 0))
     if mesh.size > 1:
         whole, split = PartitionSpec(), PartitionSpec(_POINTS)
-        # One program a device: if XLA split a single one, every loop would wait for the slowest.
+        # One program per device: if XLA split a single one, every loop would wait for the slowest.
         program = jax.shard_map(
             program, mesh=mesh, in_specs=(whole, whole, split), out_specs=split, check_vma=False
         )

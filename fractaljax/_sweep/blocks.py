@@ -9,14 +9,14 @@ import numpy as np
 
 @dataclasses.dataclass(frozen=True)
 class Blocks:
-    """A grid of `shape` in blocks of the shape `block`; the last ones on an axis may be shorter."""
+    """A grid of `shape` in blocks of the shape `block`; the last one on an axis may be shorter."""
 
     shape: tuple[int, ...]
     block: tuple[int, ...]
 
     @property
     def most(self) -> int:
-        """The points of a block that is not shorter."""
+        """The number of points of a full block."""
         return math.prod(self.block)
 
     @property
@@ -29,7 +29,7 @@ class Blocks:
         return math.prod(self.counts)
 
     def place(self, k: int) -> tuple[int, ...]:
-        """The place of block k among the blocks, on each axis."""
+        """The index of block k among the blocks, on each axis."""
         return tuple(map(int, np.unravel_index(k, self.counts)))
 
     def index(self, k: int) -> tuple[slice, ...]:
@@ -53,13 +53,13 @@ class Blocks:
 
 
 def blocks(shape: Sequence[int], most: int) -> Blocks:
-    """Few blocks of at most `most` points: all of the last axes, parts of two, one of the first."""
+    """Few blocks of at most `most` points: whole last axes, parts of two, single first points."""
     split, row = len(shape) - 1, 1
     while split and row * shape[split] <= most:
         row *= shape[split]
         split -= 1
     n, before = shape[split], shape[split - 1] if split else 1
-    # Equal pieces of the axis that does not fit as a whole, and what then fits of the one before.
+    # Equal pieces of the axis that does not fit as a whole, and what then fits of the axis before.
     pieces = np.arange(-(-n // min(most // row, n)), n + 1)
     lengths = -(-n // pieces)
     others = np.clip(most // (row * lengths), 1, before)

@@ -38,15 +38,15 @@ _MEANT = {
     "custom_vmap_call": ("call", "rule"),
     "reduce": ("jaxpr", "dimensions"),
 }
-_HARMLESS = ("debug_callback", "debug_print")  # give no value
+_HARMLESS = ("debug_callback", "debug_print")  # return no value
 _PLAIN = (type(None), str, bytes, bool, int, float, complex, np.dtype, enum.Enum, type)
 
 
 class Program:
     """`measure` at the point of a grid where the quantities `names` have given values.
 
-    Traced anew for every sweep, so that captured values are those of now. Programs are equal where
-    their results are.
+    Traced anew for every sweep, so that captured values are current. Programs are equal if their
+    results are.
     """
 
     def __init__(
@@ -60,8 +60,8 @@ class Program:
         """`place` gives the scene at a point, from the whole and the values there by name."""
 
         def point(scene, values):
-            moved = place(scene, dict(zip(names, values, strict=True)))
-            return jax.tree.map(jnp.asarray, measure(moved))
+            scene_at_point = place(scene, dict(zip(names, values, strict=True)))
+            return jax.tree.map(jnp.asarray, measure(scene_at_point))
 
         values = [jax.ShapeDtypeStruct((), axis.dtype) for axis in grid]
         # `shapes` is the pytree of the measure at one point.
@@ -75,7 +75,7 @@ class Program:
 
     @property
     def digest(self) -> bytes:
-        """Equal for equal programs, in every process; blind to what a program calls outside."""
+        """Equal for equal programs, in every process; external calls of a program do not count."""
         return self._digest.digest
 
     def _identity(self):
@@ -131,7 +131,7 @@ def under(settings: Mapping[str, Any]) -> Iterator[None]:
 
 
 def _only_raises(called) -> bool:
-    """Whether a callback is that of `eqx.error_if`, which raises or is never called."""
+    """True for the callback of `eqx.error_if`, which raises or is never called."""
     function = getattr(called, "callback_func", None)
     return getattr(function, "__module__", None) == "equinox._errors"
 
@@ -141,15 +141,15 @@ class Digest:
 
     def __init__(self, program: ClosedJaxpr):
         self.outside: list[tuple[str, Any]] = []
-        self._known: dict[int, bytes] = {}
+        self._digests: dict[int, bytes] = {}
         settings = [str(getattr(jax.config, name)) for name in _SETTINGS]
         self.digest = _sha(repr((settings, self._plain(program, ""))).encode())
 
     def _plain(self, x: Any, name: str) -> Any:
-        """x, of the operation `name`, as tuples of texts and bytes that others do not have."""
+        """x, a parameter of the operation `name`, as tuples of text and bytes unique to it."""
         if isinstance(x, _PLAIN):
             return repr(x)
-        if hasattr(x, "dtype") and hasattr(x, "__array__"):  # of NumPy, of JAX, or in between
+        if hasattr(x, "dtype") and hasattr(x, "__array__"):  # an array of NumPy or JAX, or similar
             return array_digest(x)
         if isinstance(x, ClosedJaxpr):
             return self._jaxpr(x.jaxpr), self._plain(x.consts, name)
@@ -167,17 +167,17 @@ class Digest:
         if isinstance(x, jax.tree_util.PyTreeDef):
             return "tree", self._plain(x.node_data(), name), self._plain(x.children(), name)
         if isinstance(x, (jax.sharding.Sharding, jax.sharding.AbstractMesh)):
-            return "sharding"  # where numbers are, not which
+            return "sharding"  # where numbers are stored, not their values
         text = repr(x)
         if type(x).__module__.startswith("jax.") and not any(w in text for w in (" at 0x", "...")):
-            return type(x).__qualname__, text  # of JAX, and wholly said by its text
+            return type(x).__qualname__, text  # a JAX object that its text describes fully
         self.outside.append((name, x))
         return type(x).__qualname__
 
     def _jaxpr(self, jaxpr: Jaxpr) -> bytes:
         # Parts of a program are shared: each is read once.
-        if id(jaxpr) in self._known:
-            return self._known[id(jaxpr)]
+        if id(jaxpr) in self._digests:
+            return self._digests[id(jaxpr)]
         numbers: dict[Any, int] = {}
 
         def new(variable):
@@ -201,8 +201,8 @@ class Digest:
             lines.append((name, *map(old, equation.invars), self._plain(parameters, name)))
             lines.append([new(v) for v in equation.outvars])
         lines.append([old(v) for v in jaxpr.outvars])
-        self._known[id(jaxpr)] = found = _sha(repr(lines).encode())
-        return found
+        self._digests[id(jaxpr)] = digest = _sha(repr(lines).encode())
+        return digest
 
 
 def _aval(x):
@@ -210,7 +210,7 @@ def _aval(x):
 
 
 def array_digest(x) -> bytes:
-    """SHA-256 of an array, its dtype and shape; of a key of `jax.random`, of its data."""
+    """SHA-256 of an array with its dtype and shape, or of the data of a `jax.random` key."""
     if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
         return _sha(str(x.dtype).encode() + array_digest(jax.random.key_data(x)))
     return _sha(repr((str(x.dtype), x.shape)).encode() + np.asarray(x).tobytes())

@@ -48,7 +48,7 @@ class Sweep(Record):
         return getattr(self.values, name)
 
     def to_xarray(self) -> "DataArray | Dataset":
-        """A `DataArray` with units on its axes; of a pytree a `Dataset`, one variable a leaf.
+        """A `DataArray` with units on its axes; for a pytree a `Dataset`, one variable per leaf.
 
         **Raises:** `ImportError` unless xarray is installed.
         """
@@ -62,8 +62,8 @@ class Sweep(Record):
         }
 
         def labelled(name, leaf):
-            own = [f"{name}_{i}" for i in range(np.ndim(leaf) - len(self.names))]
-            return xarray.DataArray(leaf, coords, [*self.names, *own])
+            dimensions = [f"{name}_{i}" for i in range(np.ndim(leaf) - len(self.names))]
+            return xarray.DataArray(leaf, coords, [*self.names, *dimensions])
 
         if self._single:
             return labelled("dim", self.values)

@@ -28,8 +28,8 @@ from .blocks import Blocks
 from .program import Program, array_digest
 
 _ABOUT = "fractaljax"  # the attribute that describes the sweep
-_VERSIONS = "versions"  # those that wrote the store
-_NAMES = "names"  # of the arrays: one program may come from measures of several names
+_VERSIONS = "versions"  # the versions that wrote the store
+_NAMES = "names"  # names of the arrays: one program may come from measures of several names
 _MEANINGS = {
     "key": "measure or scene",
     "axes": "axes",
@@ -52,13 +52,13 @@ class Store:
         leaves: Mapping[str, Any],
         blocks: Blocks,
     ):
-        """Make the store of the sweep that `about` describes, or resume it.
+        """Create the store of the sweep that `about` describes, or resume it.
 
-        `leaves` are the shapes and dtypes of the measure at one point, by name. Warns of a store
-        that other versions have written.
+        `leaves` are the shapes and dtypes of the measure at one point, by name. Warns if other
+        versions wrote the store.
 
         **Raises:** `ValueError` for the store of another sweep, a folder with other files, and
-        numbers that NumPy itself has not, such as bfloat16.
+        dtypes that NumPy itself lacks, such as bfloat16.
         """
         for name, leaf in leaves.items():
             if np.dtype(leaf.dtype).kind not in "biufc":
@@ -74,11 +74,11 @@ class Store:
             with zarr().config.set(_SETTINGS):
                 group = zarr().open_group(self._path, mode="r+", use_consolidated=False)
                 *self._leaves, self._computed = (group[name] for name in (*names, _COMPUTED))
-        except Exception as error:  # whatever Zarr says of files that are damaged
+        except Exception as error:  # whatever Zarr raises for damaged files
             raise ValueError(f"out {path} cannot be read: {one_line(error)}") from None
 
     def _make(self, about, scene, axes, leaves) -> None:
-        """Everything but the batches, beside its place until it is whole."""
+        """Write everything but the batches, in a folder beside its place until it is complete."""
         beside = self._path.with_name(f".{self._path.name}-{secrets.token_hex(4)}")
         names, blocks = axis_names(axes), self._blocks
         try:
@@ -95,10 +95,10 @@ class Store:
                     _add(group, name, values.dtype, values.shape, values.shape, [name], words)
                     group[name][:] = values
                 for name, leaf in leaves.items():
-                    own = [f"{name}_{i}" for i in range(len(leaf.shape))]
-                    own = _distinct(own, [*names, *leaves])
+                    dimensions = [f"{name}_{i}" for i in range(len(leaf.shape))]
+                    dimensions = _distinct(dimensions, [*names, *leaves])
                     shape, chunks = (first + leaf.shape for first in (blocks.shape, blocks.block))
-                    _add(group, name, leaf.dtype, shape, chunks, [*names, *own])
+                    _add(group, name, leaf.dtype, shape, chunks, [*names, *dimensions])
                 words = {"long_name": "checksum of the batch of the point; 0: not computed yet"}
                 _add(group, _COMPUTED, np.uint64, blocks.shape, blocks.block, names, words)
                 with warnings.catch_warnings():
@@ -116,30 +116,30 @@ class Store:
             shutil.rmtree(beside, ignore_errors=True)
 
     def _compare(self, path, about) -> list[str]:
-        """Refuse the store of another sweep; the names of the arrays in this one."""
-        found = describe(path) or {}
-        others = versions_differ(found.get(_VERSIONS, {}))
-        differs = [words for key, words in _MEANINGS.items() if found.get(key) != about[key]]
+        """Refuse the store of another sweep; return the names of the arrays in this one."""
+        stored = describe(path) or {}
+        others = versions_differ(stored.get(_VERSIONS, {}))
+        differs = [words for key, words in _MEANINGS.items() if stored.get(key) != about[key]]
         if differs:
             note = f" (it was {others})" if others else ""
             raise ValueError(f"out {path} holds another sweep: {', '.join(differs)} differ{note}")
         if others:
             warnings.warn(f"out {path} was {others}: digits may differ", stacklevel=4)
-        return found[_NAMES]
+        return stored[_NAMES]
 
     def there(self) -> set[int]:
-        """The numbers of the batches that are there now, with every file of theirs."""
+        """The numbers of the batches that are stored now, with all their files."""
         step = tuple(slice(None, None, size) for size in self._blocks.block)
         try:
             sums = self._computed[step]
         except Exception:
             for k in range(self._blocks.number):
-                self._sum(k)  # names the one that is damaged
+                self._sum(k)  # names the damaged one
             raise
         return {k for k in np.flatnonzero(sums).tolist() if all(map(Path.exists, self._files(k)))}
 
     def write(self, k: int, arrays: Sequence[np.ndarray]) -> None:
-        """Keep the arrays (*shape of batch k, ...) of the leaves."""
+        """Store the arrays (*shape of batch k, ...) of the leaves."""
         index = self._blocks.index(k)
         with self._named_errors():
             for kept, array in zip(self._leaves, arrays, strict=True):
@@ -148,13 +148,13 @@ class Store:
 
     def read(self, k: int) -> list[np.ndarray]:
         """The arrays of batch k. **Raises:** `ValueError` for one that is damaged or missing."""
-        index, wanted = self._blocks.index(k), self._sum(k)
+        index, checksum = self._blocks.index(k), self._sum(k)
         try:
             arrays = [np.asarray(kept[index]) for kept in self._leaves]
             reason = "it is damaged, or no batch of this sweep"
-        except Exception as error:  # whatever a codec makes of damaged bytes
+        except Exception as error:  # whatever a codec raises for damaged bytes
             arrays, reason = None, one_line(error)
-        if arrays is None or wanted != self._checksum(k, arrays):
+        if arrays is None or checksum != self._checksum(k, arrays):
             raise self._damaged(k, reason)
         return arrays
 
@@ -194,7 +194,7 @@ class Store:
 
 
 def zarr() -> Any:
-    """The package, or an error of one line."""
+    """The package; raises an `ImportError` of one line without it."""
     try:
         import zarr
     except ImportError:
@@ -213,7 +213,7 @@ def _add(group, name, dtype, shape, chunks, dimensions, attributes=None) -> None
         shape=shape,
         chunks=tuple(max(1, n) for n in chunks),
         dtype=dtype,
-        # No value of a float. There is no such integer: `computed` tells.
+        # NaN marks a missing float. There is no such integer: `computed` tells.
         fill_value=np.nan if dtype.kind in "fc" else np.zeros((), dtype).item(),
         compressors=[*packed, Crc32cCodec()],
         chunk_key_encoding={"name": "default", "separator": "."},
@@ -223,14 +223,14 @@ def _add(group, name, dtype, shape, chunks, dimensions, attributes=None) -> None
 
 
 def folder(path: str | os.PathLike) -> Path:
-    """Where a store is, without links. **Raises:** `ValueError` for an address."""
+    """The folder of a store, links resolved. **Raises:** `ValueError` for a URL."""
     if "://" in str(path):
         raise ValueError(f"out must be a folder of this machine, got {path}")
     return Path(os.path.realpath(path))
 
 
 def describe(path: str | os.PathLike) -> dict[str, Any] | None:
-    """What a store says of its sweep, or None where there is no file zarr.json.
+    """The description of its sweep in a store, or None if there is no file zarr.json.
 
     **Raises:** `ValueError` for a file that does not describe a sweep.
     """
@@ -238,21 +238,21 @@ def describe(path: str | os.PathLike) -> dict[str, Any] | None:
     if not file.exists():
         return None
     try:
-        found = json.loads(file.read_bytes())["attributes"][_ABOUT]
+        about = json.loads(file.read_bytes())["attributes"][_ABOUT]
         kinds = {_VERSIONS: dict, _NAMES: list, "key": str, "axes": list, "batch": int}
-        if {name: type(value) for name, value in found.items()} != kinds | {"arrays": list}:
+        if {name: type(value) for name, value in about.items()} != kinds | {"arrays": list}:
             raise ValueError("other keys than those of a sweep")
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{file} does not describe a sweep: {one_line(error)}") from None
-    return found
+    return about
 
 
 def description(
     program: Program, scene: Any, axes: Mapping[str, np.ndarray], batch: int
 ) -> dict[str, Any]:
-    """What tells sweeps apart: equal for equal sweeps on any number of devices.
+    """The identity of a sweep: equal for equal sweeps on any number of devices.
 
-    **Raises:** `ValueError` for a measure that calls what is not in its program.
+    **Raises:** `ValueError` for a measure that calls functions outside its program.
     """
     content = hashlib.sha256(program.key())
     for array in jax.tree.leaves(scene):
@@ -273,22 +273,22 @@ def axis_names(axes: Mapping[str, Any]) -> list[str]:
 
 
 def leaf_names(measure: Any, shapes: Any, axes: Mapping[str, Any]) -> list[str]:
-    """The names of the arrays of a measure: its own, or of several those of `Sweep.to_xarray`."""
+    """The names of the arrays of a measure: its own, or for several those of `Sweep.to_xarray`."""
     leaves = jax.tree_util.tree_leaves_with_path(shapes)
     names = [jax.tree_util.keystr(place, simple=True, separator=".") for place, _ in leaves]
     if names == [""]:
-        own = getattr(getattr(measure, "func", measure), "__name__", "").strip("_")
-        names = [own if own.isidentifier() else "value"]
+        function_name = getattr(getattr(measure, "func", measure), "__name__", "").strip("_")
+        names = [function_name if function_name.isidentifier() else "value"]
     return _distinct(names, ["zarr.json", _COMPUTED, *axis_names(axes)])
 
 
 def _distinct(names, taken: Sequence[str]) -> list[str]:
-    """Names of files that differ from one another and from those taken, on any system."""
-    used, found = {name.casefold() for name in taken}, []
+    """Names of files, distinct from one another and from `taken` on any system."""
+    used, distinct = {name.casefold() for name in taken}, []
     for name in names:
         name = re.sub(r"[^\w.+-]", "_", name.replace("/", "_over_"))
         while name.casefold() in used:
             name += "_"
         used.add(name.casefold())
-        found.append(name)
-    return found
+        distinct.append(name)
+    return distinct

@@ -1,8 +1,8 @@
 """A measure over a grid of any named quantities, in batches of one compiled shape.
 
-The grid itself is never stored: memory is that of two batches and of the result. With a folder
-every batch is kept (`store.py`), so that an interrupted sweep resumes and processes share the work.
-With an executor other processes and machines compute (`workers.py`).
+The grid itself is never stored: memory holds two batches and the result. With a folder every batch
+is kept (`store.py`), so that an interrupted sweep resumes and processes share the work. With an
+executor other processes and machines compute (`workers.py`).
 """
 
 import contextlib
@@ -32,8 +32,8 @@ from .result import Sweep
 from .store import Store, describe, description, leaf_names, zarr
 from .workers import Computed, Job, gathered, require_executor
 
-_POINTS_EACH = 8192  # in a batch, on every device; fewer of structures:
-_ENTRIES_EACH = 2**21  # of one matrix of the eigenvalue problem, of all points together
+_POINTS_EACH = 8192  # points in a batch, on every device; fewer for structures:
+_ENTRIES_EACH = 2**21  # entries of one matrix of the eigenvalue problem, at all points together
 
 
 def sweep(
@@ -52,31 +52,31 @@ def sweep(
     Each axis is a quantity by its name in `x.replace`, or a ratio as in `**{"K_t/K_n": ratios}`
     (`quantities.py`), and its values (n,). `measure` gives an array or a pytree of arrays; the
     result holds it as NumPy arrays (n_1, n_2, ..., *shape of the measure's). `jax.jit` and
-    `jax.grad` act on the measure, not on the sweep. The measure is traced once a sweep, with the
+    `jax.grad` act on the measure, not on the sweep. The measure is traced once per sweep, with the
     values that it captures at that time; equal programs are compiled once.
 
     Points are evaluated in batches, blocks of the grid of at most `batch_size` points (8192 for
-    every device, fewer of a structure of more than 8 degrees of freedom), split evenly over
+    every device, fewer for a structure with more than 8 degrees of freedom), split evenly over
     `devices` (all of this process). The last digits of a result may depend on the size of a batch,
     and on nothing else here.
 
     `out` names a folder for a Zarr store, which `xarray.open_zarr` opens, finished or not: the
-    values of each axis with unit and meaning (K_t/K_n as K_t_over_K_n), an array for each of the
-    measure, and `computed`, which is 0 where a point is not computed yet. The same sweep called
-    again computes what is missing; what was running when it was killed is lost. Another sweep is
-    refused, and one begun by other versions resumes under a warning. Under `jax.distributed` every
+    values of each axis with unit and meaning (K_t/K_n as K_t_over_K_n), each array of the measure,
+    and `computed`, which is 0 where a point is not computed yet. The same sweep called again
+    computes what is missing; batches running when it was killed are lost. Another sweep is
+    refused, and one begun by other versions resumes with a warning. Under `jax.distributed` every
     process must name the same folder: each computes its share of the batches, and all return the
     whole. Needs `fractaljax[sweep]`.
 
     `executor` computes the batches: a `ThreadPoolExecutor`, a `ProcessPoolExecutor` that spawns,
     `client.get_executor()` of Dask, an `MPIPoolExecutor`, or anything like them. It needs several
-    batches for each worker. Measure and x are sent along, a lambda with `fractaljax[sweep]` alone;
+    batches for each worker. Measure and x are sent along, a lambda only with `fractaljax[sweep]`;
     workers trace and compile them once, with the 64 bits and other settings of the caller, who
-    collects the results and alone writes to `out`. Where a batch fails, those that were running
-    are kept in `out` before its error is raised.
+    collects the results and alone writes to `out`. If a batch fails, those that were running are
+    kept in `out` before its error is raised.
 
-    **Raises:** `ValueError` for no axis, an unknown name, two of one quantity, values that are not
-    one-dimensional or outside their domain, a batch size that does not divide by the devices, a
+    **Raises:** `ValueError` for no axis, an unknown name, two axes of one quantity, values that are
+    not one-dimensional or outside their domain, a batch size that does not divide by the devices, a
     scene that holds arrays, more values than memory, a store of another sweep or with a damaged
     batch, a measure that calls Python (`jax.pure_callback`) beside `out`, several processes without
     it, devices beside an executor, or an executor that forks; `TypeError` for what is not numeric,
@@ -109,8 +109,8 @@ def run(
 ) -> Any:
     """The pytree of a program's arrays over a grid, in batches; arguments and errors as `sweep`.
 
-    Of `whole` the program takes what is at a point. By default there are `each` points in a batch,
-    on every device.
+    The program takes the scene at each point from `whole`. By default a batch has `each` points on
+    every device.
     """
     if executor is not None:
         require_executor(executor)
@@ -137,8 +137,8 @@ def run(
         raise ValueError("out must name a folder that all processes share, got None")
     arrays = [np.empty((*shape, *leaf.shape), leaf.dtype) for leaf in leaves]
 
-    def put(k, found):
-        for array, leaf in zip(arrays, found, strict=True):
+    def put(k, batch):
+        for array, leaf in zip(arrays, batch, strict=True):
             array[parts.index(k)] = leaf
 
     share = range(jax.process_index(), parts.number, jax.process_count())
@@ -153,10 +153,10 @@ def run(
     shown = progress and jax.process_index() == 0
     with contextlib.closing(computed), _bar(sum(map(parts.size, share)), shown) as bar:
         bar.update(sum(parts.size(k) for k in share if k in kept))
-        for k, found in computed:
+        for k, batch in computed:
             if store:
-                store.write(k, found)
-            put(k, found)
+                store.write(k, batch)
+            put(k, batch)
             bar.update(parts.size(k))
     if store:
         if jax.process_count() > 1:
@@ -169,7 +169,7 @@ def run(
 
 
 def _in_turn(batches: Batches, numbers: Sequence[int]) -> Computed:
-    """Every batch by its number with its leaves, each computed while the last one is put away."""
+    """Each batch by its number with its leaves, computed while the previous one is stored."""
     begun = None
     for k in numbers:
         last, begun = begun, (k, batches.begin(k))
@@ -180,7 +180,7 @@ def _in_turn(batches: Batches, numbers: Sequence[int]) -> Computed:
 
 
 def _checked(x: Any, axes: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """The values of every axis, each inside its domain together with those of the others."""
+    """The values of every axis, inside their domains jointly with those of the other axes."""
     if isinstance(x, Scene):
         require_scalar(x)
     if not axes:
@@ -192,22 +192,22 @@ def _checked(x: Any, axes: Mapping[str, Any]) -> dict[str, np.ndarray]:
 
 
 def _each(x: Any) -> int:
-    """The points of a batch on a device."""
-    if isinstance(x, Structure):  # whose modes take memory by the square of their number
+    """The default number of points of a batch on a device."""
+    if isinstance(x, Structure):  # the memory of its modes grows as the square of their number
         return max(1, min(_POINTS_EACH, _ENTRIES_EACH // (2 * x.n) ** 2))
     return _POINTS_EACH
 
 
-def _batch_size(asked: int | None, points: int, devices: int, each: int) -> int:
-    if asked is None:
+def _batch_size(batch_size: int | None, points: int, devices: int, each: int) -> int:
+    if batch_size is None:
         return devices * min(each, -(-points // devices))
-    if isinstance(asked, bool) or not isinstance(asked, int) or asked < 1:
-        raise ValueError(f"batch_size must be an integer of at least 1, got {asked!r}")
-    if asked % devices:
+    if isinstance(batch_size, bool) or not isinstance(batch_size, int) or batch_size < 1:
+        raise ValueError(f"batch_size must be an integer of at least 1, got {batch_size!r}")
+    if batch_size % devices:
         raise ValueError(
-            f"batch_size must be a multiple of the number of devices, {devices}, got {asked}"
+            f"batch_size must be a multiple of the number of devices, {devices}, got {batch_size}"
         )
-    return asked
+    return batch_size
 
 
 def _bar(points: int, shown: bool):

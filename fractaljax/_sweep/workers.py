@@ -1,9 +1,9 @@
 """The batches of a sweep on the workers of an executor: threads, processes, other machines.
 
-What travels is the measure, the scene and the axes. A worker traces them itself, under the settings
-of JAX that the sweep was called under, and refuses unless its program has the digest of the
-caller's: no worker computes in 32 bits, or something else, unnoticed. Results travel back, and the
-caller alone keeps them: a batch that an executor computes anew, since its worker died, counts once.
+The measure, the scene and the axes are sent. A worker traces them itself, under the settings of JAX
+that the sweep was called under, and refuses unless its program has the digest of the caller's: no
+worker computes in 32 bits, or something else, unnoticed. Results are sent back, and the caller
+alone stores them: a batch that an executor computes again, because its worker died, counts once.
 """
 
 import functools
@@ -30,7 +30,7 @@ _lock = threading.RLock()  # a worker may have several threads, and compiles onc
 
 
 class Job:
-    """One sweep. To another process it goes as bytes, which are read when it is first needed."""
+    """One sweep, sent to another process as bytes that are read when it is first needed."""
 
     def __init__(
         self,
@@ -57,7 +57,7 @@ class Job:
         return _arrived, (self._token, self._settings, self.pack())
 
     def pack(self) -> bytes:
-        """Measure, scene and axes. **Raises:** `TypeError` for what cannot be sent."""
+        """The pickled measure, scene and axes. **Raises:** `TypeError` if they cannot be sent."""
         if self._bytes is not None:
             return self._bytes
         try:
@@ -82,9 +82,9 @@ class Job:
             return batches.end(k, begun)
 
 
-def _arrived(token: str, found: dict[str, Any], content: bytes) -> Job:
+def _arrived(token: str, jax_settings: dict[str, Any], content: bytes) -> Job:
     job = Job.__new__(Job)
-    job._token, job._settings, job._bytes, job._batches = token, found, content, None
+    job._token, job._settings, job._bytes, job._batches = token, jax_settings, content, None
     return job
 
 
@@ -102,7 +102,7 @@ def _prepared(job: Job) -> Batches:
 
 
 def _computed(job: Job, k: int) -> list[np.ndarray]:
-    """What a worker calls."""
+    """Compute batch k in a worker; errors that cannot be sent become `RuntimeError`."""
     try:
         return job.compute(k)
     except Exception as error:
@@ -114,9 +114,9 @@ def _computed(job: Job, k: int) -> list[np.ndarray]:
 
 
 def gathered(executor: Any, job: Job, batches: Sequence[int], hint: str) -> Computed:
-    """Every batch by its number with its leaves, in the order in which they are done.
+    """Each batch by its number with its leaves, in the order of completion.
 
-    Where one fails those that are running are still given. Then its error is raised.
+    If one fails, those that are running are still yielded before its error is raised.
     """
     if not isinstance(executor, ThreadPoolExecutor):
         job.pack()
@@ -153,9 +153,9 @@ def gathered(executor: Any, job: Job, batches: Sequence[int], hint: str) -> Comp
 
 
 def require_executor(executor: Any) -> None:
-    """Refuse what has no interface of `concurrent.futures`, and processes that are forked.
+    """Refuse an object without the interface of `concurrent.futures`, and forked processes.
 
-    **Raises:** `TypeError` and `ValueError`, in this order.
+    **Raises:** `TypeError` and `ValueError`, respectively.
     """
     methods = (getattr(executor, name, None) for name in ("submit", "map"))
     if isinstance(executor, type) or not all(map(callable, methods)):
