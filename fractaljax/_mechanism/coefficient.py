@@ -1,4 +1,4 @@
-"""Coefficients of matrices: numbers, and functions or texts of a structure's parameters."""
+"""Coefficients of matrices: numbers, functions of a structure's parameters, and formulas."""
 
 import ast
 import math
@@ -27,7 +27,7 @@ _LONGEST = 500  # characters
 
 
 class Expression(NamedTuple):
-    """A coefficient as text, "Omega**2 - 1": the one kind of function that a file can hold."""
+    """A coefficient as text, "Omega**2 - 1": the only kind of function that a file can hold."""
 
     text: str
 
@@ -35,34 +35,34 @@ class Expression(NamedTuple):
         return _value(_parsed(self.text), p)
 
 
-def coefficient_of(name: str, given: Any, parameters: Parameters) -> Callable | ArrayLike:
+def coefficient_of(name: str, coefficient: Any, parameters: Parameters) -> Callable | ArrayLike:
     """A number, or a function of the parameters; a text becomes an `Expression`.
 
-    What reads none of them is a number.
+    A function that reads no parameter is replaced by its value.
 
-    **Raises:** `ValueError` or `TypeError`, calling it `name`, for anything else, and for a
-    function that does not give a finite number of these parameters.
+    **Raises:** `ValueError` or `TypeError`, naming it `name`, for anything else, and for a
+    function whose value at these parameters is not a finite number.
     """
-    if isinstance(given, str):
-        given = Expression(given)
-    if not callable(given):
-        return scalar(name, given)
-    seen = _Watched(parameters)
+    if isinstance(coefficient, str):
+        coefficient = Expression(coefficient)
+    if not callable(coefficient):
+        return scalar(name, coefficient)
+    watched = _Watched(parameters)
     try:
-        value: Any = given(seen)
+        value: Any = coefficient(watched)
     except (KeyError, NameError) as error:
         raise ValueError(
             f"{name} needs the parameter {error.args[0]!r}; given are {_listed(parameters)}"
         ) from None
     except (OverflowError, ZeroDivisionError):
-        shown = f", got {brief(given.text)}" if isinstance(given, Expression) else ""
+        shown = f", got {brief(coefficient.text)}" if isinstance(coefficient, Expression) else ""
         raise ValueError(f"{name} must be a finite number of these parameters{shown}") from None
     value = scalar(name, value)
-    return given if seen.read else value
+    return coefficient if watched.read else value
 
 
 class _Watched(Mapping):
-    """Parameters, and whether any of them was read."""
+    """Parameters that record in `read` whether any of them was read."""
 
     def __init__(self, parameters: Parameters):
         self.parameters, self.read = parameters, False
@@ -79,7 +79,7 @@ class _Watched(Mapping):
 
 
 def evaluated(coefficient: Callable | None, p: Parameters) -> Any:
-    """The value of a coefficient; of None, which stands for 1, None."""
+    """The value of a coefficient, or None for None, which stands for 1."""
     return None if coefficient is None else coefficient(p)
 
 
@@ -95,14 +95,14 @@ def _parsed(text: str) -> ast.expr:
     except (SyntaxError, ValueError, RecursionError, MemoryError):
         raise wrong from None
     for node in ast.walk(tree):
-        known = (ast.BinOp, ast.UnaryOp, ast.Name, ast.Load, *_OPERATORS)
+        allowed = (ast.BinOp, ast.UnaryOp, ast.Name, ast.Load, *_OPERATORS)
         number = isinstance(node, ast.Constant) and type(node.value) in (int, float)
         if isinstance(node, ast.Call):
             function = node.func
-            known_call = isinstance(function, ast.Name) and function.id in _FUNCTIONS
-            if not known_call or len(node.args) != 1 or node.keywords:
+            allowed_call = isinstance(function, ast.Name) and function.id in _FUNCTIONS
+            if not allowed_call or len(node.args) != 1 or node.keywords:
                 raise wrong
-        elif not (number or isinstance(node, known)):
+        elif not (number or isinstance(node, allowed)):
             raise wrong
     return tree
 
@@ -111,7 +111,7 @@ def _value(node: Any, p: Parameters) -> Any:
     match node:
         case ast.Constant():
             number: Any = node.value
-            return float(number)  # a power of whole numbers has no end
+            return float(number)  # powers of integers can grow without limit
         case ast.Name():
             if node.id in p:
                 return p[node.id]

@@ -1,4 +1,4 @@
-"""Damping matrices of a structure from what is known of its damping."""
+"""Damping matrices of a structure from Rayleigh coefficients or modal damping ratios."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -22,10 +22,10 @@ from .matrices import (
 def rayleigh_damping(M: MatrixLike, K: MatrixLike, alpha: ArrayLike, beta: ArrayLike) -> MatrixLike:
     """C = alpha M + beta K (n, n) [N s/m], alpha in 1/s and beta in s.
 
-    Of two sparse matrices with more than 2000 rows it is sparse as well.
+    C is sparse if M and K are sparse matrices with more than 2000 rows.
 
     **Raises:** `ValueError` unless alpha >= 0 and beta >= 0 are scalars and M and K are square
-    matrices of one size; `TypeError` for anything but real numbers.
+    matrices of the same size; `TypeError` for anything but real numbers.
     """
     M = square_or_sparse("M", M)
     K = fitting_or_sparse("K", K, M.shape)
@@ -43,7 +43,7 @@ def modal_damping(M: MatrixLike, K: MatrixLike, ratio: ArrayLike) -> Float[Array
     frequencies are distinct.
 
     **Raises:** `ValueError` unless ratio >= 0, M is symmetric and positive definite, and K
-    symmetric and of the size of M; `TypeError` for anything but real numbers.
+    is symmetric and has the size of M; `TypeError` for anything but real numbers.
     """
     M = mass_matrix(square("M", M))
     K, ratio = fitting("K", K, M.shape), number("damping_ratio", ratio, at_least=0)

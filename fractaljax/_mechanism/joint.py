@@ -1,4 +1,4 @@
-"""Joints: contact, friction and the directions in which they act."""
+"""Joints: contact, friction, and the directions in which they act."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -28,11 +28,11 @@ from .._contact.contact import MU_M_MAX, Contact, refused_stiffness
 from .._contact.laws import CONTACTS
 from .._friction import LAWS, Friction
 
-# By their names in files.
+# Classes by their names in files.
 JOINT_LAWS: Laws = {
     "contact": CONTACTS,
     "friction": LAWS,
-    "of": LAWS,  # the law that a `Scaled` one scales
+    "of": LAWS,  # the law that a `Scaled` law scales
 }
 
 PRELOAD_NOTE = (
@@ -42,15 +42,15 @@ PRELOAD_NOTE = (
 
 Dof = int | str  # a degree of freedom, by index or name
 Direction = Dof | Sequence[Any] | Mapping[Any, float] | ArrayLike
-Stored = tuple[Any, ...]  # a direction as `stored_direction` gives it
+Stored = tuple[Any, ...]  # a direction as returned by `stored_direction`
 
 
 def friction_for(contact: Contact, friction: Friction) -> Friction:
     """The friction law of a joint, checked against its contact.
 
     **Raises:** `TypeError` for a part of the wrong kind; `ValueError` if the contact yields
-    and the smallest friction exceeds 0.9, where Eq. 19 ends, and if the stiffness of a law of the
-    user's is below 0 or no number under this friction.
+    and the smallest friction exceeds 0.9, the limit of Eq. 19, and if the stiffness of a user's
+    law is negative or not a number under this friction.
     """
     require_kind("contact", contact, Contact)
     require_kind("friction", friction, Friction)
@@ -62,13 +62,13 @@ def friction_for(contact: Contact, friction: Friction) -> Friction:
         return friction
     number(friction.lowest, friction.mu_m, at_most=MU_M_MAX)
     if concrete(friction.mu_m) is None:
-        # The stiffness depends on mu_m alone: it counts as refused with what is above it.
+        # The stiffness depends on mu_m alone, so mu_m becomes NaN with a refused mu_s.
         friction = nan_where(~(friction.mu_m <= MU_M_MAX) | jnp.isnan(friction.mu_s), friction)
     return friction
 
 
 def preload_form(value: Any) -> bool | str:
-    """`preload` of a joint: True, False or "linear".
+    """The checked `preload` of a joint: True, False or "linear".
 
     **Raises:** `TypeError` for anything else.
     """
@@ -77,41 +77,41 @@ def preload_form(value: Any) -> bool | str:
     try:
         return flag("preload", value)
     except TypeError:
-        wanted = f'preload must be True, False or "linear", got {brief(value)}'
-        raise TypeError(wanted) from None
+        message = f'preload must be True, False or "linear", got {brief(value)}'
+        raise TypeError(message) from None
 
 
 def require_load(contact: Contact, what: str) -> None:
-    """Refuse a contact without a normal load P, which `what` needs.
+    """Require a contact with a normal load P, which `what` needs.
 
-    **Raises:** `ValueError` as said.
+    **Raises:** `ValueError` for a contact without P.
     """
     if getattr(contact, "P", None) is None:
         raise ValueError(f"{what} needs a contact with a normal load P, got {brief(contact)}")
 
 
 class Joint(Part):
-    """A contact with friction between two bodies of a structure, or a body and the ground.
+    """A contact with friction between two bodies of a structure, or between a body and the ground.
 
     `tangential` and `normal` are directions t and n, rows (n,) of weights of the degrees of
-    freedom. Each is a degree of freedom, by its index or its name, a pair (i, j), whose relative
-    displacement x_i - x_j counts, a mapping {degree of freedom: weight}, or all weights as an array
-    or floats. Positive `normal` displacement n.x compresses the joint. Friction pushes towards
+    freedom. Each is a degree of freedom, by index or name, a pair (i, j) for the relative
+    displacement x_i - x_j, a mapping {degree of freedom: weight}, or all weights as an array or
+    floats. Positive `normal` displacement n.x compresses the joint. Friction pushes towards
     positive t.x, as the belt does in Eq. 39. `V` is the sliding velocity; a law without slope needs
-    none.
+    no V.
 
-    The normal force on which friction acts is K_n n.x, the source's form. With `preload` it begins
-    with the load P of the contact, and x = 0 is the pressed rest: N(n.x) is the load curve of the
-    contact law, dN/du = K_n(N), or P + K_n n.x for a law that has none and with
-    `preload="linear"`. Without `normal` it is P, constant, and neither a normal spring nor a
-    friction face normal to the belt is there. In all forms the tangential spring K_t stays.
+    The normal force N on which friction acts is K_n n.x, the source's form. With `preload`, x = 0
+    is the state of rest under the load P of the contact, where N = P: N(n.x) is the load curve of
+    the contact law, dN/du = K_n(N), or P + K_n n.x for a law without a load curve and with
+    `preload="linear"`. Without `normal`, N is the constant P, and there is neither a normal spring
+    nor a friction face normal to the belt. The tangential spring K_t is present in all forms.
 
     **Raises:** `TypeError` for a part of the wrong kind; `ValueError` unless V > 0, for directions
-    that are zero or have one degree of freedom twice, without a P where it is needed, and where
-    `Scene` refuses the friction.
+    that are zero or have one degree of freedom twice, for a missing P where it is needed, and for
+    friction that `Scene` refuses.
     """
 
-    contact: Any  # a Contact; its kind decides what else it has
+    contact: Any  # a Contact; its other attributes depend on its class
     friction: Friction
     tangential: Stored = eqx.field(static=True)
     normal: Stored | None = eqx.field(static=True)
@@ -142,20 +142,20 @@ class Joint(Part):
 
     @property
     def normal_load(self) -> Numbers | None:
-        """P [N], if the normal force on which friction acts has it; None in the source's form."""
+        """P [N], if the friction's normal force includes it; None in the source's form."""
         return self.contact.P if self.preload or self.normal is None else None
 
     @property
     def follows_load_curve(self) -> bool:
-        """Whether the normal force is the load curve of the contact law."""
+        """True if the normal force is the load curve of the contact law."""
         return self.normal is not None and follows_load_curve(self)
 
     def stiffness(self) -> tuple[Numbers, Numbers]:
-        """(K_n, K_t) [N/m], scalars: Eqs. 30 and 36, or as given."""
+        """(K_n, K_t) [N/m], scalars, from Eqs. 30 and 36 or as given."""
         return self.contact.stiffness(self.friction.mu_s, self.friction.mu_m)
 
     def coefficient(self) -> Numbers:
-        """mu at the joint's sliding velocity, a scalar."""
+        """The friction coefficient mu at the joint's sliding velocity, a scalar."""
         law = self.friction
         if self.V is None or not law.velocity_dependent:
             return law.mu_s
@@ -163,7 +163,7 @@ class Joint(Part):
 
 
 def follows_load_curve(joint: Any) -> bool:
-    """Whether a scene, or a joint with a normal direction, follows its law's load curve."""
+    """True if a scene, or a joint with a normal direction, follows the load curve of its law."""
     return joint.preload is True and joint.contact.opening_exponent is not None
 
 
@@ -194,14 +194,14 @@ def stored_direction(name: str, value: Any) -> Stored:
         return tuple(zip(dofs, _weights(name, weights, wrong), strict=True))
     if len(items) <= 2 and (dofs := _dofs(items)):
         return dofs
-    # Whole numbers are degrees of freedom: (1, 2, 3) is a mistake, (1.0, 2.0, 3.0) a vector.
+    # Integers are degrees of freedom: (1, 2, 3) is a mistake, (1.0, 2.0, 3.0) a vector.
     if not several or all(isinstance(item, int) for item in items):
         raise wrong
     return _weights(name, items, wrong)
 
 
 def _dofs(items: Sequence[Any]) -> tuple[Dof, ...]:
-    """Different degrees of freedom, or nothing if they are not."""
+    """Distinct degrees of freedom, or () if `items` are anything else."""
     plain = tuple(int(item) if isinstance(item, np.integer) else item for item in items)
     good = all(isinstance(dof, (int, str)) and not isinstance(dof, bool) for dof in plain)
     return plain if good and len(set(plain)) == len(plain) else ()

@@ -1,4 +1,4 @@
-"""Matrices of numbers in MATLAB's files of version 4, which have no header of their own."""
+"""Numeric matrices in MATLAB files of version 4, which have no file header."""
 
 import struct
 from typing import Any
@@ -13,13 +13,13 @@ _LONGEST_NAME = 64  # bytes
 
 
 def read_matlab_4(content: bytes) -> dict[str, Any]:
-    """The variables of a file by name, arrays or sparse.
+    """The variables of a file by name, as arrays or sparse matrices.
 
-    A `ValueError` stands in the place of one that is no matrix of real numbers.
+    A variable that is no matrix of real numbers is returned as a `ValueError`.
 
     **Raises:** `ValueError` if the file is damaged.
     """
-    found: dict[str, Any] = {}
+    variables: dict[str, Any] = {}
     place = 0
     while place < len(content):
         head = content[place : place + 20]
@@ -41,28 +41,28 @@ def read_matlab_4(content: bytes) -> dict[str, Any]:
         place = start + size * (1 + imaginary)
         if place > len(content):
             raise ValueError("it ends within a variable")
-        if name in found:
+        if name in variables:
             raise ValueError(f"it holds {name} twice")
         values = np.frombuffer(content[start : start + size], dtype).astype(dtype.newbyteorder("="))
         values = values.reshape((rows, columns), order="F")
         try:
-            found[name] = _matrix(name, what, bool(imaginary), values)
+            variables[name] = _matrix(name, what, bool(imaginary), values)
         except ValueError as error:
-            found[name] = error
-    return found
+            variables[name] = error
+    return variables
 
 
 def _matrix(name: str, what: int, is_complex: bool, values: np.ndarray) -> Any:
     if what == _TEXT:
         raise ValueError(f"{name} must be real numbers, got text")
-    # The imaginary parts of a sparse matrix are a column of its own.
+    # The imaginary parts of a sparse matrix are a fourth column.
     if is_complex or (what == _SPARSE and values.shape[1] == 4):
         raise ValueError(f"{name} must be real numbers, got complex ones")
     return values if what == _FULL else _sparse(name, values)
 
 
 def _sparse(name: str, table: np.ndarray) -> Any:
-    """Of lines of row, column and value, the last of which is the shape."""
+    """The sparse matrix from lines of row, column and value; the last line is its shape."""
     whole = np.isfinite(table[:, :2]).all() and (table[:, :2] == np.rint(table[:, :2])).all()
     if table.shape[1] != 3 or not len(table) or not whole:
         raise ValueError(f"{name} is damaged: it has no rows, columns and values")

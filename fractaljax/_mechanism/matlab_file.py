@@ -1,7 +1,7 @@
-"""Matrices of numbers in MATLAB's files of version 5 to 7, and 4.
+"""Numeric matrices in MATLAB files of versions 5 to 7 and 4.
 
 `scipy.io.loadmat` cannot serve: damaged sparse matrices crash the interpreter (SciPy 1.17), and a
-small file may unpack to any amount.
+small file may unpack to any size.
 """
 
 import struct
@@ -25,20 +25,20 @@ _COMPLEX, _LOGICAL = 0x800, 0x200  # flags
 
 
 def read_matlab(content: bytes, most: int) -> dict[str, Any]:
-    """The variables of a .mat file by name, arrays or sparse, of at most `most` bytes in total.
+    """The variables of a .mat file by name, as arrays or sparse, at most `most` bytes in total.
 
-    A `ValueError` stands in the place of one that is no matrix of real numbers.
+    A variable that is no matrix of real numbers is returned as a `ValueError`.
 
     **Raises:** `ValueError` if the file is damaged or too large.
     """
     if content.startswith((b"MATLAB 7.3", b"\x89HDF")):
         raise ValueError("it is of MATLAB's version 7.3; save it with -v7")
     order = _ORDERS.get(content[124:128])
-    if order is None and b"\0" in content[:4]:  # which a text never has, and version 4 always
+    if order is None and b"\0" in content[:4]:  # always so in version 4, never in a text
         return read_matlab_4(content)
     if order is None:
         raise ValueError("it is no file of MATLAB's version 5 to 7, or 4")
-    found: dict[str, Any] = {}
+    variables: dict[str, Any] = {}
     for kind, element in _elements(content[128:], order, padded=False):
         most -= len(element)
         if kind == _COMPRESSED:
@@ -49,14 +49,14 @@ def read_matlab(content: bytes, most: int) -> dict[str, Any]:
             raise ValueError(f"it is damaged: a variable was to begin, not {kind}")
         parts = list(_elements(element, order))
         name, flags = _header(parts, order)
-        if name in found:
+        if name in variables:
             raise ValueError(f"it holds {name} twice")
-        if name:  # what objects consist of has none
+        if name:  # the parts of objects have none
             try:
-                found[name] = _matrix(name, flags, parts, order)
+                variables[name] = _matrix(name, flags, parts, order)
             except ValueError as error:
-                found[name] = error
-    return found
+                variables[name] = error
+    return variables
 
 
 def _unpacked(element: bytes, most: int) -> bytes:
@@ -73,13 +73,13 @@ def _unpacked(element: bytes, most: int) -> bytes:
 
 
 def _elements(content: bytes, order: str, padded: bool = True) -> Iterator[tuple[int, bytes]]:
-    """The type and the bytes of each element; those of variables are padded to 8 bytes."""
+    """The type and the bytes of each element; elements of variables are padded to 8 bytes."""
     place = 0
     while place < len(content):
         tag = content[place : place + 8].ljust(8, b"\0")
         kind, size = struct.unpack(f"{order}2I", tag)
         start = place + 8
-        if kind >> 16:  # a small one, with its bytes in the tag
+        if kind >> 16:  # a small element, with its bytes in the tag
             kind, size, start = kind & 0xFFFF, kind >> 16, place + 4
         end = start + size
         if end > len(content) or (start == place + 4 and size > 4):
@@ -89,16 +89,16 @@ def _elements(content: bytes, order: str, padded: bool = True) -> Iterator[tuple
 
 
 def _header(parts: list[tuple[int, bytes]], order: str) -> tuple[str, int]:
-    """The name of a variable, and its flags with its class."""
+    """The name of a variable, and its flags and class."""
     if len(parts) < 3 or len(parts[0][1]) != 8:
         raise ValueError("it is damaged: a variable lacks its header")
     flags = struct.unpack(f"{order}2I", parts[0][1])[0]
-    at = 1 if flags & 0xFF == _OPAQUE else 2  # which has no size
+    at = 1 if flags & 0xFF == _OPAQUE else 2  # an opaque object has no size
     return parts[at][1].decode("ascii", "backslashreplace"), flags
 
 
 def _of_bytes(data: bytes, begun: np.ndarray) -> bool:
-    """Whether the values of sparse columns, which begin at `begun`, have a byte each."""
+    """True if the values of sparse columns, which begin at `begun`, have one byte each."""
     count = int(begun[-1]) if len(begun) else 0
     return count <= len(data) < 8 * count
 
@@ -126,7 +126,7 @@ def _matrix(name: str, flags: int, parts: list[tuple[int, bytes]], order: str) -
         if not sparse:
             return arrays[1].reshape(shape, order="F")
         check_size(name, shape)
-        _, i, begun, values = arrays  # with room for more entries, which SciPy lets go
+        _, i, begun, values = arrays  # with room for more entries, which SciPy drops
         matrix = scipy.sparse.csc_array((values, i, begun), shape=shape)
         matrix.check_format(full_check=True)
         return matrix

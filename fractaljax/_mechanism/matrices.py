@@ -1,4 +1,4 @@
-"""The matrices of a structure: read, checked, summed, and in coordinates of unit mass."""
+"""The matrices of a structure: checked, summed, and transformed to unit mass."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -20,7 +20,7 @@ LARGEST_DENSE = 2000  # degrees of freedom; sparse matrices of more stay sparse
 
 
 class Sparse:
-    """A large sparse matrix of SciPy's, outside of JAX: two are the same if they are one object."""
+    """A large sparse matrix of SciPy's, outside of JAX; compared by identity."""
 
     def __init__(self, matrix: Any):
         self.matrix = matrix.tocsr()
@@ -29,11 +29,11 @@ class Sparse:
 class MatrixSum(eqx.Module):
     """A matrix as a sum of matrices (n, n), each times a coefficient: sum_i c_i(p) X_i.
 
-    Large sparse matrices are no leaves of the pytree: only a reduction can use them.
+    Large sparse matrices are not leaves of the pytree: only a reduction can use them.
     """
 
     arrays: tuple[Numbers, ...]
-    sparse: tuple[Sparse, ...] = eqx.field(static=True)  # in place of arrays, all or none
+    sparse: tuple[Sparse, ...] = eqx.field(static=True)  # in place of all arrays, or empty
     coefficients: tuple[Callable | None, ...] = eqx.field(static=True)  # None for 1
 
     @property
@@ -43,7 +43,7 @@ class MatrixSum(eqx.Module):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """That of the sum, with the axes of a batch before its two."""
+        """The shape of the sum, with batch axes before the two of the matrix."""
         return self.matrices[0].shape
 
     def at(self, p: Parameters) -> Any:
@@ -57,25 +57,25 @@ class MatrixSum(eqx.Module):
         return total
 
     def projected(self, left: np.ndarray, right: np.ndarray) -> "MatrixSum":
-        """left^T X right of every term, left and right (n, r)."""
+        """The sum with each X replaced by left^T X right, where left and right are (n, r)."""
         held = self.matrices if self.sparse else map(np.asarray, self.arrays)
         arrays = tuple(jnp.asarray(left.T @ (X @ right)) for X in held)
         return MatrixSum(arrays, (), self.coefficients)
 
 
 def matrix_sum(
-    name: str, given: Any, p: Parameters, fit: Callable[[str, MatrixLike], Any]
+    name: str, matrix: Any, p: Parameters, fit: Callable[[str, MatrixLike], Any]
 ) -> MatrixSum:
-    """A matrix, or a sequence of (coefficient, matrix), each matrix checked by `fit`.
+    """The sum from a matrix or a sequence of (coefficient, matrix), each matrix checked by `fit`.
 
-    A coefficient that is a number is multiplied in.
+    A numeric coefficient is multiplied into its matrix.
 
     **Raises:** as `fit` and `coefficient_of`, naming the term.
     """
-    terms = given if is_sum(given) else [(None, given)]
+    terms = matrix if is_sum(matrix) else [(None, matrix)]
     arrays, coefficients = [], []
     for i, (coefficient, X) in enumerate(terms, start=1):
-        term = f"{name}, term {i}" if terms is given else name
+        term = f"{name}, term {i}" if terms is matrix else name
         X = fit(term, X)
         if coefficient is not None:
             coefficient = coefficient_of(f"the coefficient of {term}", coefficient, p)
@@ -94,27 +94,27 @@ def matrix_sum(
     return MatrixSum(tuple(arrays), (), tuple(coefficients))
 
 
-def is_sum(given: Any) -> bool:
-    """Whether it is a sequence of (coefficient, matrix), and not a nested list of numbers."""
+def is_sum(value: Any) -> bool:
+    """True for a sequence of (coefficient, matrix), False for a nested list of numbers."""
 
     def is_matrix(x):
         if isinstance(x, (list, tuple)):
             return bool(x) and isinstance(x[0], (list, tuple))
         return len(getattr(x, "shape", ())) == 2
 
-    pairs = isinstance(given, Sequence) and not isinstance(given, str) and len(given) > 0
+    pairs = isinstance(value, Sequence) and not isinstance(value, str) and len(value) > 0
     return pairs and all(
-        isinstance(each, (list, tuple)) and len(each) == 2 and is_matrix(each[1]) for each in given
+        isinstance(each, (list, tuple)) and len(each) == 2 and is_matrix(each[1]) for each in value
     )
 
 
 def is_sparse(X: Any) -> bool:
-    """Whether it is a sparse matrix of SciPy's."""
+    """True if X is a sparse matrix of SciPy's."""
     return hasattr(X, "toarray")
 
 
 def array_of(name: str, value: MatrixLike) -> Numbers:
-    """A nested list, an array or a sparse matrix of SciPy's as an array of finite real numbers.
+    """An array of finite real numbers from a nested list, an array or a SciPy sparse matrix.
 
     **Raises:** `TypeError` for anything else; `ValueError` for NaN and infinity.
     """
@@ -135,7 +135,7 @@ def array_of(name: str, value: MatrixLike) -> Numbers:
 
 
 def square(name: str, value: MatrixLike) -> Float[Array, "n n"]:
-    """Like `array_of`, and a `ValueError` unless it is a square matrix."""
+    """As `array_of`, with a `ValueError` unless it is a square matrix."""
     array = array_of(name, value)
     if array.ndim != 2 or array.shape[0] != array.shape[1] or not array.size:
         raise ValueError(f"{name} must be a square matrix, got shape {array.shape}")
@@ -143,7 +143,7 @@ def square(name: str, value: MatrixLike) -> Float[Array, "n n"]:
 
 
 def fitting(name: str, value: MatrixLike, shape: tuple[int, ...]) -> Numbers:
-    """Like `array_of`, and a `ValueError` for another shape than the mass matrix demands."""
+    """As `array_of`, with a `ValueError` for any shape but the one that M demands."""
     array = array_of(name, value)
     if array.shape != shape:
         raise ValueError(f"{name} must have shape {shape} as M demands, got {array.shape}")
@@ -186,11 +186,11 @@ def require_mass_matrix(M: Any) -> None:
 def mass_matrix(M: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """M (n, n) made exactly symmetric.
 
-    **Raises:** `ValueError` unless M is symmetric to 1e-6 and positive definite; NaN if it is
-    traced.
+    **Raises:** `ValueError` unless M is symmetric to 1e-6 and positive definite; a traced M
+    becomes NaN instead.
     """
     values = concrete(M)
-    # NumPy's where nothing is traced: a program for each shape is slow to compile.
+    # NumPy unless M is traced: JAX would compile a program for each shape.
     X = M if isinstance(M, Tracer) else np.asarray(M)
     half = jnp.asarray((X + X.T) / 2)
     if values is None:
@@ -220,7 +220,7 @@ def mass_matrix(M: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def _least_pivot(unit) -> float:
-    """Of a mass matrix with ones on its diagonal, all digits of which are not lost."""
+    """The pivot of a unit-diagonal mass matrix at which all digits of the matrix are lost."""
     return len(unit) * float(np.finfo(unit.dtype).eps)
 
 

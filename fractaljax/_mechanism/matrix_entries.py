@@ -1,4 +1,4 @@
-"""Sparse matrices from the entries that text files give, of Abaqus and in Harwell-Boeing form."""
+"""Sparse matrices from text files of Abaqus and in Harwell-Boeing format."""
 
 import re
 from typing import Any
@@ -8,7 +8,7 @@ import numpy as np
 from .matrix_market import REAL, WHOLE, as_floats, numbers_of, refuse_line, wrong_line
 
 LARGEST = 1_000_000  # degrees of freedom
-_LARGEST_LABEL = 2**40  # of a node; its degree of freedom is below 2**20
+_LARGEST_LABEL = 2**40  # of a node; degrees of freedom are below 2**20
 _FORMAT = re.compile(rb"\((?:\d*P,?)?(\d*)([IEDFG])(\d+)(?:\.\d+(?:E\d+)?)?\)")
 _KINDS = {b"r": "real", b"i": "integer"}
 _SYMMETRIES = {b"u": 0, b"r": 0, b"s": 1, b"z": -1}  # rectangular, symmetric, skew
@@ -17,8 +17,8 @@ _SYMMETRIES = {b"u": 0, b"r": 0, b"s": 1, b"z": -1}  # rectangular, symmetric, s
 def assemble(name: str, shape: tuple[int, int], i: Any, j: Any, values: Any, mirror: int = 0):
     """The sparse matrix of `shape` with `values` (n,) in rows i and columns j, counted from 0.
 
-    `mirror` 1 makes a triangle symmetric and -1 skew. An entry that is given twice is refused, for
-    none of the formats says whether to add.
+    `mirror` 1 makes a triangle symmetric and -1 skew. Duplicate entries are refused, because
+    no format says whether to add them.
 
     **Raises:** `ValueError` naming the entry.
     """
@@ -46,7 +46,7 @@ def check_size(name: str, shape: tuple[int, ...]) -> None:
 
 
 def label_dofs(node: np.ndarray, dof: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
-    """The place (n,) of each (node, dof) among all of them in order, and the names "node.dof"."""
+    """The index (n,) of each (node, dof) in sorted order, and the names "node.dof"."""
     if max(np.abs(node).max(initial=0) / _LARGEST_LABEL, dof.max(initial=0) / 2**20) >= 1:
         raise ValueError("a node or a degree of freedom has too large a number")
     labels, place = np.unique(node * 2**20 + dof, return_inverse=True)
@@ -54,10 +54,10 @@ def label_dofs(node: np.ndarray, dof: np.ndarray) -> tuple[np.ndarray, tuple[str
 
 
 def read_abaqus(name: str, content: bytes):
-    """The matrix of an .mtx file of Abaqus, the names of its dofs, and whether it was mirrored.
+    """The matrix of an Abaqus .mtx file, the names of its dofs, and True if it was mirrored.
 
-    Lines of row node, dof, column node, dof and value (FORMAT=MATRIX INPUT and LABELS), or of row,
-    column and value (COORDINATE), which have no names.
+    Lines hold row node, dof, column node, dof and value (FORMAT=MATRIX INPUT and LABELS), or row,
+    column and value (COORDINATE), without names.
 
     **Raises:** `ValueError` with the line that is wrong.
     """
@@ -65,9 +65,9 @@ def read_abaqus(name: str, content: bytes):
     first = len((re.search(rb"\S[^\n]*", body) or [b""])[0].split())
     if first not in (3, 5):
         raise ValueError("it is neither a Matrix Market file nor a matrix of Abaqus")
-    wanted = ["row", "column"] if first == 3 else ["node", "dof", "node", "dof"]
+    labels = ["row", "column"] if first == 3 else ["node", "dof", "node", "dof"]
     whole = rb"\d{1,15}+" if first == 3 else rb"-?\d{1,15}+"  # internal nodes are negative
-    numbers = numbers_of(body, 0, [whole] * (first - 1) + [REAL], [*wanted, "number"])
+    numbers = numbers_of(body, 0, [whole] * (first - 1) + [REAL], [*labels, "number"])
     refuse_line(~np.isfinite(numbers[:, -1]), body, 0, "must be finite")
     index, values = numbers[:, :-1].astype(np.int64), numbers[:, -1]
     names = None
@@ -79,8 +79,8 @@ def read_abaqus(name: str, content: bytes):
         refuse_line((index[:, 1::2] < 0).any(axis=1), body, 0, "must have dofs from 0")
         place, names = label_dofs(index[:, ::2].T.ravel(), index[:, 1::2].T.ravel())
         (i, j), size = place.reshape(2, -1), len(names)
-    # The file does not say whether it gives one triangle. An unsymmetric matrix of finite elements
-    # is full on both sides of the diagonal, so a file without any pair gives a triangle.
+    # The file does not say whether it holds one triangle. An unsymmetric finite-element matrix
+    # has entries on both sides of the diagonal, so a file without any pair holds a triangle.
     off = i != j
     paired = np.isin(i[off] * size + j[off], j[off] * size + i[off]).any()
     mirrored = not paired and bool(off.any())
@@ -88,10 +88,10 @@ def read_abaqus(name: str, content: bytes):
 
 
 def read_harwell_boeing(name: str, content: bytes):
-    """The matrix of a Harwell-Boeing or Rutherford-Boeing file in ASCII; right sides are left out.
+    """The matrix of an ASCII Harwell-Boeing or Rutherford-Boeing file, without right-hand sides.
 
-    `scipy.io.hb_read` cannot serve: it refuses symmetric files and those with a right side, which
-    are what Ansys writes.
+    `scipy.io.hb_read` cannot serve: it refuses symmetric files and files with a right-hand side,
+    both of which Ansys writes.
 
     **Raises:** `ValueError` with the line that is wrong.
     """
@@ -110,14 +110,14 @@ def read_harwell_boeing(name: str, content: bytes):
     rows, columns, entries = map(int, sizes[:3])
     if int(cards[0]) + 4 > len(lines):
         raise ValueError(f"it ends after {len(lines)} lines of {int(cards[0]) + 4}")
-    start = 5 if len(cards) > 4 and int(cards[4]) else 4  # a line more for right sides
-    found = []
+    start = 5 if len(cards) > 4 and int(cards[4]) else 4  # one more line for right-hand sides
+    arrays = []
     for (each, letter, width), count in zip(formats, (columns + 1, entries, entries), strict=False):
         pattern = WHOLE if letter == b"I" else REAL
         layout = (int(each or 1), int(width))
         numbers, start = fixed_fields(lines, start, count, layout, pattern)
-        found.append(numbers)
-    pointers, index, values = found
+        arrays.append(numbers)
+    pointers, index, values = arrays
     steps = np.diff(pointers)
     if pointers[0] != 1 or (steps < 0).any() or pointers[-1] != entries + 1:
         raise ValueError("its column pointers are damaged")
@@ -132,9 +132,9 @@ def read_harwell_boeing(name: str, content: bytes):
 def fixed_fields(
     lines: list[bytes], start: int, count: int, layout: tuple[int, int], pattern: bytes = REAL
 ) -> tuple[np.ndarray, int]:
-    """`count` numbers (count,) from the lines from `start` on, and where the next line is.
+    """`count` numbers (count,) from the lines from `start` on, and the index of the next line.
 
-    `layout` is how many there are in a line and how wide each is, for they need not stand apart.
+    `layout` is the number of fields per line and their width; fields may touch.
     """
     each, width = layout
     if not each * width:
@@ -144,9 +144,9 @@ def fixed_fields(
         raise ValueError(f"it ends before {count} numbers from line {start + 1} on")
     used = [line.rstrip() for line in lines[start:after]]
     text = b"\n".join(used)
-    apart = rb"(?m)^(?![^\S\n]*+(?:" + pattern + rb"(?:[^\S\n]++|$))*+$)"
-    # SciPy writes fields that stand apart but are narrower than it says.
-    if not re.search(apart, text) and len(values := as_floats(text)) == count:
+    not_separated = rb"(?m)^(?![^\S\n]*+(?:" + pattern + rb"(?:[^\S\n]++|$))*+$)"
+    # SciPy writes separated fields that are narrower than declared.
+    if not re.search(not_separated, text) and len(values := as_floats(text)) == count:
         return values, after
     for number, line in enumerate(used, start + 1):
         if len(line) > each * width:

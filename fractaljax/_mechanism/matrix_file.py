@@ -1,4 +1,4 @@
-"""Matrices of finite-element models in the files that the programs write."""
+"""Matrices of finite-element models from the files of several programs."""
 
 import bz2
 import dataclasses
@@ -21,7 +21,7 @@ from .matrix_entries import LARGEST, assemble, check_size, read_abaqus, read_har
 from .matrix_market import BANNER, read_entries
 from .nastran import read_dmig, read_op4
 
-_MOST = 2**30  # bytes of a file, unpacked
+_MOST = 2**30  # bytes of an unpacked file
 _PACKED = {".gz": gzip.open, ".bz2": bz2.open}
 _COMPLEX = re.compile("must be real numbers, got .*complex")
 _DAMPING = (
@@ -31,7 +31,7 @@ _DAMPING = (
 
 
 class _ByName(dict[str, Any]):
-    """Matrices by name; asking for one that could not be read says why."""
+    """Matrices by name; the name of an unreadable one raises the reason."""
 
     def __init__(self, matrices: dict[str, Any], file: str, unread: dict[str, str]):
         super().__init__(matrices)
@@ -47,12 +47,12 @@ class _ByName(dict[str, Any]):
 class Matrices:
     """Matrices by name, in float64, and the names of their degrees of freedom if a file has them.
 
-    Each is a `scipy.sparse.csr_array`, square (n, n) or one column (n, 1) of a load. Only those of
-    Nastran may have another shape, for it writes matrices to recover results beside them.
+    Each is a `scipy.sparse.csr_array`, square (n, n), or a load of one column (n, 1). Only Nastran
+    matrices may have another shape, because it also writes matrices for recovering results.
 
-    `unread` says by name why something else in the file is no such matrix; `matrices[name]` raises
-    that as a `ValueError`. `mirrored` names those of which the file gives one triangle, without
-    saying that they are symmetric.
+    `unread` says by name why another item of the file is no such matrix; `matrices[name]` raises
+    that as a `ValueError`. `mirrored` names matrices of which the file holds one triangle without
+    declaring them symmetric.
     """
 
     matrices: dict[str, Any]
@@ -62,7 +62,7 @@ class Matrices:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was done that the file does not ask for, in a line each."""
+        """Changes that the file does not ask for, one line each."""
         said = "{} has entries in one triangle only, which was mirrored as of a symmetric matrix"
         return tuple(said.format(name) for name in self.mirrored)
 
@@ -80,19 +80,19 @@ def read_matrices(path: str | os.PathLike) -> Matrices:
 
     `.npz`: one sparse matrix of `scipy.sparse.save_npz`, or arrays of `numpy.savez`. `.mat`: MATLAB
     version 4 to 7. `.mtx`: Matrix Market, or Abaqus (*MATRIX OUTPUT). `.op4`: OUTPUT4 of Nastran.
-    `.pch`, `.bdf`, `.dat`: its DMIG cards. `.hb`, `.rb`, `.rua`, `.rsa`, `.matrix`: Harwell-Boeing
-    in ASCII, which Ansys writes with HBMAT. Each may be compressed as .gz or .bz2. A single matrix
-    has the name of its file. Symmetric matrices are filled. Matrices of Abaqus and DMIG cards have
-    names of degrees of freedom, "node.dof", in order. At most 1 GiB and 1000000 degrees of freedom
-    are read.
+    `.pch`, `.bdf`, `.dat`: DMIG cards of Nastran. `.hb`, `.rb`, `.rua`, `.rsa`, `.matrix`:
+    Harwell-Boeing in ASCII, which Ansys writes with HBMAT. Each may be compressed as .gz or .bz2.
+    A single matrix is named after its file. Symmetric matrices are filled. Matrices of Abaqus and
+    DMIG cards come with sorted names of degrees of freedom, "node.dof". At most 1 GiB and 1000000
+    degrees of freedom are read.
 
-    A matrix that is complex, not finite, or neither square nor one column, of Nastran's rectangular
-    ones excepted, and text or a cell array of MATLAB do not disturb the others: `unread` says why.
+    A matrix that is complex, not finite, or neither square nor one column (except rectangular ones
+    of Nastran), and text or a cell array of MATLAB leave the others readable: `unread` says why.
     Abaqus does not say whether it writes one triangle: `mirrored` names matrices that were filled
-    because no entry has its mirror image.
+    because no entry has a mirror image.
 
-    **Raises:** `OSError` if the file cannot be read; `ValueError` in a line that begins with its
-    name for a format that is unknown or damaged, and if nothing in it is a matrix as above.
+    **Raises:** `OSError` if the file cannot be read; `ValueError`, one line that begins with the
+    file name, for an unknown format, a damaged file, and a file without a matrix as above.
     """
     path = Path(path)
     packed = path.suffix.lower() if path.suffix.lower() in _PACKED else ""
@@ -103,14 +103,14 @@ def read_matrices(path: str | os.PathLike) -> Matrices:
             raise ValueError(f"of unknown format; known are {', '.join(_READERS)}, .gz and .bz2")
         content = read_bounded(path, _MOST)
         unpacked = _unpacked(content, packed) if packed else content
-        found, names, *mirrored = reader(inner.stem, unpacked)
-        if not found:
+        candidates, names, *mirrored = reader(inner.stem, unpacked)
+        if not candidates:
             raise ValueError("it holds no matrix")
-        matrices, unread = _sorted(found, any_shape=reader in (_op4, _dmig))
+        matrices, unread = _sorted(candidates, any_shape=reader in (_op4, _dmig))
         if not matrices:
             raise ValueError("; ".join(unread.values()))
         by_name = _ByName(matrices, path.name, unread)
-        return Matrices(by_name, names, unread, tuple(found) if any(mirrored) else ())
+        return Matrices(by_name, names, unread, tuple(candidates) if any(mirrored) else ())
     except ValueError as error:
         raise ValueError(f"{path.name}: {error}") from None
 
@@ -126,10 +126,10 @@ def _unpacked(content: bytes, packed: str) -> bytes:
     return content
 
 
-def _sorted(found: dict[str, Any], any_shape: bool) -> tuple[dict[str, Any], dict[str, str]]:
-    """The sound matrices among what was found, and by name why the others are not."""
+def _sorted(candidates: dict[str, Any], any_shape: bool) -> tuple[dict[str, Any], dict[str, str]]:
+    """The valid matrices, and by name the reason why each other candidate is invalid."""
     matrices, unread = {}, {}
-    for name, value in found.items():
+    for name, value in candidates.items():
         try:
             if isinstance(value, ValueError):
                 raise value
@@ -141,7 +141,7 @@ def _sorted(found: dict[str, Any], any_shape: bool) -> tuple[dict[str, Any], dic
 
 
 def _sound(name: str, value: Any, any_shape: bool):
-    """A matrix, dense or sparse, as a checked sparse one in float64."""
+    """A checked sparse matrix in float64 from a dense or sparse one."""
     import scipy.sparse
 
     if value.dtype.kind not in "iufb":
@@ -153,12 +153,12 @@ def _sound(name: str, value: Any, any_shape: bool):
     if value.ndim != 2 or not fits:
         raise ValueError(f"{name} must be square or one column, got shape {shape}")
     check_size(name, value.shape)
-    with np.errstate(over="ignore"):  # of numbers that are longer than 64 bits
+    with np.errstate(over="ignore"):  # numbers may be longer than 64 bits
         matrix = scipy.sparse.csr_array(value, dtype=np.float64)
     if not np.isfinite(matrix.data).all():
         raise ValueError(f"{name} must be finite")
-    matrix.sum_duplicates()  # which is what SciPy means by an entry given twice
-    matrix.eliminate_zeros()  # OUTPUT4 and others write columns dense
+    matrix.sum_duplicates()  # SciPy adds duplicate entries
+    matrix.eliminate_zeros()  # OUTPUT4 and others write dense columns
     return matrix
 
 
@@ -188,7 +188,7 @@ def _npz(stem: str, content: bytes):
         if kind in ("csr", "csc", "bsr"):
             matrix.check_format(full_check=True)
         return {stem: matrix}, None
-    except Exception as error:  # each constructor has its own kind
+    except Exception as error:  # each constructor raises its own kind
         raise ValueError(f"it is no sound file of SciPy's save_npz: {one_line(error)}") from None
 
 
@@ -205,7 +205,7 @@ def _mtx(stem: str, content: bytes):
     if banner[: len(BANNER)].lower() != BANNER.lower():
         matrix, names, mirrored = read_abaqus(stem, content)
         return {stem: matrix}, names, mirrored
-    # Blank lines go behind the banner, where they are allowed: all lines keep their numbers.
+    # Blank lines move behind the banner, where they are allowed; line numbers are kept.
     blank = content[: len(content) - len(banner)].count(b"\n")
     content = banner.replace(b"\n", b"\n" * (1 + blank), 1)
     shape, i, j, values = read_entries(io.BytesIO(content), LARGEST, _MOST)

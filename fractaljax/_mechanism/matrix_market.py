@@ -17,9 +17,9 @@ _WORDS = {
     "field": ("real", "double", "integer", "complex"),
     "symmetry": ("general", "symmetric", "skew-symmetric", "hermitian"),
 }
-MOST_DENSE = 16_000_000  # numbers of a matrix that is given dense
-_PIECE = 2**22  # bytes of text turned into numbers at a time
-# As C and Fortran write them: 1, -1.5, .5, 1e6, 1.0D+06, and 1.0+100 for want of room.
+MOST_DENSE = 16_000_000  # numbers of a matrix in the dense format
+_PIECE = 2**22  # bytes of text converted at a time
+# Numbers of C and Fortran: 1, -1.5, .5, 1e6, 1.0D+06, and 1.0+100 in narrow fields.
 REAL = rb"[+-]?(?:\d++\.?\d*+|\.\d++)(?:[eEdDqQ][+-]?\d++|[+-]\d++)?"
 WHOLE = rb"[+-]?\d++"
 
@@ -27,9 +27,9 @@ WHOLE = rb"[+-]?\d++"
 def read_matrix_market(file: BinaryIO, largest: int) -> np.ndarray:
     """The matrix (rows, columns) of an open file, complex only if a number has an imaginary part.
 
-    At most `largest` rows and columns, checked before any memory is taken for them.
+    It has at most `largest` rows and columns, checked before memory is allocated.
 
-    **Raises:** `ValueError` to follow the name of the file, with the line that is wrong.
+    **Raises:** `ValueError`, to be put after the file name, with the line that is wrong.
     """
     shape, i, j, values = read_entries(file, largest, 32 * largest**2)
     matrix = np.zeros(shape, values.dtype)
@@ -42,10 +42,10 @@ def read_entries(
 ) -> tuple[tuple[int, int], np.ndarray, np.ndarray, np.ndarray]:
     """The shape, the rows and columns from 0, and the values of the entries of an open file.
 
-    Like `read_matrix_market`, of at most `most` bytes. Both triangles of a symmetric matrix are
-    given, and no entry twice.
+    As `read_matrix_market`, for at most `most` bytes. Both triangles of a symmetric matrix are
+    returned, and no entry twice.
     """
-    start = file.read(len(BANNER))  # alone: /dev/zero never ends
+    start = file.read(len(BANNER))  # only this much: /dev/zero never ends
     text = file.read(most + 1) if start.lower() == BANNER.lower() else b""
     if len(text) > most:
         raise ValueError(f"is larger than {most / 1e6:g} MB")
@@ -53,17 +53,17 @@ def read_entries(
     words = header[1].decode("ascii", "replace").lower().split() if header else []
     if header is None or len(words) != len(_WORDS):
         raise ValueError("is not a Matrix Market file: it does not begin with %%MatrixMarket")
-    for (name, known), word in zip(_WORDS.items(), words, strict=True):
-        if word not in known:
-            raise ValueError(f"line 1 must have the {name} {' or '.join(known)}, got {word!r}")
+    for (name, allowed), word in zip(_WORDS.items(), words, strict=True):
+        if word not in allowed:
+            raise ValueError(f"line 1 must have the {name} {' or '.join(allowed)}, got {word!r}")
     _, layout, field, symmetry = words
     before = header[2].count(b"\n") + 2  # lines of the header
     columns = ["row", "column"] * (layout == "coordinate")
     shape, count = _size(header[3], before, bool(columns), symmetry, largest)
     parts = 2 if field == "complex" else 1
     tokens = [rb"\d++"] * len(columns) + [WHOLE if field == "integer" else REAL] * parts
-    wanted = columns + ["number"] * parts
-    numbers = numbers_of(body := text[header.end() :], before, tokens, wanted)
+    labels = columns + ["number"] * parts
+    numbers = numbers_of(body := text[header.end() :], before, tokens, labels)
     late = np.arange(len(numbers)) >= count
     refuse_line(late, body, before, f"must not be there, after all of {count} numbers")
     if len(numbers) < count:
@@ -96,10 +96,10 @@ def read_entries(
 def _size(
     line: bytes, number: int, coordinates: bool, symmetry: str, largest: int
 ) -> tuple[tuple[int, int], int]:
-    """The shape, and how many numbers the file gives."""
-    wanted, sizes = 3 if coordinates else 2, line.split()
-    if len(sizes) != wanted or not all(re.fullmatch(rb"\d{1,15}", size) for size in sizes):
-        raise wrong_line(number, line, f"must have the {wanted} whole numbers of the size")
+    """The shape, and the number of entries in the file."""
+    count, sizes = 3 if coordinates else 2, line.split()
+    if len(sizes) != count or not all(re.fullmatch(rb"\d{1,15}", size) for size in sizes):
+        raise wrong_line(number, line, f"must have the {count} whole numbers of the size")
     rows, columns, *entries = map(int, sizes)
     if max(rows, columns) > largest:
         raise ValueError(f"holds {rows} x {columns} numbers; reduce the model to {largest} at most")
@@ -115,24 +115,24 @@ def _size(
     return (rows, columns), entries[0] if entries else most
 
 
-def numbers_of(body: bytes, before: int, tokens: list[bytes], wanted: list[str]) -> np.ndarray:
-    """The numbers (lines, tokens) of the lines that are not blank, each checked as a text.
+def numbers_of(body: bytes, before: int, tokens: list[bytes], labels: list[str]) -> np.ndarray:
+    """The numbers (lines, tokens) of the lines that are not blank, each checked as text.
 
-    `tokens` are the patterns of the numbers of a line, `wanted` what to call them, and `before`
-    the lines of the file before `body`.
+    `tokens` are the patterns of the numbers of a line, `labels` their names in messages, and
+    `before` is the number of lines of the file before `body`.
     """
     line = rb"[^\S\n]++".join(tokens)
     bad = re.compile(rb"^(?![^\S\n]*+(?:" + line + rb")?[^\S\n]*+$).*", re.MULTILINE).search(body)
     if bad:
         number = before + body.count(b"\n", 0, bad.start()) + 1
-        raise wrong_line(number, bad[0], f"must be '{' '.join(wanted)}' and nothing else")
+        raise wrong_line(number, bad[0], f"must be '{' '.join(labels)}' and nothing else")
     return as_floats(body).reshape(-1, len(tokens))
 
 
 def as_floats(text: bytes) -> np.ndarray:
     """Numbers between blanks that match `REAL`, as floats (n,)."""
     pieces, start = [np.empty(0)], 0
-    while start < len(text):  # in pieces, for the texts of numbers take ten times their memory
+    while start < len(text):  # in pieces: split text takes ten times the memory
         end = text.find(b"\n", start + _PIECE) % (len(text) + 1)  # -1 is the end
         plain = text[start:end].translate(bytes.maketrans(b"dDqQ", b"eeee"))
         plain = re.sub(rb"[+-](?<=[\d.][+-])", rb"e\g<0>", plain)
@@ -142,7 +142,7 @@ def as_floats(text: bytes) -> np.ndarray:
 
 
 def refuse_line(wrong: Any, body: bytes, before: int, what: str) -> None:
-    """Refuse the first line of `body`, blank ones not counted, of which `wrong` is true."""
+    """Refuse the first line of `body`, not counting blank ones, for which `wrong` is true."""
     if wrong.any():
         lines = enumerate(body.split(b"\n"), before + 1)
         number, line = [(n, line) for n, line in lines if line.strip()][wrong.argmax()]

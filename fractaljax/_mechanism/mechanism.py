@@ -1,4 +1,4 @@
-"""What a `Scene` and a `Structure` have in common: named quantities, and a TOML file."""
+"""Common base of `Scene` and `Structure`: named quantities and a TOML file."""
 
 import abc
 import os
@@ -15,31 +15,31 @@ class Mechanism(Part):
 
     @abc.abstractmethod
     def _rebuilt(self, changes: dict[str, Any]) -> Self:
-        """A checked copy with those of the changes that apply."""
+        """A checked copy with the applicable changes."""
 
     @abc.abstractmethod
     def _known(self) -> list[str]:
         """The names that `replace` takes."""
 
     def replace(self, **changes: Any) -> Self:
-        """A copy with named quantities changed wherever they live: `replace(D=2.5, mu_s=0.3)`.
+        """A copy with named quantities of any part changed: `replace(D=2.5, mu_s=0.3)`.
 
-        Whole parts have names as well: `replace(friction=Coulomb(0.4))`. A quantity given beside
-        the part that holds it is changed in the new part. Of a structure, M, C, K and F can be
-        replaced; `replace(D=2.5)` changes every joint that has a D, and
-        `replace(**{"left.D": 2.5})` the joint named left, also beside a D for all.
+        Whole parts have names as well: `replace(friction=Coulomb(0.4))`. A quantity passed together
+        with the part that holds it is changed in the new part. For a structure, M, C, K and F can
+        be replaced; `replace(D=2.5)` changes every joint that has a D, and
+        `replace(**{"left.D": 2.5})` the joint named left, also together with a D for all.
 
-        Under a trace (`jit`, `vmap`) a value outside its domain becomes NaN, and with it all that
-        depends on it.
+        Under a trace (`jit`, `vmap`) a value outside its domain becomes NaN, and so do all results
+        that depend on it.
 
         **Raises:** `ValueError` for a name unknown after the change, listing the known ones, and
-        for values outside their domain that are known.
+        for concrete values outside their domain.
         """
         new = self._rebuilt(changes)
         for name in changes:
             if name not in new._known():
-                kind, known = type(self).__name__.lower(), ", ".join(new._known())
-                raise ValueError(f"{kind} has no quantity {name!r}; it has {known}")
+                kind, listed = type(self).__name__.lower(), ", ".join(new._known())
+                raise ValueError(f"{kind} has no quantity {name!r}; it has {listed}")
         return new
 
     @classmethod
@@ -52,7 +52,7 @@ class Mechanism(Part):
         """Read a TOML file, as `save` writes it; docs/model.md has the keys of a structure.
 
         **Raises:** `OSError` if a file cannot be read; `ValueError` naming the file and the key
-        for anything unknown, missing, ill-fitting or outside its domain.
+        for an entry that is unknown, missing, ill-fitting or outside its domain.
         """
         with naming(path):
             return cls._from_document(read_toml(read_bounded(path)), Path(path).parent)

@@ -1,4 +1,4 @@
-"""Where the degrees of freedom of a structure are, for pictures of its motion."""
+"""Positions of the degrees of freedom of a structure, for pictures of its motion."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -11,13 +11,14 @@ _KEYS = ("points", "dofs", "cells")
 
 
 class Mesh:
-    """Places of nodes and the cells between them; two are the same if their numbers are.
+    """Nodes and the cells between them; meshes with equal arrays are equal.
 
-    `points` (nodes, 2) or (nodes, 3) [m] are the places, `dofs`, of the same shape, the degree of
-    freedom of each displacement, -1 where it is held, and `cells` (cells, 3) or (cells, 4) the
-    nodes of triangles or quadrilaterals, of a solid the outer ones.
+    `points` (nodes, 2) or (nodes, 3) [m] are the positions of the nodes. `dofs`, of the same
+    shape, is the degree of freedom of each displacement, or -1 where it is fixed. `cells`
+    (cells, 3) or (cells, 4) are the nodes of triangles or quadrilaterals, on the surface if the
+    body is solid.
 
-    **Raises:** `ValueError` for other shapes, and numbers of nodes that are not there.
+    **Raises:** `ValueError` for other shapes, and for indices of nodes that do not exist.
     """
 
     points: Float[np.ndarray, "nodes dim"]
@@ -47,7 +48,7 @@ class Mesh:
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, Any], name: str) -> "Mesh":
-        """That in the arrays of a file. **Raises:** `ValueError` calling it `name`."""
+        """The mesh in the arrays of a file. **Raises:** `ValueError` naming the file `name`."""
         if missing := [key for key in _KEYS if key not in arrays]:
             raise ValueError(f"{name} lacks {', '.join(missing)}: a mesh is {', '.join(_KEYS)}")
         try:
@@ -56,21 +57,21 @@ class Mesh:
             raise ValueError(f"{name}: {error}") from None
 
     def require(self, n: int) -> "Mesh":
-        """Itself. **Raises:** `ValueError` unless its degrees of freedom are among n."""
+        """The mesh itself. **Raises:** `ValueError` unless its degrees of freedom are below n."""
         _require_whole("dofs", self.dofs, -1, n)
         return self
 
     def arrays(self) -> dict[str, Any]:
-        """points, dofs and cells by name, as the functions in `plot` take them."""
+        """The arrays points, dofs and cells by name, as the functions in `plot` take them."""
         return {key: getattr(self, key) for key in _KEYS}
 
     @property
     def solid(self) -> bool:
-        """Whether it is drawn in space."""
+        """True if the mesh is three-dimensional."""
         return self.points.shape[1] == 3
 
     def displacements(self, x: Shaped[np.ndarray, "*k n"]) -> Shaped[np.ndarray, "*k nodes dim"]:
-        """Of the nodes, from those of all degrees of freedom."""
+        """Displacements of the nodes from the displacements x of all degrees of freedom."""
         return np.where(self.dofs < 0, 0, x[..., self.dofs])
 
     def __eq__(self, other) -> bool:

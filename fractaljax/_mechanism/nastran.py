@@ -1,6 +1,6 @@
 """Matrices of Nastran: OUTPUT4 files, in binary or text, and DMIG cards.
 
-pyNastran cannot serve: its releases up to 1.4.1 demand NumPy below 2.
+pyNastran cannot serve: its releases up to 1.4.1 require NumPy below 2.
 """
 
 import re
@@ -13,17 +13,17 @@ import numpy as np
 from .matrix_entries import assemble, check_size, fixed_fields, label_dofs
 from .matrix_market import REAL, as_floats, wrong_line
 
-# The first record, of 24 bytes, has words of 4 bytes, and one of 48 has words of 8.
+# A first record of 24 bytes has words of 4 bytes, and one of 48 bytes has words of 8.
 _WORDS = {struct.pack(f"{order}i", 6 * wide): f"{order}{wide}" for order in "<>" for wide in (4, 8)}
 _OP4_FORMAT = re.compile(r"(?:1P,?)?(\d+)[ED](\d+)\.\d+(?:E\d+)?(?:\|I16)?")
-_Column = tuple[int, int, np.ndarray]  # its number, its first row, both from 1, and its values
+_Column = tuple[int, int, np.ndarray]  # number and first row, both from 1, and values
 
 
 def read_op4(content: bytes) -> dict[str, Any]:
     """The sparse matrices of an OUTPUT4 file by their names.
 
-    Symmetric ones are full in such a file. A `ValueError` stands in the place of a matrix that is
-    complex, too large or unsound.
+    Such a file holds symmetric matrices in full. A matrix that is complex, too large or damaged is
+    returned as a `ValueError`.
 
     **Raises:** `ValueError` with the line or the matrix that is wrong.
     """
@@ -36,17 +36,17 @@ def read_op4(content: bytes) -> dict[str, Any]:
         try:
             pieces = list(columns)
             matrices[name] = unfit or _of_columns(name, shape, pieces)
-        except ValueError as error:  # whatever follows cannot be found
+        except ValueError as error:  # the rest of the file cannot be located
             raise (unfit or error) from None
     return matrices
 
 
 def _unfit(name: str, shape: tuple[int, int], kind: int) -> ValueError | None:
-    """Why a matrix cannot be had, by its first record."""
+    """The reason why a matrix cannot be read, from its first record."""
     try:
         if kind not in (1, 2):
-            known = "complex ones" if kind in (3, 4) else "of 1 to 4"
-            raise ValueError(f"{name} must be real numbers, got type {kind}, {known}")
+            remark = "complex ones" if kind in (3, 4) else "of 1 to 4"
+            raise ValueError(f"{name} must be real numbers, got type {kind}, {remark}")
         check_size(name, shape)
     except ValueError as error:
         return error
@@ -54,7 +54,7 @@ def _unfit(name: str, shape: tuple[int, int], kind: int) -> ValueError | None:
 
 
 def _of_columns(name: str, shape: tuple[int, int], pieces: list[_Column]) -> Any:
-    """The sparse matrix of its columns, or the `ValueError` that it is damaged."""
+    """The sparse matrix from its columns, or the `ValueError` that it is damaged."""
     number, first = (np.array([piece[k] for piece in pieces], int) for k in (0, 1))
     length = np.array([len(piece[2]) for piece in pieces], int)
     begun = np.cumsum(length) - length
@@ -92,7 +92,7 @@ def _binary_columns(records, columns: int, big: bool, real: str, word: str) -> I
     for record in records:
         words = np.frombuffer(record, f"{word[0]}u{wide}", len(record) // wide)
         if len(words) > 3 and words[0] > columns:
-            return  # its length need not fit: it is a column that is none
+            return  # the end mark, of any length
         if len(words) < 3 or len(record) != (3 + int(words[2])) * wide:
             raise damaged
         column, row, end = int(words[0]), int(words[1]), len(words)
@@ -136,9 +136,9 @@ def _text(content: bytes) -> Iterator[tuple[str, tuple[int, int], int, Any]]:
             raise wrong_line(at[0] + 1, lines[at[0]], "must begin a matrix of an OUTPUT4 file")
         columns, rows, _, kind = map(int, head)
         at[0] += 1
-        found = _text_columns(lines, at, columns, rows < 0, kind, (int(layout[1]), int(layout[2])))
+        pieces = _text_columns(lines, at, columns, rows < 0, kind, (int(layout[1]), int(layout[2])))
         name = _name(line[2 * wide + 16 : 2 * wide + 24].encode())
-        yield name, (abs(rows), columns), kind, found
+        yield name, (abs(rows), columns), kind, pieces
 
 
 def _text_columns(
@@ -147,21 +147,21 @@ def _text_columns(
     per_number = 2 if kind in (2, 4) else 1  # words
 
     def whole(count: int) -> list[int]:
-        """The `count` whole numbers in the next line."""
+        """The `count` integers in the next line."""
         if at[0] >= len(lines):
             raise ValueError("it ends within a matrix")
-        found, at[0] = lines[at[0]].split(), at[0] + 1
-        if len(found) != count or not all(re.fullmatch(rb"\d{1,15}", x) for x in found):
+        fields, at[0] = lines[at[0]].split(), at[0] + 1
+        if len(fields) != count or not all(re.fullmatch(rb"\d{1,15}", x) for x in fields):
             raise wrong_line(at[0], lines[at[0] - 1], f"must have {count} whole numbers")
-        return [int(x) for x in found]
+        return [int(x) for x in fields]
 
     while True:
         column, row, words = whole(3)
         if column > columns:
-            at[0] += 1  # the number of the column that is none
+            at[0] += 1  # skip the number of the end mark
             return
         while words:
-            first, length = row, words  # of a dense column: numbers, not words
+            first, length = row, words  # in a dense column, numbers rather than words
             if not row:
                 length, first = whole(2) if big else divmod(whole(1)[0], 2**16)
                 words -= length + big
@@ -183,9 +183,9 @@ def _name(text: bytes) -> str:
 def read_dmig(content: bytes):
     """The sparse matrices in DMIG cards by their names, and the names of the degrees of freedom.
 
-    Other cards are left out. All matrices have the degrees of freedom of any of them, a scalar
-    point's being component 0; a rectangular matrix keeps its own columns. A `ValueError` stands in
-    the place of a complex one, whose degrees of freedom do not count.
+    Other cards are ignored. All matrices share the degrees of freedom that occur in any of them; a
+    scalar point has component 0, and a rectangular matrix keeps its own columns. A complex matrix
+    is returned as a `ValueError`, and its degrees of freedom are ignored.
 
     **Raises:** `ValueError` with the line that is wrong.
     """
@@ -251,16 +251,18 @@ def _dmig_matrices(heads, entries):
         if form in (1, 6):
             j = place[begun : (begun := begun + len(i))]
         else:
-            j, own = label_dofs(*index[name][2:])
-            width = columns if form == 9 and columns else len(own)
-            if len(own) > width:
-                raise ValueError(f"{name} has {len(own)} columns, {width} by its first card")
+            j, column_names = label_dofs(*index[name][2:])
+            width = columns if form == 9 and columns else len(column_names)
+            if len(column_names) > width:
+                raise ValueError(
+                    f"{name} has {len(column_names)} columns, {width} by its first card"
+                )
         matrices[name] = assemble(name, (len(names), width), i, j, values[name], int(form == 6))
     return matrices, names
 
 
 def _cards(content: bytes) -> Iterator[tuple[int, bytes, list[str]]]:
-    """The line number, first line and fields from the second on of each DMIG card."""
+    """The line number, the first line and the fields from the second on of each DMIG card."""
     card = None
     for number, line in enumerate(content.split(b"\n"), 1):
         text = line.decode("latin-1").split("$")[0].expandtabs(8).rstrip()

@@ -9,9 +9,9 @@ from .._friction import Friction
 
 
 class Oscillator(Part):
-    """A mass on springs and dampers in two directions, pressed on a belt by F under 45 degrees.
+    """A mass on springs and dampers in two directions, pressed on a belt by F at 45 degrees.
 
-    K_i = m omega_i^2 and C_i = 2 xi_i omega_i m, without the contact.
+    Without the contact, K_i = m omega_i^2 and C_i = 2 xi_i omega_i m.
 
     **Raises:** `ValueError` unless m, omega_1, omega_2, V > 0, xi_1, xi_2 >= 0 and F is finite.
     """
@@ -64,7 +64,7 @@ def equilibrium(
     mu: ArrayLike,
     P: ArrayLike | None = None,
 ) -> tuple[Numbers, Numbers]:
-    """Eq. 40 as the linear system it comes from: the static displacements (x_01, x_02) [m].
+    """The static displacements (x_01, x_02) [m] of Eq. 40, from its linear system.
 
     [[K_1 + K_t, -mu K_n], [mu K_t, K_2 + K_n]] x_0 = [F, -F]/sqrt(2); its determinant is positive.
     `P` [N] is the load of a preloaded joint, whose friction mu P is added to the first component.
@@ -86,7 +86,7 @@ def static_displacements(
     P: ArrayLike | None = None,
 ) -> tuple[Numbers, Numbers]:
     """As `equilibrium`, without checks."""
-    # In flexibilities: the determinant and its square leave the range of a float32.
+    # In flexibilities, because the determinant and its square leave the range of a float32.
     r_1 = 1 / (oscillator.m * oscillator.omega_1**2 + K_t)
     r_2 = 1 / (oscillator.m * oscillator.omega_2**2 + K_n)
     n, t = mu * K_n * r_2, mu * K_t * r_1
@@ -101,10 +101,10 @@ def static_displacements(
 def static_normal_force(
     oscillator: Oscillator, K_n: ArrayLike, K_t: ArrayLike, mu: ArrayLike, P: ArrayLike
 ) -> Array:
-    """P + K_n x_02 [N] of a preloaded joint at its equilibrium, at most 0 where it is open.
+    """P + K_n x_02 [N] of a preloaded joint at its equilibrium, at most 0 if it is open.
 
     With r_i the flexibilities 1/(K_1 + K_t) and 1/(K_2 + K_n) it is
-    [P - K_n r_2 (1 + mu K_t r_1) F/sqrt(2)]/(1 + mu^2 K_n K_t r_1 r_2), which loses no digits.
+    [P - K_n r_2 (1 + mu K_t r_1) F/sqrt(2)]/(1 + mu^2 K_n K_t r_1 r_2), without loss of digits.
     """
     r_1 = 1 / (oscillator.m * oscillator.omega_1**2 + K_t)
     r_2 = 1 / (oscillator.m * oscillator.omega_2**2 + K_n)
@@ -122,12 +122,13 @@ def linearise(
     P: ArrayLike | None = None,
     static: tuple[Array, Array] | None = None,
 ) -> Linearised:
-    """Eq. 43 about the equilibrium, at sliding velocity V; with the friction law's slope if asked.
+    """Eq. 43 about the equilibrium at sliding velocity V, optionally with the friction slope.
 
     The slope adds mu'(V) N_0/m to the damping of direction 1 and -mu'(V) K_t x_01/m to that of
-    direction 2, where N_0 is K_n x_02, or P + K_n x_02 of a joint with the preload P; or `static`
-    is (x_01, N_0), and K_n the slope of the load curve there. A law without slope traces neither of
-    them, nor the equilibrium, but for a preload: where N_0 <= 0 the joint is open, and c_1 is NaN.
+    direction 2, where N_0 is K_n x_02, or P + K_n x_02 for a joint with the preload P. Instead,
+    `static` may hold (x_01, N_0), with K_n the slope of the load curve there. A law without slope
+    traces neither these terms nor the equilibrium, except with a preload: where N_0 <= 0 the joint
+    is open, and c_1 is NaN.
     """
     m, V = oscillator.m, oscillator.V
     mu = friction.mu(V) if friction.velocity_dependent else friction.mu_s
@@ -159,12 +160,12 @@ def linearise(
 def dimensionless(lin: Linearised) -> tuple[Float[Array, ""], Linearised]:
     """omega = sqrt(a + b), and the system in its units: no power leaves the range of a float32.
 
-    omega is NaN, and all that follows from it, where rounding hides the sign of the growth rate:
-    damping above 1/sqrt(eps) omega (6.7e7 omega; 2.9e3 omega in float32), coupling above
-    omega^4/eps, and numbers that overflowed.
+    omega and all results from it are NaN where rounding hides the sign of the growth rate: damping
+    above 1/sqrt(eps) omega (6.7e7 omega; 2.9e3 omega in float32), coupling above omega^4/eps, and
+    numbers that overflowed.
     """
     omega = jnp.sqrt(lin.a + lin.b)
-    square = 1 / omega**2  # omega^4 stays in the range, but not its square in a derivative
+    square = 1 / omega**2  # omega^4 is in range, but its square in a derivative is not
     damping = jnp.maximum(jnp.abs(lin.c_1), jnp.abs(lin.c_2)) / omega
     coupling = lin.g * square * square
     most = float(jnp.finfo(omega.dtype).eps) ** -0.5

@@ -1,4 +1,4 @@
-"""The numbers of a scene or a structure by name: those it stores, and derived ones of a scene.
+"""Numbers of a scene or structure by name: stored ones and, for a scene, derived ones.
 
 | name | meaning | what it sets |
 |---|---|---|
@@ -7,8 +7,8 @@
 | `mu` | friction coefficient mu(V) at the belt velocity | the friction law, scaled as a whole |
 
 The mu that a `Coulomb` law stores is mu(V) as well. Where several quantities are set at once,
-derived ones come last: K_t/K_n = 0.5 beside K_n = 1e8 N/m sets K_t = 5e7 N/m. A structure has
-those of its joints, "left.D", and "D" for that of all joints that have one.
+derived ones come last: K_t/K_n = 0.5 beside K_n = 1e8 N/m sets K_t = 5e7 N/m. A structure has the
+quantities of its joints, such as "left.D", and "D" for the D of all joints that have one.
 """
 
 import dataclasses
@@ -39,7 +39,7 @@ STIFFNESS_RATIO, FREQUENCY_RATIO, FRICTION = "K_t/K_n", "omega_1/omega_2", "mu"
 
 
 def require_one(name: str, x: Any) -> None:
-    """Refuse, as argument `name`, what is no mechanism, and one that holds a batch."""
+    """Refuse, as argument `name`, anything but a mechanism, and one that holds a batch."""
     if isinstance(x, Structure):
         require_single(x)
         if x.is_sparse:
@@ -51,58 +51,58 @@ def require_one(name: str, x: Any) -> None:
 
 
 def joints_of(x: Mechanism) -> dict[str, Any]:
-    """The joints of a structure by name; a scene, with contact and friction itself, as ""."""
+    """The joints of a structure by name; a scene is its own joint, named ""."""
     if isinstance(x, Structure):
         return dict(zip(x.joint_names, x.joints, strict=True))
     return {"": x}
 
 
 class Quantity(NamedTuple):
-    """A number of a scene."""
+    """A number of a scene or structure."""
 
-    value: Array | None  # None where it is optional, and not given
+    value: Array | None  # None for an optional number without a value
     unit: str
     meaning: str
-    log: bool  # a scale, whose ratios count
+    log: bool  # positive, and compared by ratios
 
 
 def own_quantities(x: Part | Structure) -> dict[str, Quantity]:
-    """The numbers stored in a scene, a structure or a part, by name; no parts among them."""
-    found = {}
+    """The numbers stored in a scene, a structure or a part by name, without the parts."""
+    stored = {}
     if isinstance(x, Structure):
         for name, joint in zip(x.joint_names, x.joints, strict=True):
-            own = own_quantities(joint)
-            found = own | found | {f"{name}.{plain}": own[plain] for plain in own}
+            of_joint = own_quantities(joint)
+            stored = of_joint | stored | {f"{name}.{plain}": of_joint[plain] for plain in of_joint}
         parameters = {
             name: Quantity(value, "-", "parameter", False) for name, value in x.parameters.items()
         }
-        return parameters | found
+        return parameters | stored
     for field in dataclasses.fields(x):
         value, meant = getattr(x, field.name), field.metadata
         if isinstance(value, Part):
-            found |= own_quantities(value)
+            stored |= own_quantities(value)
         elif "unit" in meant:
-            found[quantity_name(field)] = Quantity(
+            stored[quantity_name(field)] = Quantity(
                 value, meant["unit"], meant["meaning"], meant.get("log", False)
             )
-    return found
+    return stored
 
 
 def known_quantities(x: Mechanism) -> list[str]:
-    """The names that `replaced` takes: own ones, then the derived ones of a scene."""
+    """The names that `replaced` takes: stored quantities, then the derived ones of a scene."""
     return list(dict.fromkeys([*own_quantities(x), *_derived(x)]))
 
 
 def require_known(x: Mechanism, name: str) -> None:
-    """Refuse a name that is neither an own nor a derived quantity, listing those there are."""
-    known = known_quantities(x)
-    if name not in known:
+    """Refuse a name that is neither a stored nor a derived quantity, and list the valid names."""
+    names = known_quantities(x)
+    if name not in names:
         kind = "structure" if isinstance(x, Structure) else "scene"
-        raise ValueError(f"{kind} has no quantity {name!r}; it has {', '.join(known)}")
+        raise ValueError(f"{kind} has no quantity {name!r}; it has {', '.join(names)}")
 
 
 def require_independent(x: Mechanism, names: Sequence[str]) -> None:
-    """Refuse names two of which set one quantity, such as K_t and K_t/K_n, or D and left.D."""
+    """Refuse two names that set the same quantity, such as K_t and K_t/K_n, or D and left.D."""
     for i, name in enumerate(names):
         for other in names[:i]:
             if not moved_by(x, other).isdisjoint(moved_by(x, name)):
@@ -110,66 +110,66 @@ def require_independent(x: Mechanism, names: Sequence[str]) -> None:
 
 
 def moved_by(x: Mechanism, name: str) -> set[str]:
-    """The own quantities that a name sets; of a structure with the names of their joints."""
-    own = own_quantities(x)
-    if name not in own:
-        moved = set(_DERIVED[name].set(x, 1.0))
+    """The stored quantities that a name sets, with joint names in a structure."""
+    stored = own_quantities(x)
+    if name not in stored:
+        targets = set(_DERIVED[name].set(x, 1.0))
         if (
-            isinstance(x, Scene) and "friction" in moved
+            isinstance(x, Scene) and "friction" in targets
         ):  # scaled as a whole: any coefficient in it may be its scale
             law = own_quantities(x.friction)
-            moved |= {each for each in law if law[each].unit == "-"}
-        return moved
+            targets |= {each for each in law if law[each].unit == "-"}
+        return targets
     if isinstance(x, Structure) and "." not in name and name not in x.parameters:
-        return {f"{joint}.{name}" for joint in x.joint_names if f"{joint}.{name}" in own}
+        return {f"{joint}.{name}" for joint in x.joint_names if f"{joint}.{name}" in stored}
     return {name}
 
 
 def value_of(x: Mechanism, name: str) -> Float[Array, ""]:
-    """The number that a scene or a structure has under a name.
+    """The value of a named quantity of a scene or structure.
 
-    **Raises:** `ValueError` for an optional one that is not given, and for a plain name whose
-    quantity differs between the joints of a structure.
+    **Raises:** `ValueError` for an optional quantity without a value, and for a plain name whose
+    value differs between the joints of a structure.
     """
-    own = own_quantities(x)
-    if name not in own:
+    stored = own_quantities(x)
+    if name not in stored:
         return _DERIVED[name].get(x)
-    values = {each: own[each].value for each in sorted(moved_by(x, name))}
-    found, *others = values.values()
-    if found is None or any(value is None for value in others):
+    values = {each: stored[each].value for each in sorted(moved_by(x, name))}
+    first, *others = values.values()
+    if first is None or any(value is None for value in others):
         raise ValueError(f"{name} is not given")
-    if not is_traced((found, others)) and any(value != found for value in others):
+    if not is_traced((first, others)) and any(value != first for value in others):
         raise ValueError(
             f"{name} differs between the joints: name {' and '.join(values)} by themselves, or "
             f"replace({name}=...) first"
         )
-    return found
+    return first
 
 
 def replaced(x: Mechanism, values: Mapping[str, ArrayLike]) -> Any:
-    """The scene or structure with these quantities changed, of any shape, as by its `replace`.
+    """The scene or structure with quantities set to values of any shape, as by its `replace`.
 
-    **Raises:** `ValueError` for values outside their domain; traced ones become NaN.
+    **Raises:** `ValueError` for values outside their domain; traced values become NaN instead.
     """
     derived = _derived(x)
-    own = own_quantities(x)
+    stored = own_quantities(x)
     checked = {
-        name: value if name in own else number(name, value, **derived[name].domain)
+        name: value if name in stored else number(name, value, **derived[name].domain)
         for name, value in values.items()
     }
     return x.replace(**_settings(x, checked))
 
 
 def require_inside(x: Mechanism, axes: Mapping[str, np.ndarray]) -> None:
-    """Refuse a grid of independent quantities, each with its values (n,), unless all is inside.
+    """Refuse a grid of independent quantities, with values (n,) each, if a point is not allowed.
 
-    In batches: the grid is never made.
+    The points are checked in batches: the whole grid is never built.
 
-    **Raises:** `ValueError` as `replaced`.
+    **Raises:** `ValueError` as in `replaced`.
     """
     ends = {name: np.array([values.min(), values.max()]) for name, values in axes.items()}
-    # Domains are intervals, also of one quantity beside another, and all that moves a limit is
-    # monotonic, so that the corners decide; but for mu(V), by which `mu` scales the friction law.
+    # Domains are intervals, and their limits are monotonic in other quantities, so the corners
+    # decide. The exception is mu(V), by which `mu` scales the friction law.
     _require_all_inside(x, ends)
     if FRICTION in axes and isinstance(x, Scene):
         law = {"V", *own_quantities(x.friction)}
@@ -183,16 +183,16 @@ def _require_all_inside(x, axes):
     points = math.prod(shape)
     batch = min(points, _CHECKED_AT_ONCE)
     for begin in range(0, points, batch):
-        # The last batch goes back to the one before: one shape compiles once.
+        # The last batch overlaps the one before, so that all batches share one compiled shape.
         begin = min(begin, points - batch)
         places = np.unravel_index(np.arange(begin, begin + batch), shape)
         replaced(x, {name: axes[name][i] for name, i in zip(axes, places, strict=True)})
 
 
 def substituted(x: Mechanism, values: Mapping[str, ArrayLike]) -> Any:
-    """Like `replaced`, without checks, for what has all of them (`with_optional`)."""
+    """Like `replaced`, without checks; every quantity must have a value (`with_optional`)."""
     settings = _settings(x, values)
-    if "friction" in settings:  # a new law, which may have another structure
+    if "friction" in settings:  # a new law, possibly with another tree structure
         x = eqx.tree_at(lambda scene: scene.friction, x, settings.pop("friction"))
     return _substitute(x, settings)
 
@@ -202,46 +202,48 @@ def _substitute(x, values):
         return substitute(x, values)
     joints = []
     for name, joint in zip(x.joint_names, x.joints, strict=True):
-        own = {f"{name}.{plain}": plain for plain in quantities(joint)}
-        plain = {key: value for key, value in values.items() if key in own.values()}
-        named = {own[key]: value for key, value in values.items() if key in own}
+        plain_names = {f"{name}.{plain}": plain for plain in quantities(joint)}
+        plain = {key: value for key, value in values.items() if key in plain_names.values()}
+        named = {plain_names[key]: value for key, value in values.items() if key in plain_names}
         joints.append(substitute(joint, plain | named))
     x = eqx.tree_at(lambda s: s.joints, x, tuple(joints))
-    own = {name: values[name] for name in x.parameters if name in values}
-    return eqx.tree_at(lambda s: s.parameters, x, x.parameters | own) if own else x
+    parameters = {name: values[name] for name in x.parameters if name in values}
+    return eqx.tree_at(lambda s: s.parameters, x, x.parameters | parameters) if parameters else x
 
 
 def with_optional(x: Mechanism, names: Sequence[str]) -> Any:
-    """`x` with 1 for what these names set and it was not given: a stiffness ratio.
+    """`x` with 1 for each quantity set by these names that is None, such as a stiffness ratio.
 
-    What is None cannot be substituted, and decides what a program computes.
+    None cannot be substituted, and it decides what a program computes.
     """
-    own = own_quantities(x)
-    moved = {name for chosen in names for name in moved_by(x, chosen)}
-    missing = {name: 1.0 for name in moved & own.keys() if own[name].value is None}
+    stored = own_quantities(x)
+    targets = {name for chosen in names for name in moved_by(x, chosen)}
+    missing = {name: 1.0 for name in targets & stored.keys() if stored[name].value is None}
     return x.replace(**missing) if missing else x
 
 
 def _settings(x, values):
-    """What `replace` and `substitute` take to give quantities these values."""
-    own = own_quantities(x)
-    found = {name: value for name, value in values.items() if name in own}
-    if len(found) == len(values):
-        return found
-    moved = substitute(x, {n: value for n, value in found.items() if own[n].value is not None})
+    """The changes for `replace` or `substitute` that set quantities to these values."""
+    stored = own_quantities(x)
+    settings = {name: value for name, value in values.items() if name in stored}
+    if len(settings) == len(values):
+        return settings
+    updated = substitute(
+        x, {n: value for n, value in settings.items() if stored[n].value is not None}
+    )
     for name, value in values.items():
-        if name not in own:
-            found |= _DERIVED[name].set(moved, value)
-    return found
+        if name not in stored:
+            settings |= _DERIVED[name].set(updated, value)
+    return settings
 
 
 def axis_values(x: Mechanism, name: str, values: ArrayLike | Sequence[float]) -> Array:
-    """The values (n,) of an axis over a quantity, a list or an array, traced or not.
+    """The values (n,) of a quantity along an axis, from a list or an array, traced or not.
 
     **Raises:** `ValueError` for an unknown name and values that are not one-dimensional.
     """
     require_known(x, name)
-    # A list as NumPy reads it; what is an array already may be traced.
+    # Lists are read by NumPy; arrays may be traced and are kept.
     values = number(name, values if isinstance(values, (Array, np.ndarray)) else np.array(values))
     if values.ndim != 1 or not values.size:
         raise ValueError(f"the values of {name} must be a list, got shape {values.shape}")
@@ -250,31 +252,31 @@ def axis_values(x: Mechanism, name: str, values: ArrayLike | Sequence[float]) ->
 
 def unit(x: Mechanism, name: str) -> str:
     """The unit of a quantity, "-" for a ratio."""
-    own = own_quantities(x)
-    return own[name].unit if name in own else "-"
+    stored = own_quantities(x)
+    return stored[name].unit if name in stored else "-"
 
 
 def meaning(x: Mechanism, name: str) -> str:
-    """What a quantity is, in words."""
-    own = own_quantities(x)
-    if name not in own:
+    """The meaning of a quantity in words."""
+    stored = own_quantities(x)
+    if name not in stored:
         return _DERIVED[name].meaning
-    return own[name].meaning.split(";")[0].split(",")[0]
+    return stored[name].meaning.split(";")[0].split(",")[0]
 
 
 def label(x: Mechanism, name: str) -> str:
-    """Meaning, symbol and unit of a quantity, as axes show them."""
-    own = own_quantities(x)
-    if name not in own:
+    """Axis label of a quantity: its meaning, symbol and unit."""
+    stored = own_quantities(x)
+    if name not in stored:
         return f"{meaning(x, name)} [-]"
-    return f"{meaning(x, name)} {name} [{own[name].unit}]"
+    return f"{meaning(x, name)} {name} [{stored[name].unit}]"
 
 
-# --- friction at the velocity of the belt -------------------------------------------------
+# --- friction at the belt velocity --------------------------------------------------------
 
 
 def sliding_friction(scene: Scene) -> Array:
-    """mu(V), the friction coefficient at the velocity of the belt."""
+    """The friction coefficient mu(V) at the belt velocity."""
     friction = scene.friction
     if not friction.velocity_dependent:
         return friction.mu_s
@@ -282,7 +284,7 @@ def sliding_friction(scene: Scene) -> Array:
 
 
 def with_friction_times(x: Any, factor: ArrayLike) -> Any:
-    """A scene or structure with each friction law as a whole times `factor`; not checked."""
+    """A scene or structure with each friction law multiplied by `factor`; not checked."""
     if isinstance(x, Structure):
         joints = tuple(with_friction_times(joint, factor) for joint in x.joints)
         return eqx.tree_at(lambda s: s.joints, x, joints)

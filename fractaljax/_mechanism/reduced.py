@@ -1,4 +1,4 @@
-"""A structure of few degrees of freedom in the place of a large one."""
+"""Reduced structures: few degrees of freedom in place of many."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,16 +14,16 @@ from .structure import ParametricStructure
 
 
 class CoarseSpace:
-    """A part of a reduced space that knows the modes roughly; two are the same if one object."""
+    """A subspace of a reduced space with approximate modes; compared by identity."""
 
     def __init__(self, V: np.ndarray, W: np.ndarray, tol: float):
         self.V = V  # (r, k): q = V p
         self.W = W  # (r, k)
-        self.tol = tol  # an eigenvalue s of it is within tol |s| of one of the reduced structure
+        self.tol = tol  # each eigenvalue s is within tol |s| of one of the reduced structure
 
 
 class Reduction:
-    """How a reduced structure was made; two are the same if they are one object."""
+    """The basis and the accuracy of a reduced structure; compared by identity."""
 
     def __init__(
         self,
@@ -48,18 +48,18 @@ class Reduction:
         self.tol = tol
         self.friction_slope = friction_slope
         self.residuals = residuals  # L^T Q^-1 R of the residuals of all terms, see `Space`
-        self.points = list(points)  # where eigenvectors were taken
-        self.touched = touched  # (m, n), `Structure._touched` of the large one
-        self.coarse = coarse  # None where it would save no time
-        self.error = error  # the largest found at candidates and fresh points, of |s|
+        self.points = list(points)  # parameters at which eigenvectors were computed
+        self.touched = touched  # (m, n), `Structure._touched` of the large structure
+        self.coarse = coarse  # None if it would save no time
+        self.error = error  # largest at candidates and fresh points, relative to |s|
 
 
 class ReducedStructure(ParametricStructure):
-    """A structure of few degrees of freedom q (r,), as `reduce` makes it: x = V q.
+    """A structure of few degrees of freedom q (r,) with x = V q, as `reduce` returns it.
 
-    It has the parameters, the joints and the mesh of the large one and goes wherever a structure
-    goes. Only eigenvalues in `band` are those of the large structure, and only they count in its
-    stability. `replace` of a matrix gives a plain structure.
+    It has the parameters, the joints and the mesh of the large structure and can be used like any
+    structure. Only eigenvalues in `band` are those of the large structure, and only they count in
+    its stability. `replace` of a matrix gives a plain structure.
     """
 
     reduction: Reduction = eqx.field(static=True)
@@ -72,12 +72,12 @@ class ReducedStructure(ParametricStructure):
 
     @property
     def band(self) -> tuple[float, float]:
-        """Where eigenvalues are those of the large structure, in |Im s| [rad/s]."""
+        """The range of |Im s| [rad/s] in which eigenvalues are those of the large structure."""
         return self.reduction.band
 
     @property
     def coarse(self) -> CoarseSpace | None:
-        """Where its modes are known roughly, if that saves time."""
+        """A subspace with approximate modes, or None if it would save no time."""
         return self.reduction.coarse
 
     def _full_n(self, n: int) -> int:
@@ -90,9 +90,9 @@ class ReducedStructure(ParametricStructure):
         return self.reduction.touched
 
     def full(self, q: ArrayLike) -> Numbers:
-        """Displacements or velocities (..., n) of all degrees of freedom from those of q (..., r).
+        """Displacements or velocities (..., n) of all degrees of freedom from q (..., r).
 
-        A state (..., 2r) gives a state (..., 2n). Shapes of modes may be complex.
+        A state (..., 2r) gives a state (..., 2n). Mode shapes may be complex.
 
         **Raises:** `ValueError` for another size.
         """
@@ -104,7 +104,7 @@ class ReducedStructure(ParametricStructure):
 
     @classmethod
     def from_file(cls, given: dict[str, Any]) -> "ReducedStructure":
-        """That of a file, from what `read_structure` found."""
+        """The reduced structure of a file, from the arguments that `read_structure` returns."""
         about: dict[str, Any] = dict(given.pop("reduced"))
         keys = ("V", "W", "residuals", "over", "band", "tol", "friction_slope", "error")
         missing = [key for key in keys if about.get(key) is None]
@@ -121,8 +121,8 @@ class ReducedStructure(ParametricStructure):
             reduction = Reduction(**about)
         except TypeError:
             raise ValueError(f"[reduced] has an unknown key among {brief(list(about))}") from None
-        given = {key: x for key, x in given.items() if key not in ("names", "notes")}
-        return cls(**{"parameters": {}, **given}, reduction=reduction)
+        arguments = {key: x for key, x in given.items() if key not in ("names", "notes")}
+        return cls(**{"parameters": {}, **arguments}, reduction=reduction)
 
     def _more_tables(self):
         of = self.reduction

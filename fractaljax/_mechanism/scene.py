@@ -31,16 +31,16 @@ from .oscillator import Oscillator
 class Scene(Mechanism):
     """A mass on a belt, with its contact and friction, as one frozen pytree.
 
-    The friction along the belt acts on the normal force K_n x_2, the source's form. With `preload`
-    it begins with the load P of the contact, and x = 0 is the pressed rest: N(x_2) is the load
-    curve of the contact law, dN/dx_2 = K_n(N), or P + K_n x_2 for a law that has none and with
-    `preload="linear"`.
+    The friction along the belt acts on the normal force N = K_n x_2, the source's form. With
+    `preload`, x = 0 is the state of rest under the load P of the contact, where N = P: N(x_2) is
+    the load curve of the contact law, dN/dx_2 = K_n(N), or P + K_n x_2 for a law without a load
+    curve and with `preload="linear"`.
 
     **Raises:** `TypeError` for a part of the wrong kind; `ValueError` if the contact is fractal
-    and the smallest friction exceeds 0.9, where Eq. 19 ends, and for preload without a P.
+    and the smallest friction exceeds 0.9, the limit of Eq. 19, and for preload without a P.
     """
 
-    contact: Any  # a Contact; its kind decides what else it has
+    contact: Any  # a Contact; its other attributes depend on its class
     friction: Friction
     oscillator: Oscillator
     preload: bool | str = eqx.field(static=True, metadata={"note": PRELOAD_NOTE})
@@ -62,12 +62,12 @@ class Scene(Mechanism):
 
     @property
     def normal_load(self) -> Numbers | None:
-        """P [N], if the normal force on which friction acts has it; None in the source's form."""
+        """P [N], if the friction's normal force includes it; None in the source's form."""
         return self.contact.P if self.preload else None
 
     @property
     def follows_load_curve(self) -> bool:
-        """Whether the normal force is the load curve of the contact law."""
+        """True if the normal force is the load curve of the contact law."""
         return follows_load_curve(self)
 
     def _rebuilt(self, changes):
@@ -82,11 +82,11 @@ class Scene(Mechanism):
 
     @classmethod
     def from_toml(cls, text: str) -> "Scene":
-        """The scene whose `to_toml` is this text; errors as in `load`, without a file."""
+        """The scene whose `to_toml` is this text; errors as in `load`, without the file name."""
         return cls._from_document(read_toml(text.encode()), Path())
 
     def to_toml(self) -> str:
-        """The text of the scene's file, with the unit and the meaning beside each number.
+        """The text of the scene's TOML file, with the unit and the meaning of each number.
 
         **Raises:** `ValueError` if the scene holds arrays.
         """
@@ -103,7 +103,7 @@ class Scene(Mechanism):
 
 @jax.jit
 def stiffness(scene: Scene) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """(K_n, K_t) of the contact [N/m]: Eqs. 30 and 36, or as given.
+    """(K_n, K_t) of the contact [N/m], from Eqs. 30 and 36 or as given.
 
     **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`.
     """
@@ -113,7 +113,7 @@ def stiffness(scene: Scene) -> tuple[Float[Array, ""], Float[Array, ""]]:
 
 
 def brake_scene() -> Scene:
-    """The reference brake: the source's sections 3.2.1 and 3.3, with the G that gives its K_n.
+    """The reference brake of the source's sections 3.2.1 and 3.3, with the G that gives its K_n.
 
     D = 2.4, G = 1.342e-10 m and P = 1907.3 N give K_n = 4.026e8 and K_t = 1.917e8 N/m. It squeals.
     """

@@ -1,4 +1,4 @@
-"""A mechanism of many degrees of freedom, given by its matrices, with joints attached to it."""
+"""A mechanism of many degrees of freedom, defined by its matrices and joints."""
 
 import functools
 import os
@@ -50,13 +50,13 @@ class Structure(Mechanism):
     """M x'' + C x' + K x = F with joints: a reduced finite-element model of n degrees of freedom.
 
     `M` (n, n) [kg] is symmetric and positive definite. `K` (n, n) [N/m] and `C` (n, n) [N s/m],
-    zero where None, are of any kind. Sparse matrices of SciPy's are welcome; with more than 2000
-    rows they stay sparse, for `reduce` to make a small structure of. Rotations have their own
-    units. `joints` is one `Joint`, a sequence of them (named joint_1, joint_2, ...) or a mapping
-    from names. `F` (n,) [N], or a mapping from degrees of freedom to forces, presses the joints
-    together: the slope of a friction law acts through the static equilibrium under it. `names` of
-    the degrees of freedom are optional, and so is a `Mesh` for pictures. `notes` say what was made
-    of the files of the matrices, such as a mirrored triangle; `load` finds them.
+    zero if None, need not be symmetric. Sparse matrices of SciPy's are accepted; with more than
+    2000 rows they stay sparse, and `reduce` makes a small structure from them. Rotations have
+    their own units. `joints` is one `Joint`, a sequence of them (named joint_1, joint_2, ...) or a
+    mapping from names. `F` (n,) [N], or a mapping from degrees of freedom to forces, presses the
+    joints together: the slope of a friction law acts through the static equilibrium under it.
+    `names` of the degrees of freedom and a `Mesh` for pictures are optional. `notes` report
+    changes made on reading the matrices' files, such as a mirrored triangle; `load` sets them.
 
     **Raises:** `ValueError` or `TypeError` saying which matrix does not fit, is not finite or not
     positive definite, which degree of freedom is unknown, or which joint is wrong.
@@ -84,11 +84,11 @@ class Structure(Mechanism):
     ):
         self._fill({"M": M, "C": C, "K": K}, {}, joints, F, names, mesh, notes)
 
-    def _fill(self, given, parameters, joints, F, names, mesh, notes):
+    def _fill(self, matrices, parameters, joints, F, names, mesh, notes):
         self.parameters = parameters
         self.notes = tuple(notes)
-        mass = matrix_sum("M", given["M"], parameters, square_or_sparse)
-        # Each term symmetric to the last bit, if their sum is a mass matrix.
+        mass = matrix_sum("M", matrices["M"], parameters, square_or_sparse)
+        # Each term is made symmetric to the last bit, if their sum is a mass matrix.
         if mass.sparse:
             require_mass_matrix(mass.at(parameters))
         elif len(mass.arrays) == 1 and mass.coefficients[0] is None:
@@ -101,8 +101,8 @@ class Structure(Mechanism):
             mass = eqx.tree_at(lambda x: x.arrays, mass, halves)
         n = mass.shape[-1]
         fit = functools.partial(fitting_or_sparse, shape=(n, n))
-        stiffness = matrix_sum("K", given["K"], parameters, fit)
-        damping = given["C"]
+        stiffness = matrix_sum("K", matrices["K"], parameters, fit)
+        damping = matrices["C"]
         if damping is None:
             damping = 0 * abs(stiffness.at(parameters))
         self.sums = {"M": mass, "C": matrix_sum("C", damping, parameters, fit), "K": stiffness}
@@ -117,7 +117,7 @@ class Structure(Mechanism):
         self.F = None if F is None else fitting("F", F, (n,))
 
     def _full_n(self, n: int) -> int:
-        """The degrees of freedom that its mesh has, of n itself."""
+        """The number of degrees of freedom of the mesh, for n of the structure."""
         return n
 
     @classmethod
@@ -147,27 +147,27 @@ class Structure(Mechanism):
 
     @property
     def C(self) -> Float[Array, "n n"]:
-        """The damping matrix without the joints [N s/m]; errors as of `M`."""
+        """The damping matrix without the joints [N s/m]; errors as for `M`."""
         return self._matrix("C")
 
     @property
     def K(self) -> Float[Array, "n n"]:
-        """The stiffness matrix without the joints [N/m]; errors as of `M`."""
+        """The stiffness matrix without the joints [N/m]; errors as for `M`."""
         return self._matrix("K")
 
     @property
     def band(self) -> tuple[float, float] | None:
-        """Where eigenvalues are those of the structure, in |Im s| [rad/s]; None: everywhere."""
+        """The range of |Im s| [rad/s] in which eigenvalues are valid; None for no limit."""
         return None
 
     @property
     def coarse(self) -> Any:
-        """A space in which modes are known roughly, of a reduced structure; else None."""
+        """A subspace with approximate modes for a reduced structure, else None."""
         return None
 
     @property
     def is_sparse(self) -> bool:
-        """Whether the matrices are large and sparse: then `reduce` comes first."""
+        """True if the matrices are large and sparse, so that `reduce` must come first."""
         return any(held.sparse for held in self.sums.values())
 
     def _matrix(self, name: str) -> Float[Array, "n n"]:
@@ -181,22 +181,22 @@ class Structure(Mechanism):
         return arrays[0].dtype if arrays else jnp.result_type(float)
 
     def index(self, dof: Dof | np.integer) -> int:
-        """The index of a degree of freedom given by index or name.
+        """The index of a degree of freedom from its index or name.
 
         **Raises:** `ValueError` if there is none; `TypeError` for anything else.
         """
         if isinstance(dof, bool) or not isinstance(dof, (int, str, np.integer)):
             raise TypeError(f"a degree of freedom must be an index or a name, got {dof!r}")
-        known: list[Any] = list((self.names or ()) if isinstance(dof, str) else range(self.n))
-        if dof not in known:
-            has = _some(known) or "no names"
+        dofs: list[Any] = list((self.names or ()) if isinstance(dof, str) else range(self.n))
+        if dof not in dofs:
+            has = _some(dofs) or "no names"
             raise ValueError(f"unknown degree of freedom {dof!r}; the structure has {has}")
-        return known.index(dof)
+        return dofs.index(dof)
 
     def direction(self, direction: Direction) -> np.ndarray:
-        """The weights d (n,) for which d.x is the displacement in a direction, as `Joint` has it.
+        """The weights d (n,) for which d.x is the displacement in a direction, given as in `Joint`.
 
-        **Raises:** `ValueError` for a direction that is zero or has another length, and as `index`.
+        **Raises:** `ValueError` for a direction that is zero or not of length n, and as `index`.
         """
         stored = stored_direction("direction", direction)
         if isinstance(stored[0], float):
@@ -214,14 +214,14 @@ class Structure(Mechanism):
         return d
 
     def _touched(self) -> np.ndarray | None:
-        """How much the directions of each joint move each degree of freedom (m, n), where known."""
-        moved = [np.abs(self._directions(joint)).sum(axis=0) for joint in self.joints]
-        return np.array(moved).reshape(len(moved), self.n)
+        """Summed absolute weights (m, n) of the degrees of freedom in each joint, if available."""
+        weights = [np.abs(self._directions(joint)).sum(axis=0) for joint in self.joints]
+        return np.array(weights).reshape(len(weights), self.n)
 
     def _directions(self, joint: Joint) -> list[np.ndarray]:
-        """The tangential and, where there is one, the normal direction (n,) of a joint."""
-        given = (joint.tangential, joint.normal)
-        return [self.direction(each) for each in given if each is not None]
+        """The tangential and, if there is one, the normal direction (n,) of a joint."""
+        stored = (joint.tangential, joint.normal)
+        return [self.direction(each) for each in stored if each is not None]
 
     def _check_joints(self) -> None:
         for name, joint in zip(self.joint_names, self.joints, strict=True):
@@ -235,12 +235,12 @@ class Structure(Mechanism):
                     "are one direction"
                 )
 
-    def _forces(self, given: Mapping[Any, ArrayLike]) -> Float[Array, " n"]:
-        places = [self.index(dof) for dof in given]
-        twice = [dof for dof, place in zip(given, places, strict=True) if places.count(place) > 1]
+    def _forces(self, loads: Mapping[Any, ArrayLike]) -> Float[Array, " n"]:
+        places = [self.index(dof) for dof in loads]
+        twice = [dof for dof, place in zip(loads, places, strict=True) if places.count(place) > 1]
         if twice:
             raise ValueError(f"F gives one degree of freedom twice: {_some(map(repr, twice))}")
-        forces = [number(f"F at {dof}", force) for dof, force in given.items()]
+        forces = [number(f"F at {dof}", force) for dof, force in loads.items()]
         return jnp.zeros(self.n).at[np.array(places, int)].set(jnp.array(forces, float))
 
     def _rebuilt(self, changes):
@@ -253,13 +253,13 @@ class Structure(Mechanism):
             name: number(name, changes[name]) for name in self.parameters if name in changes
         }
         if changes.keys() & {*self.sums, "F"}:
-            own = {name: changes.get(name, self._terms(name)) for name in self.sums}
-            own |= {"joints": joints, "F": changes.get("F", self.F), "names": self.names}
-            own |= {"mesh": self._own_mesh(), "notes": self.notes}
+            arguments = {name: changes.get(name, self._terms(name)) for name in self.sums}
+            arguments |= {"joints": joints, "F": changes.get("F", self.F), "names": self.names}
+            arguments |= {"mesh": self._own_mesh(), "notes": self.notes}
             if not self.parameters:
-                return Structure(**own)
-            return ParametricStructure(**own, parameters=parameters)
-        # The matrices are as they were: there is nothing to check or factorise again.
+                return Structure(**arguments)
+            return ParametricStructure(**arguments, parameters=parameters)
+        # The matrices are unchanged and need no new check or factorisation.
         new = eqx.tree_at(lambda structure: structure.joints, self, tuple(joints.values()))
         new._check_joints()
         if changes.keys() & parameters.keys():
@@ -268,19 +268,19 @@ class Structure(Mechanism):
         return new
 
     def _own_mesh(self) -> Mesh | None:
-        """The mesh, if its degrees of freedom are those of the matrices."""
+        """The mesh, if it has the degrees of freedom of the matrices, else None."""
         return self.mesh
 
     def _terms(self, name: str) -> list[tuple[Any, Any]]:
-        """The matrix of a name as it was given, less its numbers."""
+        """The terms (coefficient, matrix) of a matrix, with numeric coefficients multiplied in."""
         held = self.sums[name]
         return list(zip(held.coefficients, held.matrices, strict=True))
 
     def _known(self):
-        known = ["M", "C", "K", "F", *self.parameters]
+        names = ["M", "C", "K", "F", *self.parameters]
         for name, joint in zip(self.joint_names, self.joints, strict=True):
-            known += [*quantities(joint), *(f"{name}.{plain}" for plain in quantities(joint))]
-        return list(dict.fromkeys(known))
+            names += [*quantities(joint), *(f"{name}.{plain}" for plain in quantities(joint))]
+        return list(dict.fromkeys(names))
 
     def _shown(self):
         yield f"n={self.n}"
@@ -290,36 +290,36 @@ class Structure(Mechanism):
 
     @classmethod
     def _from_document(cls, document, folder):
-        given = read_structure(document, folder)
-        if "reduced" in given:
+        arguments = read_structure(document, folder)
+        if "reduced" in arguments:
             from .reduced import ReducedStructure
 
-            return ReducedStructure.from_file(given)
-        if "parameters" in given or any(is_sum(given[name]) for name in "MCK"):
-            return ParametricStructure(**given)
-        return Structure(**given)
+            return ReducedStructure.from_file(arguments)
+        if "parameters" in arguments or any(is_sum(arguments[name]) for name in "MCK"):
+            return ParametricStructure(**arguments)
+        return Structure(**arguments)
 
     def _more_tables(self) -> dict[str, Any]:
-        """Tables of its TOML file beyond those of every structure."""
+        """Additional tables of the TOML file."""
         return {}
 
     def _more_arrays(self) -> dict[str, np.ndarray]:
-        """Arrays of its .npz file beyond those of every structure."""
+        """Additional arrays of the .npz file."""
         return {}
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write a TOML file, and beside it the matrices as a .npz file of the same name.
+        """Write a TOML file and, in the same folder, the matrices as a .npz file of the same name.
 
-        Both or neither: an error leaves the files of an earlier structure as they were.
+        Both files are written or neither: an error leaves the files of an earlier structure intact.
 
         **Raises:** `OSError` if a file cannot be written; `ValueError` if the structure holds a
-        batch, if `path` itself ends in .npz, and if there is a .npz file of that name which the
-        TOML file at `path` does not name.
+        batch, if `path` itself ends in .npz, and if a .npz file of that name exists which the TOML
+        file at `path` does not name.
         """
         write_together(self._files(Path(path)))
 
     def _files(self, path: Path) -> dict[Path, bytes]:
-        """What `save` writes to `path`, by file; errors as there."""
+        """The contents that `save` writes, by file; errors as there."""
         matrices = path.with_suffix(".npz")
         if matrices == path:
             raise ValueError(f"path must be that of the TOML file, got {str(path)!r}")
@@ -337,15 +337,15 @@ class Structure(Mechanism):
 class ParametricStructure(Structure):
     """A structure whose matrices depend on named parameters: rotation, friction, temperature, ...
 
-    `M`, `C` and `K` are a matrix or a list of (coefficient, matrix), of which the sum counts. A
+    Each of `M`, `C` and `K` is a matrix, or a list of (coefficient, matrix) to be summed. A
     coefficient is a number, a function of the parameters, `lambda p: p["Omega"] ** 2 - 1`, or the
     same as text, "Omega**2 - 1", with + - * / **, pi, sqrt, exp, log, sin, cos and tan, which a
-    file can hold. So gyroscopic terms are ("Omega", G) in C, circulatory ones ("mu", N) in K.
-    `parameters` maps names to numbers. `replace(Omega=...)`, sweeps and designs know them by name,
-    and derivatives go to each. All else is as in `Structure`.
+    file can hold. For example, a gyroscopic term is ("Omega", G) in C and a circulatory one
+    ("mu", N) in K. `parameters` maps names to numbers. `replace(Omega=...)`, sweeps and designs
+    accept these names, and derivatives reach each parameter. All else is as in `Structure`.
 
-    **Raises:** as `Structure`; `ValueError` for a coefficient that is not finite or asks for an
-    unknown parameter, and for a parameter whose name another quantity has.
+    **Raises:** as `Structure`; `ValueError` for a coefficient that is not finite or reads an
+    unknown parameter, and for a parameter with the name of another quantity.
     """
 
     def __init__(
@@ -383,7 +383,7 @@ def _of_oscillator(oscillator: Oscillator):
 
 
 def too_large(structure: Structure) -> str:
-    """What is said where a structure must be reduced first."""
+    """The message for a structure that must be reduced first."""
     return (
         f"the structure is sparse with {structure.n} degrees of freedom, too many for this: "
         "take reduce(structure, ...) in its place"
@@ -391,11 +391,11 @@ def too_large(structure: Structure) -> str:
 
 
 def _check_coefficients(structure: Structure) -> None:
-    """Refuse parameters, if they are known numbers, at which a coefficient is not finite."""
-    known = {name: concrete(value) for name, value in structure.parameters.items()}
-    if any(value is None or value.ndim for value in known.values()):
+    """Refuse concrete parameters at which a coefficient is not finite."""
+    values = {name: concrete(value) for name, value in structure.parameters.items()}
+    if any(value is None or value.ndim for value in values.values()):
         return
-    p = {name: jnp.asarray(value) for name, value in known.items()}
+    p = {name: jnp.asarray(value) for name, value in values.items()}
     for name, held in structure.sums.items():
         for coefficient in held.coefficients:
             if coefficient is not None:
@@ -407,7 +407,7 @@ def _check_coefficients(structure: Structure) -> None:
 
 
 def _names_matrices(path: Path, matrices: str) -> bool:
-    """Whether `path` is a structure's TOML file that has its matrices in the file `matrices`."""
+    """True if `path` is a structure's TOML file with its matrices in the file `matrices`."""
     try:
         table = read_toml(path.read_bytes()).get("structure")
     except (OSError, ValueError):
@@ -416,7 +416,7 @@ def _names_matrices(path: Path, matrices: str) -> bool:
 
 
 def load(path: str | os.PathLike) -> Scene | Structure:
-    """What a TOML file holds: a structure if it has a table of that name, else a scene.
+    """The mechanism in a TOML file: a structure if it has a table [structure], else a scene.
 
     **Raises:** as `Scene.load` and `Structure.load`.
     """
@@ -452,8 +452,10 @@ def _names(names: Iterable[str] | None, n: int) -> tuple[str, ...] | None:
     names = (names,) if isinstance(names, str) else tuple(names)
     printable = all(isinstance(name, str) and name and name.isprintable() for name in names)
     if not printable or len(names) != n:
-        wanted = f"{n} printable strings, one a degree of freedom"
-        raise ValueError(f"names must be {wanted}, got {len(names)}: {_some(map(repr, names))}")
+        requirement = f"{n} printable strings, one a degree of freedom"
+        raise ValueError(
+            f"names must be {requirement}, got {len(names)}: {_some(map(repr, names))}"
+        )
     name, times = Counter(names).most_common(1)[0]
     if times > 1:
         raise ValueError(f"names must differ, got {name!r} more than once")

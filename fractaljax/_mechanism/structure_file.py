@@ -1,4 +1,4 @@
-"""Structures as files: a TOML file for the joints, and the matrices it names."""
+"""Files of a structure: a TOML file for the joints, and the files of its matrices."""
 
 import io
 import re
@@ -23,13 +23,13 @@ from .mesh import Mesh
 _LARGEST_FILE = 2**30
 _MATRICES = ("M", "C", "K")
 _BASES = ("V", "W", "residuals", "touched", "coarse_V", "coarse_W")
-_MESH = "mesh."  # what its arrays begin with, beside the matrices
+_MESH = "mesh."  # prefix of its arrays in the file of matrices
 _TABLES = ("structure", "parameters", "joints", "reduction", "reduced")
-_SPARSE = ("data", "indices", "indptr", "shape")  # of a matrix in compressed rows
-_WANTED = "the name of a file or of a matrix, or a list of {coefficient = ..., matrix = ...}"
-_KEYS = {  # of [structure]: what each may be
+_SPARSE = ("data", "indices", "indptr", "shape")  # a matrix in compressed rows
+_MATRIX_FORMS = "the name of a file or of a matrix, or a list of {coefficient = ..., matrix = ...}"
+_KEYS = {  # of [structure]: types, and their description
     "matrices": (str, "the name of a file"),
-    **dict.fromkeys(_MATRICES, ((str, list), _WANTED)),
+    **dict.fromkeys(_MATRICES, ((str, list), _MATRIX_FORMS)),
     "F": ((list, dict, str), "a list, a table or a file's name"),
     "rayleigh": (list, "[alpha, beta]"),
     "damping_ratio": ((float, int, list), "a number or a list of one a mode"),
@@ -39,45 +39,47 @@ _KEYS = {  # of [structure]: what each may be
 
 
 class _Source:
-    """Matrices that the file of a structure names, and names of degrees of freedom with them."""
+    """Matrices that the file of a structure names, and the names of degrees of freedom."""
 
     def __init__(self, table: dict[str, Any], folder: Path):
         self.folder, self.names = folder, table.get("names")
         self.held: dict[str, Any] = {}
-        self.unread: dict[str, str] = {}  # of the file of matrices, and why
+        self.unread: dict[str, str] = {}  # reasons by name, for the file of matrices
         self.notes: list[str] = []
         self.used: set[str] = set()
         self.file = table.get("matrices")
         if self.file is not None:
             path = folder / self.file
-            # Arrays of NumPy's stay dense.
+            # NumPy arrays stay dense.
             if path.suffix.lower() == ".npz":
                 self.held = _npz(path)
             else:
-                found = self._read(path)
-                self.held, self.unread = found.matrices, found.unread
+                model = self._read(path)
+                self.held, self.unread = model.matrices, model.unread
 
     def matrix(self, key: str, value: str) -> Any:
-        """The matrix of a name in the file of matrices, or in a file of its own."""
+        """The matrix `value` of the file of matrices, or the matrix `key` in the file `value`."""
         if value in self.held or value in self.unread:
             self.used.add(value)
             return self.held[value]
         read = self._read(self.folder / value)
-        found = read.matrices
-        if len(found) == 1 and key not in read.unread:
-            return next(iter(found.values()))
-        if key not in found and key not in read.unread:
-            raise ValueError(f"{value} must hold {key} or one matrix; it holds {', '.join(found)}")
-        return found[key]
+        matrices = read.matrices
+        if len(matrices) == 1 and key not in read.unread:
+            return next(iter(matrices.values()))
+        if key not in matrices and key not in read.unread:
+            raise ValueError(
+                f"{value} must hold {key} or one matrix; it holds {', '.join(matrices)}"
+            )
+        return matrices[key]
 
     def sum(self, key: str, value: Any) -> Any:
-        """What `Structure` takes as M, C or K."""
+        """M, C or K in the form that `Structure` takes."""
         if isinstance(value, str):
             return self.matrix(key, value)
         terms = []
         for term in value:
             if not isinstance(term, dict):
-                raise ValueError(f"[structure] {key} must be {_WANTED}, got {brief(term)}")
+                raise ValueError(f"[structure] {key} must be {_MATRIX_FORMS}, got {brief(term)}")
             toml.refuse_unknown(f"a term of [structure] {key}", term, ("coefficient", "matrix"))
             if not isinstance(term.get("matrix"), str):
                 raise ValueError(f"a term of [structure] {key} lacks the key 'matrix'")
@@ -85,16 +87,16 @@ class _Source:
         return terms
 
     def refuse_unused(self) -> None:
-        """Refuse arrays in the file of matrices that nothing asks for."""
+        """Refuse unused arrays in the file of matrices."""
         if self.file is not None and self.file.lower().endswith(".npz"):
-            known = [*_MATRICES, "F", *_BASES]
+            allowed = [*_MATRICES, "F", *_BASES]
             rest = [
                 name for name in self.held if name not in self.used and not name.startswith(_MESH)
             ]
-            toml.refuse_unknown(self.file, rest, known)
+            toml.refuse_unknown(self.file, rest, allowed)
 
     def mesh(self, name: str | None) -> Mesh | None:
-        """That in a file of its own, or beside the matrices."""
+        """The mesh in the file `name`, or in the file of matrices."""
         if name is None:
             held = {key.removeprefix(_MESH): x for key, x in self.held.items() if _MESH in key}
             return Mesh.of_arrays(held, str(self.file)) if held else None
@@ -105,16 +107,16 @@ class _Source:
         return Mesh.of_arrays(_npz(self.folder / name), name)
 
     def _read(self, path: Path) -> Matrices:
-        found = read_matrices(path)
-        self.names = self.names or found.names
-        self.notes += [f"{path.name}: {note}" for note in found.notes]
-        return found
+        model = read_matrices(path)
+        self.names = self.names or model.names
+        self.notes += [f"{path.name}: {note}" for note in model.notes]
+        return model
 
 
 def read_structure(document: dict[str, Any], folder: Path) -> dict[str, Any]:
     """The arguments of the structure in a TOML file that lies in `folder`, by name.
 
-    With `parameters` and `reduced`, those of its reduction, where the file has them.
+    They include `parameters` and the arguments `reduced` of a reduction, if the file has them.
 
     **Raises:** `ValueError` naming the table and the key that is unknown, missing or of the wrong
     kind, or the file whose matrix is wrong; `OSError` if one cannot be read.
@@ -125,38 +127,38 @@ def read_structure(document: dict[str, Any], folder: Path) -> dict[str, Any]:
         toml.table_at(document, key) if key in document else {} for key in ("joints", "parameters")
     )
     if not parameters and "reduced" not in document:
-        toml.table_at(document, "joints")  # a plain structure says that it has none
+        toml.table_at(document, "joints")  # required, even if empty, in a plain structure
     toml.refuse_unknown("[structure]", table, _KEYS)
     for key, value in table.items():
-        kinds, wanted = _KEYS[key]
+        kinds, expected = _KEYS[key]
         if not isinstance(value, kinds):
-            raise ValueError(f"[structure] {key} must be {wanted}, got {brief(value)}")
+            raise ValueError(f"[structure] {key} must be {expected}, got {brief(value)}")
     source = _Source(table, folder)
-    given: dict[str, Any] = {}
+    matrices: dict[str, Any] = {}
     for name in (*_MATRICES, "F"):
         if name in table and name in source.held and not _among(table[name], source.held):
             raise ValueError(f"[structure] gives {name} twice: in matrices and as {name}")
         if name not in table and (name in source.held or name in source.unread):
-            given[name] = source.held[name]
+            matrices[name] = source.held[name]
         elif name in table and (name != "F" or isinstance(table[name], str)):
-            given[name] = source.sum(name, table[name])
+            matrices[name] = source.sum(name, table[name])
     source.refuse_unused()
     for name in ("M", "K"):
-        if name not in given:
+        if name not in matrices:
             raise ValueError(f"[structure] lacks the matrix {name}, or matrices that has it")
-    damping = [key for key in ("C", "rayleigh", "damping_ratio") if key in table | given]
+    damping = [key for key in ("C", "rayleigh", "damping_ratio") if key in table | matrices]
     if len(damping) > 1:
         raise ValueError(f"[structure] gives damping twice: {' and '.join(damping)}")
     if "rayleigh" in table:
         if len(table["rayleigh"]) != 2:
             raise ValueError(f"[structure] rayleigh must be [alpha, beta], got {table['rayleigh']}")
-        given["C"] = _rayleigh(given["M"], given["K"], *table["rayleigh"])
+        matrices["C"] = _rayleigh(matrices["M"], matrices["K"], *table["rayleigh"])
     if "damping_ratio" in table:
         ratio = table["damping_ratio"]
         ratio = np.asarray(ratio) if isinstance(ratio, list) else ratio
-        given["C"] = modal_damping(_one("M", given), _one("K", given), ratio)
+        matrices["C"] = modal_damping(_one("M", matrices), _one("K", matrices), ratio)
     names = source.names
-    F = given.get("F", table.get("F"))
+    F = matrices.get("F", table.get("F"))
     F = np.asarray(F.toarray()) if F is not None and is_sparse(F) else F
     if isinstance(F, dict):
         F = {_dof(key, names or ()): force for key, force in F.items()}
@@ -169,29 +171,29 @@ def read_structure(document: dict[str, Any], folder: Path) -> dict[str, Any]:
             if isinstance(joint.get(which), dict):
                 joint[which] = {_dof(key, names or ()): x for key, x in joint[which].items()}
         attached[name] = toml.read_part(Joint, joint, JOINT_LAWS, f"joints.{name}")
-    found = {"C": None, **given, "F": F, "joints": attached, "names": names}
-    found["mesh"] = source.mesh(table.get("mesh"))
-    found["notes"] = tuple(dict.fromkeys(source.notes))  # a file may be named twice
+    arguments = {"C": None, **matrices, "F": F, "joints": attached, "names": names}
+    arguments["mesh"] = source.mesh(table.get("mesh"))
+    arguments["notes"] = tuple(dict.fromkeys(source.notes))  # a file may be read twice
     if "reduced" in document:
         bases = {name: source.held.get(name) for name in _BASES}
-        found["reduced"] = {**toml.table_at(document, "reduced"), **bases}
-    return found | ({"parameters": parameters} if parameters else {})
+        arguments["reduced"] = {**toml.table_at(document, "reduced"), **bases}
+    return arguments | ({"parameters": parameters} if parameters else {})
 
 
 def _among(value: Any, held: Mapping[str, Any]) -> bool:
-    """Whether a matrix or all of its terms are named in the file of matrices."""
+    """True if the file of matrices contains a matrix, or all of its terms."""
     terms = value if isinstance(value, list) else [{"matrix": value}]
     return all(isinstance(term, dict) and term.get("matrix") in held for term in terms)
 
 
-def _one(name: str, given: Mapping[str, Any]) -> Any:
-    if isinstance(given[name], list):
+def _one(name: str, matrices: Mapping[str, Any]) -> Any:
+    if isinstance(matrices[name], list):
         raise ValueError(f"[structure] damping_ratio needs {name} as one matrix: give C")
-    return given[name]
+    return matrices[name]
 
 
 def _rayleigh(M: Any, K: Any, alpha: Any, beta: Any) -> Any:
-    """alpha M + beta K, of sums and of sparse matrices too."""
+    """alpha M + beta K, also for sums and sparse matrices."""
     if not isinstance(M, list) and not isinstance(K, list) and not is_sparse(M):
         return rayleigh_damping(M, K, alpha, beta)
     terms = []
@@ -204,12 +206,12 @@ def _rayleigh(M: Any, K: Any, alpha: Any, beta: Any) -> Any:
 
 
 def _dof(key: str, names) -> int | str:
-    """Keys of TOML are texts: one that is no name may be an index."""
+    """A degree of freedom from a TOML key: a name, or else an index written as text."""
     return int(key) if key not in names and re.fullmatch("0|[1-9][0-9]{0,8}", key) else key
 
 
 def _npz(path: Path) -> dict[str, Any]:
-    """The arrays of a .npz file, sparse ones from their parts: "K.data", "K.indices", ..."""
+    """The arrays of a .npz file, sparse ones from the parts "K.data", "K.indices", ..."""
     with toml.naming(path.name):
         arrays: dict[str, Any] = read_npz(read_bounded(path, _LARGEST_FILE), _LARGEST_FILE)
         for name in [key.removesuffix(".data") for key in arrays if key.endswith(".data")]:
@@ -230,7 +232,7 @@ def _compressed(name: str, data, indices, indptr, shape) -> Any:
 
 
 def structure_text(structure: Any, matrices: str) -> str:
-    """The TOML text of a structure whose matrices are in the file `matrices` beside it.
+    """The TOML text of a structure whose matrices are in the file `matrices` in its folder.
 
     **Raises:** `ValueError` for a coefficient that is a function.
     """
@@ -269,10 +271,10 @@ def _term(name: str, i: int, coefficient: Any) -> dict[str, str]:
 
 
 def _written(direction: tuple[Any, ...] | None, names: tuple[str, ...]) -> Any:
-    """A direction in a TOML file: weights by degree of freedom as an inline table."""
+    """A direction in TOML form: weights by degree of freedom become an inline table."""
     if direction is None or not isinstance(direction[0], tuple):
         return direction
-    # An index that is another's name would be read as that name.
+    # An index that equals a name would be read as that name.
     weights = {
         str(names[dof] if str(dof) in names and isinstance(dof, int) else dof): weight
         for dof, weight in direction
@@ -296,11 +298,11 @@ def npz_bytes(structure: Any) -> bytes:
 
 def _arrays_of(name: str, held: MatrixSum) -> dict[str, np.ndarray]:
     one = held.coefficients == (None,)
-    found = {}
+    arrays = {}
     for i, X in enumerate(held.matrices, start=1):
         key = name if one else f"{name}_{i}"
         if is_sparse(X):
-            found |= {f"{key}.{part}": np.asarray(getattr(X, part)) for part in _SPARSE}
+            arrays |= {f"{key}.{part}": np.asarray(getattr(X, part)) for part in _SPARSE}
         else:
-            found[key] = np.asarray(X)
-    return found
+            arrays[key] = np.asarray(X)
+    return arrays
