@@ -1,8 +1,9 @@
 """Residuals of growth rates that solvers can follow through the coalescence of two modes.
 
-Beyond coalescence a growth rate rises like a square root; before it, it may not move at all. The
-Hopf test function of the two modes (`critical_pair.py`), of rates beyond the target, is smooth
-there. Unless both modes grow it is above 0 exactly where none does; their mean tells the rest.
+Beyond coalescence a growth rate rises like a square root; before it, the rate may be constant. The
+Hopf test function of the two modes (`critical_pair.py`), with rates relative to the target, is
+smooth there. Unless both modes grow it is positive exactly where neither does; the sign of their
+mean decides that case.
 """
 
 import jax
@@ -14,24 +15,24 @@ from .._stability.critical_pair import hopf_test
 from .._stability.linearise import linearised
 from .._stability.quadratic import Leading
 
-_APART = 0.01  # ((s_1 - s_2)/s)^2 of two modes whose residuals are of order one
+_SEPARATION = 0.01  # ((s_1 - s_2)/s)^2 of two modes whose residuals are of order one
 
 
 def of_neighbours(
-    found: Leading, target: Float[Array, ""], scale: Float[Array, ""]
+    modes: Leading, target: Float[Array, ""], scale: Float[Array, ""]
 ) -> Float[Array, " k"]:
     """Residuals of k modes, all at most 0 exactly where no growth rate is above the target.
 
-    `scale` is that of a growth rate [1/s].
+    `scale` is the scale of growth rates [1/s].
     """
-    mean = (found.s + found.neighbour) / 2 - target
-    spread = ((found.s - found.neighbour) / 2) ** 2
+    mean = (modes.s + modes.neighbour) / 2 - target
+    spread = ((modes.s - modes.neighbour) / 2) ** 2
     decay = mean.real < 0
     test = hopf_test(mean, spread, ~decay)
-    unit = _APART * jnp.abs(jax.lax.stop_gradient(found.s)) ** 2
+    unit = _SEPARATION * jnp.abs(jax.lax.stop_gradient(modes.s)) ** 2
     unit = jnp.where(unit > 0, unit, 1)
-    faster = jnp.where(decay, -test / unit, (found.s.real - target) / scale)
-    return jnp.arcsinh(jnp.where(found.first, faster, mean.real / scale))
+    faster = jnp.where(decay, -test / unit, (modes.s.real - target) / scale)
+    return jnp.arcsinh(jnp.where(modes.first, faster, mean.real / scale))
 
 
 def of_scene(
@@ -41,7 +42,7 @@ def of_scene(
     target: Float[Array, ""],
     scale: Float[Array, ""],
 ) -> list[Float[Array, ""]]:
-    """As `of_neighbours`, of the two modes of a scene, by its Hurwitz determinant."""
+    """As `of_neighbours`, for the two modes of a scene, from its Hurwitz determinant."""
     # (s^2 + c_1 s + a)(s^2 + c_2 s + b) + g at s + target: s^4 + q_3 s^3 + q_2 s^2 + q_1 s + q_0.
     lin = linearised(scene, friction_slope)
     c_1, c_2 = lin.c_1 + 2 * target, lin.c_2 + 2 * target
@@ -50,5 +51,5 @@ def of_scene(
     decide = (q_3 > 0) & (q_2 > 0) & (q_1 > 0) & (q_0 > 0)  # necessary
     ratio, squared = q_1 / jnp.where(decide, q_3, 1), jnp.where(decide, q_2, 1)
     test = ratio * (1 - ratio / squared) - q_0 / squared
-    faster = jnp.where(decide, -test / (_APART * squared), (growth - target) / scale)
+    faster = jnp.where(decide, -test / (_SEPARATION * squared), (growth - target) / scale)
     return [jnp.arcsinh(faster), jnp.arcsinh(-q_3 / (4 * scale))]

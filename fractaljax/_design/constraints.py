@@ -1,8 +1,8 @@
 """Requirements on a scene, for `design(constraints=...)`: at most 0 where they are met.
 
-Each is called with a scene and gives its residual, a scalar of order one, continuous and with a
-slope on both sides of every regime boundary: one that asks for elastic contacts keeps growing with
-ln(a_e/a_l) below the critical area, where the quantity itself no longer changes.
+Each is called with a scene and returns its residual: a scalar of order one, continuous, with a
+nonzero slope on both sides of every regime boundary. A residual that requires elastic contacts
+keeps growing with ln(a_e/a_l) below the critical area, where the quantity itself is constant.
 """
 
 import abc
@@ -40,7 +40,7 @@ class Constraint(Record):
     symbol: ClassVar[str]
     unit: ClassVar[str] = ""
     domain: ClassVar[dict[str, float]] = {"above": 0}
-    # Whether the quantity is constant in a fully plastic joint, which lacks elastic contacts.
+    # True if the quantity is constant in a fully plastic joint, which lacks elastic contacts.
     flat_if_plastic: ClassVar[bool] = False
 
     def __init__(self, at_least: ArrayLike | None = None, at_most: ArrayLike | None = None):
@@ -95,7 +95,7 @@ class Constraint(Record):
 
 
 class Plain(Constraint):
-    """A function of the user's that is a residual itself."""
+    """A user's function that is itself a residual."""
 
     function: Callable[[Any], Any] = eqx.field(static=True)
 
@@ -126,7 +126,7 @@ def _state(scene: Mechanism, symbol: str) -> ContactState:
 
 
 class _LogConstraint(Constraint):
-    """A scale: its residuals are logarithms."""
+    """A quantity on a logarithmic scale: its residuals are logarithms."""
 
     def below(self, value):
         return jnp.log(self.at_least / value)
@@ -136,7 +136,7 @@ class _LogConstraint(Constraint):
 
 
 class NormalStiffness(Constraint):
-    """K_n [N/m] of at least some value > 0."""
+    """K_n [N/m], at least a limit > 0."""
 
     symbol: ClassVar[str] = "K_n"
     unit: ClassVar[str] = "N/m"
@@ -150,7 +150,7 @@ class NormalStiffness(Constraint):
 
 
 class ElasticShare(Constraint):
-    """Share of the load on elastic contacts, 1 - `plastic_share`, of at least some value."""
+    """Share of the load on elastic contacts, 1 - `plastic_share`, at least a limit."""
 
     symbol: ClassVar[str] = "elastic share"
     domain: ClassVar[dict[str, float]] = {"above": 0, "below": 1}
@@ -164,9 +164,9 @@ class ElasticShare(Constraint):
 
 
 class RealContactArea(_LogConstraint):
-    """Real contact area A_r [m^2] within limits, of the contact law (Eq. 28 of the fractal one).
+    """Real contact area A_r [m^2] within limits, by the contact law (Eq. 28 of the fractal one).
 
-    Fully plastic, Eq. 28 is P/H for every surface, the least there is.
+    In a fully plastic joint Eq. 28 gives P/H for every surface, the least possible area.
     """
 
     symbol: ClassVar[str] = "A_r"
@@ -213,9 +213,9 @@ class Roughness(_LogConstraint):
 
 
 class DampingRatio(Constraint):
-    """Least damping ratio -Re/|lambda| of all eigenvalues, of at least some value.
+    """Least damping ratio -Re/|lambda| of all eigenvalues, at least a limit.
 
-    Of a structure, of all but rigid-body modes.
+    For a structure, rigid-body modes do not count.
     """
 
     friction_slope: bool = eqx.field(static=True)
@@ -233,13 +233,13 @@ class DampingRatio(Constraint):
         return least_damping_ratio(jnp.where(modes.counted | jnp.isnan(s), s, -1))
 
     def below(self, value):
-        return jnp.arcsinh((self.at_least - value) / 1e-3)  # the size that they have at squeal
+        return jnp.arcsinh((self.at_least - value) / 1e-3)  # their magnitude at squeal
 
 
 class Frequency(Constraint):
     """Frequencies [Hz] of all modes within limits: the lowest at least, the highest at most.
 
-    Of all, since the critical one jumps where modes cross.
+    All modes count, since the critical one jumps where modes cross.
     """
 
     friction_slope: bool = eqx.field(static=True)
@@ -260,9 +260,9 @@ class Frequency(Constraint):
     def measure(self, scene):
         """The lowest and the highest frequency (2,) [Hz]; 0 for an overdamped mode."""
         modes = stability(scene, self.friction_slope)
-        found = jnp.abs(modes.eigenvalues.imag) / (2 * math.pi)
-        lowest = jnp.where(modes.counted, found, jnp.inf).min()
-        return jnp.stack([lowest, jnp.where(modes.counted, found, 0).max()])
+        frequencies = jnp.abs(modes.eigenvalues.imag) / (2 * math.pi)
+        lowest = jnp.where(modes.counted, frequencies, jnp.inf).min()
+        return jnp.stack([lowest, jnp.where(modes.counted, frequencies, 0).max()])
 
     def below(self, value):
         return super().below(value[0])
@@ -275,7 +275,7 @@ class CycleConstraint(Constraint):
     """A measure of the limit cycle in one degree of freedom: at most a limit, or an objective.
 
     Without a limit it is an objective only. `design` follows the cycle from one design to the next.
-    Called by itself it searches for the one that `limit_cycle` finds. At rest the measure is 0.
+    Called directly, it measures the cycle that `limit_cycle` finds. At rest the measure is 0.
     """
 
     dof: int = eqx.field(static=True)  # from 0
@@ -317,7 +317,8 @@ class CycleAmplitude(CycleConstraint):
 class VelocityLevel(CycleConstraint):
     """20 lg(v/1 nm/s) [dB] of the root mean square v of a velocity of the limit cycle.
 
-    At most a limit. The level of the sound of one radiator rises and falls by as much. 0 at rest.
+    At most a limit. The sound level of a single radiator changes by the same amount. It is 0 at
+    rest.
     """
 
     symbol: ClassVar[str] = "velocity level"

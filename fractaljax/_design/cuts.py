@@ -1,4 +1,4 @@
-"""Neighbourhoods that a design must leave, or cross by one of two planes."""
+"""Neighbourhoods that a design must leave, or cross beyond one of two planes."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 
 class Cuts(eqx.Module):
-    """Neighbourhoods of designs that are excluded, each up to two planes.
+    """Excluded neighbourhoods of designs, each bounded by two planes.
 
     Within `reach` of a centre a design must be beyond one of its planes.
     """
@@ -18,13 +18,13 @@ class Cuts(eqx.Module):
 
     @classmethod
     def none(cls, count: int, u: Array) -> "Cuts":
-        """Room for so many cuts of designs like u (v,)."""
+        """Room for `count` cuts of designs like u (v,), none of which excludes anything."""
         zeros = jnp.zeros((count, len(u)), u.dtype)
         gaps = jnp.full((count, 2), 1e3, u.dtype)
         return cls(zeros - 10, jnp.stack([zeros, zeros], axis=1), gaps, gaps[:, 0] * 0)
 
     def added(self, k: int, centre, normals, gaps, reach: float) -> "Cuts":
-        """With the cut of number k."""
+        """A copy with cut k set."""
         return Cuts(
             self.centres.at[k].set(centre),
             self.normals.at[k].set(normals),
@@ -33,8 +33,8 @@ class Cuts(eqx.Module):
         )
 
     def residuals(self, u: Float[Array, " v"]) -> Float[Array, " k"]:
-        """At most 0 where a design is excluded by none."""
-        away = u[None] - self.centres
-        planes = jnp.min(self.gaps - jnp.einsum("kpv,kv->kp", self.normals, away), axis=1)
-        distance = jnp.sqrt(jnp.sum(away**2, axis=1) + 1e-24)
+        """At most 0 where no cut excludes the design."""
+        offsets = u[None] - self.centres
+        planes = jnp.min(self.gaps - jnp.einsum("kpv,kv->kp", self.normals, offsets), axis=1)
+        distance = jnp.sqrt(jnp.sum(offsets**2, axis=1) + 1e-24)
         return 10 * jnp.minimum(planes, self.reach - distance)

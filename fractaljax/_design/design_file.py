@@ -1,4 +1,4 @@
-"""A design as a TOML file: what was given, every option, how it ended, and the way there."""
+"""A design as a TOML file: the initial design, every option, the result and the history."""
 
 import importlib
 import inspect
@@ -38,14 +38,14 @@ _PACKAGE = __name__.split(".")[0]
 STATED = ("bounds", "objective", "target", "K_n_min", "constraints", "envelope", "tolerance")
 STATED += ("quantile", "area_ratio_min", "slip_ratio_max", "friction_slope", "laws")
 OPTIONS = (*STATED, "risk", "optimiser", "solver", "starts", "lattice", "seed", "quiet_within")
-# Of the fields of a `Design`.
+# Fields of a `Design` that are not in the table of results.
 _NOT_RESULTS = {"scene", "initial", "result", "history", "options", "least_growth", "sensitivity"}
 
 
 def design_files(best: Any, path: Path) -> dict[Path, bytes]:
-    """The content of the file of a `Design` at `path`, and of those beside it.
+    """The contents of the file of a `Design` at `path` and of the files beside it.
 
-    A structure, given and designed, has files of its own: `run.given.toml` of `run.toml`.
+    Structures, given and designed, have separate files: `run.given.toml` beside `run.toml`.
     """
     heads: dict[str, Any] = {
         **versions(),
@@ -61,11 +61,11 @@ def design_files(best: Any, path: Path) -> dict[Path, bytes]:
             files |= x._files(beside)
     options = dict(best.options)
     options["solver"] = options["solver"] and _function_name(options["solver"])
-    options["optimiser"] = options["optimiser"] and "optimiser"  # it has no name of its own
+    options["optimiser"] = options["optimiser"] and "optimiser"  # it has no name
     if (objective := options["objective"]) is not None:
         table = _constraint_table(objective)
         options["objective"] = table if isinstance(objective, Constraint) else table["function"]
-    options["constraints"] = [_constraint_table(asked) for asked in options["constraints"]]
+    options["constraints"] = [_constraint_table(each) for each in options["constraints"]]
     options["laws"] = {
         f"{i}": law_table("contact", law, JOINT_LAWS) for i, law in enumerate(options["laws"], 1)
     }
@@ -88,22 +88,22 @@ def design_files(best: Any, path: Path) -> dict[Path, bytes]:
 def read_design(
     path: str | os.PathLike, functions: Mapping[str, Any] | None = None
 ) -> tuple[Mechanism, dict[str, Any]]:
-    """What was given and the arguments of `design`; errors and warning as `repeat_design`."""
+    """The initial design and the arguments of `design`; errors and warning as `repeat_design`."""
     if not isinstance(functions, Mapping) and functions is not None:
         raise TypeError(f"functions must be a mapping of names to functions, got {functions!r}")
     with naming(path):
         document = read_toml(read_bounded(path))
-        # Versions are texts, of whatever packages.
+        # Versions, of any packages, are texts.
         tables = [name for name, value in document.items() if not isinstance(value, str)]
         refuse_unknown("the file", tables, ("options", "result", "history"))
         options = table_at(document, "options")
         try:
-            found = _given(document, Path(path)), _options(options, dict(functions or {}))
+            inputs = _given(document, Path(path)), _options(options, dict(functions or {}))
         except KeyError as error:
             raise ValueError(f"not a design file, it lacks {error}") from None
     if others := versions_differ(document):
         warnings.warn(f"{path} was {others}: digits may differ", stacklevel=3)
-    return found
+    return inputs
 
 
 def tolerance_text(tolerance: Tolerance, comment: str) -> str:
@@ -112,7 +112,7 @@ def tolerance_text(tolerance: Tolerance, comment: str) -> str:
 
 
 def read_tolerance(path: str | os.PathLike) -> Tolerance:
-    """The scatter in a file of a [tolerance]. **Raises:** `OSError`; `ValueError` naming it."""
+    """The scatter in a file with a [tolerance]. **Raises:** `OSError`; `ValueError` naming it."""
     with naming(path):
         document = read_toml(read_bounded(path))
         refuse_unknown("the file", document, ("tolerance",))
@@ -162,15 +162,15 @@ def _options(table, functions) -> dict[str, Any]:
     options["bounds"] = table_at(options, "bounds", "options.")
     for name in ("objective", "optimiser", "solver"):
         if name in options:
-            given = options[name]
-            if name == "objective" and isinstance(given, dict):
-                options[name] = _constraint(given, functions)
+            value = options[name]
+            if name == "objective" and isinstance(value, dict):
+                options[name] = _constraint(value, functions)
             else:
-                options[name] = _function(given, functions)
+                options[name] = _function(value, functions)
     for name, kind in (("envelope", Envelope), ("tolerance", Tolerance)):
         if name in options:
-            given = table_at(options, name, "options.")
-            options[name] = _with_arguments(kind, given, f"[options.{name}]")
+            arguments = table_at(options, name, "options.")
+            options[name] = _with_arguments(kind, arguments, f"[options.{name}]")
     if isinstance(options["risk"], list):
         options["risk"] = tuple(options["risk"])
     laws = table_at(options, "laws", "options.") if "laws" in options else {}
@@ -183,7 +183,7 @@ def _options(table, functions) -> dict[str, Any]:
     constraints = options["constraints"]
     if not (isinstance(constraints, list) and all(isinstance(c, dict) for c in constraints)):
         raise TypeError(f"constraints must be a list of tables, got {brief(constraints)}")
-    options["constraints"] = [_constraint(asked, functions) for asked in constraints]
+    options["constraints"] = [_constraint(entry, functions) for entry in constraints]
     return options
 
 
@@ -194,7 +194,7 @@ def _function_name(function) -> str:
 
 
 def _function(name: str, functions):
-    """The function of this name: one of those given, or of this package."""
+    """The function of this name, from `functions` or from this package."""
     if _text("a function's name", name) in functions:
         return functions[name]
     module, _, member = name.partition(":")
@@ -206,11 +206,11 @@ def _function(name: str, functions):
         raise ValueError(f"the package has no function {name!r}") from None
 
 
-def _constraint_table(asked) -> dict[str, Any]:
-    if not isinstance(asked, Constraint):
-        return {"function": _function_name(asked)}
-    fields = {name: value for name, value in vars(asked).items() if value is not None}
-    return {"kind": type(asked).__name__} | {
+def _constraint_table(constraint) -> dict[str, Any]:
+    if not isinstance(constraint, Constraint):
+        return {"function": _function_name(constraint)}
+    fields = {name: value for name, value in vars(constraint).items() if value is not None}
+    return {"kind": type(constraint).__name__} | {
         name: value if isinstance(value, int) else float(value) for name, value in fields.items()
     }
 
@@ -222,9 +222,9 @@ def _constraint(table, functions):
     kind = getattr(known_constraints, _text("the kind of a constraint", fields.pop("kind")), None)
     if not (isinstance(kind, type) and issubclass(kind, Constraint)) or inspect.isabstract(kind):
         raise ValueError(f"there is no constraint {table['kind']!r}")
-    known = inspect.signature(kind).parameters
-    refuse_unknown(f"the constraint {kind.__name__}", fields, known)
-    for name, parameter in known.items():
+    parameters = inspect.signature(kind).parameters
+    refuse_unknown(f"the constraint {kind.__name__}", fields, parameters)
+    for name, parameter in parameters.items():
         if parameter.default is inspect.Parameter.empty and name not in fields:
             raise ValueError(f"the constraint {kind.__name__} lacks {name!r}")
     return kind(**fields)

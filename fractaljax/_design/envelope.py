@@ -19,20 +19,20 @@ from .._mechanism.quantities import known_quantities, own_quantities, replaced
 
 _SIDES = {1: 33, 2: 11, 3: 6, 4: 4, 5: 3, 6: 3}  # points along each range, by their number
 _INNER_SIDES = {1: 16, 2: 6, 3: 4, 4: 3, 5: 2, 6: 2}  # the same for an average over conditions
-_CORNERS = 4  # of a first guess at what is worst
+_CORNERS = 4  # in a first guess at the worst
 _HALVINGS = 10
 
 
 class Envelope(Record):
-    """Ranges and samples of quantities of a scene or structure, by the names that `replace` knows.
+    """Ranges and samples of quantities of a scene or structure, by the names that `replace` takes.
 
     `ranges` are independent: every combination inside them is a condition. `samples` belong
-    together: the i-th of every quantity make one measured condition, combined with all ranges.
-    Where a plain mapping stands for an envelope, two numbers are a range and three or more are
-    samples.
+    together: the i-th samples of all quantities are one measured condition, combined with all
+    ranges. Where a plain mapping stands for an envelope, two numbers are a range and three or more
+    are samples.
 
-    **Raises:** `ValueError` for nothing at all, an empty or inverted range, samples of unequal
-    length, one name in both, and more than six ranges; `TypeError` for what is no number.
+    **Raises:** `ValueError` for no quantity at all, an empty or inverted range, samples of unequal
+    length, one name in both, and more than six ranges; `TypeError` for other than numbers.
     """
 
     ranges: dict[str, tuple[float, ...]]
@@ -43,9 +43,9 @@ class Envelope(Record):
         ranges: Mapping[str, Sequence[float]] = {},
         samples: Mapping[str, Sequence[float]] = {},
     ):
-        for which, given in (("ranges", ranges), ("samples", samples)):
-            if not isinstance(given, Mapping):
-                raise TypeError(f"{which} must be a mapping, got {brief(given)}")
+        for which, mapping in (("ranges", ranges), ("samples", samples)):
+            if not isinstance(mapping, Mapping):
+                raise TypeError(f"{which} must be a mapping, got {brief(mapping)}")
         self.ranges = {name: _numbers(name, ends) for name, ends in ranges.items()}
         self.samples = {name: _numbers(name, values) for name, values in samples.items()}
         for name, ends in self.ranges.items():
@@ -71,15 +71,15 @@ class Envelope(Record):
             return conditions
         if not isinstance(conditions, Mapping):
             raise TypeError(f"envelope must be a mapping or an Envelope, got {brief(conditions)}")
-        given = {name: _numbers(name, values) for name, values in conditions.items()}
-        for name, values in given.items():
+        entries = {name: _numbers(name, values) for name, values in conditions.items()}
+        for name, values in entries.items():
             if len(values) < 2:
                 raise ValueError(
                     f"envelope of {name} must be a range or samples, got {_shown(values)}"
                 )
         return cls(
-            ranges={name: values for name, values in given.items() if len(values) == 2},
-            samples={name: values for name, values in given.items() if len(values) > 2},
+            ranges={name: values for name, values in entries.items() if len(values) == 2},
+            samples={name: values for name, values in entries.items() if len(values) > 2},
         )
 
     @property
@@ -89,18 +89,20 @@ class Envelope(Record):
 
     @property
     def sample_count(self) -> int:
-        """How many samples there are; 1, of nothing, where there are ranges alone."""
+        """The number of samples; 1, without quantities, where there are ranges alone."""
         return len(next(iter(self.samples.values()))) if self.samples else 1
 
     def check(self, x: Mechanism, designed: Sequence[str]) -> None:
-        """Refuse names that `x` lacks or the design moves, and values outside a domain."""
-        own = own_quantities(x)
-        known = [
-            name for name in known_quantities(x) if name not in own or own[name].value is not None
+        """Refuse names that `x` lacks or that are designed, and values outside a domain."""
+        quantities = own_quantities(x)
+        available = [
+            name
+            for name in known_quantities(x)
+            if name not in quantities or quantities[name].value is not None
         ]
         for name in self.names:
-            if name not in known:
-                raise ValueError(f"envelope names {name!r}; there are {', '.join(known)}")
+            if name not in available:
+                raise ValueError(f"envelope names {name!r}; there are {', '.join(available)}")
             if name in designed:
                 raise ValueError(f"{name} cannot be both designed and in the envelope")
         # Domains are intervals: where all corners are inside, everything is.
@@ -137,7 +139,7 @@ class Envelope(Record):
         return self._grid(lambda n: (np.arange(n) + 0.5) / n, _INNER_SIDES)
 
     def likely(self, count: int) -> np.ndarray:
-        """A first guess (at most `count`, 1 + ranges) at what is worst: middle and corners."""
+        """A first guess (at most `count`, 1 + ranges) at the worst places: middle and corners."""
         corners = self._corners()
         chosen = np.linspace(0, len(corners) - 1, min(_CORNERS, len(corners))).astype(int)
         middle = np.full((1, len(self.ranges)), 0.5)
@@ -153,10 +155,10 @@ class Envelope(Record):
         return np.hstack([which, random.uniform(size=(count, len(self.ranges)))])
 
     def climb(self, residual: Callable, places: np.ndarray, values: np.ndarray):
-        """Worse places than `places` (n, 1 + ranges), `residual` rising from their `values` (n,).
+        """Places and residuals after a climb from `places` (n, 1 + ranges) with `values` (n,).
 
         `residual(places, i)` is evaluated at places (m, 1 + ranges), row j for problem i[j]. Every
-        range is tried either way, the step halving where that does not help.
+        range is tried in both directions; the step is halved where neither helps.
         """
         k = len(self.ranges)
         if k == 0 or not len(places):
@@ -167,11 +169,13 @@ class Envelope(Record):
         for _ in range(_HALVINGS):
             tried = places[:, None] + step[:, None, None] / 2 * directions[None]
             tried[..., 1:] = np.clip(tried[..., 1:], 0, 1)
-            found = residual(tried.reshape(-1, 1 + k), np.repeat(every, 2 * k)).reshape(-1, 2 * k)
-            best = found.argmax(axis=1)
-            risen = found[every, best] > values
+            residuals = residual(tried.reshape(-1, 1 + k), np.repeat(every, 2 * k)).reshape(
+                -1, 2 * k
+            )
+            best = residuals.argmax(axis=1)
+            risen = residuals[every, best] > values
             places = np.where(risen[:, None], tried[every, best], places)
-            values = np.where(risen, found[every, best], values)
+            values = np.where(risen, residuals[every, best], values)
             step = np.where(risen, step, step / 2)
         return places, values
 
@@ -195,7 +199,7 @@ class _Alone(Envelope):
         self.ranges, self.samples = {}, {}
 
 
-ALONE = _Alone()  # a scene as it is: one condition, of nothing
+ALONE = _Alone()  # a scene as it is: one condition, without quantities
 
 
 def _numbers(name, values) -> tuple[float, ...]:

@@ -11,10 +11,10 @@ from .envelope import ALONE, Envelope
 from .problem import DesignProblem
 from .rows import evaluate, paired
 
-_LIKELY = 8  # conditions of a first guess at the worst
+_LIKELY = 8  # conditions in a first guess at the worst
 _NEW = 1e-7  # by which a condition must be worse than the working ones
 _NEAR = 0.05  # a requirement met by more than this on the grid is met between its points
-_TEMPERATURE = 0.02  # of the smooth maximum over an envelope
+_TEMPERATURE = 0.02  # temperature of the smooth maximum over an envelope
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,17 +36,17 @@ class Evaluation:
 
     @property
     def worst(self) -> np.ndarray:
-        """The largest residual (n,); infinite without a number, or without a value."""
+        """The largest residual (n,); infinite where it or the objective is undefined."""
         return np.where(np.isfinite(self.values), self.residuals.max(axis=1), np.inf)
 
     def of(self, i: int) -> "Evaluation":
-        """That of one design alone, still with a leading axis."""
+        """The evaluation of one design, still with a leading axis."""
         return Evaluation(self.rows[i : i + 1], self.places[i : i + 1])
 
 
 @dataclasses.dataclass(frozen=True)
 class Evaluator:
-    """Every requirement at every condition of an envelope, the objective at its worst."""
+    """Evaluates requirements and objective of designs at the worst conditions of an envelope."""
 
     problem: DesignProblem
     envelope: Envelope = ALONE
@@ -58,22 +58,22 @@ class Evaluator:
 
     @property
     def working(self) -> np.ndarray:
-        """The conditions (m, c) that a design is first solved for."""
+        """The conditions (m, c) for which a design is first optimised."""
         return self.likely
 
     @property
     def minimax(self) -> bool:
-        """Whether the objective is the largest of those at many conditions."""
+        """True if the objective is the largest of its values at many conditions."""
         return self.problem.objective is not None and self.envelope is not ALONE
 
     def screen(self, us: np.ndarray) -> np.ndarray:
-        """Objective and residuals (n, 1 + k) of us (n, v), roughly: to choose starts by."""
+        """Approximate objective and residuals (n, 1 + k) of us (n, v), for the choice of starts."""
         # Cycles are followed from the starts only.
         rough = dataclasses.replace(self, problem=self.problem.with_fields(cycles=None))
         return rough._at_all(us, self.likely).max(axis=1)[:, self.problem.asked]
 
     def evaluate(self, us: np.ndarray) -> Evaluation:
-        """Designs us (n, v), over all conditions."""
+        """Evaluate designs us (n, v) over all conditions."""
         grid = self.envelope.grid()
         each = self._at_all(us, self.envelope.values(grid))
         each = each[:, :, self.problem.asked]
@@ -91,24 +91,24 @@ class Evaluator:
         return Evaluation(rows, places)
 
     def average(self, rows: np.ndarray, jacobians: np.ndarray):
-        """What a design must keep to, from rows (m, 1 + k) at conditions and their Jacobians."""
+        """The rows and Jacobians that a design must satisfy, from rows (m, 1 + k) at conditions."""
         return rows, jacobians
 
     def exchange(self, us: np.ndarray, working: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Conditions (m, c) at which each of us (n, v) is worse than at all its working ones."""
-        found, new = self.evaluate(us), []
+        evaluation, new = self.evaluate(us), []
         counts = [len(conditions) for conditions in working]
-        known = self._at(np.repeat(us, counts, axis=0), np.concatenate(working))
-        known = known[:, self.problem.asked]
-        pieces = np.split(known, np.cumsum(counts)[:-1])
-        for rows, places, piece in zip(found.rows, found.places, pieces, strict=True):
+        working_rows = self._at(np.repeat(us, counts, axis=0), np.concatenate(working))
+        working_rows = working_rows[:, self.problem.asked]
+        pieces = np.split(working_rows, np.cumsum(counts)[:-1])
+        for rows, places, piece in zip(evaluation.rows, evaluation.places, pieces, strict=True):
             worse = rows > piece.max(axis=0) + _NEW
             worse[1:] &= rows[1:] > 0
             new.append(self.envelope.values(np.unique(places[worse], axis=0)))
         return new
 
     def _at(self, us, conditions):
-        """Rows (n, 1 + k) of designs (n, v), each at a condition; infinite without a number."""
+        """Rows (n, 1 + k) of designs (n, v), each at a condition; infinite where undefined."""
         rows = evaluate(self.problem, us, conditions)
         return np.where(np.isnan(rows), np.inf, rows)
 
@@ -122,7 +122,7 @@ class Evaluator:
 class OnAverage(Evaluator):
     """An average of each requirement over fixed, equally likely conditions.
 
-    `risk` is a temperature T, of T ln sum exp(r/T), which is at least the largest residual, or
+    `risk` is the temperature T of T ln sum exp(r/T), which is at least the largest residual, or
     weights (m,) of the ordered residuals.
     """
 
@@ -150,7 +150,7 @@ class OnAverage(Evaluator):
         return [conditions[:0] for conditions in working]
 
     def _average(self, rows):
-        """The columns of rows (m, 1 + k) on average, and the derivative (m, 1 + k) by them."""
+        """The average (1 + k,) of rows (m, 1 + k), and its derivative (m, 1 + k) by them."""
         row, weights = averaged(rows, self.risk)
         if self.problem.objective is None:
             row[0], weights[:, 0] = rows[0, 0], np.arange(len(rows)) == 0
@@ -158,16 +158,16 @@ class OnAverage(Evaluator):
 
 
 def evaluator_of(problem: DesignProblem, envelope: Envelope | None, risk: Any) -> Evaluator:
-    """What evaluates designs over the conditions of an envelope, at a risk as in `design`."""
+    """The evaluator of designs over the conditions of an envelope, with `risk` as in `design`."""
     match risk:
         case "worst":
             return Evaluator(problem, envelope or ALONE)
         case "smooth":
             kind, number = "smooth", _TEMPERATURE
-        case ("smooth" as kind, given):
-            number = float(scalar("temperature of risk", given, above=0))
-        case ("cvar" as kind, given):
-            number = float(scalar("alpha of risk", given, at_least=0, below=1))
+        case ("smooth" as kind, temperature):
+            number = float(scalar("temperature of risk", temperature, above=0))
+        case ("cvar" as kind, alpha):
+            number = float(scalar("alpha of risk", alpha, at_least=0, below=1))
         case _:
             raise ValueError(
                 'risk must be "worst", "smooth", ("smooth", T) or ("cvar", alpha), got '
@@ -183,16 +183,16 @@ def evaluator_of(problem: DesignProblem, envelope: Envelope | None, risk: Any) -
 
 
 def averaged(rows: np.ndarray, risk: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Columns of rows (m, k) on average (k,) as `OnAverage` has it, and their weights (m, k)."""
+    """The average (k,) of rows (m, k) as in `OnAverage`, and their weights (m, k)."""
     if np.ndim(risk):
         weights = np.empty_like(rows)
         np.put_along_axis(weights, rows.argsort(axis=0), np.asarray(risk)[:, None], axis=0)
         with np.errstate(invalid="ignore"):  # infinite rows of weight 0
             return np.where(weights > 0, weights * rows, 0).sum(axis=0), weights
     largest = rows.max(axis=0)
-    known = np.isfinite(largest)  # an infinite one is all that counts
-    below = np.where(known, rows, 0) - np.where(known, largest, 0)
-    shares = np.where(known, np.exp(below / risk), ~(rows < largest))
+    finite = np.isfinite(largest)  # an infinite value outweighs all others
+    below = np.where(finite, rows, 0) - np.where(finite, largest, 0)
+    shares = np.where(finite, np.exp(below / risk), ~(rows < largest))
     total = shares.sum(axis=0)
     return largest + risk * np.log(total), shares / total
 

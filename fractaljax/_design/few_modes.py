@@ -1,7 +1,7 @@
-"""A design problem in the space of the modes that grow most in a few designs, to search roughly.
+"""A design problem in the space of the modes that grow most in a few designs, for a rough search.
 
-Eigenvalues are most of what a design costs, and those of half the size take an eighth of the time.
-Elsewhere they are off by what the modes of these designs leave out: a search ends in the whole
+Eigenvalues take most of the time of a design, and at half the size they take an eighth of it. At
+other designs they are in error by what the modes of these few leave out: a search ends in the full
 problem.
 """
 
@@ -21,19 +21,19 @@ from .._stability.snapshots import projected
 from .problem import DesignProblem
 
 _LARGE = 60  # degrees of freedom, below which little is saved
-_SHARE = 0.7  # of them: neither in a space of more
-_MODES = 3  # times as many as may grow are in it
-_CUT = 1e-5  # of the largest singular value
+_SHARE = 0.7  # of them, above which the space saves too little
+_MODES = 3  # in the space, as a multiple of those that may grow
+_CUT = 1e-5  # relative to the largest singular value
 
 
 def in_few_modes(problem: DesignProblem, us: np.ndarray) -> DesignProblem | None:
-    """The problem in the space of what grows most in designs us (n, v); None if it saves little.
+    """The problem in the space of the modes that grow most in us (n, v); None if it saves little.
 
-    Neither is it there for functions of the user's, which may ask for all degrees of freedom.
+    It is also None with functions of the user's, which may need all degrees of freedom.
     """
     x = problem.x
-    own = (problem.objective is not None and not problem.least_growth) or problem.constraints
-    if not problem.modes or x.n < _LARGE or x.band is not None or own or problem.cycles:
+    needs_all = (problem.objective is not None and not problem.least_growth) or problem.constraints
+    if not problem.modes or x.n < _LARGE or x.band is not None or needs_all or problem.cycles:
         return None
     vectors, size = in_batches(functools.partial(_growing, problem), 1, us)
     V = decomposed(list(vectors[np.isfinite(vectors).all(axis=(1, 2))]), np.sqrt(size[0]), _CUT)
@@ -49,10 +49,10 @@ def _growing(problem: DesignProblem, us):
     def one(u):
         _, x = problem.stiffened(problem.moved(u, problem.own_condition))
         attached = assembled(x, problem.friction_slope, refuse=False)
-        found = solve(*attached[:3])
-        sought = jnp.argsort(jnp.where(found.s.imag >= 0, -found.s.real, jnp.inf))
+        modes = solve(*attached[:3])
+        sought = jnp.argsort(jnp.where(modes.s.imag >= 0, -modes.s.real, jnp.inf))
         chosen = sought[: _MODES * problem.modes]
-        vectors = jnp.concatenate([found.x[chosen], found.y[chosen]]).T
+        vectors = jnp.concatenate([modes.x[chosen], modes.y[chosen]]).T
         return vectors, jnp.diagonal(attached.M)
 
     return jax.vmap(one)(us)

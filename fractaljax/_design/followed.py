@@ -1,8 +1,8 @@
 """The limit cycle of a design, followed from one design to the next.
 
-Newton's method makes the cycle of a design nearby periodic again, which takes a hundredth of the
+Newton's method makes the cycle of a nearby design periodic again, which takes a hundredth of the
 time of a search. Where that fails, since the itinerary changes or the cycle ends, the motion itself
-is followed from a state of the last cycle to whatever attracts it.
+is followed from a state of the last cycle to its attractor.
 """
 
 import dataclasses
@@ -27,8 +27,8 @@ _REACH = 0.05, 0.01  # longest step between designs, in scaled variables, and th
 _NEAR = 0.2  # relative distance of states beyond which an orbit is another one
 
 
-class _Known(NamedTuple):
-    """What is known of one design: no segments where nothing moves."""
+class _StoredCycle(NamedTuple):
+    """The cycle of one design; its segments are None where there is none."""
 
     u: np.ndarray
     segments: Segments | None
@@ -39,39 +39,39 @@ class _Known(NamedTuple):
 
 @dataclasses.dataclass(eq=False)  # hashable: a problem holds it beside its numbers
 class FollowedCycles:
-    """The cycles of the designs of one problem, as far as they have been asked for."""
+    """The cycles of the designs of one problem, each computed on demand and stored."""
 
     objective: CycleConstraint | None
-    known: dict[bytes, _Known] = dataclasses.field(default_factory=dict)
+    stored: dict[bytes, _StoredCycle] = dataclasses.field(default_factory=dict)
 
     def fill(self, problem, us: np.ndarray, rows: np.ndarray, jacobians: np.ndarray) -> None:
-        """Write what is asked of the cycles into rows (n, 1 + k) and Jacobians (n, 1 + k, v)."""
+        """Write the columns of cycles into rows (n, 1 + k) and Jacobians (n, 1 + k, v)."""
         columns = [
-            (column, asked, (lambda asked, value: asked.above(value)) if column else _itself)
-            for column, asked in self.columns(problem)
+            (column, constraint, (lambda c, value: c.above(value)) if column else _itself)
+            for column, constraint in self.columns(problem)
         ]
         for i, u in enumerate(np.asarray(us, float)):
-            found = self.at(problem, u)
-            for column, asked, residual in columns:
-                given = jnp.asarray(found.measures[:, asked.dof])
+            cycle = self.at(problem, u)
+            for column, constraint, residual in columns:
+                measures = jnp.asarray(cycle.measures[:, constraint.dof])
                 rows[i, column], slope = jax.value_and_grad(
-                    lambda pair, asked=asked, residual=residual: residual(asked, asked.of(*pair))
-                )(given)
-                jacobians[i, column] = np.asarray(slope) @ found.slopes[:, asked.dof]
+                    lambda pair, c=constraint, residual=residual: residual(c, c.of(*pair))
+                )(measures)
+                jacobians[i, column] = np.asarray(slope) @ cycle.slopes[:, constraint.dof]
 
     def columns(self, problem) -> list[tuple[int, CycleConstraint]]:
-        """Which columns of a row are of cycles: requirements, and perhaps the objective."""
+        """The columns of a row that depend on cycles: requirements, perhaps the objective."""
         first = 1 + problem.requirements - len(problem.constraints)
         first -= 0 if problem.cuts is None else len(problem.cuts.reach)
         columns = [
-            (first + i, asked)
-            for i, asked in enumerate(problem.constraints)
-            if isinstance(asked, CycleConstraint)
+            (first + i, constraint)
+            for i, constraint in enumerate(problem.constraints)
+            if isinstance(constraint, CycleConstraint)
         ]
         return columns if self.objective is None else [*columns, (0, self.objective)]
 
     def ends(self, problem, u: np.ndarray) -> dict[str, tuple[float, float]]:
-        """What is asked of the cycles, of the given design and of u (v,), by name and unit."""
+        """The measures of the cycles of the initial design and of u (v,), by name and unit."""
         before = self.at(problem, np.asarray(problem.start, float)).measures
         after = self.at(problem, u).measures
         return {
@@ -83,46 +83,46 @@ class FollowedCycles:
             if isinstance(each, CycleConstraint)
         }
 
-    def at(self, problem, u: np.ndarray) -> _Known:
-        """What is known of the cycle at u (v,), by way of the nearest design with one."""
-        if u.tobytes() in self.known:
-            return self.known[u.tobytes()]
-        if not self.known:
-            own = np.asarray(problem.start, float)
-            self._searched(problem, own, None)
+    def at(self, problem, u: np.ndarray) -> _StoredCycle:
+        """The cycle at u (v,), followed from the nearest design with one."""
+        if u.tobytes() in self.stored:
+            return self.stored[u.tobytes()]
+        if not self.stored:
+            first = np.asarray(problem.start, float)
+            self._searched(problem, first, None)
             return self.at(problem, u)
-        cycles = [known for known in self.known.values() if known.segments is not None]
+        cycles = [other for other in self.stored.values() if other.segments is not None]
         if not cycles:
             return self._searched(problem, u, None)
-        last = min(cycles, key=lambda known: np.abs(u - known.u).max())
+        last = min(cycles, key=lambda other: np.abs(u - other.u).max())
         reach, shortest = _REACH
         while True:
-            away = float(np.abs(u - last.u).max())
-            arrives = away <= reach
-            next_u = u if arrives else last.u + reach / away * (u - last.u)
-            found = self._newton(problem, next_u, last.segments)
-            if found is None and reach > shortest:
-                reach = min(away, reach) / 2
+            distance = float(np.abs(u - last.u).max())
+            arrives = distance <= reach
+            next_u = u if arrives else last.u + reach / distance * (u - last.u)
+            cycle = self._newton(problem, next_u, last.segments)
+            if cycle is None and reach > shortest:
+                reach = min(distance, reach) / 2
                 continue
-            if found is None:
-                found = self._searched(problem, next_u, last.start)
-                if found.segments is None and not arrives:
-                    found = self._beyond(problem, u, found, last.start)
-            self.known[found.u.tobytes()] = found
-            if np.array_equal(found.u, u):
-                return found
-            last = found
+            if cycle is None:
+                cycle = self._searched(problem, next_u, last.start)
+                if cycle.segments is None and not arrives:
+                    cycle = self._beyond(problem, u, cycle, last.start)
+            self.stored[cycle.u.tobytes()] = cycle
+            if np.array_equal(cycle.u, u):
+                return cycle
+            last = cycle
 
-    def _beyond(self, problem, u, found: _Known, start) -> _Known:
-        """What is at u if the cycle has ended before it, where `found` was."""
+    def _beyond(self, problem, u, ended: _StoredCycle, start) -> _StoredCycle:
+        """The cycle at u if its branch has ended on the way there, with the one in `ended`."""
         x = _mechanism(problem, u)
-        at_rest = not found.measures.any()
+        at_rest = not ended.measures.any()
         if at_rest and float(growth_rate(x)) < 0:
-            return found._replace(u=u)
+            return ended._replace(u=u)
         return self._searched(problem, u, None if at_rest else start)
 
-    def _newton(self, problem, u, segments) -> _Known | None:
-        """The orbit near that of another design; None unless it is a cycle that attracts."""
+    def _newton(self, problem, u, segments) -> _StoredCycle | None:
+        """The orbit near another design's segments; None unless it is an attracting cycle."""
         (segments, start, ok), measures, slopes = _followed(
             problem.with_fields(cycles=None, cuts=None, constraints=(), grid=None),
             jnp.asarray(u, problem.low.dtype),
@@ -130,26 +130,26 @@ class FollowedCycles:
         )
         if not bool(ok):
             return None
-        return _Known(u, segments, *(np.asarray(x, float) for x in (start, measures, slopes)))
+        return _StoredCycle(u, segments, *(np.asarray(x, float) for x in (start, measures, slopes)))
 
-    def _searched(self, problem, u, start) -> _Known:
-        """What the motion from a start ends in."""
+    def _searched(self, problem, u, start) -> _StoredCycle:
+        """The cycle, if any, to which the motion from a start settles."""
         x = _mechanism(problem, u)
         cycle = limit_cycle(x, start, throw=False)
         n = len(cycle.amplitude)
-        found = None
-        if bool(jnp.isfinite(cycle.period)):  # or one that repels hardly
-            found = self._newton(problem, u, cycle._orbit.segments)
-        if found is None:
+        stored = None
+        if bool(jnp.isfinite(cycle.period)):  # or one that hardly repels
+            stored = self._newton(problem, u, cycle._orbit.segments)
+        if stored is None:
             at_rest = bool(cycle.result == CycleResult.equilibrium)
             measures = np.full((2, n), 0.0 if at_rest else np.nan)
             none = np.zeros((2, n, len(u)))
-            found = _Known(u, None, np.full(2 * n, np.nan), measures, none)
-        self.known[u.tobytes()] = found
-        return found
+            stored = _StoredCycle(u, None, np.full(2 * n, np.nan), measures, none)
+        self.stored[u.tobytes()] = stored
+        return stored
 
 
-def _itself(asked: CycleConstraint, value: jax.Array) -> jax.Array:
+def _itself(constraint: CycleConstraint, value: jax.Array) -> jax.Array:
     return value
 
 
@@ -159,26 +159,26 @@ def _mechanism(problem, u):
 
 @exported_jit
 def _followed(problem, u, segments: Segments):
-    """The orbit of the design u near those segments, what is measured of it, and by u."""
+    """The orbit of the design u near these segments, its measures, and their slopes by u."""
     rtol = check_rtol(None, u.dtype)
 
     def measured(u):
         system = hybrid_system(problem.moved(u, problem.own_condition))
         frozen = jax.lax.stop_gradient(system)
         lane = jax.tree.map(lambda x: x[..., None], segments)  # the only one
-        wanted, reach = jnp.array([True]), jnp.array([jnp.inf], u.dtype)
-        found = jax.lax.stop_gradient(solve_periodic_orbits(frozen, lane, wanted, reach))
-        y, duration = orbit(system, jax.tree.map(lambda x: x[..., 0], found.segments))
+        active, reach = jnp.array([True]), jnp.array([jnp.inf], u.dtype)
+        solution = jax.lax.stop_gradient(solve_periodic_orbits(frozen, lane, active, reach))
+        y, duration = orbit(system, jax.tree.map(lambda x: x[..., 0], solution.segments))
         closed = Segments(y, duration, segments.s, segments.guard)
         rows = jnp.eye(len(y) // 2, len(y), dtype=y.dtype)
         low, high = extreme_values(system, closed, rows)
         n, units = len(rows), system.units
         velocity = jnp.sqrt(mean_square(system, closed)[n:])
         measures = jnp.stack([(high - low) * units[:n], velocity * units[n:]])
-        moved = jnp.max(jnp.abs(y - segments.y)) < _NEAR * (1 + jnp.max(jnp.abs(y)))
-        ok = found.converged & (found.error <= rtol) & (growth_of(frozen, found) < HARDLY)
-        ok = jnp.all(ok & admissible(frozen, found.segments, found.middle))
-        ok = ok & moved & jnp.all(jnp.isfinite(measures))
+        near = jnp.max(jnp.abs(y - segments.y)) < _NEAR * (1 + jnp.max(jnp.abs(y)))
+        ok = solution.converged & (solution.error <= rtol) & (growth_of(frozen, solution) < HARDLY)
+        ok = jnp.all(ok & admissible(frozen, solution.segments, solution.middle))
+        ok = ok & near & jnp.all(jnp.isfinite(measures))
         return measures, (measures, (closed, y[:, 0] * units, ok))
 
     slopes, (measures, orbit_of) = jax.jacfwd(measured, has_aux=True)(u)

@@ -1,4 +1,4 @@
-"""A design problem as a solver sees it: an objective and constraints with their slopes."""
+"""A design problem in a solver's form: an objective and constraints with their slopes."""
 
 import dataclasses
 from collections.abc import Callable
@@ -11,20 +11,20 @@ from .problem import UNKNOWN
 
 @dataclasses.dataclass
 class Functions:
-    """What a solver asks, from one evaluation at each point: minimise f subject to c <= 0.
+    """Minimise f subject to c <= 0: what a solver calls, with one evaluation at each point.
 
-    Rows (m, 1 + k) have their columns in `aim` minimised at their largest, by a variable of its own
-    (`extra`) where there are several, and those in `limited` met with some slack, so that rounding
-    cannot undo it.
+    The largest of the columns in `aim` of rows (m, 1 + k) is minimised, by an additional variable
+    (`extra`) where there are several; the columns in `limited` are met with some slack, so that
+    rounding cannot violate them.
     """
 
     rows_at: Callable
-    aim: np.ndarray  # (1 + k,), whether a column is
-    limited: np.ndarray
+    aim: np.ndarray  # (1 + k,), True for columns to minimise
+    limited: np.ndarray  # (1 + k,), True for columns to keep at most 0
     slack: float | np.ndarray  # (1 + k,)
     scale: float  # of the objective
     extra: bool
-    seen: list[np.ndarray] = dataclasses.field(default_factory=list)  # where rows were asked for
+    seen: list[np.ndarray] = dataclasses.field(default_factory=list)  # where rows were evaluated
     _known: dict[bytes, Any] = dataclasses.field(default_factory=dict)
 
     def at(self, z):
@@ -58,7 +58,7 @@ class Functions:
 
 
 def finite(rows: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows with numbers in place of those that are none, and slopes with zeros."""
+    """Rows with finite numbers in place of undefined ones, and slopes with zeros."""
     rows = np.nan_to_num(rows, nan=UNKNOWN, posinf=UNKNOWN, neginf=-UNKNOWN)
     return rows, np.nan_to_num(slopes, posinf=0, neginf=0)
 

@@ -1,4 +1,4 @@
-"""How many modes of a structure may grow: each has a growth rate to keep low."""
+"""The number of modes of a structure that may grow; each has a growth rate to keep low."""
 
 from typing import TYPE_CHECKING
 
@@ -16,19 +16,19 @@ from .rows import paired, rows_in_batches
 if TYPE_CHECKING:
     from .problem import DesignProblem
 
-_LOOKED_AT = 15  # designs, besides the given one, in which growing modes are counted
-MODES_MOST = 16  # that requirements are made of
+_LOOKED_AT = 15  # designs, besides the initial one, in which growing modes are counted
+MODES_MOST = 16  # that requirements can include
 
 
 def modes_to_keep(problem: "DesignProblem") -> int:
-    """How many modes may grow: two more than grow in any of a few designs."""
+    """The number of modes that may grow: two more than grow in any of a few designs."""
     designs = np.concatenate(
         [np.asarray(problem.start)[None], low_discrepancy(_LOOKED_AT, len(problem.names))]
     )
     modes = max(2, min(MODES_MOST, problem.x.n))
     looking = problem.with_fields(modes=modes)
-    own = paired(designs, np.asarray(problem.own_condition)[None])
-    growing = rows_in_batches(_rates, looking, *own) > float(problem.target)
+    pairs = paired(designs, np.asarray(problem.own_condition)[None])
+    growing = rows_in_batches(_rates, looking, *pairs) > float(problem.target)
     return min(int(growing.sum(axis=2).max()) + 2, modes)
 
 
@@ -41,8 +41,8 @@ def _rates(problem: "DesignProblem", us, conditions):
         rates = []
         for each in (problem.stiffened(x)[1], *(under(x, law) for law in problem.laws)):
             attached = assembled(each, problem.friction_slope, refuse=False)
-            found = leading(*attached[:3], problem.modes, x.band)
-            rates.append(jnp.where(attached.lost, jnp.nan, found.s.real))
+            modes = leading(*attached[:3], problem.modes, x.band)
+            rates.append(jnp.where(attached.lost, jnp.nan, modes.s.real))
         return jnp.stack(rates)
 
     return jax.vmap(one)(us, conditions)

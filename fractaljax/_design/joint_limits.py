@@ -1,4 +1,4 @@
-"""What joints alone require of designs: it takes no eigenvalues."""
+"""Requirements on the joints of designs, which take no eigenvalues."""
 
 import functools
 from collections.abc import Callable
@@ -15,17 +15,17 @@ from .problem import UNKNOWN, DesignProblem
 from .rows import paired
 from .tolerance import quantile
 
-_BATCH = 8  # designs: of a step in a trust region there are few at once
-_INSIDE, _INSIDE_STEPS = 0.01, 40  # by how much designs that are screened are inside the limits
+_BATCH = 8  # designs: a step in a trust region evaluates few at once
+_INSIDE, _INSIDE_STEPS = 0.01, 40  # margin within the limits, and most steps to reach it
 
 Limits = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 def limits_of_joints(problem: DesignProblem) -> Limits:
-    """A function: what joints alone require (n, r) of designs (n, v), and Jacobians.
+    """A function of designs (n, v): their residuals (n, r) of joints alone, and Jacobians.
 
-    Each design is at a condition (n, c). Stiffness counts by its logarithm, which many steps of a
-    design change evenly. To take the problem apart once, not at each call, saves half of a call.
+    Each design is at a condition (n, c). Stiffness enters by its logarithm, which changes evenly
+    over many steps of a design. Flattening the problem once, not at each call, halves its time.
     """
     leaves, structure = jax.tree.flatten(problem)
     program = functools.partial(_limits_of_joints, leaves, structure=structure)
@@ -38,11 +38,11 @@ def limits_of_joints(problem: DesignProblem) -> Limits:
 
 
 def within_joints(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray) -> np.ndarray:
-    """Designs us (n, v) moved to where every joint is inside its limits, as far as that goes.
+    """Designs us (n, v) moved until every joint is inside its limits, as far as possible.
 
-    At all conditions (m, c). Of many joints a design that is drawn has nearly always one outside,
-    where no growth rate says anything. Their limits take no eigenvalues. By Levenberg and
-    Marquardt's method.
+    The limits apply at all conditions (m, c). With many joints a random design nearly always has
+    one outside, where growth rates are meaningless. The limits take no eigenvalues. The method is
+    that of Levenberg and Marquardt.
     """
     limits, (n, v) = limits_of_joints(problem), us.shape
 
@@ -82,11 +82,11 @@ def _limits_of_joints(leaves, us, conditions, structure):
 
     def residuals(u, condition):
         if problem.scatter is None:
-            found = required(u, condition)
+            values = required(u, condition)
         else:
-            found = jax.vmap(lambda shift: required(u, condition, shift))(problem.scatter.shifts)
-            found = quantile(found, problem.scatter.weights, problem.scatter.level)
-        model, stiff = jnp.split(found, [problem.model_residuals])
+            values = jax.vmap(lambda shift: required(u, condition, shift))(problem.scatter.shifts)
+            values = quantile(values, problem.scatter.weights, problem.scatter.level)
+        model, stiff = jnp.split(values, [problem.model_residuals])
         both = jnp.concatenate([model, -jnp.log1p(-stiff)])
         return both, both
 

@@ -1,4 +1,4 @@
-"""What designs ask of the joints of a scene or of a structure, which has several."""
+"""The joints of a scene, or of a structure, which has several, as designs need them."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -19,16 +19,16 @@ from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
 from .._stability.band import in_band
 
-_FEW = 2  # joints, of which each has its own program
+_FEW = 2  # joints, up to which each has a separate program
 
 
 def of_joint(name: str) -> str:
-    """What a quantity of a joint begins with; of a scene, nothing."""
+    """The prefix of the quantities of a joint; empty for a scene."""
     return f"{name}." if name else ""
 
 
 class _Stiffness(NamedTuple):
-    """What designs ask of a `ContactState`, of a law without one."""
+    """The fields of a `ContactState` that designs need, for a law without one."""
 
     K_n: Array
     K_t: Array
@@ -37,14 +37,14 @@ class _Stiffness(NamedTuple):
 
 
 class _Part(NamedTuple):
-    """What `state_of` asks of a scene or a joint."""
+    """The fields of a scene or a joint that `state_of` needs."""
 
     contact: Any
     friction: Any
 
 
 def state_of(part) -> Any:
-    """The `ContactState` of a scene or a joint, of other laws their stiffness."""
+    """The `ContactState` of a scene or a joint, or the stiffness by other laws."""
     law, friction = part.contact, part.friction
     if law.fractal:
         return law.state(friction.mu_s, friction.mu_m)
@@ -52,7 +52,7 @@ def state_of(part) -> Any:
 
 
 def states_of(parts: Mapping[str, Any]) -> dict[str, Any]:
-    """`state_of` of many, by name: a law that more than two share is compiled once."""
+    """`state_of` for many parts, by name; a law that more than two share is compiled once."""
     alike: dict[Any, list[str]] = {}
     pairs = {name: (part.contact, part.friction) for name, part in parts.items()}
     for name, pair in pairs.items():
@@ -65,36 +65,36 @@ def states_of(parts: Mapping[str, Any]) -> dict[str, Any]:
             states |= {name: state_of(parts[name]) for name in names}
             continue
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(pairs[name] for name in names))
-        found = jax.vmap(lambda contact, friction: state_of(_Part(contact, friction)))(*stacked)
+        batch = jax.vmap(lambda contact, friction: state_of(_Part(contact, friction)))(*stacked)
         for i, name in enumerate(names):
-            states[name] = jax.tree.map(lambda leaf, i=i: leaf[i], found)
+            states[name] = jax.tree.map(lambda leaf, i=i: leaf[i], batch)
     return {name: states[name] for name in parts}
 
 
 def is_fractal(x, name) -> bool:
-    """Whether a contact has the source's law."""
+    """True if a contact has the source's law."""
     return joints_of(x)[name].contact.fractal
 
 
 def slips(x, name) -> bool:
-    """Whether a contact has the source's tangential law, which slips."""
+    """True if a contact has the source's tangential law, which slips."""
     return is_fractal(x, name) and joints_of(x)[name].contact.stiffness_ratio is None
 
 
 def with_stiffness(x, states):
-    """`x` with contacts of known stiffness where their states (by name) are known already."""
+    """`x` with contacts of fixed stiffness in the joints whose states (by name) are given."""
     parts, zero = joints_of(x), FixedContact(0.0, 0.0, 1.0)
     for name, state in states.items():
         P = getattr(parts[name].contact, "P", zero.P)  # of a preloaded joint
-        known = substitute(zero, {"K_n": state.K_n, "K_t": state.K_t, "P": P})
-        parts[name] = eqx.tree_at(lambda part: part.contact, parts[name], known)
+        fixed = substitute(zero, {"K_n": state.K_n, "K_t": state.K_t, "P": P})
+        parts[name] = eqx.tree_at(lambda part: part.contact, parts[name], fixed)
     if isinstance(x, Structure):
         return eqx.tree_at(lambda s: s.joints, x, tuple(parts.values()))
     return parts[""]
 
 
 def with_contacts(x: Mechanism, contacts: Mapping[str, Contact]) -> Any:
-    """`x` with other contact laws in the joints of these names; that of a scene is "".
+    """`x` with other contact laws in the joints of these names; the joint of a scene is "".
 
     **Raises:** `ValueError` naming the joint of a structure that a law does not suit.
     """
@@ -114,26 +114,26 @@ def with_contacts(x: Mechanism, contacts: Mapping[str, Contact]) -> Any:
 def under(x: Mechanism, law: Contact) -> Any:
     """`x` with another contact law for its surface, material and load.
 
-    Of a structure, in every joint whose contact has a surface; errors as `with_contacts`.
+    For a structure, in every joint whose contact has a surface; errors as `with_contacts`.
     """
-    found = {
+    contacts = {
         name: on_the_same_joint(law, part.contact)
         for name, part in joints_of(x).items()
         if isinstance(x, Scene) or part.contact.has_surface
     }
-    return with_contacts(x, found)
+    return with_contacts(x, contacts)
 
 
 def moved_contacts(x, names) -> tuple[str, ...]:
-    """The contacts with a law whose stiffness these quantities move."""
-    moved = {each for name in names for each in moved_by(x, name)}
-    found = []
+    """The contacts with a law whose stiffness depends on these quantities."""
+    affected = {each for name in names for each in moved_by(x, name)}
+    contacts = []
     for name, part in joints_of(x).items():
-        own = {*own_quantities(part.contact), *own_quantities(part.friction)}
+        quantities = {*own_quantities(part.contact), *own_quantities(part.friction)}
         law = not isinstance(part.contact, FixedContact)
-        if law and moved & {of_joint(name) + each for each in own}:
-            found.append(name)
-    return tuple(found)
+        if law and affected & {of_joint(name) + each for each in quantities}:
+            contacts.append(name)
+    return tuple(contacts)
 
 
 def least_damping(x) -> tuple[Any, Any]:

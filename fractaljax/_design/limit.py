@@ -1,10 +1,10 @@
 """How far a growth rate can be lowered where its target is out of reach, and what holds it there.
 
-At a least largest growth rate the slopes of those that are largest, with weights that sum to 1,
-and of the requirements and bounds that are met with nothing to spare cancel (Karush, Kuhn and
-Tucker): no small change lowers all of them. This is a proof for small changes. For large ones
-there is only how many starts end at the same growth rate. Where the other requirements cannot be
-met either, it is the largest of their residuals that is as small as can be, whatever grows.
+Where the largest growth rate is least, the slopes of the largest growth rates, with weights that
+sum to 1, cancel with those of the active requirements and bounds (Karush, Kuhn and Tucker): no
+small change lowers all of them. This is a proof for small changes. For large ones the only evidence
+is the number of starts that end at the same growth rate. Where the other requirements cannot be met
+either, the largest of their residuals is minimised instead, whatever grows.
 """
 
 from collections.abc import Mapping
@@ -20,24 +20,24 @@ from .search import Search
 
 _ACTIVE = 1e-4  # a residual, or a scaled variable, is at its limit within this
 _AGREE = 0.01  # of a growth rate
-_LEVEL = 1e-3  # of the steepest slope: as good as none
+_LEVEL = 1e-3  # of the steepest slope, below which a slope counts as zero
 
 
 class LeastGrowth(Record):
     """The least growth rate that was found with every other requirement met.
 
     `held_by` are the growth rates, requirements and bounds without which it could be lowered, with
-    their multipliers: of growth rates, weights that sum to 1; of others, by how many 1/s it falls
-    where one of them, a residual or a share of the bounds, is loosened by 1. `slope` is what these
+    their multipliers: for growth rates, weights that sum to 1; for the others, the decrease [1/s]
+    when one of them, a residual or a share of the bounds, is loosened by 1. `slope` is what these
     leave of the slopes, by designed quantities as shares of their bounds, and `steepest` the
-    steepest slope among the growth rates that are largest [1/s].
+    steepest slope among the largest growth rates [1/s].
 
-    Where no design was found to meet the others, `unmet` are their residuals at the design whose
-    largest is least, and that takes the place of the growth rate in `held_by`, `slope`, `steepest`
-    and `agreed`.
+    Where no design was found to meet the other requirements, `unmet` are their residuals at the
+    design whose largest residual is least, and that residual takes the place of the growth rate in
+    `held_by`, `slope`, `steepest` and `agreed`.
     """
 
-    growth_rate: float  # [1/s], of all modes, laws and conditions that are required
+    growth_rate: float  # [1/s], over all required modes, laws and conditions
     target: float
     values: Mapping[str, float]  # of the designed quantities
     unmet: Mapping[str, float]  # other requirements that are not met, the worst first
@@ -49,7 +49,7 @@ class LeastGrowth(Record):
 
     @property
     def met(self) -> bool:
-        """Whether every other requirement is."""
+        """True if every other requirement is met."""
         return not self.unmet
 
     @property
@@ -59,7 +59,7 @@ class LeastGrowth(Record):
 
     @property
     def stationary(self) -> bool:
-        """Whether no small change lowers it, to first order."""
+        """True if no small change lowers it, to first order."""
         return self.slope <= _LEVEL * self.steepest
 
     def __repr__(self) -> str:
@@ -80,22 +80,24 @@ class LeastGrowth(Record):
         return "\n".join([first, least, grows, there, held, f"{can}: {cancel}", agreed])
 
 
-def least_growth(search: Search, paths: list[np.ndarray], found: Evaluation) -> LeastGrowth | None:
+def least_growth(
+    search: Search, paths: list[np.ndarray], evaluation: Evaluation
+) -> LeastGrowth | None:
     """What holds the least growth rate at the ends of `Search.least_growth`; None if it has none.
 
-    That is so where no design slides steadily at all that is asked.
+    There is none where no design slides steadily at every condition and law required.
     """
     problem = search.evaluator.problem
     target, scale = float(problem.target), float(problem.growth_scale)
     count = 1 + len(problem.residual_names)
     growing, others = search.growing[:count], search.others[:count]
-    growth, unmet = search.growth_and_rest(found)
+    growth, unmet = search.growth_and_rest(evaluation)
     if not (unmet <= 0).any():
-        paths, found = search.least_unmet([path[-1] for path in paths])
-        growth, unmet = search.growth_and_rest(found)
+        paths, evaluation = search.least_unmet([path[-1] for path in paths])
+        growth, unmet = search.growth_and_rest(evaluation)
     possible, rates = unmet <= 0, target + scale * np.sinh(growth)
     best = int(np.lexsort((rates, ~possible, np.maximum(unmet, 0) * ~possible))[0])
-    u, residuals = paths[best][-1], found.residuals[best]
+    u, residuals = paths[best][-1], evaluation.residuals[best]
     if not np.isfinite(rates[best] if possible[best] else unmet[best]):
         return None
     if possible[best]:
@@ -126,7 +128,8 @@ def least_growth(search: Search, paths: list[np.ndarray], found: Evaluation) -> 
 def _held_by(search: Search, u: np.ndarray, aim: np.ndarray, limited: np.ndarray) -> Any:
     """Multipliers by name, what they leave of the slopes, and the steepest slope.
 
-    Of the largest in `aim` (1 + k,), of what is `limited`, and of bounds; of growth rates [1/s].
+    They belong to the largest columns in `aim` (1 + k,), to the active ones in `limited`, and to
+    active bounds; slopes of growth rates are in 1/s.
     """
     from scipy.optimize import nnls
 
@@ -143,12 +146,12 @@ def _held_by(search: Search, u: np.ndarray, aim: np.ndarray, limited: np.ndarray
     v = len(u)
     low, high = u <= _ACTIVE, u >= 1 - _ACTIVE
     columns = [*slopes[largest], *slopes[others], *-np.eye(v)[low], *np.eye(v)[high]]
-    known = [name for name, here in zip(names, largest, strict=True) if here]
-    known += [name for name, here in zip(names, others, strict=True) if here]
-    known += [
+    labels = [name for name, here in zip(names, largest, strict=True) if here]
+    labels += [name for name, here in zip(names, others, strict=True) if here]
+    labels += [
         f"{name} >= lower bound" for name, here in zip(problem.names, low, strict=True) if here
     ]
-    known += [
+    labels += [
         f"{name} <= upper bound" for name, here in zip(problem.names, high, strict=True) if here
     ]
     steepest = float(np.linalg.norm(slopes[largest], axis=1).max())
@@ -158,7 +161,7 @@ def _held_by(search: Search, u: np.ndarray, aim: np.ndarray, limited: np.ndarray
     weight = 1e4 * (np.arange(matrix.shape[1]) < largest.sum())
     multipliers = nnls(np.vstack([matrix, weight]), np.append(np.zeros(v), 1e4))[0]
     left = float(np.linalg.norm(matrix @ multipliers) * unit)
-    held = {name: float(x) for name, x in zip(known, multipliers, strict=True) if x > 0}
+    held = {name: float(x) for name, x in zip(labels, multipliers, strict=True) if x > 0}
     return held, left, steepest
 
 
@@ -170,7 +173,7 @@ def _linearised(evaluator: Evaluator, u: np.ndarray) -> tuple[np.ndarray, np.nda
         us = np.repeat(u[None], len(conditions), axis=0)
         row, slopes = evaluator.average(*linearise(problem, us, conditions)[:2])
         return row[0], slopes[0]
-    places = evaluator.evaluate(u[None]).places[0]  # of each column, its worst
+    places = evaluator.evaluate(u[None]).places[0]  # where each column is worst
     conditions, which = np.unique(evaluator.envelope.values(places), axis=0, return_inverse=True)
     us = np.repeat(u[None], len(conditions), axis=0)
     rows, slopes = linearise(problem, us, conditions)[:2]

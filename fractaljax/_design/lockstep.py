@@ -8,15 +8,15 @@ from collections.abc import Callable, Sequence
 def in_lockstep(tasks: Sequence[Callable], answer: Callable[[dict], dict]) -> list:
     """The results of tasks, each a function of `ask`, run side by side.
 
-    What all of them ask next is answered at once, in this thread: one call of a compiled program
-    costs about as much for many designs as for one. `answer` takes {task: question}, and may leave
-    some to be asked again with those of the tasks that it answers.
+    Their next questions are answered together, in this thread: one call of a compiled program costs
+    about as much for many designs as for one. `answer` takes {task: question}, and may leave some
+    unanswered, which it gets again with the next questions of the tasks that it answers.
     """
-    asked, replies = queue.SimpleQueue(), [queue.SimpleQueue() for _ in tasks]
+    requests, replies = queue.SimpleQueue(), [queue.SimpleQueue() for _ in tasks]
 
     def run(i):
         def ask(question):
-            asked.put((i, question))
+            requests.put((i, question))
             reply = replies[i].get()
             if isinstance(reply, BaseException):
                 raise reply
@@ -25,14 +25,14 @@ def in_lockstep(tasks: Sequence[Callable], answer: Callable[[dict], dict]) -> li
         try:
             return tasks[i](ask)
         finally:
-            asked.put((i, None))
+            requests.put((i, None))
 
     with concurrent.futures.ThreadPoolExecutor(max(1, len(tasks))) as pool:
         results = [pool.submit(run, i) for i in range(len(tasks))]
         questions, due = {}, len(tasks)
         try:
             while due:
-                questions |= dict(asked.get() for _ in range(due))
+                questions |= dict(requests.get() for _ in range(due))
                 questions = {i: questions[i] for i in sorted(questions) if questions[i] is not None}
                 answers = answer(questions) if questions else {}
                 for i, reply in answers.items():

@@ -1,7 +1,7 @@
 """Trade-offs: the designs at which one objective cannot fall unless another one rises.
 
 The second objective becomes a requirement, at most a limit. A family of limits between its least
-and the value it has where the first objective is least gives the front (epsilon-constraint).
+value and its value where the first objective is least gives the front (epsilon-constraint).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -21,8 +21,8 @@ from .problem import DesignProblem
 from .rows import describe
 from .search import Search
 
-_STARTS = 6  # of each member of the front
-_RESOLVED = 1e-6  # relative, of the values at the ends of a front
+_STARTS = 6  # for each member of the front
+_RESOLVED = 1e-6  # relative difference of the ends of a front
 _POINTS_MAX = 1000
 
 
@@ -84,7 +84,7 @@ def pareto(
 ) -> Front:
     """The front of two objectives, both functions of a scene or structure that are minimised.
 
-    `options` are those of `design`, but for `objective`, `starts`, `envelope`, `risk` and
+    `options` are those of `design`, except `objective`, `starts`, `envelope`, `risk` and
     `quiet_within`: bounds, target, K_n_min, constraints, tolerance and so on hold for every member.
 
     **Raises:** `ValueError` for fewer than three points, where no design meets the requirements,
@@ -102,8 +102,8 @@ def pareto(
     refused = {"objective", "starts", "envelope", "risk", "quiet_within"} & set(options)
     if refused:
         raise ValueError(f"pareto does not take {', '.join(sorted(refused))}")
-    asked: dict[str, Any] = {**options, "progress": False}
-    ends = design(x, objective=first, **asked), design(x, objective=second, **asked)
+    arguments: dict[str, Any] = {**options, "progress": False}
+    ends = design(x, objective=first, **arguments), design(x, objective=second, **arguments)
     for name, end in zip(names, ends, strict=True):
         if end.violated:
             raise ValueError(
@@ -124,15 +124,15 @@ def pareto(
     if not high > low or _equal(high, low) or _equal(*rows[:, 0].tolist()):
         raise ValueError(f"the least {names[0]} and the least {names[1]} are one design")
     _, designs = screened(problem, None, made["lattice"])
-    known = Evaluator(problem).evaluate(designs)
+    screening = Evaluator(problem).evaluate(designs)
     solver = made["solver"] or solver_of(problem)
-    found = []
+    members = []
     for share in tqdm(np.linspace(1, 0, points), desc="pareto", disable=not progress):
         limit = low + share * (high - low)
         residuals = np.column_stack(
-            [known.residuals[:, :-1], (known.residuals[:, -1] - limit) / (high - low)]
+            [screening.residuals[:, :-1], (screening.residuals[:, -1] - limit) / (high - low)]
         )
-        merit = known.values / scale + 10 * np.maximum(residuals, 0).sum(axis=1)
+        merit = screening.values / scale + 10 * np.maximum(residuals, 0).sum(axis=1)
         promising = designs[np.argsort(np.nan_to_num(merit, nan=np.inf), kind="stable")]
         between = share * places[0] + (1 - share) * places[1]
         starts = np.concatenate([places, between[None], promising[: _STARTS - 3]])
@@ -144,9 +144,9 @@ def pareto(
         meets = ends_here.worst <= 0
         if meets.any():
             u = us[np.where(meets, ends_here.values, np.inf).argmin()]
-            found.append((*Evaluator(problem).evaluate(u[None]).rows[0, (0, -1)].tolist(), u))
+            members.append((*Evaluator(problem).evaluate(u[None]).rows[0, (0, -1)].tolist(), u))
     best = sorted(
-        (member for member in found if not any(_beats(other, member) for other in found)),
+        (member for member in members if not any(_beats(other, member) for other in members)),
         key=lambda member: member[0],
     )
     first_values, second_values, us = (np.array(column) for column in zip(*best, strict=True))
@@ -158,7 +158,7 @@ def pareto(
         quantities={name: numbers[name] for name in shown},
         names=(names[0], names[1]),
         ends=ends,
-        failed=points - len(found),
+        failed=points - len(members),
     )
 
 
@@ -168,5 +168,5 @@ def _equal(one: float, other: float) -> bool:
 
 
 def _beats(other, member) -> bool:
-    """Whether a member is as good in the first objective and better in the second."""
+    """True if `other` is as good in the first objective and better in the second."""
     return other[0] <= member[0] and other[1] < member[1]
