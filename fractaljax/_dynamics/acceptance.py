@@ -1,4 +1,4 @@
-"""Which periodic orbits a motion can settle to: they keep to the friction law and attract."""
+"""Which periodic orbits a motion can settle on: those that obey the friction law and attract."""
 
 import functools
 
@@ -13,11 +13,11 @@ from .lanes import log_spectral_radius
 from .orbit import PeriodicOrbit
 from .segments import Segments, cumulative, next_start
 
-HARDLY = 1e-3  # growth in a period up to which an orbit that repels is kept
+HARDLY = 1e-3  # growth per period up to which a repelling orbit is kept
 
 
 def _quintic(y, d, x):
-    """The quintic with values y (3, ...) and slopes d (3, ...) at 0, 1/2 and 1, at x."""
+    """Quintic interpolant at x, of values y (3, ...) and slopes d (3, ...) at 0, 1/2 and 1."""
     u, v, w = x, x - 0.5, x - 1
     # Lagrange weights squared, each with the correction of its own slope.
     at_0, at_m, at_1 = 4 * (v * w) ** 2, 16 * (u * w) ** 2, 4 * (u * v) ** 2
@@ -26,18 +26,18 @@ def _quintic(y, d, x):
 
 
 def admissible(system: HybridSystem, segments: Segments, middle) -> Bool[Array, " g"]:
-    """Whether orbits obey the friction law along their itinerary; `middle` are the midpoints.
+    """True where orbits obey the friction law along their itinerary; `middle` are the midpoints.
 
     No guard is below zero inside a segment, and every switch leads to the next contact state.
     """
     y, s, h, ends = segments.y, segments.s, segments.duration, next_start(segments.y)
     at = jnp.stack([y, middle, ends])
-    # One by one, which compiles and runs sooner than all at once.
+    # One at a time, which compiles and runs faster than all at once.
     d = jax.lax.map(lambda y: h[None] * system.field(y, s), at)
-    guards = functools.partial(jax.lax.map, lambda y: system.guards(y, s)[1:])  # but the section
+    guards = functools.partial(jax.lax.map, lambda y: system.guards(y, s)[1:])  # no section
     scale = 1 + jnp.max(jnp.abs(y), axis=(0, 1), keepdims=True)
-    # Half a segment each: the cubic through a guard's ends and a point between says where it is
-    # lowest. There the guard itself is evaluated.
+    # On each half of a segment a cubic through samples of a guard tells where it is lowest. The
+    # guard itself is evaluated there.
     places = jnp.arange(7) / 6
     inside = jax.vmap(lambda x: _quintic(at, d, x))(places)
     g = guards(inside)
@@ -48,27 +48,26 @@ def admissible(system: HybridSystem, segments: Segments, middle) -> Bool[Array, 
     half = jnp.arange(2).reshape(2, *(1,) * (theta.ndim - 1))
     lowest = jax.vmap(lambda x: _quintic(at, d, x))((half + theta) / 2)
     g = jnp.concatenate([g, guards(lowest)])
-    # The quintic is this good in a segment of the default length.
+    # The quintic has this accuracy on a segment of the default length.
     holds = jnp.all(g > -1e-8 * scale[None], axis=(0, 1)) & (h > -1e-10)
     _, after = system.switch(ends, s, segments.guard)
     return jnp.all(holds & jnp.all(after == next_start(s), axis=0), axis=0)
 
 
 def growth_of(system: HybridSystem, orbit: PeriodicOrbit) -> Float[Array, " g"]:
-    """ln of the largest Floquet multiplier, but the one of the motion itself, in modulus.
+    """ln of the largest modulus of the Floquet multipliers, without the one along the orbit.
 
-    The multipliers of an excitation, which are 1, are none of the mechanism's. Without an orbit it
-    is not a number.
+    The multipliers of an excitation, which are 1, are left out too. Without an orbit it is NaN.
     """
-    own = system.own(jnp.swapaxes(system.own(orbit.jacobian), 0, 1))
-    log = log_spectral_radius(jnp.swapaxes(own, 0, 1), SQUARINGS)
+    jacobian = system.own(jnp.swapaxes(system.own(orbit.jacobian), 0, 1))
+    log = log_spectral_radius(jnp.swapaxes(jacobian, 0, 1), SQUARINGS)
     return jnp.where(orbit.converged, log, jnp.nan)
 
 
 def has_shorter_period(orbit: Segments, returns) -> Bool[Array, " g"]:
-    """Whether orbits are back at their start before the last of their returns (g,)."""
+    """True where orbits are back at their start before the last of their returns (g,)."""
     start = orbit.y[:, :1]
-    away = jnp.max(jnp.abs(next_start(orbit.y) - start), axis=0)
+    distance = jnp.max(jnp.abs(next_start(orbit.y) - start), axis=0)
     at_section = orbit.guard == SECTION
     early = at_section & (returns[None] > cumulative(at_section.T).T)
-    return jnp.any(early & (away < 1e-5 * (1 + jnp.max(jnp.abs(start), axis=0))), axis=0)
+    return jnp.any(early & (distance < 1e-5 * (1 + jnp.max(jnp.abs(start), axis=0))), axis=0)

@@ -23,7 +23,7 @@ def attractors(
     rtol: float | None = None,
     max_returns: int = 5000,
 ) -> list[LimitCycle]:
-    """Every distinct motion that the starts end in, also those without a cycle.
+    """Every distinct motion that the starts end in, including those without a cycle.
 
     Two cycles are the same if their periods and amplitudes agree to 1e-6. `starts` is (k, 2n),
     [x, v] in m and m/s; by default 32 spread about the equilibrium, up to velocities of 2 V. The
@@ -48,7 +48,7 @@ def attractors(
         if any(_same(cycle, other) for other in distinct):
             continue
         if bool(cycle.result == CycleResult.inaccurate):
-            # On its own it gets the segments it needs. It may then equal a known one.
+            # Refined alone it gets the segments it needs. It may then equal a listed one.
             cycle = refined(cycle, (system, growth, cycle.state, returns), segments, static)
             if any(_same(cycle, other) for other in distinct):
                 continue
@@ -59,13 +59,13 @@ def attractors(
 @jax.jit
 def _spread(mechanism: Mechanism) -> Float[Array, "32 2n"]:
     system = hybrid_system(mechanism)
-    # Unrelated steps in the phases of the degrees of freedom, at three sizes.
+    # Incommensurate phase steps of the degrees of freedom, at three sizes.
     k = jnp.arange(32)
     steps = np.append(1 / 32, (np.arange(1, system.n) * 0.618034) % 1)
     phase = 2 * jnp.pi * ((k[:, None] * steps[None]) % 1)
     size = jnp.array([0.5, 1.0, 2.0])[k % 3]
-    away = jnp.concatenate([jnp.cos(phase), jnp.sin(phase)], axis=1)
-    return (system.equilibrium()[None] + size[:, None] * away) * system.units[None]
+    direction = jnp.concatenate([jnp.cos(phase), jnp.sin(phase)], axis=1)
+    return (system.equilibrium()[None] + size[:, None] * direction) * system.units[None]
 
 
 def _same(one: LimitCycle, other: LimitCycle) -> bool:

@@ -1,4 +1,4 @@
-"""Which motion each of many starts ends in, and the share of the starts that each one takes.
+"""Basins of attraction: what each of many starts ends in, and the share of each outcome.
 
 All starts run side by side, coarsely, as in `search.py`, and leave the run once they are labelled:
 near an attracting orbit that is known, decaying at the equilibrium, or diverging. One that stays
@@ -31,8 +31,8 @@ from .scaled import check_rtol, degrees_of_freedom
 from .segments import next_start
 from .starts import starts_of
 
-_LANES, _FEW_LANES = 256, 32  # that run side by side, of many starts and of few
-_CHUNKS = 4  # of lanes, shared by the cores; not their number, on which nothing shall depend
+_LANES, _FEW_LANES = 256, 32  # run side by side, for many starts and for few
+_CHUNKS = 4  # of lanes, shared by the cores; fixed, so that no result depends on their number
 _STEPS_OF = 0.1, 0.2  # lengths, in scaled time: no eigenfrequency exceeds 1
 _FINE = 64  # rounds of the shorter steps, for a start may be near the boundary of two basins
 _STEPS = 128  # in a round
@@ -40,22 +40,22 @@ _SAMPLED = 4  # steps between two samples of the energy
 _ROUNDS = 16  # before the starts that have ended make room for others
 _WINDOW = 4  # rounds over which the energy of a motion without switches is averaged
 _APPROACHES = 0.15  # relative distance from a known orbit below which an approach counts
-_NEAR = 0.02  # and below which few rounds of it are enough
+_NEAR = 0.02  # relative distance below which few rounds are enough
 _FEW, _STAYS = 3, 8  # rounds of approach, or near without approach
 _PATIENCE = 8  # rounds without a label after which a start is searched in full
 _FAILURES = 8  # full searches without an orbit; then all others are left to the coarse run
-# A cycle has its number.
+# A cycle is labelled by its index.
 _RUNNING, _EQUILIBRIUM, _DIVERGES, _UNDECIDED, _LOST = -1, -2, -3, -4, -5
 
 
 class Basin(Record):
-    """What the starts end in, as `basin` returns it; arrays as NumPy. Printed, it is a table."""
+    """What the starts end in, as `basin` returns it, in NumPy arrays. It prints as a table."""
 
     starts: Float[np.ndarray, "k 2n"]  # [x, v] [m, m/s]
-    labels: Int[np.ndarray, " k"]  # places in `outcomes`
+    labels: Int[np.ndarray, " k"]  # indices into `outcomes`
     outcomes: tuple[str, ...]  # "equilibrium", "cycle 1", ..., "diverges", "undecided"
     cycles: tuple[LimitCycle, ...]  # "cycle 1", ..., from the largest share to the smallest
-    reasons: Mapping[int, CycleResult]  # why a start is undecided, by its place
+    reasons: Mapping[int, CycleResult]  # why a start is undecided, by its index
 
     @property
     def shares(self) -> dict[str, float]:
@@ -65,7 +65,7 @@ class Basin(Record):
 
     @property
     def standard_errors(self) -> dict[str, float]:
-        """Of the shares: sqrt(p (1 - p)/k), that of k independent starts.
+        """Standard errors of the shares: sqrt(p (1 - p)/k), as for k independent starts.
 
         Low-discrepancy starts are mostly closer. A share of 0 is below 3/k with 95 % confidence.
         """
@@ -94,7 +94,7 @@ class Basin(Record):
 
 
 class _Lanes(Record):
-    """Motions side by side; their number is the last axis."""
+    """Motions side by side, along the last axis."""
 
     y: Float[Array, "2n k"]
     s: Float[Array, "f k"]
@@ -105,10 +105,10 @@ class _Lanes(Record):
     smooth: Int[Array, " k"]  # rounds since the last switch
     energy: Float[Array, "2n k"]  # of the modes, summed over samples of this window
     log: Float[Array, "2n k"]  # amplitude of the modes in the last window
-    rate: Float[Array, "2n k"]  # by which that changed since the window before
-    owner: Int[Array, " k"]  # the known cycle that is nearest
+    rate: Float[Array, "2n k"]  # change of `log` since the previous window
+    owner: Int[Array, " k"]  # the nearest known cycle
     distance: Float[Array, " k"]  # from it
-    approach: Int[Array, " k"]  # rounds in which that fell
+    approach: Int[Array, " k"]  # rounds in which the distance fell
     near: Int[Array, " k"]  # rounds in which it was small
     label: Int[Array, " k"]
 
@@ -117,7 +117,7 @@ class _Lanes(Record):
 def _linearised(system: HybridSystem, starts) -> tuple[Array, ...]:
     """The equilibrium (2n,), the field's Jacobian there, the normal forces and their Jacobian.
 
-    And the size beyond which a motion from `starts` (2n, k) diverges.
+    The last value is the size beyond which a motion from `starts` (2n, k) diverges.
     """
     y, slip = system.equilibrium(), jnp.ones(len(system.P), system.P.dtype)
     x = y[: system.n]
@@ -127,21 +127,21 @@ def _linearised(system: HybridSystem, starts) -> tuple[Array, ...]:
 
 
 class _Modes(eqx.Module):
-    """Small motions about the sliding equilibrium."""
+    """Linear modes of small motions about the sliding equilibrium."""
 
     equilibrium: Float[Array, " 2n"]
     values: Complex[Array, " 2n"]
     vectors: Complex[Array, "2n 2n"]
     inverse: Complex[Array, "2n 2n"]
-    reach: Float[Array, "g 2n"]  # what each mode takes of the way to every switch
+    reach: Float[Array, "g 2n"]  # share of the way to each switch per unit of each mode
     attracts: Bool[Array, ""]
     bound: Float[Array, ""]  # beyond which a motion diverges
     free: bool = eqx.field(static=True)  # not excited: only then is there an equilibrium
 
     @classmethod
     def of(cls, system: HybridSystem, starts) -> "_Modes":
-        n, found = system.n, map(np.asarray, _linearised(system, starts))
-        equilibrium, A, closures, normals, bound = found
+        n, linearisation = system.n, map(np.asarray, _linearised(system, starts))
+        equilibrium, A, closures, normals, bound = linearisation
         values, vectors = map(np.asarray, np.linalg.eig(A))
         T = np.eye(n) if system.T is None else np.asarray(system.T)
         rows = [T @ vectors[n:] / np.asarray(system.V)[:, None]]
@@ -152,9 +152,9 @@ class _Modes(eqx.Module):
         return cls(*map(jnp.asarray, arrays), free=not system.excited)
 
     def amplitudes(self, y) -> Array:
-        """Those (2n, k), complex, of states (2n, k)."""
-        away = y - self.equilibrium[:, None]
-        return jnp.sum(self.inverse[:, :, None] * away[None], axis=1)
+        """Complex modal amplitudes (2n, k) of states (2n, k)."""
+        deviation = y - self.equilibrium[:, None]
+        return jnp.sum(self.inverse[:, :, None] * deviation[None], axis=1)
 
     def grown(self, y, log) -> Array:
         """States (2n, k) after the amplitudes have grown by exp(log), log (2n, k)."""
@@ -189,15 +189,15 @@ def _step_length(rounds, dtype) -> Array:
 
 
 def _advance(system: HybridSystem, modes: _Modes, lanes: _Lanes) -> _Lanes:
-    """One round of steps of every lane."""
+    """Advance every lane by one round of steps."""
     h = _step_length(lanes.rounds, lanes.y.dtype)
 
     def one(_, carry):
-        y, s, guard, seen, returns, switches = carry
+        y, s, guard, section_state, returns, switches = carry
         y, s, _, guard, *_ = step(system, y, s, guard, h)
         returned = guard == SECTION
-        seen = jnp.where(returned[None], y, seen)
-        return y, s, guard, seen, returns + returned, switches + (guard > 0)
+        section_state = jnp.where(returned[None], y, section_state)
+        return y, s, guard, section_state, returns + returned, switches + (guard > 0)
 
     def some(_, carry):
         carry, energy = carry
@@ -206,17 +206,17 @@ def _advance(system: HybridSystem, modes: _Modes, lanes: _Lanes) -> _Lanes:
 
     start = lanes.y, lanes.s, lanes.guard, lanes.seen, lanes.returns, jnp.zeros_like(lanes.returns)
     count = _STEPS // _SAMPLED
-    (*moved, switches), energy = jax.lax.fori_loop(0, count, some, (start, lanes.energy))
-    moved = dict(zip(("y", "s", "guard", "seen", "returns"), moved, strict=True))
-    moved |= {"rounds": lanes.rounds + 1, "energy": energy}
-    moved |= {"smooth": jnp.where(switches > 0, 0, lanes.smooth + 1)}
-    return dataclasses.replace(lanes, **moved)
+    (*state, switches), energy = jax.lax.fori_loop(0, count, some, (start, lanes.energy))
+    updates = dict(zip(("y", "s", "guard", "seen", "returns"), state, strict=True))
+    updates |= {"rounds": lanes.rounds + 1, "energy": energy}
+    updates |= {"smooth": jnp.where(switches > 0, 0, lanes.smooth + 1)}
+    return dataclasses.replace(lanes, **updates)
 
 
 def _decay(modes: _Modes, lanes: _Lanes):
-    """Which lanes come to rest, and the lanes after a round, with slow changes extrapolated.
+    """Mask of the lanes that come to rest, and the lanes with slow changes extrapolated.
 
-    A motion without switches is followed by the mean energy of its modes in windows of some
+    For a motion without switches, the mean energy of its modes is tracked over windows of several
     rounds, in which ripples average out.
     """
     switched = lanes.smooth == 0
@@ -231,10 +231,10 @@ def _decay(modes: _Modes, lanes: _Lanes):
     window = _WINDOW * _STEPS * _step_length(lanes.rounds - 1, lanes.y.dtype)
     linear = modes.values.real[:, None] * window[None]
     steady = jnp.abs(rate - before) < 0.2 * jnp.abs(rate)
-    # No switch is reached any more, and every mode decays much as the smallest motions do.
+    # No switch is reached any more, and every mode decays about as fast as in small motions.
     decays = (way < 0.9) & jnp.all(small | (steady & (rate < 0.6 * linear)), axis=0)
     decays = modes.attracts & full & (decays | (way < 1e-6))
-    # Of a slow change at most half is skipped that is left if it slows down geometrically.
+    # At most half of the rest of a slow change is skipped, if that slows down geometrically.
     left = jnp.abs(rate * before) / jnp.maximum(jnp.abs(before) - jnp.abs(rate), 1e-300)
     windows = jnp.minimum(0.25, left / 2) / jnp.maximum(jnp.abs(rate), 1e-300)
     windows = jnp.min(jnp.where(small, jnp.inf, windows), axis=0)
@@ -252,7 +252,7 @@ def _decay(modes: _Modes, lanes: _Lanes):
 
 
 def _label(modes: _Modes, lanes: _Lanes, returned, points, owners) -> _Lanes:
-    """The lanes after a round, labelled where their end is known."""
+    """The lanes after a round, labelled where their outcome is known."""
     centre = modes.equilibrium[:, None]
     size = jnp.max(jnp.abs(lanes.y), axis=0)
     decays, lanes = _decay(modes, lanes)
@@ -267,8 +267,8 @@ def _label(modes: _Modes, lanes: _Lanes, returned, points, owners) -> _Lanes:
     arrived = (approach >= patience) | (near >= _STAYS)
     label = jnp.where(decays, _EQUILIBRIUM, jnp.where(arrived & returned, owner, _RUNNING))
 
-    def since(found, old):
-        return jnp.where(returned, found, old)
+    def since(new, old):
+        return jnp.where(returned, new, old)
 
     return dataclasses.replace(
         lanes,
@@ -282,7 +282,7 @@ def _label(modes: _Modes, lanes: _Lanes, returned, points, owners) -> _Lanes:
 
 @jax.jit
 def _run(system, modes: _Modes, points, owners, lanes: _Lanes) -> _Lanes:
-    """Rounds until a quarter of the lanes have got a label, at most `_ROUNDS`."""
+    """Run rounds until a quarter of the lanes are labelled, at most `_ROUNDS`."""
     most = 3 * jnp.sum(lanes.label == _RUNNING) // 4
 
     def going(carry):
@@ -306,15 +306,15 @@ def section_points(cycle: LimitCycle) -> Float[np.ndarray, "2n m"]:
     return np.asarray(next_start(segments.y))[:, np.asarray(segments.guard) == SECTION]
 
 
-class _Known:
-    """The attracting orbits that have been found."""
+class _KnownOrbits:
+    """The attracting orbits known so far."""
 
     def __init__(self, size: int):
         self.cycles: list[LimitCycle] = []
         self._points, self._owners = np.zeros((size, 0)), np.zeros(0, int)
 
     def number(self, cycle: LimitCycle) -> int:
-        """Its place among the known ones, to which it is added if it is new."""
+        """Index of a cycle among the known ones; a new one is added to them."""
         points = section_points(cycle)
         if self._owners.size:
             gaps = np.abs(self._points - points[:, :1]).max(axis=0)
@@ -326,7 +326,7 @@ class _Known:
         return len(self.cycles) - 1
 
     def padded(self, dtype) -> tuple[np.ndarray, np.ndarray]:
-        """Points (2n, m) at the returns and the cycles (m,) that they are of; m grows rarely."""
+        """Points (2n, m) at the returns and the indices (m,) of their cycles; m grows rarely."""
         m = 16
         while m < len(self._owners):
             m *= 4
@@ -351,12 +351,12 @@ def basin(
     """What the motions from many starts end in: the equilibrium, which limit cycle, or neither.
 
     Every start runs on, coarsely, until its returns to the section of `limit_cycle` approach those
-    of a known attracting orbit: in three rounds of some returns within 2 % of its size, or in
-    eight within 15 %. It comes to rest once the linear modes that it holds reach no switch and
-    each decays at 0.6 of its linear rate or faster. A start that gets no label is searched in full
-    by `limit_cycle`, and an orbit that this finds is known from then on. Starts that are still
-    without a label after `max_returns` are undecided, with the reason of the last full search
-    that found nothing, their own one where there was one.
+    of a known attracting orbit: in three rounds of several returns within 2 % of its size, or in
+    eight within 15 %. It comes to rest once its linear modes reach no switch and each decays at
+    0.6 of its linear rate or faster. A start that gets no label is searched in full by
+    `limit_cycle`, and an orbit found there is known from then on. Starts without a label after
+    `max_returns` are undecided; the reason is that of their own full search, or else that of the
+    last full search that found no orbit.
 
     **Arguments:**
 
@@ -366,9 +366,10 @@ def basin(
     - `radius`: instead of a box, a ball about the sliding equilibrium. It is the Euclidean norm of
       the state in units of V/omega and V, with omega as in `limit_cycle`; or the semi-axes (2n,) of
       an ellipsoid in m and m/s.
-    - `starts`: how many, Sobol points scrambled by `seed`; or the starts themselves, (k, 2n),
+    - `starts`: the number of Sobol points, scrambled by `seed`; or the starts, (k, 2n), then
       without box and ball.
-    - `excitation`, `rtol`, `max_returns`: as in `limit_cycle`; nothing then ends in equilibrium.
+    - `excitation`, `rtol`, `max_returns`: as in `limit_cycle`; no excited motion ends in
+      equilibrium.
 
     **Raises:** `ValueError` for corners, semi-axes or starts of another shape, a box that is empty,
     for box, ball or starts given twice or not at all, and what `limit_cycle` raises.
@@ -380,23 +381,25 @@ def basin(
     dtype = system.F.dtype
     tolerance = check_rtol(rtol, dtype)
     max_returns, progress = whole("max_returns", max_returns, 1), flag("progress", progress)
-    given = starts_of(system, n, low, high, starts, whole("seed", seed, 0), radius)
-    y = system.with_excitation(jnp.asarray(given.T / np.asarray(system.units)[:, None], dtype), 0.0)
+    initial_states = starts_of(system, n, low, high, starts, whole("seed", seed, 0), radius)
+    y = system.with_excitation(
+        jnp.asarray(initial_states.T / np.asarray(system.units)[:, None], dtype), 0.0
+    )
     lanes, modes = jax.tree.map(np.array, _first(system, y)), _Modes.of(system, y)
     options: dict[str, Any] = {"excitation": excitation, "rtol": tolerance, "throw": False}
-    known, reasons = _Known(2 * system.n), {}
+    orbits, reasons = _KnownOrbits(2 * system.n), {}
     search = functools.partial(limit_cycle, mechanism, max_returns=max_returns, **options)
-    _label_all(system, lanes, known, reasons, search, modes, max_returns, progress)
-    return _conclude(given, lanes.label, known.cycles, reasons)
+    _label_all(system, lanes, orbits, reasons, search, modes, max_returns, progress)
+    return _conclude(initial_states, lanes.label, orbits.cycles, reasons)
 
 
-def _label_all(system, lanes, known, reasons, search, modes, max_returns, progress):
+def _label_all(system, lanes, orbits, reasons, search, modes, max_returns, progress):
     """Label every lane of NumPy arrays in place."""
     from tqdm import tqdm
 
     k = len(lanes.label)
     searched, failures, patience = np.zeros(k, bool), 0, _PATIENCE
-    failure, own = CycleResult.exhausted, {}  # of the last full search, and of each start's
+    failure, failure_by_start = CycleResult.exhausted, {}  # of the last full search
     bar = tqdm(total=k, desc="basin", unit="start", disable=not progress)
     with bar, concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
         while (running := np.flatnonzero(lanes.label == _RUNNING)).size:
@@ -404,7 +407,7 @@ def _label_all(system, lanes, known, reasons, search, modes, max_returns, progre
             size = _FEW_LANES if running.size <= _FEW_LANES * _CHUNKS else _LANES
             chosen = running[: size * _CHUNKS]
             chunks = [chosen[i : i + size] for i in range(0, len(chosen), size)]
-            run = functools.partial(_run, system, modes, *known.padded(lanes.y.dtype))
+            run = functools.partial(_run, system, modes, *orbits.padded(lanes.y.dtype))
             results = pool.map(run, [_some(lanes, chunk, size) for chunk in chunks])
             for chunk, result in zip(chunks, results, strict=True):
                 for whole_array, piece in zip(
@@ -417,7 +420,7 @@ def _label_all(system, lanes, known, reasons, search, modes, max_returns, progre
             left = lanes.label == _RUNNING
             over = left & ((lanes.returns >= max_returns) | (lanes.rounds >= max_returns))
             lanes.label[over] = _UNDECIDED
-            reasons |= {i: own.get(i, failure) for i in np.flatnonzero(over).tolist()}
+            reasons |= {i: failure_by_start.get(i, failure) for i in np.flatnonzero(over).tolist()}
             # A motion without switches is slow, but not lost.
             slow = (lanes.smooth >= _WINDOW) & (lanes.rounds < 16 * patience)
             lost = left & ~over & ~searched & (lanes.rounds >= patience)
@@ -429,24 +432,24 @@ def _label_all(system, lanes, known, reasons, search, modes, max_returns, progre
             # At a return the time of an excitation is 0 again.
             state = lanes.seen[:, i] if lanes.returns[i] else lanes.y[:, i]
             cycle = search(system.own(jnp.asarray(state)) * system.units)
-            result, before = cycle.result, len(known.cycles)
+            result, before = cycle.result, len(orbits.cycles)
             if bool((result == CycleResult.converged) | (result == CycleResult.inaccurate)):
-                lanes.label[i] = known.number(cycle)
+                lanes.label[i] = orbits.number(cycle)
             elif bool(result == CycleResult.equilibrium):
                 lanes.label[i] = _EQUILIBRIUM
             elif bool(result == CycleResult.diverged):
                 lanes.label[i] = _DIVERGES
             else:
-                # A long transient, perhaps: the coarse run of it goes on.
+                # Perhaps a long transient: its coarse run continues.
                 failures, failure = failures + 1, result
-                own[i] = result
-            # What brings nothing new is done less and less often.
-            patience = _PATIENCE if len(known.cycles) > before else 2 * patience
+                failure_by_start[i] = result
+            # Full searches that find nothing new become less and less frequent.
+            patience = _PATIENCE if len(orbits.cycles) > before else 2 * patience
         bar.update(k - bar.n)
 
 
 def _some(lanes: _Lanes, chosen: np.ndarray, size: int) -> _Lanes:
-    """The chosen lanes, filled up to `size` with one that counts as labelled."""
+    """The chosen lanes, padded to `size` with one that counts as labelled."""
     padded = np.concatenate([chosen, np.repeat(chosen[-1:], size - len(chosen))])
     some = jax.tree.map(lambda x: x[..., padded], lanes)
     some.label[len(chosen) :] = _UNDECIDED

@@ -1,4 +1,4 @@
-"""Where in two quantities a mechanism is quiet, squeals, or does as it was kicked."""
+"""Maps of two quantities: where a mechanism is quiet, squeals, or does either by its start."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -22,7 +22,7 @@ Range = tuple[str, float, float]
 
 
 class BifurcationMap(Record):
-    """The boundaries of every kind in a window of two quantities, as `bifurcation_map` finds."""
+    """All boundaries in a window of two quantities, as `bifurcation_map` finds them."""
 
     mechanism: Scene | Structure
     x: Range = eqx.field(static=True)  # name and range
@@ -30,11 +30,11 @@ class BifurcationMap(Record):
     boundary: Boundary  # of stability against small disturbances
     curves: tuple[EventCurve, ...]  # of cycles; their x and y are those of the map
     branches: tuple[Branch, ...]  # in one quantity or the other through `mechanism`
-    unfollowed: tuple[BranchEvent, ...]  # events of the branches that no curve was found for
+    unfollowed: tuple[BranchEvent, ...]  # events of the branches for which no curve was found
 
     @property
     def own(self) -> tuple[float, float]:
-        """The quantities of the mechanism itself."""
+        """Values of the two quantities of the mechanism itself."""
         first, second = (float(value_of(self.mechanism, name)) for name, *_ in (self.x, self.y))
         return first, second
 
@@ -62,13 +62,13 @@ def bifurcation_map(
 
     The cycles are those that `basin` finds from a ball of starts, and those that begin at a Hopf
     point. Each is followed through `mechanism` in x and in y, and each event of these branches that
-    bounds stable cycles (`Branch.limits`) in both. A cycle that exists elsewhere in the window
-    alone, connected with none of these, is not seen.
+    bounds stable cycles (`Branch.limits`) in both. A cycle that exists only elsewhere in the
+    window, connected with none of these, is missed.
 
     **Arguments:**
 
     - `mechanism`: a scene, or a structure whose joints all have a V.
-    - `x`, `y`: (name, low, high) of two quantities, which hold those of `mechanism`.
+    - `x`, `y`: (name, low, high) of two quantities; the ranges hold the values of `mechanism`.
     - `radius`, `starts`, `seed`: as in `basin`.
     - `step`, `points`: as in `continue_cycle`.
     - `lines`: as in `hopf_boundary`.
@@ -83,16 +83,16 @@ def bifurcation_map(
     boundary = hopf_boundary(mechanism, x, y, lines=lines)
     windows, options = {x[0]: x[1:], y[0]: y[1:]}, {"step": step, "points": points}
     for name, (low, high) in windows.items():
-        own = float(value_of(mechanism, name))
-        if not low <= own <= high:
-            raise ValueError(f"the window must hold {name} = {own!r}, that of the mechanism")
-    found = basin(mechanism, radius=radius, starts=starts, seed=seed, progress=progress)
+        value = float(value_of(mechanism, name))
+        if not low <= value <= high:
+            raise ValueError(f"the window must hold {name} = {value!r}, that of the mechanism")
+    basins = basin(mechanism, radius=radius, starts=starts, seed=seed, progress=progress)
     branches: list[Branch] = []
     curves: list[EventCurve] = []
     unfollowed: list[BranchEvent] = []
     for name, window in windows.items():
         mine: list[Branch] = []
-        for start in (*found.cycles, "hopf"):
+        for start in (*basins.cycles, "hopf"):
             if start != "hopf" and any(_holds(mechanism, branch, start) for branch in mine):
                 continue
             try:
@@ -126,11 +126,11 @@ def bifurcation_map(
 
 
 def _holds(mechanism, branch: Branch, cycle: Any) -> bool:
-    """Whether a branch passes through a cycle of the mechanism."""
-    own = float(value_of(mechanism, branch.name))
-    crosses = np.flatnonzero(np.diff(np.sign(branch.parameter - own)) != 0)
+    """True if a branch passes through a cycle of the mechanism."""
+    value = float(value_of(mechanism, branch.name))
+    crosses = np.flatnonzero(np.diff(np.sign(branch.parameter - value)) != 0)
     for i in crosses:
-        share = (own - branch.parameter[i]) / (branch.parameter[i + 1] - branch.parameter[i])
+        share = (value - branch.parameter[i]) / (branch.parameter[i + 1] - branch.parameter[i])
         for one, of_cycle in ((branch.period, cycle.period), (branch.amplitude, cycle.amplitude)):
             between = one[i] + share * (one[i + 1] - one[i])
             size = np.abs(one[i + 1] - one[i]).max() + 1e-6 * np.abs(between).max()
@@ -142,7 +142,7 @@ def _holds(mechanism, branch: Branch, cycle: Any) -> bool:
 
 
 def _same(branch: Branch, other: Branch) -> bool:
-    """Whether two branches begin at one Hopf point."""
+    """True if two branches begin at one Hopf point."""
     values = [float(event.value) for event in other.hopf]
     return any(
         np.isclose(float(e.value), value, rtol=1e-8) for e in branch.hopf for value in values
@@ -150,10 +150,10 @@ def _same(branch: Branch, other: Branch) -> bool:
 
 
 def _on(curve: EventCurve, at: dict[str, float], ranges) -> bool:
-    """Whether a curve passes through a place."""
+    """True if a curve passes through the point `at` of the map."""
     windows = [Window.over(*each) for each in ranges]
     pairs = zip(windows, (curve.x, curve.y), strict=True)
     places = np.stack([window.place(values) for window, values in pairs], axis=1)
     point = np.array([float(window.place(at[window.name])) for window in windows])
-    known = Curve(places, CurveEnd.edge, CurveEnd.edge)
-    return len(places) > 1 and len(passing(known, point, 1e-6)) > 0
+    polyline = Curve(places, CurveEnd.edge, CurveEnd.edge)
+    return len(places) > 1 and len(passing(polyline, point, 1e-6)) > 0

@@ -27,8 +27,8 @@ from .scaled import check_rtol, degrees_of_freedom
 from .sensitivity import event_value
 from .shooting import Chain, Lifted, Window, linearised
 
-_BESIDE = 1e-3, 1e-4, 1e-2  # steps from an event to a cycle at which nothing happens
-_SCANNED = 129  # places in the window at which Hopf points are looked for
+_BESIDE = 1e-3, 1e-4, 1e-2  # steps from an event to a regular cycle
+_SCANNED = 129  # places in the window at which Hopf points are searched for
 
 
 class BranchEvent(Record):
@@ -43,20 +43,20 @@ class BranchEvent(Record):
     after: str = eqx.field(static=True)  # none where the branch ends with a jump
     side: int = eqx.field(static=True)  # 1: stable cycles beside it are at larger values of the
     # quantity, -1: at smaller ones, 0: on both sides or on none
-    _data: Any = eqx.field(default=None, repr=False)  # what vanishes, of which equations
+    _data: Any = eqx.field(default=None, repr=False)  # the vanishing condition and its equations
     _cycle: Any = eqx.field(default=None, repr=False)
     _rtol: float = eqx.field(static=True, default=0.0, repr=False)
 
     def value_at(self, x: Mechanism) -> Float[jax.Array, ""]:
         """`value` as a function of the mechanism, whose other quantities are as on the branch.
 
-        To be differentiated, not moved: nothing is followed again.
+        It serves for derivatives at that mechanism: the event is not followed to another one.
         """
         return event_value(self._data[0], x, self._data[1:])
 
 
 class Branch(Record):
-    """A branch of periodic orbits of k points, as `continue_cycle` returns it."""
+    """A branch of periodic orbits with k points, as `continue_cycle` returns it."""
 
     name: str = eqx.field(static=True)
     parameter: Float[np.ndarray, " k"]  # the quantity
@@ -66,7 +66,7 @@ class Branch(Record):
     velocity_max: Float[np.ndarray, "k n"]  # [m/s]
     stick_fraction: Float[np.ndarray, "k m"]  # of the period, as in `limit_cycle`
     open_fraction: Float[np.ndarray, "k m"]
-    stable: Bool[np.ndarray, " k"]  # whether small deviations from the cycle die out
+    stable: Bool[np.ndarray, " k"]  # True where small deviations from the cycle die out
     multipliers: Complex[np.ndarray, "k 2n"]  # the one that is 1 comes last
     state: Float[np.ndarray, "k 2n"]  # [x, v] where t.x of the first joint is largest [m, m/s]
     error: Float[np.ndarray, " k"]  # estimated, of the states, relative
@@ -124,20 +124,20 @@ def continue_cycle(
 ) -> Branch:
     """Follow a periodic orbit, stable or unstable, as a quantity of its mechanism changes.
 
-    By pseudo-arclength continuation of the exact orbit with all its switches, so through folds,
+    Pseudo-arclength continuation of the exact orbit with all its switches passes through folds,
     period doublings, grazings and every other change of itinerary. The branch goes from one end
     to the other, through the start.
 
     **Arguments:**
 
-    - `x`: a scene, or a structure whose joints all have a V. The other quantities are its own.
-    - `name`: a quantity, of a structure also "left.D".
+    - `x`: a scene, or a structure whose joints all have a V. Its other quantities stay fixed.
+    - `name`: a quantity; for a structure also one such as "left.D".
     - `window`: (low, high) of it; logarithmic over a decade or more.
     - `start`: a limit cycle of `x`, as `limit_cycle` finds it by default; or "hopf": the Hopf
-      point of `x` in the window that is nearest to its own value, where a cycle of no amplitude
-      begins; or an event of another branch of `x`, the quantity of which then has its value there.
-    - `step`: the longest step between two points, where the window is of length 1 and so are the
-      orbit's period and its largest state.
+      point of `x` in the window that is nearest to its own value, where a cycle of zero amplitude
+      begins; or an event of another branch of `x`, whose quantity then has its value there.
+    - `step`: the longest step between two points, with the window, the orbit's period and its
+      largest state scaled to 1.
     - `points`: most points from the start each way.
     - `rtol`: sets the length of the segments, as in `limit_cycle`.
 
@@ -188,7 +188,7 @@ def checked_window(x: Mechanism, name: str, window) -> tuple[float, float]:
 
 
 def _from_cycle(follower: Follower, cycle):
-    """Both ways from a limit cycle; returns why the branch ends at either end."""
+    """Follow both ways from a limit cycle; return the reason for either end."""
     if cycle is None:
         cycle = limit_cycle(follower.x)
     require_kind("start", cycle, LimitCycle)
@@ -201,7 +201,7 @@ def _from_cycle(follower: Follower, cycle):
 
 
 def _from_event(follower: Follower, event: BranchEvent):
-    """Both ways through an event, from a cycle beside it; None in place of it for a Hopf point."""
+    """Follow both ways from a cycle beside an event; from a Hopf point, along its cycles."""
     q = own_place(follower.x, follower.window)
     solution = event._cycle
     if solution is None:
@@ -211,17 +211,17 @@ def _from_event(follower: Follower, event: BranchEvent):
     def begun():
         shooting, at, tangent = _begun(follower, solution)
         for length in _BESIDE:
-            for away in (length * tangent, -length * tangent):
-                found = shooting.curves.corrected(at + away)
-                if found is not None and shooting.admissibility(found[0]) > 0:
-                    return shooting, found[0], shooting.curves.tangent(found[1])
+            for offset in (length * tangent, -length * tangent):
+                corrected = shooting.curves.corrected(at + offset)
+                if corrected is not None and shooting.admissibility(corrected[0]) > 0:
+                    return shooting, corrected[0], shooting.curves.tangent(corrected[1])
         raise ValueError("no cycle beside start was found")
 
     return follower.both_ways(begun)
 
 
 def own_place(x: Mechanism, window: Window) -> float:
-    """The place of a mechanism's own quantity in the window."""
+    """Place in the window of the mechanism's value of the quantity."""
     value = float(value_of(x, window.name))
     q = float(window.place(value))
     if not -1e-9 <= q <= 1 + 1e-9:
@@ -230,16 +230,16 @@ def own_place(x: Mechanism, window: Window) -> float:
 
 
 def _begun(follower: Follower, solution: Solution, held=False):
-    """Equations, unknowns and tangent of an orbit that is known, perhaps at its very quantity."""
+    """Equations, unknowns and tangent at a known orbit; if `held`, at exactly its quantity."""
     shooting = Shooting(follower.family, solution, solution.phases, solution.times)
-    found = shooting.curves.corrected(shooting.begin, shooting.quantity if held else None)
-    if found is None or np.linalg.norm(found[0] - shooting.begin) > 0.1:
+    corrected = shooting.curves.corrected(shooting.begin, shooting.quantity if held else None)
+    if corrected is None or np.linalg.norm(corrected[0] - shooting.begin) > 0.1:
         raise ValueError("start must be a limit cycle of x itself")
-    return shooting, found[0], shooting.curves.tangent(found[1])
+    return shooting, corrected[0], shooting.curves.tangent(corrected[1])
 
 
 def _from_hopf(follower: Follower, q: float):
-    """Along the cycles that begin at the Hopf point nearest to q."""
+    """Follow the cycles that begin at the Hopf point nearest to q."""
     scanned = np.linspace(0, 1, _SCANNED)
     matrices = jax.vmap(lambda q: linearised(follower.x, follower.window, q)[1])(
         jnp.asarray(scanned)
@@ -249,11 +249,11 @@ def _from_hopf(follower: Follower, q: float):
     last = np.argmax(np.where(frequency > 1e-9, growth, -np.inf), axis=1)
     growth, frequency = (x[np.arange(_SCANNED), last] for x in (growth, frequency))
     crossings = np.flatnonzero(np.diff(np.sign(growth)) != 0)
-    found = [follower.family.hopf_near(scanned[i], frequency[i]) for i in crossings]
-    found = [point for point in found if point is not None and 0 <= point[0] <= 1]
-    if not found:
+    hopf_points = [follower.family.hopf_near(scanned[i], frequency[i]) for i in crossings]
+    hopf_points = [point for point in hopf_points if point is not None and 0 <= point[0] <= 1]
+    if not hopf_points:
         raise ValueError(f"there is no Hopf point of {follower.window.name} in the window")
-    at, frequency = min(found, key=lambda point: abs(point[0] - q))
+    at, frequency = min(hopf_points, key=lambda point: abs(point[0] - q))
     y, A = follower.family.linearised(at)
     eigenvalues, vectors = np.linalg.eig(A)
     vector = vectors[:, np.argmin(np.abs(eigenvalues - 1j * frequency))]
@@ -267,14 +267,14 @@ def _from_hopf(follower: Follower, q: float):
     shooting = Shooting(follower.family, blank, blank.phases, [0, period])
     begin = shooting.begin
     held = int(np.argmax(np.abs(vector.real[:n])))
-    found = shooting.curves.corrected(begin, held)
-    if found is None:
+    corrected = shooting.curves.corrected(begin, held)
+    if corrected is None:
         raise ValueError("the cycles at the Hopf point could not be followed")
     follower.record_hopf(at, frequency, shooting)
-    follower.record(shooting, found[0])
-    tangent = shooting.curves.tangent(found[1])
+    follower.record(shooting, corrected[0])
+    tangent = shooting.curves.tangent(corrected[1])
     outward = tangent[: 2 * n] @ (begin[: 2 * n] * shooting.scale[: 2 * n] - y)
-    end = follower.follow(shooting, found[0], tangent if outward > 0 else -tangent)
+    end = follower.follow(shooting, corrected[0], tangent if outward > 0 else -tangent)
     return BranchEnd.hopf, end
 
 
@@ -298,13 +298,13 @@ def _smooth(follower, y, vector, frequency, q) -> Solution:
 
 
 def _side(places, stable, i: int) -> int:
-    """On which side of point i of a branch its stable neighbours are; 0 if on both or on none."""
+    """Side of point i of a branch on which its neighbour is stable; 0 if both or none are."""
     beside = [k for k in (i - 1, i + 1) if 0 <= k < len(places) and stable[k]]
     return int(np.sign(sum(np.sign(places[k] - places[i]) for k in beside)))
 
 
 def _branch(follower: Follower, x, name: str, start, end) -> Branch:
-    """The result, with values of the events that depend on x."""
+    """The `Branch`, with values of the events that depend on x."""
     points, window = follower.points, follower.window
     rows = {key: np.array([point.row[key] for point in points]) for key in points[0].row}
     places = np.array([point.place[0] for point in points])
@@ -326,7 +326,7 @@ def _branch(follower: Follower, x, name: str, start, end) -> Branch:
                 _rtol=follower.family.rtol,
             )
         )
-    # At a Hopf point a multiplier is 1: it is shown as the cycles beside it are.
+    # At a Hopf point a multiplier is 1: its stability is that of the cycle beside it.
     for event in events:
         if event.kind == "Hopf":
             beside = event.index - 1 if event.index else 1

@@ -54,9 +54,9 @@ class CycleResult(eqx.Enumeration):
 def repels(
     monodromy: Float[Array, "4 4"], rate: Float[Array, "4"], error: Float[Array, ""]
 ) -> Bool[Array, ""]:
-    """Whether small deviations from an orbit grow, by more than the error of their growth.
+    """True if small deviations from an orbit grow by more than the error of their growth.
 
-    The monodromy maps the orbit's own `rate` onto itself. Its error is how far it misses that,
+    The exact monodromy maps the orbit's `rate` onto itself. The error is the deviation from that
     plus the relative `error` of the orbit.
     """
     along = rate / jnp.linalg.norm(rate)
@@ -72,7 +72,7 @@ class Switch(Record):
     """One change of the contact state, as `LimitCycle.switches` lists them."""
 
     time: float  # after `state` [s]
-    direction: int  # which one switches, from 1
+    direction: int  # number of the one that switches, from 1
     before: str  # "+" (slip, t.v < V), "-" (slip, t.v > V), "stick" or "open"
     after: str
 
@@ -93,7 +93,7 @@ class Fractions(eqx.Module):
 
 
 class Orbit(eqx.Module):
-    """The motion along the segments of a periodic orbit, and what follows from it when asked."""
+    """The motion along the segments of a periodic orbit, and quantities computed from it."""
 
     segments: Segments
 
@@ -111,13 +111,13 @@ class Orbit(eqx.Module):
         """Extremes of displacements, velocities and normal forces."""
         n = system.n - system.excited
         rows, offset = _normal_rows(system)
-        own = system.own(jnp.eye(2 * system.n, dtype=rows.dtype))
-        values = extreme_values(system, self.segments, jnp.concatenate([own, rows]))
+        state_rows = system.own(jnp.eye(2 * system.n, dtype=rows.dtype))
+        values = extreme_values(system, self.segments, jnp.concatenate([state_rows, rows]))
         if not system.joints:
             return Ranges(values[:, : 2 * n] * system.units[None], jnp.zeros((0, 2), rows.dtype))
         linear = jnp.zeros((len(system.P), 2), rows.dtype)
         linear = linear.at[_tangential(system)].set((values[:, 2 * n :] + offset[None]).T)
-        # A load curve rises, so that its extremes are where those of the approach are.
+        # A load curve increases, so that its extremes are at the extremes of the approach.
         forces = system.normal_forces(linear) * system.force_unit
         opens = np.array(system.opens)[:, None]
         forces = jnp.where(opens, jnp.maximum(forces, 0), forces)
@@ -145,7 +145,7 @@ class Orbit(eqx.Module):
         return Fractions(share(0), share(OPEN)[_tangential(system)], jnp.stack(pulls))
 
     def monodromy(self, system: HybridSystem) -> Float[Array, "2n 2n"]:
-        """The product of all segments' maps, with the jump of the tangent at every switch."""
+        """The product of the maps of all segments, with the saltation at every switch."""
         segments = self.segments
         local = exact_maps(system, segments)
         ends, s = next_start(segments.y), segments.s
@@ -183,8 +183,8 @@ def _normal_rows(system: HybridSystem) -> tuple[Float[Array, "m 2n"], Float[Arra
 class LimitCycle(Record):
     """A limit cycle, as `limit_cycle` returns it. NaN throughout where there is none.
 
-    Fields are what the search finds. Everything else is computed from the orbit when it is asked
-    for, so that a program which asks for the period alone compiles no more than that.
+    Fields hold what the search finds. Everything else is computed from the orbit on access, so
+    that a program that needs the period alone compiles nothing else.
     """
 
     period: Float[Array, ""]  # [s]
@@ -240,7 +240,7 @@ class LimitCycle(Record):
     def stick_fraction(self) -> Float[Array, " m"]:
         """The share of the period in stick: of a scene's two directions, or of each joint.
 
-        Of a regularised cycle, the share with abs(v) < eps.
+        For a regularised cycle, it is the share with abs(v) < eps.
         """
         stick = self._fractions.stick
         return stick if self.of_scene else stick[..., _tangential(self._system)]
@@ -254,14 +254,14 @@ class LimitCycle(Record):
     def tension_fraction(self) -> Float[Array, "..."]:
         """The share of the period with K_n n.x < 0, in which the contact pulls.
 
-        Of a scene one number (), of a structure one a joint (m,).
+        It is one number () for a scene, and one per joint (m,) for a structure.
         """
         tension = self._fractions.tension
         return tension[..., 0] if self.of_scene else tension
 
     @property
     def multipliers(self) -> Complex[Array, " 2n"]:
-        """The Floquet multipliers, largest modulus first; one is 1 where nothing excites."""
+        """The Floquet multipliers, largest modulus first; one is 1 without an excitation."""
         return _multipliers(self._monodromy)
 
     @property
@@ -294,9 +294,9 @@ class LimitCycle(Record):
 
     @property
     def velocity_level(self) -> Float[Array, " n"]:
-        """20 lg(`velocity_rms`/1 nm/s) [dB], as ISO 1683 has it.
+        """20 lg(`velocity_rms`/1 nm/s) [dB], as in ISO 1683.
 
-        The sound power level of one radiator rises and falls by as much.
+        The sound power level of one radiator changes by as much.
         """
         return 20 * jnp.log10(self.velocity_rms / VELOCITY_REFERENCE)
 
@@ -312,13 +312,14 @@ class LimitCycle(Record):
         return self.harmonics(jnp.eye(len(self.state) // 2, dtype=self.state.dtype), n)
 
     def harmonics(self, rows, n: int = 512) -> tuple[Float[Array, " n/2"], Float[Array, "n/2 k"]]:
-        """As `spectrum`, of the displacements rows @ x, rows (k, dofs)."""
+        """As `spectrum`, for the displacements rows @ x with rows (k, dofs)."""
         return _harmonics(self._orbit, self._system, self.period, rows, n=n)
 
     def contact_states(self, n: int = 512) -> Float[Array, "n f"]:
-        """From the times of `orbit(n)` on: +1, -1 slip forward, backward, 0 stick, 2 open.
+        """Contact states from the times of `orbit(n)` on: +1, -1 slip, 0 stick, 2 open.
 
-        As of a `Trajectory`: of each direction of friction, the tangential one of a joint first.
+        Slip is forward at +1 and backward at -1. As in a `Trajectory`, there is one for each
+        direction of friction, the tangential one of a joint first.
 
         **Raises:** `ValueError` for the regularised law, which has none.
         """
@@ -342,24 +343,24 @@ class LimitCycle(Record):
         used = np.asarray(segments.guard) != UNUSED
         states = np.asarray(segments.s)[:, used].astype(int)
         times = np.cumsum(np.asarray(segments.duration)[used]) / float(self._system.omega)
-        found = []
+        switches = []
         for k, time in enumerate(times):
             before, after = states[:, k], np.roll(states, -1, axis=1)[:, k]
             for i in np.flatnonzero(before != after):
-                found.append(Switch(float(time), int(i) + 1, names[before[i]], names[after[i]]))
-        return found
+                switches.append(Switch(float(time), int(i) + 1, names[before[i]], names[after[i]]))
+        return switches
 
 
 @functools.partial(exported_jit, static_argnames="what")
 def _of_orbit(orbit, system: HybridSystem, period, what: str) -> Any:
-    """What a method of an orbit says: of one cycle, or of each of a batch; NaN without a cycle."""
+    """Result of an orbit's method for one cycle, or for each of a batch; NaN without a cycle."""
 
     def of_one(orbit, system, period):
-        exists, found = jnp.isfinite(period), getattr(orbit, what)(system)
-        # A choice, as of `period`: its derivative without a cycle is 0, which a batch can select,
-        # but not a number for a mechanism that is none.
-        found = jax.tree.map(lambda x: jnp.where(exists, x, jnp.nan), found)
-        return found if (bad := refused(system)) is None else nan_where(bad, found)
+        exists, values = jnp.isfinite(period), getattr(orbit, what)(system)
+        # A selection, as for `period`: without a cycle its derivative is 0, which a batch can
+        # select, but NaN for an invalid mechanism.
+        values = jax.tree.map(lambda x: jnp.where(exists, x, jnp.nan), values)
+        return values if (bad := refused(system)) is None else nan_where(bad, values)
 
     for _ in range(period.ndim):
         of_one = jax.vmap(of_one)

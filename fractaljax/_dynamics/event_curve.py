@@ -24,14 +24,14 @@ _STRAIGHT = 0.95  # cosine of the angle by which a curve may turn at a change of
 
 
 class EventCurve(Record):
-    """Where in two quantities cycles fold, graze, or change stability, as `continue_event` finds.
+    """Curve in two quantities along which cycles fold, graze, or change stability.
 
-    It has k points.
+    It has k points; `continue_event` returns it.
     """
 
-    kind: str = eqx.field(static=True)  # that of the event, not "Hopf"
+    kind: str = eqx.field(static=True)  # kind of the event, never "Hopf"
     names: tuple[str, str] = eqx.field(static=True)  # of the quantities
-    x: Float[np.ndarray, " k"]  # the first quantity, that of the branch
+    x: Float[np.ndarray, " k"]  # the first quantity, which the branch follows
     y: Float[np.ndarray, " k"]  # the second one
     period: Float[np.ndarray, " k"]  # of the cycle at the event [s]
     amplitude: Float[np.ndarray, "k n"]  # peak to peak [m]
@@ -42,7 +42,7 @@ class EventCurve(Record):
     end: BranchEnd
 
     def swapped(self) -> "EventCurve":
-        """With the quantities in the other order."""
+        """The same curve with the quantities in the other order."""
         turned = {"names": self.names[::-1], "x": self.y, "y": self.x, "side": -self.side}
         return dataclasses.replace(self, **turned)
 
@@ -56,7 +56,7 @@ class EventCurve(Record):
 
 
 class _CurveFollower(Follower):
-    """A cycle at an event: nothing is noted on the way but where the curve ends."""
+    """Follows a cycle at an event; only the ends of the curve are noted."""
 
     def note(self, *_) -> None:
         pass
@@ -68,18 +68,18 @@ class _CurveFollower(Follower):
         return BranchEnd.hopf
 
     def _leaves_itinerary(self, shooting, z, reached):
-        """On where the curve stays smooth: elsewhere the event is another one from there."""
-        known = len(self.points)
+        """Go on where the curve stays smooth; elsewhere another event takes over and it ends."""
+        count = len(self.points)
         onward = super()._leaves_itinerary(shooting, z, reached)
         if isinstance(onward, BranchEnd):
             return onward
         new, begin, ahead = onward
-        away, came = begin[new.quantity :] - z[shooting.quantity :], reached - z
+        gap, came = begin[new.quantity :] - z[shooting.quantity :], reached - z
         before, after = came[shooting.quantity :], ahead[new.quantity :]
         straight = before @ after > _STRAIGHT * np.linalg.norm(before) * np.linalg.norm(after)
-        if straight and np.linalg.norm(away) < 2 * np.linalg.norm(came):
+        if straight and np.linalg.norm(gap) < 2 * np.linalg.norm(came):
             return onward
-        del self.points[known:]
+        del self.points[count:]
         return BranchEnd.meets
 
     def _jumps(self, *_) -> BranchEnd:
@@ -97,9 +97,9 @@ def continue_event(
 ) -> EventCurve:
     """Follow a fold, grazing, order of switches or change of stability in a second quantity.
 
-    By pseudo-arclength continuation of the exact orbit together with what vanishes at the event, so
-    through extremes of either quantity, and through changes of the itinerary elsewhere on the
-    cycle. The curve goes both ways from the event.
+    Pseudo-arclength continuation of the exact orbit together with the condition that vanishes at
+    the event passes through extremes of either quantity, and through changes of the itinerary
+    elsewhere on the cycle. The curve goes both ways from the event.
 
     **Arguments:**
 
@@ -129,10 +129,10 @@ def continue_event(
 
     def begun():
         pinned = Pinned(family, second, held, solution, solution.phases, solution.times)
-        found = pinned.curves.corrected(pinned.begin, pinned.quantity + 1)
-        if found is None or np.linalg.norm(found[0] - pinned.begin) > 0.1:
+        corrected = pinned.curves.corrected(pinned.begin, pinned.quantity + 1)
+        if corrected is None or np.linalg.norm(corrected[0] - pinned.begin) > 0.1:
             raise ValueError("event must be one of a branch of x itself")
-        return pinned, found[0], pinned.curves.tangent(found[1])
+        return pinned, corrected[0], pinned.curves.tangent(corrected[1])
 
     start, end = follower.both_ways(begun)
     places = np.array([point.place for point in follower.points])
@@ -146,7 +146,7 @@ def continue_event(
         x=np.array([float(first.value(q)) for q in places[:, 0]]),
         y=np.array([float(second.value(r)) for r in places[:, 1]]),
         itinerary=tuple(point.itinerary for point in follower.points),
-        # To the left of a curve upwards are the smaller values.
+        # To the left of an upward curve are the smaller values.
         side=-event.side,
         start=start,
         end=end,

@@ -8,8 +8,8 @@ from jaxtyping import Array
 from .hybrid import NONE, SECTION, HybridSystem
 from .lanes import first_least, row_numbers
 
-# Times the length h of a step, over the highest rate: of a stable step, where h is 0.3, and of what
-# is cut into stable segments of the eighth order.
+# Longest steps in units of h over the highest rate: of a stable step, where h is 0.3, and of a step
+# that can be cut into stable segments of the eighth order.
 STABLE, MOST = 8.0, 14.0
 
 
@@ -23,12 +23,12 @@ class Cubic(eqx.Module):
 
     @classmethod
     def through(cls, g_0, g_1, d_0, d_1) -> "Cubic":
-        """With values g and slopes d at 0 and at 1."""
+        """The cubic with values g and slopes d at 0 and at 1."""
         return cls(g_0, d_0, 3 * (g_1 - g_0) - 2 * d_0 - d_1, d_0 + d_1 - 2 * (g_1 - g_0))
 
     @classmethod
     def at_thirds(cls, g) -> "Cubic":
-        """With values g (4, ...) at 0, 1/3, 2/3 and 1."""
+        """The cubic with values g (4, ...) at 0, 1/3, 2/3 and 1."""
         g_0, a, b, g_1 = g
         return cls(
             g_0,
@@ -44,14 +44,14 @@ class Cubic(eqx.Module):
         return self.k_0 + x * (self.k_1 + x * (self.k_2 + x * self.k_3))
 
     def slope(self, x):
-        """Its derivative at x."""
+        """Derivative at x."""
         return self.k_1 + x * (2 * self.k_2 + 3 * x * self.k_3)
 
     def minimum(self) -> tuple[Array, Array]:
-        """Where its minimum strictly inside is, else 0, and whether there is one."""
+        """Place of the minimum strictly inside 0 < x < 1, else 0, and whether there is one."""
         square = self.k_2**2 - 3 * self.k_1 * self.k_3
         root = jnp.sqrt(jnp.maximum(square, 0))
-        # Of the two forms of this root, the one without cancellation.
+        # The form of this root without cancellation.
         over = jnp.where(self.k_2 > 0, -self.k_1, root - self.k_2)
         below = jnp.where(self.k_2 > 0, self.k_2 + root, 3 * self.k_3)
         x = jnp.where(below == 0, 0, over / jnp.where(below == 0, 1, below))
@@ -59,10 +59,11 @@ class Cubic(eqx.Module):
         return jnp.where(inside, x, 0), inside
 
     def root_before(self, end) -> Array:
-        """Where it falls through zero in (0, end], if it does and no minimum is inside that.
+        """Root at which it falls through zero in (0, end], if there is one and no minimum inside.
 
-        Newton's method, kept in a bracket by bisection. Beyond a maximum it only falls: there the
-        first guess is the root of the parabola from that to `end`, elsewhere the secant's.
+        Newton's method, kept in a bracket by bisection. Beyond a maximum the cubic only falls:
+        there the first guess is the root of the parabola from the maximum to `end`, elsewhere the
+        root of the secant.
         """
         at_end, (peak, inside) = self(end), (-self).minimum()
         inside = inside & (peak < end)
@@ -81,7 +82,7 @@ class Cubic(eqx.Module):
 
 
 def without_start(cubic: Cubic, rising) -> Cubic:
-    """Where `rising`, the cubic less its value at 0, divided by x; elsewhere the cubic.
+    """The cubic less its value at 0, divided by x, where `rising`; elsewhere the cubic itself.
 
     The root of the quotient is where the cubic returns to its first value, however soon.
     """
@@ -95,7 +96,7 @@ def without_start(cubic: Cubic, rising) -> Cubic:
 
 
 def first_root(whole: Cubic) -> Array:
-    """Where in (0, 1] cubics first fall through zero, or 2 where they do not; any shape.
+    """First root in (0, 1] at which cubics fall through zero, or 2 without one; any shape.
 
     A root at 0 does not count: the motion has just left it. A cubic below zero at 0 has its root
     there.
@@ -113,19 +114,19 @@ def first_root(whole: Cubic) -> Array:
 
 
 def rounding(y) -> Array:
-    """Within how much of zero a guard at y (2n, ...) is zero."""
+    """Rounding error of a guard at y (2n, ...), within which it counts as zero."""
     return 64 * jnp.finfo(y.dtype).eps * (1 + jnp.max(jnp.abs(y), axis=0))
 
 
 def step(system: HybridSystem, y, s, last, h, reach=None):
-    """A step of length h, or less, in contact state s by the classical fourth-order method.
+    """A step of length h or less in contact state s, by the classical fourth-order method.
 
-    `last` is the guard that ended the step before: a section just crossed is not crossed again.
-    Returns the state and contact state after it, its length, the number of the guard that ended it
-    or `NONE`, by how much friction made it shorter, and the reach of the next step. States inside
-    the step are those of the cubic through its ends.
+    `last` is the guard that ended the previous step: a section just crossed is not crossed again.
+    Returns the state and contact state after the step, its length, the number of the guard that
+    ended it or `NONE`, the factor by which friction shortened it or 0, and the reach of the next
+    step. States inside the step lie on the cubic through its ends.
 
-    Of a system whose steps follow the motion `reach` (...) is the length that has the error of a
+    For a system whose steps follow the motion, `reach` (...) is the length that has the error of a
     step h of a harmonic motion with frequency 1.
     """
     unit, allowed = h if reach is None else h / system.fastest, (0.9 * h) ** 4 / 72
@@ -150,10 +151,10 @@ def step(system: HybridSystem, y, s, last, h, reach=None):
 
     nodes = jnp.stack([y, between(1 / 3), between(2 / 3), y_1])
     guards = jax.vmap(lambda y: system.guards(y, s))(nodes)
-    # A guard starts on its own side: to rounding at zero, it is entered.
+    # A guard within rounding of zero at the start has just been entered.
     start = jnp.where(jnp.abs(guards[0]) <= rounding(y)[None], 0, guards[0])
     roots = first_root(Cubic.at_thirds((start, *guards[1:])))
-    # Only a fall through the section counts. (XLA does not turn updates of rows into vectors.)
+    # Only a fall through the section counts. (XLA does not vectorise updates of rows.)
     falls = (start > 0) & (last != SECTION)[None]
     first, theta = first_least(jnp.where((row_numbers(roots) != SECTION) | falls, roots, 2))
     hit = theta <= 1

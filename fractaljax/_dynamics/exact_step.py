@@ -12,12 +12,12 @@ _MOST_GUESSES = 60  # of the time of an event; usually four suffice
 
 
 def _event(system: HybridSystem, y, s, h, g_0, g_1, d_0, d_1):
-    """When the first switch happens in a step: its time and guard.
+    """Time and guard of the first switch in a step.
 
-    The cubics through the guards g and their rates d at both ends say where to look. The
+    The cubics through the guards g and their rates d at both ends give the first guess. The
     eighth-order flow decides, also whether a guard that dips towards zero and rises reaches it.
     """
-    # One lane a guard: each has its own time t.
+    # One lane per guard, each at its own time t.
     k = len(g_0)
     lanes = jnp.broadcast_to(y[:, None], (len(y), k)), jnp.broadcast_to(s[:, None], (len(s), k))
 
@@ -54,18 +54,18 @@ def _event(system: HybridSystem, y, s, h, g_0, g_1, d_0, d_1):
     end = jnp.where(dips, bottom, h)
     falls = dips | (g_1 < 0)
     t = without_start(cubic, rising).root_before(end / h) * h
-    # A shallow dip is a parabola. From afar Newton's method would confuse its two roots.
+    # A shallow dip is a parabola. Far from it Newton's method would confuse its two roots.
     half = jnp.sqrt(2 * jnp.maximum(-depth, 0) / jnp.where(second > 0, second, 1))
     shallow = dips & (second > 0) & (depth > -1e-2)
     t = jnp.where(shallow, jnp.clip(bottom - half, 0, bottom), t)
     t = jnp.where(dips & (t >= bottom), bottom / 2, t)
 
     def searching(carry):
-        *_, found, count = carry
-        return ~jnp.all(found) & (count < _MOST_GUESSES)
+        *_, converged, count = carry
+        return ~jnp.all(converged) & (count < _MOST_GUESSES)
 
     def refine(carry):
-        t, low, high, found, count = carry
+        t, low, high, converged, count = carry
         y = along(t)
         g, d = value(y), rate(y)
         low, high = jnp.where(g > 0, t, low), jnp.where(g > 0, high, t)
@@ -76,7 +76,7 @@ def _event(system: HybridSystem, y, s, h, g_0, g_1, d_0, d_1):
         between = (guess >= low) & (guess <= high)
         guess = jnp.where(between, guess, (low + high) / 2)
         near = (jnp.abs(guess - t) <= close) | (jnp.abs(g) <= close)
-        return jnp.where(found, t, guess), low, high, found | near, count + 1
+        return jnp.where(converged, t, guess), low, high, converged | near, count + 1
 
     close = 2 * jnp.finfo(y.dtype).eps
     start = t, jnp.zeros_like(t), end, ~falls | late, 0
@@ -90,7 +90,7 @@ def _event(system: HybridSystem, y, s, h, g_0, g_1, d_0, d_1):
 
 
 def _smooth_step(system: HybridSystem, y, s, longest, left, rtol):
-    """A step in contact state s, as long as rtol allows: the state it ends in, and its length."""
+    """A step in contact state s, as long as rtol allows: the state at its end, and its length."""
     h = jnp.minimum(system.step_length(y, s, system.field(y, s), longest, longest), left)
     allowed = rtol * (1 + jnp.max(jnp.abs(y)))
 
@@ -118,7 +118,7 @@ def step_to_switch(system: HybridSystem, y, s, longest, left, rtol):
     ends = [x[1:] for x in (g_0, g_1, d_0, d_1)]
     cubic = Cubic.through(*ends)
     theta, dips = cubic.minimum()
-    # A cubic well above zero has no event to look for.
+    # A cubic well above zero has no event.
     near = (jnp.minimum(cubic(theta), ends[1]) < 0.05) & (dips | (ends[1] < 0.05))
     dt, guard = jax.lax.cond(
         jnp.any(near | (ends[0] < 0)),

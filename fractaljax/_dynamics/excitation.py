@@ -1,7 +1,7 @@
 """A harmonic force on a mechanism, as one more degree of freedom of its hybrid system.
 
-a cos(Omega t) is a z with z'' = -Omega^2 z, z(0) = 1, z'(0) = 0, which nothing acts on. So motions,
-periodic orbits and every derivative are those of an autonomous system.
+The force a cos(Omega t) is a z, where z'' = -Omega^2 z, z(0) = 1 and z'(0) = 0; no force acts on z.
+Motions, periodic orbits and all derivatives are then those of an autonomous system.
 """
 
 from collections.abc import Mapping, Sequence
@@ -66,16 +66,16 @@ class Excitation(Record):
         twice, or arrays of another shape.
         """
         n = mechanism.n if isinstance(mechanism, Structure) else 2
-        wanted = (n,) if self.dofs is None else (len(self.dofs),)
-        if self.amplitude.shape != wanted:
-            shapes = f"{wanted}, got {self.amplitude.shape}"
+        shape = (n,) if self.dofs is None else (len(self.dofs),)
+        if self.amplitude.shape != shape:
+            shapes = f"{shape}, got {self.amplitude.shape}"
             raise ValueError(f"amplitude of the excitation must have shape {shapes}")
-        if self.phase.shape not in ((), wanted):
-            shapes = f"() or {wanted}, got {self.phase.shape}"
+        if self.phase.shape not in ((), shape):
+            shapes = f"() or {shape}, got {self.phase.shape}"
             raise ValueError(f"phase of the excitation must have shape {shapes}")
         if self.frequency.ndim:
             raise ValueError(f"frequency must be a single number, got shape {self.frequency.shape}")
-        phase = jnp.broadcast_to(self.phase, wanted)
+        phase = jnp.broadcast_to(self.phase, shape)
         forces = self.amplitude * jnp.cos(phase), -self.amplitude * jnp.sin(phase)
         if self.dofs is None:
             return forces
@@ -96,16 +96,16 @@ def _numbers(name: str, values: Any) -> Numbers:
 def _index(mechanism: Mechanism, dof: Dof) -> int:
     if isinstance(mechanism, Structure):
         return mechanism.index(dof)
-    known: tuple[Any, ...] = _NAMES if isinstance(dof, str) else (0, 1)
-    if dof not in known or isinstance(dof, bool):
+    dofs: tuple[Any, ...] = _NAMES if isinstance(dof, str) else (0, 1)
+    if dof not in dofs or isinstance(dof, bool):
         raise ValueError(f"unknown degree of freedom {dof!r}; a scene has x1 and x2")
-    return known.index(dof)
+    return dofs.index(dof)
 
 
 def excited_system(mechanism: Any, excitation: Excitation | None) -> HybridSystem:
     """The scaled system of a scene or a structure, with the excitation if there is one.
 
-    Its last degree of freedom is z, of order one and without unit. Its unit of time is the
+    Its last degree of freedom is z, dimensionless and of order one. Its unit of time is the
     reciprocal of hypot(omega, Omega), so that no frequency exceeds 1.
     """
     system = hybrid_system(mechanism)
@@ -149,5 +149,5 @@ def excited_system(mechanism: Any, excitation: Excitation | None) -> HybridSyste
     ).with_products()
 
 
-# Outside of a program: its some hundred operations, one by one, would be compiled one by one.
+# For use outside of a program, where some hundred operations would be compiled one by one.
 compiled_system = exported_jit(excited_system)

@@ -12,11 +12,11 @@ from .lanes import first_least, row_numbers
 from .segments import Segments, cumulative, flow, next_start
 
 _CROSSINGS = 16  # segments in which x2 may change sign
-_MINIMA = 4  # nearly equal ones of a displacement or a velocity
+_MINIMA = 4  # nearly equal minima of a displacement or a velocity
 
 
 def _along(system: HybridSystem, y, s, t, row):
-    """row @ y and its first two derivatives by time, each lane at its own time t."""
+    """row @ y and its first two time derivatives, each lane at its own time t."""
     y = flow(system, y, t, s)
     rate = system.field(y, s)
     _, change = jax.jvp(lambda y: system.field(y, s), (y,), (rate,))
@@ -24,7 +24,7 @@ def _along(system: HybridSystem, y, s, t, row):
 
 
 def _lowest(x, count: int) -> tuple[Array, Array]:
-    """The lowest values (r, count) in the rows of x (r, k), and where: quicker than sorting."""
+    """Lowest values (r, count) in the rows of x (r, k) and their indices, faster than sorting."""
 
     def without(x, _):
         k, least = first_least(x)
@@ -34,9 +34,9 @@ def _lowest(x, count: int) -> tuple[Array, Array]:
     return least.T, k.T
 
 
-def _vertex(given, t):
-    """The minimum of row @ y by the parabola at t, of third order, and a step towards it."""
-    system, y, s, h, row = given
+def _vertex(segment, t):
+    """The minimum of row @ y by the parabola at t, to third order, and a step towards it."""
+    system, y, s, h, row = segment
     value, rate, change = _along(system, y, s, t, row)
     most = h / 8
     near = jnp.abs(rate) < change * most
@@ -45,21 +45,21 @@ def _vertex(given, t):
 
 
 @jax.custom_jvp
-def _minima(given: tuple, t, exists) -> tuple[Array, Array]:
-    """The minima near the times t, infinite but where one `exists`, and when they are.
+def _minima(segment: tuple, t, exists) -> tuple[Array, Array]:
+    """The minima near the times t, infinite unless one `exists`, and their times.
 
-    Derivatives are those of the last parabola: with respect to its time a minimum has none.
+    Derivatives are those of the last parabola: with respect to its time a minimum is stationary.
     """
-    length = given[3]
+    length = segment[3]
 
     def going(carry):
         _, change, _, steps = carry
         return (steps < 6) & jnp.any(exists & (jnp.abs(change) > length / 2**20))
 
-    # The cubic's minimum is near, but where it is nearly an inflection.
+    # The cubic's minimum is near, except where it is almost an inflection.
     def step(carry):
         t, _, _, steps = carry
-        value, change = _vertex(given, t)
+        value, change = _vertex(segment, t)
         return jnp.clip(t + change, 0, length), change, value, steps + 1
 
     far = jnp.full_like(t, jnp.inf)
@@ -69,9 +69,9 @@ def _minima(given: tuple, t, exists) -> tuple[Array, Array]:
 
 @_minima.defjvp
 def _minima_jvp(primals, tangents):
-    given, t, exists = primals
-    value, t = _minima(given, t, exists)
-    _, change = jax.jvp(lambda given: _vertex(given, t)[0], (given,), (tangents[0],))
+    segment, t, exists = primals
+    value, t = _minima(segment, t, exists)
+    _, change = jax.jvp(lambda primal: _vertex(primal, t)[0], (segment,), (tangents[0],))
     return (value, t), (jnp.where(exists, change, 0), jnp.zeros_like(t))
 
 
@@ -81,18 +81,18 @@ def extreme_values(system: HybridSystem, segments: Segments, rows) -> Float[Arra
     nodes = _at_nodes(system, segments, lambda x: system.times(rows, x))
     g_0, g_1, d_0, d_1 = (jnp.concatenate([x, -x]) for x in nodes)
     rows = jnp.concatenate([rows, -rows])
-    # Minima inside of segments, by the cubic through the ends. Of those nearly as low it cannot say
-    # which is the lowest, so that a few are refined. A row at rest has none.
+    # Minima inside segments, by the cubic through the ends. It cannot tell which of nearly equal
+    # ones is the lowest, so that a few are refined. A row at rest has none.
     through = jax.lax.stop_gradient((g_0, g_1, d_0, d_1))
     cubic, small = Cubic.through(*through), jnp.max(rounding(y))
     theta, inside = cubic.minimum()
     least = jnp.where(inside & (d_1 - d_0 > small / 64), cubic(theta), jnp.inf)
     least, k = (x.ravel() for x in _lowest(least, _MINIMA))
     of_row, length = jnp.arange(len(k)) // _MINIMA, h[k]
-    given = (system, y[:, k], s[:, k], length, rows[of_row].T)
-    value, _ = _minima(given, theta[of_row, k] * length, least < jnp.inf)
+    selected = (system, y[:, k], s[:, k], length, rows[of_row].T)
+    value, _ = _minima(selected, theta[of_row, k] * length, least < jnp.inf)
     value = jnp.min(value.reshape(-1, _MINIMA), axis=1)
-    # Where one ends a segment both are equal to rounding, and the parabola alone follows it.
+    # At the end of a segment both are equal to rounding, and only the parabola tracks it.
     node = jnp.min(g_0, axis=1)
     value = jnp.where(value <= node + small, value, node)
     low, high = jnp.split(value, 2)
@@ -108,7 +108,7 @@ def _at_nodes(system: HybridSystem, segments: Segments, values: Callable) -> lis
 
 
 def time_below_zero(system: HybridSystem, segments: Segments, row, offset) -> Float[Array, ""]:
-    """How long row @ y + offset is negative in one period."""
+    """Time for which row @ y + offset is negative in one period."""
     y, h, s = segments.y, segments.duration, segments.s
     g_0, g_1, d_0, d_1 = _at_nodes(system, segments, lambda x: system.times(row[None], x)[0])
     g_0, g_1 = g_0 + offset, g_1 + offset

@@ -21,9 +21,9 @@ from .shooting import largest_friction, linearised, measured, rate_at
 
 _FINER = 8  # attempts at a mesh that is fine enough
 SMALL = 0.03  # size of a smooth orbit, in units of V/omega, below which a Hopf point is near
-_FAST = 10.0  # coefficient of friction over the static one, beyond which no law is one
-_SAMPLED = 512  # states of an orbit at which that is looked at
-_ROUNDING = 1e-9  # a guard this far below zero is kept to
+_FAST = 10.0  # coefficient of friction over the static one, beyond which laws are meaningless
+_SAMPLED = 512  # states of an orbit at which that is checked
+_ROUNDING = 1e-9  # a guard this far below zero still holds
 
 
 class BranchEnd(eqx.Enumeration):
@@ -45,9 +45,9 @@ def _system(window, x: Mechanism, q) -> HybridSystem:
 
 
 class Point(NamedTuple):
-    """One solution and what is shown of it."""
+    """One solution and the values that are listed for it."""
 
-    place: np.ndarray  # of the quantities that are free, in their windows
+    place: np.ndarray  # of the free quantities, in their windows
     row: dict[str, Any]
     itinerary: str
 
@@ -66,8 +66,8 @@ class Follower:
 
     def record(self, shooting: Shooting, z) -> None:
         solution = shooting.solution(z)
-        given = solution.x, self.window, solution.chain, solution.lifted, solution.u
-        (low, high, state), second, error = map(np.asarray, measured(*given))
+        orbit = solution.x, self.window, solution.chain, solution.lifted, solution.u
+        (low, high, state), second, error = map(np.asarray, measured(*orbit))
         n, h = self.n, shooting.lengths(z)
         values = shooting.multipliers(z)
         states = np.array([phase.s for phase in shooting.phases])
@@ -103,10 +103,10 @@ class Follower:
     # --- following ---
 
     def both_ways(self, begun: Callable) -> tuple[BranchEnd, BranchEnd]:
-        """Adds the points before and beyond a solution, and says why they end.
+        """Add the points on both sides of a solution; return the reason for either end.
 
-        `begun()` makes its equations, and returns them with the unknowns and the tangent there. The
-        last point is in the direction in which the last quantity rises.
+        `begun()` builds its equations, and returns them with the unknowns and the tangent there.
+        The last point is in the direction in which the last quantity increases.
         """
         shooting, z, tangent = begun()
         tangent = tangent if tangent[-1] > 0 else -tangent
@@ -122,7 +122,7 @@ class Follower:
         return start, end
 
     def follow(self, shooting: Shooting, z, ahead) -> BranchEnd:
-        """Adds the points beyond z in the direction `ahead`, and says why they end."""
+        """Add the points beyond z in the direction `ahead`; return the reason for the end."""
         state: Any = shooting, z, ahead
         origin = len(self.points)
         while not isinstance(state, BranchEnd):
@@ -132,7 +132,7 @@ class Follower:
         return state
 
     def _within_itinerary(self, shooting: Shooting, z, ahead, origin):
-        """Follows one itinerary on one mesh; returns where to go on, or why not."""
+        """Follow one itinerary on one mesh; return where to go on, or the reason for the end."""
         smooth = shooting.phases[0].guard == SECTION
         for reached, turned, leaves in shooting.curves.steps(z, ahead):
             if smooth and self._shrinks(shooting, reached):
@@ -158,7 +158,7 @@ class Follower:
         return self._lost(shooting, z)
 
     def _leaves_itinerary(self, shooting: Shooting, z, reached):
-        """From an admissible z to where the orbit ceases to be, and on from there."""
+        """Go from an admissible z to where the orbit ceases to be admissible, and on from there."""
         change = ItineraryChange(self, shooting, z, reached)
         onward = change.onward()
         return self._jumps(change) if onward is None else onward
@@ -169,15 +169,15 @@ class Follower:
         return BranchEnd.jump
 
     def _lost(self, shooting: Shooting, z) -> BranchEnd:
-        """Why Newton's method fails beyond z: perhaps friction that grows without bound."""
+        """Reason why Newton's method fails beyond z, perhaps friction that grows without bound."""
         solution = shooting.solution(z)
         times = np.linspace(0, solution.times[-1], _SAMPLED, endpoint=False)
         y, _ = self.family.sampled(solution, times, _SAMPLED)
-        given = solution.x, self.window, solution.u[-1], y
-        return BranchEnd.fast if float(largest_friction(*given)) > _FAST else BranchEnd.lost
+        sampled_orbit = solution.x, self.window, solution.u[-1], y
+        return BranchEnd.fast if float(largest_friction(*sampled_orbit)) > _FAST else BranchEnd.lost
 
     def reverse(self) -> None:
-        """The points in the opposite order."""
+        """Reverse the order of the points and the direction of the events."""
         self.points.reverse()
         last = len(self.points) - 1
         for event in self.events:
@@ -191,7 +191,7 @@ class Follower:
         return shooting.curves.passes(start - z, ahead, reached - z)
 
     def accurate(self, shooting: Shooting, z, ahead):
-        """Where to go on from z, recorded last: on a finer mesh, and recorded anew, if need be."""
+        """Where to go on from z, the last point: if inaccurate, that is redone on a finer mesh."""
         if not self.points[-1].row["error"] > self.family.rtol:
             return shooting, z, ahead
         onward = self._remeshed(shooting, z, ahead)
@@ -201,31 +201,31 @@ class Follower:
         return onward
 
     def _remeshed(self, old: Shooting, z, ahead):
-        """Where to go on with a new mesh of the same itinerary, finer if that is not enough."""
+        """Where to go on with a new mesh of the same itinerary, refined until it is accurate."""
         times = old.times(z)
         for _ in range(_FINER):
             new = old.again(old.solution(z), old.phases, times)
-            found = new.curves.corrected(new.begin)
-            if found is None:
+            corrected = new.curves.corrected(new.begin)
+            if corrected is None:
                 return self._lost(old, z)
-            solution = new.solution(found[0])
-            given = solution.x, self.window, solution.chain, solution.lifted, solution.u
-            if float(measured(*given)[2]) <= self.family.rtol / 2:
+            solution = new.solution(corrected[0])
+            orbit = solution.x, self.window, solution.chain, solution.lifted, solution.u
+            if float(measured(*orbit)[2]) <= self.family.rtol / 2:
                 break
             self.family.h *= 0.7
         direction = ahead * old.scale / new.scale
-        tangent = new.curves.tangent(found[1])
-        return new, found[0], tangent if tangent @ direction > 0 else -tangent
+        tangent = new.curves.tangent(corrected[1])
+        return new, corrected[0], tangent if tangent @ direction > 0 else -tangent
 
     def between(self, shooting, z, reached, share):
-        """The point of the curve near that share of the way, or None."""
+        """Point of the curve near a `share` of the way from z to `reached`, or None."""
         if share in (0.0, 1.0):
             return reached if share else z
         way = reached - z
         ends = (shooting.curves.tangent(shooting.equations(at)[1]) for at in (z, reached))
         first, last = (t if t @ way > 0 else -t for t in ends)
-        found = shooting.curves.corrected(cubic(z, first, reached, last, share))
-        return None if found is None else found[0]
+        corrected = shooting.curves.corrected(cubic(z, first, reached, last, share))
+        return None if corrected is None else corrected[0]
 
     def root(self, shooting, z, reached, test: Callable) -> np.ndarray | None:
         """The point between two at which a test function of z vanishes."""
@@ -234,7 +234,7 @@ class Follower:
             at = self.between(shooting, z, reached, share)
             return np.nan if at is None else test(at)
 
-        import scipy.optimize  # not before it is used: it takes its time
+        import scipy.optimize  # imported only when used: it is slow
 
         try:
             share: Any = scipy.optimize.brentq(along, 0.0, 1.0, xtol=1e-13)
@@ -277,7 +277,7 @@ class Follower:
     # --- the Hopf point ---
 
     def _shrinks(self, shooting, z, factor=1.0) -> bool:
-        """Whether a smooth orbit is about to vanish, or has passed the point where it does."""
+        """True if a smooth orbit is about to vanish, or has passed the point where it does."""
         u = shooting.full(z)
         x, y = shooting.mechanism(z), u[: 2 * self.n]
         equilibrium = np.asarray(linearised(x, self.window, u[-1])[0])
@@ -288,10 +288,10 @@ class Follower:
     def _hopf(self, shooting, z):
         """The Hopf point near the small orbit z, and the end of the branch."""
         q, period = z[shooting.quantity], float(shooting.lengths(z).sum())
-        found = self.family.hopf_near(q, 2 * np.pi / period)
-        if found is None:
+        hopf_point = self.family.hopf_near(q, 2 * np.pi / period)
+        if hopf_point is None:
             return BranchEnd.lost
-        self.record_hopf(*found, shooting)
+        self.record_hopf(*hopf_point, shooting)
         return BranchEnd.hopf
 
     def record_hopf(self, q, frequency, shooting: Shooting) -> None:

@@ -26,16 +26,16 @@ OPEN = 2
 # can open. The section is where t.u of the first face falls through 0, a maximum of t.x; of an
 # excited system it is the maximum of the excitation, once in each of its periods.
 SECTION, NONE, UNUSED = 0, -1, -2
-_SMOOTH = 1e-4  # of the way to the opening: nearer, what a load curve adds is below rounding
+_SMOOTH = 1e-4  # of the way to the opening; nearer to it, what a load curve adds is below rounding
 FEW = 4  # degrees of freedom up to which a product is a sum, which compiles into one loop
-_FAR = 1e3  # factor by which a motion that diverges exceeds all scales that it has
-_RESONANCE = 1e3  # times what a harmonic force moves at rest
-_HALVINGS = 48  # of the unit of velocity, to where a law can be continued below w = 0
-_TRIALS = 4.0 ** -np.arange(13)  # shares of a step at which the steepness ahead is looked at
+_FAR = 1e3  # factor by which a diverging motion exceeds all of its scales
+_RESONANCE = 1e3  # largest amplification of the static response to a harmonic force
+_HALVINGS = 48  # of the unit of velocity, to find how far a law continues below w = 0
+_TRIALS = 4.0 ** -np.arange(13)  # shares of a step at which the steepness ahead is evaluated
 
 
 def _traced_once(method: Callable) -> Callable:
-    """A method that a program calls at many places, traced and lowered once for each shape."""
+    """Trace and lower a method that a program calls at many places once for each shape."""
     jitted = jax.jit(method)
 
     @functools.wraps(method)
@@ -46,7 +46,7 @@ def _traced_once(method: Callable) -> Callable:
 
 
 class Products(eqx.Module):
-    """What a field takes of a state in one product, which runs and compiles as fast as one part."""
+    """All linear terms of a field in one product, which runs and compiles as fast as one term."""
 
     matrix: Float[Array, "3f+n 2n"]  # L x, T u, T (K x + C u), K x + C u
     W: Float[Array, "f f"]  # T B
@@ -54,12 +54,12 @@ class Products(eqx.Module):
 
 
 class LawScales(eqx.Module):
-    """What steps need to know of friction that depends on the velocity, of each face."""
+    """Bounds on velocity-dependent friction at each face, which limit the steps."""
 
     below: Float[Array, " f"]  # how far below w = 0 its law is continued
     # Its steepest slope up to each of `SPEEDS`: by how much a unit of load changes dw/dt with w.
     steepest: Float[Array, "f v"]
-    falls_until: Float[Array, " f"]  # where it is least, up to 100 m/s
+    falls_until: Float[Array, " f"]  # velocity at which it is least, up to 100 m/s
 
 
 class HybridSystem(eqx.Module):
@@ -80,21 +80,21 @@ class HybridSystem(eqx.Module):
     curves: tuple[LoadTable | None, ...]  # of the joints whose load follows one, over (L x)/P
     faces: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # of each joint
     sharing: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # the joints of each of the laws
-    opens: tuple[bool, ...] = eqx.field(static=True)  # whether a joint can open
-    jointless: bool = eqx.field(static=True, default=False)  # its one face is no joint's
-    # Whether the last degree of freedom is the phase of an excitation: excitation.py.
+    opens: tuple[bool, ...] = eqx.field(static=True)  # True for joints that can open
+    jointless: bool = eqx.field(static=True, default=False)  # its one face belongs to no joint
+    # True if the last degree of freedom is the phase of an excitation: excitation.py.
     excited: bool = eqx.field(static=True, default=False)
-    # Of many degrees of freedom the largest rate of the mechanism without friction, within a per
-    # cent: steps then follow the motion, as far as that allows. None: steps are those of rate 1.
+    # With many degrees of freedom, the largest rate of the mechanism without friction, within 1 %:
+    # steps then follow the motion, as far as that rate allows. None: steps are for a rate of 1.
     fastest: Float[Array, ""] | None = None
     products: Products | None = None  # of a structure
     scales: LawScales | None = None  # None: no law depends on the velocity
 
     def with_scales(self) -> "HybridSystem":
-        """With those of laws that depend on the velocity.
+        """The system with `scales`, if any law depends on the velocity.
 
-        Below w = 0 a law goes on while mu is between 0 and 2 mu_s, and is constant beyond: a coarse
-        step may overshoot to there, where the formula of a law may be anything.
+        Below w = 0 a law continues while mu is between 0 and 2 mu_s, and is constant beyond: a
+        coarse step may overshoot to where the formula of a law has no meaning.
         """
         if not any(law.velocity_dependent for law in self.laws):
             return self
@@ -109,17 +109,17 @@ class HybridSystem(eqx.Module):
             steepest = self.speed * jax.lax.cummax(jnp.abs(law.slope(speeds)))
             return one * jnp.concatenate([jnp.stack([below, falls_until]), steepest])
 
-        found = jax.lax.stop_gradient(self._each(numbers, jnp.ones_like(self.P)))
-        steepest = self._own(found[:, 2:])
-        return replace(self, scales=LawScales(found[:, 0], steepest, found[:, 1]))
+        face_scales = jax.lax.stop_gradient(self._each(numbers, jnp.ones_like(self.P)))
+        steepest = self._self_acceleration(face_scales[:, 2:])
+        return replace(self, scales=LawScales(face_scales[:, 0], steepest, face_scales[:, 1]))
 
     def with_products(self) -> "HybridSystem":
-        """With them, if its faces have directions of their own; K and C are matrices then."""
+        """The system with `products`, if it has T and B; K and C are matrices then."""
         if self.T is None or self.B is None:
             return self
         both, zero = jnp.concatenate([self.K, self.C], axis=1), jnp.zeros_like(self.T)
-        seen = [jnp.concatenate([self.L, zero], axis=1), jnp.concatenate([zero, self.T], axis=1)]
-        matrix = jnp.concatenate([*seen, self.T @ both, both])
+        blocks = [jnp.concatenate([self.L, zero], axis=1), jnp.concatenate([zero, self.T], axis=1)]
+        matrix = jnp.concatenate([*blocks, self.T @ both, both])
         return replace(self, products=Products(matrix, self.T @ self.B, self.T @ self.F))
 
     @property
@@ -129,18 +129,18 @@ class HybridSystem(eqx.Module):
 
     @property
     def n(self) -> int:
-        """The number of degrees of freedom, with that of an excitation."""
+        """The number of degrees of freedom, including that of an excitation."""
         return self.F.shape[0]
 
     def own(self, y) -> Array:
-        """The mechanism's part (2n, ...) of states, without that of an excitation."""
+        """The mechanism's part (2n, ...) of states, without the excitation."""
         if not self.excited:
             return y
         return jnp.concatenate([y[: self.n - 1], y[self.n : -1]])
 
     @property
     def affine(self) -> bool:
-        """Whether the field of every contact state is affine."""
+        """True if the field of every contact state is affine."""
         return not any(self.curves) and not any(law.velocity_dependent for law in self.laws)
 
     @property
@@ -166,11 +166,11 @@ class HybridSystem(eqx.Module):
         return constant + jnp.max(jnp.abs(self.K[:-1, -1]), axis=0)
 
     def bound(self, y, equilibrium) -> Array:
-        """The size (...) that a motion from y (2n, ...) passes only where it diverges."""
+        """The size (...) that a motion from y (2n, ...) exceeds only if it diverges."""
         size = 1 + jnp.max(jnp.abs(y), axis=0)
         size = size + jnp.max(jnp.where(jnp.isfinite(equilibrium), jnp.abs(equilibrium), 0), axis=0)
         if self.scales is not None:
-            # With a small V, motions that take many V are ordinary.
+            # With a small V, motions of many V are ordinary.
             size = size + jnp.max(self.scales.falls_until, axis=0)
         return _FAR * (size + _RESONANCE * self.largest_force if self.excited else size)
 
@@ -198,10 +198,10 @@ class HybridSystem(eqx.Module):
 
     def times(self, matrix, x) -> Array:
         """matrix (i, j) times x (j, ...); a matrix (j,) is a diagonal."""
-        own = self.omega.ndim
-        if matrix.ndim - own == 1:
+        batch_axes = self.omega.ndim
+        if matrix.ndim - batch_axes == 1:
             return self._leaf(matrix, x.ndim - 1) * x
-        if len(x) > 2 * FEW and not own:
+        if len(x) > 2 * FEW and not batch_axes:
             return jnp.tensordot(matrix, x, 1)
         matrix = self._leaf(matrix, x.ndim - 1)
         if len(x) == 2:  # written out: many lanes run a fifth faster than with XLA's reduction
@@ -213,7 +213,7 @@ class HybridSystem(eqx.Module):
         return x if self.T is None else self.times(self.T, x)
 
     def _acceleration(self, forces) -> Array:
-        """What forces (f, ...) on the faces accelerate (n, ...)."""
+        """Accelerations (n, ...) by forces (f, ...) on the faces."""
         return forces if self.B is None else self.times(self.B, forces)
 
     def linear_loads(self, x) -> Array:
@@ -221,24 +221,24 @@ class HybridSystem(eqx.Module):
         return self.times(self.L, x) + self._leaf(self.P, x.ndim - 1)
 
     def loads(self, x) -> Array:
-        """What the coefficient of friction multiplies (f, ...); sticking attracts where > 0."""
+        """Loads (f, ...), which friction multiplies; stick is attracting where they are > 0."""
         linear = self.linear_loads(x)
         if not any(self.curves):
             return linear
-        found = list(linear)
+        loads = list(linear)
         for faces, force in zip(self.faces, self.normal_forces(linear), strict=True):
-            found[faces[0]] = force
-        return jnp.stack(found)
+            loads[faces[0]] = force
+        return jnp.stack(loads)
 
     def normal_forces(self, linear) -> Array:
-        """Those of the joints (m, ...) whose faces have the loads (f, ...) by linear springs."""
-        found = rows(linear, self._first)
+        """Normal forces of joints (m, ...) whose faces have loads (f, ...) by linear springs."""
+        forces = rows(linear, self._first)
         if not any(self.curves):
-            return found
-        found = list(found)
+            return forces
+        forces = list(forces)
         for j, P, e, curve in self._on_curves(linear):
-            found[j] = P * curve(e)
-        return jnp.stack(found)
+            forces[j] = P * curve(e)
+        return jnp.stack(forces)
 
     def _on_curves(self, linear) -> Iterator[tuple[int, Array, Array, LoadTable]]:
         """The joints that follow a load curve: number, P, e = (L x)/P, and the curve, by lanes."""
@@ -249,32 +249,32 @@ class HybridSystem(eqx.Module):
                 yield j, P, linear[faces[0]] / P - 1, jax.tree.map(leaf, curve)
 
     def closures(self, x) -> Array:
-        """What falls through 0 where a joint opens (m, ...), linear in x [load]."""
+        """Closures of the joints (m, ...), which fall through 0 on opening, linear in x [load]."""
         linear = self.linear_loads(x)
-        found = rows(linear, self._first)
+        closures = rows(linear, self._first)
         if not any(self.curves):
-            return found
-        found = list(found)
+            return closures
+        closures = list(closures)
         for j, P, e, curve in self._on_curves(linear):
-            found[j] = P + P * e / curve.opening
-        return jnp.stack(found)
+            closures[j] = P + P * e / curve.opening
+        return jnp.stack(closures)
 
     def sliding(self, u) -> Array:
         """Sliding velocity w of each face (f, ...)."""
         return self._leaf(self.V, u.ndim - 1) - self.along(u)
 
     def _each(self, function, *arrays) -> Array:
-        """function(law, *rows) of each face, with the law of its joint."""
-        found, order = [], []
+        """function(law, *rows) for each face, with the law of its joint."""
+        values, order = [], []
         for law, joints in zip(self.laws, self.sharing, strict=True):
             faces = [i for j in joints for i in self.faces[j]]
-            given = [rows(x, faces) for x in arrays]
+            face_arrays = [rows(x, faces) for x in arrays]
             if len(joints) > 1:
-                found.append(jax.vmap(function)(law, *given))
+                values.append(jax.vmap(function)(law, *face_arrays))
             else:
-                found.append(jax.vmap(functools.partial(function, law))(*given))
+                values.append(jax.vmap(functools.partial(function, law))(*face_arrays))
             order += faces
-        return rows(jnp.concatenate(found), np.argsort(order))
+        return rows(jnp.concatenate(values), np.argsort(order))
 
     @property
     def _first(self) -> list[int]:
@@ -295,10 +295,10 @@ class HybridSystem(eqx.Module):
         return self._each(lambda law, speed: law.mu(speed) / law.mu_s, speeds)
 
     def _driven(self, y, friction, s=None) -> Array:
-        """Acceleration (n, ...) with these friction forces, without those of sticking faces."""
+        """Acceleration (n, ...) by these friction forces, with no force holding sticking faces."""
         x, u = y[: self.n], y[self.n :]
         if any(self.curves):
-            # K holds the spring of the preload: what the load curve lacks is added.
+            # K contains the spring of the preload: the difference from the load curve is added.
             linear = self.linear_loads(x)
             forces = list(friction)
             for j, P, e, curve in self._on_curves(linear):
@@ -311,7 +311,7 @@ class HybridSystem(eqx.Module):
         return free + self._acceleration(friction)
 
     def _taken_back(self, loads) -> Array:
-        """The spring forces (f, ...), which K holds and an open joint does not have."""
+        """Forces (f, ...) that cancel the springs of an open joint, which K contains."""
         if all(self.opens):
             pairs = loads.reshape(-1, 2, *loads.shape[1:])
             return jnp.stack([-pairs[:, 1], pairs[:, 0]], axis=1).reshape(loads.shape)
@@ -338,30 +338,30 @@ class HybridSystem(eqx.Module):
 
     def held(self, accelerations, held) -> Array:
         """Forces (f, ...) on the faces `held` that cancel their accelerations t.x'' (f, ...)."""
-        wanted = jnp.where(held, -accelerations, 0)
+        required = jnp.where(held, -accelerations, 0)
         if self.products is None:
-            return wanted
+            return required
         W = self._leaf(self.products.W, held.ndim - 1)
-        own = np.eye(len(W), dtype=W.dtype).reshape(len(W), len(W), *(1,) * (held.ndim - 1))
-        W = jnp.where(held[:, None] & held[None], W, own)
+        identity = np.eye(len(W), dtype=W.dtype).reshape(len(W), len(W), *(1,) * (held.ndim - 1))
+        W = jnp.where(held[:, None] & held[None], W, identity)
 
-        def solved():
-            return jnp.where(held, solve_positive(W, wanted), 0)
+        def constraint_forces():
+            return jnp.where(held, solve_positive(W, required), 0)
 
         if len(W) <= SMALL:
-            return solved()
-        return jax.lax.cond(jnp.any(held), solved, lambda: jnp.zeros_like(wanted))
+            return constraint_forces()
+        return jax.lax.cond(jnp.any(held), constraint_forces, lambda: jnp.zeros_like(required))
 
     @property
     def _at_faces(self) -> Products | None:
-        """What is seen of the motion at the faces, where forces are found from that."""
+        """The `products`, where the forces follow from the motion at the faces alone."""
         return None if any(self.curves) else self.products
 
-    def _seen(self, products: Products, y, s, which: slice) -> tuple[Array, ...]:
-        """Loads, w, forces and those of sticking faces (f, ...), and the rest of those products."""
+    def _face_quantities(self, products: Products, y, s, which: slice) -> tuple[Array, ...]:
+        """Loads, w, forces and holding forces of faces (f, ...), and the rest of the products."""
         f, leaf = len(self.P), functools.partial(self._leaf, lanes=y.ndim - 1)
-        seen = self.times(products.matrix[which], y)
-        loads, along, driven, rest = jnp.split(seen, [f, 2 * f, 3 * f])
+        projections = self.times(products.matrix[which], y)
+        loads, along, driven, rest = jnp.split(projections, [f, 2 * f, 3 * f])
         loads, w = loads + leaf(self.P), leaf(self.V) - along
         forces = jnp.where(jnp.abs(s) == 1, self._by_laws(w, loads, s), 0)
         if any(self.opens):
@@ -374,7 +374,7 @@ class HybridSystem(eqx.Module):
         """dy/dt in contact state s. A sticking face must have w = 0."""
         products = self._at_faces
         if products is not None:
-            _, _, forces, held, driven = self._seen(products, y, s, slice(None))
+            _, _, forces, held, driven = self._face_quantities(products, y, s, slice(None))
             free = self._leaf(self.F, y.ndim - 1) - driven
             return jnp.concatenate([y[self.n :], free + self._acceleration(forces + held)])
         acceleration = self._driven(y, self._slipping(y, s), s)
@@ -387,12 +387,12 @@ class HybridSystem(eqx.Module):
         return jnp.concatenate([y[self.n :], acceleration])
 
     def regularised_field(self, y, signs) -> Array:
-        """dy/dt where friction has `signs` (f, ...) between -1 and 1, by a smoothed sign."""
+        """dy/dt where friction has smoothed `signs` (f, ...) between -1 and 1."""
         force, opens = self._friction(y, signs), self.open_faces(y)
         return jnp.concatenate([y[self.n :], self._driven(y, force, jnp.where(opens, OPEN, 1))])
 
     def open_faces(self, y) -> Array:
-        """The faces (f, ...) of joints that can open and whose normal force would pull."""
+        """True for faces (f, ...) of joints that can open and whose normal force would pull."""
         closures = self.closures(y[: self.n])
         opens = jnp.asarray(np.repeat(self.opens, [len(faces) for faces in self.faces]))
         first = jnp.stack([closures[j] for j, faces in enumerate(self.faces) for _ in faces])
@@ -401,7 +401,7 @@ class HybridSystem(eqx.Module):
     def section(self, y) -> Array:
         """t.u of the first face, which falls through 0 at a return to the Poincare section.
 
-        Of an excited system z', so that the section is stroboscopic.
+        In an excited system it is z', so that the section is stroboscopic.
         """
         return y[-1] if self.excited else self.along(y[self.n :])[0]
 
@@ -409,13 +409,13 @@ class HybridSystem(eqx.Module):
     def guards(self, y, s) -> Array:
         """Functions (k, ...) that are positive while contact state s lasts, and the section.
 
-        Of a face in slip s w and a constant, in stick the distances of the friction force from
-        its two limits; of a joint that can open its closure, or minus that while open.
+        A face in slip has s w and a constant, a face in stick the distances of the friction force
+        from its two limits; a joint that can open has its closure, or minus that while open.
         """
         x, u = y[: self.n], y[self.n :]
         products = self._at_faces
         if products is not None:
-            loads, w, _, force, _ = self._seen(products, y, s, slice(3 * len(self.P)))
+            loads, w, _, force, _ = self._face_quantities(products, y, s, slice(3 * len(self.P)))
         else:
             w, loads = self.sliding(u), self.loads(x)
             if self.B is None:
@@ -427,24 +427,24 @@ class HybridSystem(eqx.Module):
         lower = jnp.where(slip, s * w, jnp.where(stick, limits - force, one))
         upper = jnp.where(stick, limits + force, one)
         pairs = jnp.stack([lower, upper], axis=1).reshape(2 * len(w), *w.shape[1:])
-        found = [self.section(y)[None], pairs]
+        guards = [self.section(y)[None], pairs]
         if any(self.opens):
             closures = rows(self.closures(x), self._opening)
             opened = rows(s, [self._first[j] for j in self._opening]) == OPEN
-            found.append(jnp.where(opened, -closures, closures))
-        return jnp.concatenate(found)
+            guards.append(jnp.where(opened, -closures, closures))
+        return jnp.concatenate(guards)
 
     def crowding(self, y, s) -> Array:
-        """By how much shorter than elsewhere segments should be where load curves bend (...)."""
+        """Factor (...) by which segments should be shorter where load curves bend."""
         return 2 * self._of_curves(y, s, 1 / 4)
 
     def density(self, y, s, longest) -> Array:
-        """By how much shorter than `longest` (...) segments that begin at y should be (...)."""
+        """Factor (...) by which segments from y on should be shorter than `longest` (...)."""
         shortest = self.step_length(y, s, self.field(y, s), longest, longest)
         return jnp.maximum(longest / shortest, self.crowding(y, s))
 
-    def _own(self, forces) -> Array:
-        """What each of the forces (f, ...) on the faces accelerates that face by itself."""
+    def _self_acceleration(self, forces) -> Array:
+        """Acceleration of each face (f, ...) by the force on that face alone."""
         if self.T is None or self.B is None:
             return forces
         return forces * self._leaf(
@@ -464,7 +464,7 @@ class HybridSystem(eqx.Module):
         if self.scales is None:
             return step
         u, loads = y[self.n :], self.loads(y[: self.n])
-        loads = self._own(jnp.where(jnp.abs(s) == 1, jnp.abs(loads), 0))
+        loads = self._self_acceleration(jnp.where(jnp.abs(s) == 1, jnp.abs(loads), 0))
         w, change = jnp.abs(self.sliding(u)), jnp.abs(self.along(rate[self.n :]))
         # No eigenfrequency exceeds 1, so that accelerations change by about the velocities.
         bend = (1 + jnp.max(jnp.abs(u), axis=0)) / 2
@@ -489,16 +489,16 @@ class HybridSystem(eqx.Module):
         assert self.scales is not None
         # In lanes each has its own unit of speed.
         speeds = (self.speed[None] if self.speed.ndim else self.speed) * w
-        # They are 0 and then evenly spaced in their logarithm.
+        # The table's speeds are 0 and then evenly spaced in their logarithm.
         decades = jnp.log10(jnp.maximum(speeds, SPEEDS[1]) / SPEEDS[1])
         place = 1 + jnp.ceil(decades / np.log10(SPEEDS[2] / SPEEDS[1])).astype(int)
-        known = self._leaf(self.scales.steepest, w.ndim - 1)
+        slopes = self._leaf(self.scales.steepest, w.ndim - 1)
         place = jnp.minimum(place, len(SPEEDS) - 1)[:, None]
-        found = jnp.take_along_axis(known, place, axis=1)[:, 0]
-        return jnp.where(speeds <= SPEEDS[-1], found, jnp.inf)
+        steepest = jnp.take_along_axis(slopes, place, axis=1)[:, 0]
+        return jnp.where(speeds <= SPEEDS[-1], steepest, jnp.inf)
 
     def _steepness(self, w, loads) -> Array:
-        """The largest rate (...) at which friction at |w| (f, ...) changes that; 0 of no load."""
+        """The largest rate (...) at which friction at |w| (f, ...) changes w; 0 without load."""
 
         def rate(law, w, load):
             return jnp.abs(self.speed * law.slope(self.speed * w)) * load
@@ -508,16 +508,17 @@ class HybridSystem(eqx.Module):
     def _of_curves(self, y, s, closing: float) -> Array:
         """The largest rate (...) at which load curves change; 0 without any.
 
-        Half of what they add to the springs of the preload, and `closing` times the rate of
-        relative change of the way to the opening, where they are not smooth.
+        It is half the rate of the stiffness that they add to the springs of the preload, or
+        `closing` times the rate of relative change of the way to the opening, where they are not
+        smooth, whichever is larger.
         """
         x, u = y[: self.n], y[self.n :]
         linear, by_time, most = self.linear_loads(x), self.times(self.L, u), jnp.zeros_like(x[0])
         for j, P, e, curve in self._on_curves(linear):
             tangential, normal = self.faces[j]
             _, slope = jax.jvp(curve, (e,), (jnp.ones_like(e),))
-            away = jnp.zeros((len(linear), *e.shape), e.dtype).at[normal].set(1)
-            added = self.times(self.L, self._acceleration(away))[tangential] * (slope - 1)
+            unit_force = jnp.zeros((len(linear), *e.shape), e.dtype).at[normal].set(1)
+            added = self.times(self.L, self._acceleration(unit_force))[tangential] * (slope - 1)
             stiffer = jnp.sqrt(jnp.where(added > 0, added, 0)) / 2
             way = jnp.abs(e + curve.opening) + _SMOOTH * curve.opening
             nearing = jnp.where(s[tangential] == OPEN, 0, jnp.abs(by_time[tangential] / P) / way)
@@ -525,7 +526,7 @@ class HybridSystem(eqx.Module):
         return most
 
     def switch(self, y, s, guard) -> tuple[Array, Array]:
-        """State and contact state after the guard of that number has reached zero.
+        """State and contact state after guard number `guard` has reached zero.
 
         A slip that ends reverses if the force on the other side carries it on; otherwise it
         sticks. Under a negative load it always reverses: the sliding mode there is repelling.
@@ -556,21 +557,21 @@ class HybridSystem(eqx.Module):
         y = jnp.concatenate([x, u])
         if self.B is None or f == 1:
             return y, new
-        # The forces on faces that stick jump with the others' friction, perhaps beyond limits.
+        # The forces on sticking faces jump with the others' friction, perhaps beyond their limits.
         free = ended & (s != 0) | (new == 0)
         switched = jnp.any(guard > 0)
         return y, jax.lax.cond(switched, lambda: self._consistent(y, new, free), lambda: new)
 
     def _consistent(self, y, s, free) -> Array:
-        """s with other signs of the faces `free` (f, ...), whose w is 0, where it contradicts y.
+        """Contact state s, changed at faces `free` (f, ...) with w = 0 where it contradicts y.
 
         A force beyond its limits starts a slip; a slip that its own acceleration reverses sticks.
         The largest contradiction goes first, as in the pivoting of a complementarity problem.
         """
-        # A contact state has no derivative, and the loop none in reverse mode.
+        # A contact state has no derivative, and the loop has none in reverse mode.
         system, y = jax.lax.stop_gradient((self, y))
         limits = system.limits(system.loads(y[: self.n]))
-        # To rounding, a face at its limit does either.
+        # To rounding, a face at its limit may stick or slip.
         slack = 64 * jnp.finfo(y.dtype).eps
 
         def pivot(carry):
@@ -591,9 +592,9 @@ class HybridSystem(eqx.Module):
         return jax.lax.while_loop(going, pivot, (s, jnp.array(True), 0))[0]
 
     def _guarded(self, guard, which: Sequence[int]) -> Array:
-        """Whether `guard` (...) is that of the opening of the joint of each face (f, ...).
+        """True for faces (f, ...) of the joint that `guard` (...) opens or closes.
 
-        Of the tangential faces (0), the normal ones (1) or both.
+        `which` selects the tangential faces (0), the normal ones (1) or both.
         """
         numbers = np.full(len(self.P), -9)  # no guard
         for k, j in enumerate(self._opening):
@@ -601,9 +602,9 @@ class HybridSystem(eqx.Module):
         return guard[None] == numbers.reshape(-1, *(1,) * guard.ndim)
 
     def _without_load(self, x, guard) -> Array:
-        """x moved along the normal of the joint that `guard` opens or closes, to no load on it."""
+        """x shifted along the normal of the joint that `guard` opens or closes, to zero load."""
         of_first, of_normal = (self._guarded(guard, [i]) for i in (0, 1))
-        away = self._acceleration(of_normal.astype(x.dtype))
+        direction = self._acceleration(of_normal.astype(x.dtype))
         loads, openings = self.linear_loads(x), jnp.ones_like(x[:1])
         if any(self.curves):
             closures, ones = list(loads), [jnp.ones_like(x[0])] * len(loads)
@@ -616,9 +617,9 @@ class HybridSystem(eqx.Module):
                         self._leaf(curve.opening, x.ndim - 1), load.shape
                     )
             loads, openings = jnp.stack(closures), jnp.stack(ones)
-        change = jnp.sum(jnp.where(of_first, self.times(self.L, away) / openings, 0), axis=0)
+        change = jnp.sum(jnp.where(of_first, self.times(self.L, direction) / openings, 0), axis=0)
         load = jnp.sum(jnp.where(of_first, loads, 0), axis=0)
-        return x - (load / jnp.where(change == 0, 1, change))[None] * away
+        return x - (load / jnp.where(change == 0, 1, change))[None] * direction
 
     def contact_state(self, y) -> Array:
         """The contact state in which the motion from y begins."""
@@ -639,7 +640,7 @@ class HybridSystem(eqx.Module):
         if curved:
             first, normal = (np.array([faces[i] for faces, _ in curved]) for i in (0, 1))
             P, curves = self.P[first], [curve for _, curve in curved]
-            # What each load lacks does not push along n, nor rub along t.
+            # The deficit of each load neither pushes along n nor rubs along t.
             missing = (B[:, normal] - mu[first][None] * B[:, first]) * P[None]
             by = jnp.linalg.solve(coupled, missing)
             e = loaded_equilibrium(curves, self.L[first] @ x / P, self.L[first] @ by / P[:, None])
