@@ -7,13 +7,13 @@ MOST_DAMPED = 0.3  # damping ratio of the modes that a reduction looks for
 
 
 def in_band(s: Complex[Array, " k"], band: tuple[float, float] | None) -> Bool[Array, " k"]:
-    """Which eigenvalues a reduction to the band (low, high) [rad/s] gives: low < |Im s| <= high.
+    """True for eigenvalues that a reduction to the band (low, high) gives: low < |Im s| <= high.
 
-    Not those with |Re s| > 0.3 |s|, which it does not look for.
+    In rad/s. False for |Re s| > 0.3 |s|, which it does not look for.
     """
     if band is None:
         return jnp.ones(s.shape, bool)
-    frequency = abs(s.imag)  # in NumPy for its arrays: a program a shape is slow to compile
+    frequency = abs(s.imag)  # in NumPy for its arrays: one program per shape is slow to compile
     sought = abs(s.real) <= MOST_DAMPED * (s.real**2 + frequency**2) ** 0.5
     return (frequency > band[0]) & (frequency <= band[1]) & sought
 

@@ -72,12 +72,12 @@ class BoundaryBranch(Record):
 
     @property
     def closed(self) -> bool:
-        """Whether it is a loop; its last point is then its first."""
+        """True if it is a loop, whose last point is its first."""
         return bool(self.end == BoundaryEnd.closed)
 
     @property
     def divergence(self) -> bool:
-        """Whether a real eigenvalue is 0 on it, not a pair imaginary: static instability."""
+        """True if a real eigenvalue is 0 on it, not an imaginary pair: static instability."""
         return not self.frequency.any()
 
 
@@ -118,7 +118,7 @@ def hopf_boundary(
 ) -> Boundary:
     """Trace where the growth rate is 0 in the window of two quantities of a scene or structure.
 
-    `x` and `y` are (name, low, high): any quantity, of a structure also "left.D"; of a scene also
+    `x` and `y` are (name, low, high): any quantity; for a structure also "left.D"; for a scene also
     "K_t/K_n" at the scene's K_n (the given stiffness ratio of a fractal contact), "omega_1/omega_2"
     at the scene's omega_2, and "mu", the friction at the belt velocity, which scales the friction
     law as a whole. A range over a decade or more is logarithmic. Every point lies on the boundary
@@ -127,10 +127,10 @@ def hopf_boundary(
     be missed. Where both directions lose all their damping at once, along a whole line, the Hopf
     test function does not change sign smoothly: such crossings are counted as `untraced`.
 
-    Of a structure the boundary is flutter or static divergence (`BoundaryBranch.divergence`). A
+    For a structure, the boundary is flutter or static divergence (`BoundaryBranch.divergence`). A
     branch ends at a corner, where a second mode loses its damping too; the next branch begins
-    there. Points lie on it within 1e-10 of the window, or eps over the damping ratio. Each takes
-    the eigenvalues once: choose fewer `lines` for many degrees of freedom.
+    there. Points lie on it within 1e-10 of the window, or eps over the damping ratio. Each
+    takes a full eigenvalue solution: choose fewer `lines` for many degrees of freedom.
 
     Not differentiable, and not for use under `jit`; see `critical_friction` for that.
 
@@ -163,12 +163,12 @@ def hopf_boundary(
         valid=field.damped,
         tolerance=field.tolerance,
     )
-    found, squeals, untraced = trace(curves, field.values, lines)
+    branch_curves, squeals, untraced = trace(curves, field.values, lines)
     return Boundary(
         scene=scene,
         x=windows[0],
         y=windows[1],
-        branches=tuple(_branch(field, windows, curve) for curve in found),
+        branches=tuple(_branch(field, windows, curve) for curve in branch_curves),
         friction_slope=friction_slope,
         squeals=squeals,
         untraced=untraced,
@@ -176,7 +176,7 @@ def hopf_boundary(
 
 
 def _window(scene, which, window) -> Window:
-    """A range, checked; not yet against the domain of the scene."""
+    """The validated range, not yet checked against the domain of the scene."""
     if not (isinstance(window, (tuple, list)) and len(window) == 3 and isinstance(window[0], str)):
         raise ValueError(f"{which} must be (name, low, high), got {window!r}")
     name, *ends = window
@@ -188,11 +188,11 @@ def _window(scene, which, window) -> Window:
 
 
 def _decisive(scene, name, low, high) -> np.ndarray:
-    """The values of a range that decide whether all of it is inside the domain of the scene."""
-    own = own_quantities(scene)
+    """The values of a range that decide if all of it is inside the domain of the scene."""
+    quantities = own_quantities(scene)
     # mu(V), by which "mu" scales the friction law, is least at V = v_m: perhaps between the ends.
     other = {"V": "v_m", "v_m": "V"}.get(name)
-    value = own[other].value if other in own else None
+    value = quantities[other].value if other in quantities else None
     least = low if value is None else min(max(float(value), low), high)
     return np.array([low, least, high])
 
@@ -218,14 +218,17 @@ class _Plane(eqx.Module):
     scene: Any
     low: Float[Array, "2"]  # of each quantity, or of its logarithm
     high: Float[Array, "2"]
-    rigid: Any  # how many eigenvalues of a structure are those of rigid-body modes
+    rigid: Any  # number of rigid-body eigenvalues of a structure
     names: tuple[str, str] = eqx.field(static=True)
     logarithmic: tuple[bool, ...] = eqx.field(static=True)
     friction_slope: bool = eqx.field(static=True)
 
     def quantities(self, u) -> list[jax.Array]:
-        found = self.low + u * (self.high - self.low)
-        return [jnp.exp(found[i]) if log else found[i] for i, log in enumerate(self.logarithmic)]
+        coordinates = self.low + u * (self.high - self.low)
+        return [
+            jnp.exp(coordinates[i]) if log else coordinates[i]
+            for i, log in enumerate(self.logarithmic)
+        ]
 
     def at(self, u) -> _Point:
         scene = substituted(self.scene, dict(zip(self.names, self.quantities(u), strict=True)))
@@ -241,8 +244,8 @@ class _Plane(eqx.Module):
             attached = assembled(scene, self.friction_slope, refuse=False)
             pair = critical_pair(*attached.matrices, self.rigid, scene.band)
             return _Point(*pair, attached.open, regimes, lowest)
-        known = [Pressed(state.K_n, state.K_t, None) for state in states]
-        joint = known[0] if known else pressed(scene)
+        pressed_joints = [Pressed(state.K_n, state.K_t, None) for state in states]
+        joint = pressed_joints[0] if pressed_joints else pressed(scene)
         lin = linearised_at(scene, joint, self.friction_slope)
         damping = jnp.stack([lin.c_1, lin.c_2]) / jnp.sqrt(lin.a + lin.b)
         growth, frequency = rightmost_root(lin).real, critical_frequency(lin)
@@ -252,7 +255,7 @@ class _Plane(eqx.Module):
 
 @functools.partial(jax.jit, static_argnums=1)
 def _rigid(structure: Structure, friction_slope: bool):
-    """How many eigenvalues are those of rigid-body modes, at little friction."""
+    """The number of rigid-body eigenvalues, at little friction."""
     x = with_friction_times(structure, 1e-3)
     return (solve(*assembled(x, friction_slope).matrices).s == 0).sum()
 
@@ -276,15 +279,15 @@ def _tests(plane: _Plane, us):
 
 
 class _Field:
-    """The test function for NumPy: at many points, or at one with all that is known there."""
+    """The test function for NumPy: at many points, or at one with what the result shows of it."""
 
     def __init__(self, plane: _Plane):
         self.plane, self.dtype, self.entered = plane, plane.low.dtype, False
         eps = float(jnp.finfo(self.dtype).eps)
         self.tolerance, self.undamped = max(1e-12, 10 * eps), max(_UNDAMPED, (10 * eps) ** 2)
-        if plane.rigid is not None:  # eigenvalues know light damping to eps of the frequency
+        if plane.rigid is not None:  # eigenvalues resolve light damping to eps of the frequency
             self.tolerance, self.undamped = max(1e-10, 1e4 * eps), _COALESCED * eps**0.5
-        # A point is asked for its zero, for its damping and for what the result shows.
+        # Each point is evaluated for its zero, its damping and what the result shows.
         self._at = functools.lru_cache(8)(lambda u: _at(plane, jnp.asarray(u, self.dtype)))
 
     def at(self, u) -> _Point:
@@ -295,7 +298,7 @@ class _Field:
         return np.asarray(point.test, float)[None], np.asarray(gradient, float)[None]
 
     def values(self, us):
-        """Test function (k,) and gradient (k, 2) at any number of points, first of the lattice."""
+        """Test function (k,) and gradient (k, 2) at any number of points, the lattice first."""
 
         def program(us):
             return _tests(self.plane, jnp.asarray(us, self.dtype))
@@ -318,7 +321,7 @@ class _Field:
         return tests.astype(float), gradients.astype(float)
 
     def damped(self, u) -> bool:
-        """Whether all modes are; else the test function can be 0 without a Hopf point."""
+        """True if all modes are damped; else the test function can be 0 without a Hopf point."""
         return bool(np.asarray(self.at(u).damping).min() >= -self.undamped)
 
     def quantities(self, u) -> list[float]:

@@ -34,15 +34,15 @@ from .linearise import assembled, linearised
 from .quadratic import solve
 
 _FACTORS = 512  # of the friction law, among which the first root is bracketed
-_AT_ONCE = 8  # of them, and so many points that divide the bracket further
+_AT_ONCE = 8  # factors evaluated together, and points that divide the bracket further
 _REFINED = 12  # times, to 9^-12 of it
 
 
 def critical_coupling(lin: Linearised) -> Float[Array, ""]:
     """g_c [1/s^4], the coupling at which a pair of eigenvalues is imaginary.
 
-    Without damping it depends on how the damping vanishes: that of equal damping, (a - b)^2/4,
-    where the modes coalesce.
+    Without damping it depends on how the damping vanishes: the value is that of equal damping,
+    (a - b)^2/4, at which the modes coalesce.
     """
     a_3, a_1 = lin.c_1 + lin.c_2, lin.c_1 * lin.b + lin.c_2 * lin.a
     half = jnp.full_like(a_3, 0.5)
@@ -83,12 +83,12 @@ def critical_friction(
     NaN where it cannot be computed, and where a preloaded joint opens first. To hold the stiffness,
     `scene.replace(contact=FixedContact(*stiffness(scene)))`, with its P if it is preloaded.
 
-    Of a structure one factor scales the friction of all joints, and the equilibrium follows.
-    Returned is mu at the sliding velocity of `joint`, which all joints share unless it is named;
-    those of the others are in the same proportion as before. Squeal begins by flutter or by static
+    For a structure, one factor scales the friction of all joints, and the equilibrium follows.
+    The result is mu at the sliding velocity of `joint`, which all joints share unless it is named;
+    the other coefficients keep their proportion to it. Squeal begins by flutter or by static
     divergence (a real eigenvalue). The factor is the root of the Hopf test function of n degrees
     of freedom (`critical_pair.py`) between two of 512 factors f, evenly spaced in f/(1 + f): an
-    interval of squeal narrower than that can be missed. Each takes the eigenvalues once.
+    interval of squeal narrower than that can be missed. Each takes a full eigenvalue solution.
 
     The derivative is that of the root, and 0 where it is 0 or infinite.
 
@@ -112,22 +112,22 @@ def _finite(factor):
 
 
 def _coefficient(structure: Structure, name: str | None) -> Array:
-    """mu at the sliding velocity of a joint, by name or that of all."""
-    known = ", ".join(structure.joint_names)
+    """mu at the sliding velocity of the named joint, or the one that all joints share."""
+    names = ", ".join(structure.joint_names)
     if not structure.joints:
         raise ValueError("critical_friction needs a joint, and the structure has none")
     if name is not None:
         if name not in structure.joint_names:
-            raise ValueError(f"the structure has no joint {brief(name)}; it has {known}")
+            raise ValueError(f"the structure has no joint {brief(name)}; it has {names}")
         return _sliding(structure.joints[structure.joint_names.index(name)])
     first, *others = map(_sliding, structure.joints)
-    wanted = f"joint must be given, for friction differs between the joints: {known}"
+    message = f"joint must be given, for friction differs between the joints: {names}"
     for other in others:
         values = concrete(first), concrete(other)
         if values[0] is None or values[1] is None:
             first = nan_where(first != other, first)
         elif values[0] != values[1]:
-            raise ValueError(wanted)
+            raise ValueError(message)
     return first
 
 
@@ -136,7 +136,7 @@ _sliding = jax.jit(Joint.coefficient)
 
 @functools.partial(exported_jit, static_argnames="friction_slope")
 def _factor_of_structure(structure, friction_slope):
-    # Beyond a static divergence there is an equilibrium again: it is looked for before.
+    # Beyond a static divergence there is an equilibrium again: look for it before.
     least = assembled(with_friction_times(structure, 1e-3), friction_slope)
     return _first_factor(structure, friction_slope)[0] + 0 * least.C[0, 0]
 
@@ -153,16 +153,16 @@ def _of_scene(scene: Scene, friction_slope: bool) -> Float[Array, ""]:
     omega, lin = dimensionless(lin)
     coupling = positive_sqrt(K_n / m / omega**2 * (K_t / m / omega**2))
     infinite = jnp.full_like(coupling, jnp.inf)
-    found = safe_divide(positive_sqrt(critical_coupling(lin)), coupling, infinite)
+    critical_mu = safe_divide(positive_sqrt(critical_coupling(lin)), coupling, infinite)
     if scene.normal_load is None:
-        return found
+        return critical_mu
     # Its sign changes at most once as friction grows: closed there, it is closed below.
-    mu = jax.lax.stop_gradient(jnp.where(found == jnp.inf, 0, found))
+    mu = jax.lax.stop_gradient(jnp.where(critical_mu == jnp.inf, 0, critical_mu))
     N = static_normal_force(scene.oscillator, K_n, K_t, mu, scene.normal_load)
-    return jnp.where(N > 0, found, jnp.nan)
+    return jnp.where(N > 0, critical_mu, jnp.nan)
 
 
-class _Found(NamedTuple):
+class _FactorSearch(NamedTuple):
     """The search for the first factor of the friction that squeals: at `high`, not at `low`."""
 
     low: jax.Array
@@ -183,23 +183,23 @@ def _test(x, factor, friction_slope, rigid):
 
 
 def _signs(x, factors, friction_slope, rigid):
-    """Numbers (k,) of its sign at factors (k,), whether a joint is open (k,), and `rigid`.
+    """Numbers (k,) with the sign of the test, True where a joint is open (k,), and `rigid`.
 
-    A number is 0 where rounding decides the sign. Rigid-body modes are those at the first factor,
-    the least; later ones mean divergence.
+    One for each factor (k,). A number is 0 where rounding decides the sign. Rigid-body modes are
+    those at the first factor, the least; later ones mean divergence.
     """
     if not isinstance(x, Structure):
         values = jax.vmap(lambda f: _test(x, f, friction_slope, None))(factors)
         return values, jnp.isnan(values), None
 
-    def solved(factor):
+    def modes_at(factor):
         attached = assembled(with_friction_times(x, factor), friction_slope, refuse=False)
         return solve(*attached.matrices), attached
 
-    modes, attached = jax.vmap(solved)(factors)
+    modes, attached = jax.vmap(modes_at)(factors)
     rigid = jnp.where(rigid < 0, (modes.s[0] == 0).sum(), rigid)
     values = jax.vmap(least_test, (0, 0, None, None))(modes, attached.C, rigid, x.band)
-    return values, jax.vmap(lambda found: found.open)(attached), rigid
+    return values, jax.vmap(lambda system: system.open)(attached), rigid
 
 
 def _lattice(x):
@@ -219,7 +219,7 @@ def _lattice(x):
 def _first_factor(x: Any, friction_slope: bool):
     """The least factor of the friction that squeals; 0 if any does, infinite if none.
 
-    And the number of rigid-body eigenvalues of a structure.
+    Also the number of rigid-body eigenvalues of a structure.
     """
     groups = _lattice(x).reshape(-1, _AT_ONCE)
     inner = (jnp.arange(_AT_ONCE, dtype=groups.dtype) + 1) / (_AT_ONCE + 1)
@@ -236,7 +236,7 @@ def _first_factor(x: Any, friction_slope: bool):
         squeals = ~(values >= 0) | lifted  # NaN does not count as stable
         first, some = jnp.argmax(squeals), squeals.any()
         last = jnp.where(some, factors[first - 1], factors[-1])
-        return _Found(
+        return _FactorSearch(
             low=jnp.where(some & (first == 0), at.low, last),
             high=jnp.where(some, factors[first], at.high),
             value=jnp.where(some, values[first], at.value),
@@ -248,18 +248,18 @@ def _first_factor(x: Any, friction_slope: bool):
 
     zero, number = jnp.zeros((), groups.dtype), jnp.zeros((), int)
     rigid = number - 1 if isinstance(x, Structure) else None
-    start = _Found(zero, zero + jnp.inf, zero - 1, zero > 0, number, number, rigid)
-    found = jax.lax.while_loop(onward, search, start)
-    bracketed = found.high < jnp.inf
-    factor = jnp.where(bracketed, found.high, 1)
+    start = _FactorSearch(zero, zero + jnp.inf, zero - 1, zero > 0, number, number, rigid)
+    final = jax.lax.while_loop(onward, search, start)
+    bracketed = final.high < jnp.inf
+    factor = jnp.where(bracketed, final.high, 1)
     value, slope = jax.jvp(
-        lambda f: _test(x, f, friction_slope, found.rigid), (factor,), (jnp.ones_like(factor),)
+        lambda f: _test(x, f, friction_slope, final.rigid), (factor,), (jnp.ones_like(factor),)
     )
     step = safe_divide(value, slope, jnp.zeros_like(value))
     # At the step of Eq. 19 the sign can change without a root.
     factor = factor - jnp.where(jnp.abs(step) < 1e-6 * factor, step, 0)
-    root = jnp.where(found.least, 0, jnp.where(bracketed, factor, jnp.inf))
-    return jnp.where(found.value < 0, root, jnp.nan), found.rigid
+    root = jnp.where(final.least, 0, jnp.where(bracketed, factor, jnp.inf))
+    return jnp.where(final.value < 0, root, jnp.nan), final.rigid
 
 
 @_first_factor.defjvp
@@ -274,6 +274,6 @@ def _first_factor_jvp(friction_slope, primals, tangents):
     change = linear(dx, jnp.zeros_like(at))
     slope = linear(jax.tree.map(jnp.zeros_like, dx), jnp.ones_like(at))
     none = jnp.where(jnp.isnan(factor), jnp.nan, 0)
-    moved = -jnp.where(inside, safe_divide(change, slope, jnp.zeros_like(slope)), none)
+    tangent = -jnp.where(inside, safe_divide(change, slope, jnp.zeros_like(slope)), none)
     fixed = None if rigid is None else np.zeros(rigid.shape, jax.dtypes.float0)
-    return (factor, rigid), (moved, fixed)
+    return (factor, rigid), (tangent, fixed)

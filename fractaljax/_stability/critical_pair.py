@@ -57,8 +57,8 @@ def critical_pair(
 ) -> CriticalPair:
     """T of the mode where it is least, the `rigid` eigenvalues of least modulus left out.
 
-    Those of rigid-body modes are 0 at any friction; another one that is 0 means divergence. With
-    a `band` only modes in it count.
+    Rigid-body eigenvalues are 0 at any friction; another one that is 0 means divergence. With a
+    `band` only modes in it count.
     """
     s = solve(M, C, K, C_error).s
     fixed = jax.lax.stop_gradient(s)
@@ -67,8 +67,8 @@ def critical_pair(
     j, alone, undamped = (x[i] for x in (chosen.partner, chosen.alone, chosen.undamped))
     sigma, delta = _mean_and_spread(M, C, K, s, i, j)
     test = jnp.where(alone, _alone(s[i].real, jnp.abs(fixed[i])), hopf_test(sigma, delta, undamped))
-    apart = _quotient(delta.imag, 2 * -sigma.real, undamped)
-    imaginary = jnp.where(alone, fixed[i].imag, sigma.imag + apart)
+    splitting = _quotient(delta.imag, 2 * -sigma.real, undamped)
+    imaginary = jnp.where(alone, fixed[i].imag, sigma.imag + splitting)
     real = (fixed[j] == fixed[i].conj()) | ((fixed[i].imag == 0) & (fixed[j].imag == 0))
     imaginary = jnp.where(real & ~alone, 0, imaginary)
     ratios = -fixed.real / jnp.where(fixed == 0, 1, jnp.abs(fixed))
@@ -89,7 +89,7 @@ def least_test(
     rigid: Int[Array, ""],
     band: tuple[float, float] | None = None,
 ) -> Float[Array, ""]:
-    """T [1/s^2] as `critical_pair` has it, without derivatives; 0 for what rounding may decide."""
+    """T [1/s^2] as in `critical_pair`, without derivatives; 0 if rounding may decide its sign."""
     test = _choice(modes.s, rigid, ~(C != 0).any(), band).test
     unresolved = jnp.abs(modes.s.real) <= modes.error
     test = jnp.where(unresolved, jnp.maximum(test, 0), test).min()
@@ -102,9 +102,9 @@ def _choice(s: Complex[Array, " k"], rigid, conservative, band) -> _Choice:
         (size[None] == size[:, None]) & (place[None] < place[:, None])
     )
     counted = smaller.sum(axis=1) >= rigid
-    apart = jnp.abs(s[:, None] - s[None])
-    apart = jnp.where(counted[None] & (place[None] != place[:, None]), apart, jnp.inf)
-    partner = jnp.argmin(apart, axis=1)
+    distance = jnp.abs(s[:, None] - s[None])
+    distance = jnp.where(counted[None] & (place[None] != place[:, None]), distance, jnp.inf)
+    partner = jnp.argmin(distance, axis=1)
     sigma, delta = (s + s[partner]) / 2, ((s - s[partner]) / 2) ** 2
     eps = jnp.finfo(size.dtype).eps
     # Exactly 0 where C = 0, but for neighbours of which one grows alone.
@@ -124,7 +124,7 @@ def _alone(growth, size):
 def hopf_test(sigma, delta, undamped):
     """T of two modes with mean and spread sigma and delta, -|T| where p < 0: both modes grow.
 
-    Where they are `undamped`, that of p = 0 with equal damping.
+    If they are `undamped`, T is the value at p = 0 with equal damping.
     """
     p = -sigma.real
     ratio = _quotient(delta.imag, 2 * p, undamped)

@@ -57,14 +57,14 @@ def linearised(scene: Scene, friction_slope: bool) -> Linearised:
 
 
 def linearised_at(scene: Scene, at: Pressed, friction_slope: bool) -> Linearised:
-    """As `linearised`, with a joint that is known already."""
+    """As `linearised`, with the joint `at` its equilibrium."""
     load = scene.normal_load
     o, law = scene.oscillator, scene.friction
     return linearise(o, law, at.K_n, at.K_t, friction_slope, load, at.static)
 
 
 def normal_force(scene: Scene, at: Pressed) -> Float[Array, " 1"] | None:
-    """The normal force [N] at the equilibrium, if the scene is preloaded; at most 0: it is open."""
+    """The normal force [N] at the equilibrium of a preloaded scene; at most 0 if it is open."""
     if scene.normal_load is None:
         return None
     if at.static is not None:
@@ -74,7 +74,7 @@ def normal_force(scene: Scene, at: Pressed) -> Float[Array, " 1"] | None:
 
 
 def _curve_of(joint: Any) -> LoadCurve:
-    """That of a scene or a joint which follows it."""
+    """The load curve of a scene or joint that follows one."""
     return joint.contact.load_curve(joint.friction.mu_s, joint.friction.mu_m)
 
 
@@ -95,12 +95,12 @@ class Assembled(NamedTuple):
 
     @property
     def open(self) -> jax.Array:
-        """Whether a preloaded joint is."""
+        """True if a preloaded joint is open."""
         return jnp.zeros((), bool) if self.normal_force is None else (self.normal_force <= 0).any()
 
     @property
     def lost(self) -> jax.Array:
-        """Whether there is no steady sliding: a joint is open, or there is no equilibrium."""
+        """True if there is no steady sliding: a joint is open, or there is no equilibrium."""
         return self.open if self.supported is None else self.open | ~self.supported
 
     @property
@@ -118,7 +118,7 @@ def assemble(
     - mu K_n t n^T + mu K_t n t^T is added to K. The slope of the friction law adds
     mu' N_0 t t^T - mu' K_t (t.x_0) n n^T to C, where x_0 is the equilibrium and N_0 = K_n n.x_0.
     With preload N_0 = P + K_n n.x_0, and the equilibrium is that under F and the friction mu P t;
-    of a load curve N_0 = N(n.x_0), and the tangent at N_0 takes the place of P + K_n n.x.
+    for a load curve N_0 = N(n.x_0), and the tangent at N_0 takes the place of P + K_n n.x.
     C and K are NaN where such a joint is open, N_0 <= 0, and under `jit` where there is no
     equilibrium. A joint without normal has N_0 = P and no term with n.
 
@@ -161,7 +161,7 @@ class _Joint(NamedTuple):
 
     @property
     def of_equilibrium(self) -> bool:
-        """Whether it needs the static displacements."""
+        """True if it needs the static displacements."""
         return self.n is not None and (self.P is not None or self.slope is not None)
 
 
@@ -200,7 +200,7 @@ def attachments(structure: Structure, friction_slope: bool) -> Attachments:
             i: (along[2 * k : 2 * k + 2], errors[2 * k : 2 * k + 2]) for k, i in enumerate(places)
         }
     zero = jnp.zeros((), K.dtype)
-    each, found_errors, forces = [], [], []
+    each, damping_errors, forces = [], [], []
     for i, joint in enumerate(joints):
         N, N_error, t_x, t_error = joint.P, 0.0, zero, zero
         if i in displaced:
@@ -215,8 +215,8 @@ def attachments(structure: Structure, friction_slope: bool) -> Attachments:
             error = jnp.abs(joint.slope) * N_error, jnp.abs(by_t) * t_error
             error = error if i in displaced else None
         each.append(Attachment(joint.K_n, joint.K_t, joint.mu, c_t, c_n))
-        found_errors.append(error)
-    return Attachments(each, found_errors, forces, loaded, supported)
+        damping_errors.append(error)
+    return Attachments(each, damping_errors, forces, loaded, supported)
 
 
 def assembled(structure: Structure, friction_slope: bool, refuse: bool = True) -> Assembled:
@@ -242,11 +242,11 @@ def assembled(structure: Structure, friction_slope: bool, refuse: bool = True) -
     uncertain = any(each is not None for each in attached.errors)
     error = jax.lax.stop_gradient(error) if uncertain else None
     forces = jnp.stack(attached.forces) if attached.loaded else None
-    found = Assembled(structure.M, C, K, error, forces, attached.supported)
+    system = Assembled(structure.M, C, K, error, forces, attached.supported)
     if not refuse or (forces is None and attached.supported is None):
-        return found
-    C, K = (jnp.where(found.lost, jnp.nan, X) for X in (C, K))
-    return found._replace(C=C, K=K)
+        return system
+    C, K = (jnp.where(system.lost, jnp.nan, X) for X in (C, K))
+    return system._replace(C=C, K=K)
 
 
 # One program: operation by operation the first call would compile sixty.
@@ -265,59 +265,59 @@ def _with_joint(K, K_n, K_t, mu, t, n) -> Array:
 def _tangents(structure: Structure, F) -> tuple[list[tuple[Array, Array, Array | None]], Array]:
     """(K_n, K_t, P) of each joint, with the tangent P + K_n n.x to a load curve at equilibrium.
 
-    And the external forces F with what keeps the joints' pressed rest at x = 0.
+    Also the external forces F, plus what keeps the joints' pressed rest at x = 0.
     """
-    found = [(*joint.stiffness(), joint.normal_load) for joint in structure.joints]
+    tangents = [(*joint.stiffness(), joint.normal_load) for joint in structure.joints]
     curved = [i for i, joint in enumerate(structure.joints) if joint.follows_load_curve]
     if not curved:
-        return found, F
+        return tangents, F
     K, pushes, total = structure.K, [], F
-    for joint, (K_n, K_t, P) in zip(structure.joints, found, strict=True):
+    for joint, (K_n, K_t, P) in zip(structure.joints, tangents, strict=True):
         mu, t = joint.coefficient(), jnp.asarray(structure.direction(joint.tangential))
         n = None if joint.normal is None else jnp.asarray(structure.direction(joint.normal))
         K = _with_joint(K, K_n, K_t, mu, t, n)
         total = total if P is None else total + mu * P * t
         pushes.append(None if n is None else (n, n - mu * t))
     normals, lacking = (jnp.stack(x) for x in zip(*(pushes[i] for i in curved), strict=True))
-    K_n, P = (jnp.stack([jnp.asarray(found[i][k]) for i in curved])[:, None] for k in (0, 2))
-    # What the loads lack, one a column.
+    K_n, P = (jnp.stack([jnp.asarray(tangents[i][k]) for i in curved])[:, None] for k in (0, 2))
+    # What the loads lack, one column each.
     columns = (lacking * P).T
-    solved = solve(K, jnp.concatenate([total[:, None], columns], axis=1))
-    solved = K_n / P * normals @ solved
+    displacements = solve(K, jnp.concatenate([total[:, None], columns], axis=1))
+    relative_forces = K_n / P * normals @ displacements
     curves = [_curve_of(structure.joints[i]) for i in curved]
-    displaced = loaded_equilibrium(curves, solved[:, 0], solved[:, 1:])
+    displaced = loaded_equilibrium(curves, relative_forces[:, 0], relative_forces[:, 1:])
     for i, curve, e, n in zip(curved, curves, displaced, normals, strict=True):
-        own, K_t, load = found[i]
+        contact_stiffness, K_t, load = tangents[i]
         force, slope = _on_curve(curve, e)
         load = jnp.asarray(load)
         tangent = load * (force - slope * e)
         F = F + (load - tangent) * n
-        found[i] = own * slope, K_t, tangent
-    return found, F
+        tangents[i] = contact_stiffness * slope, K_t, tangent
+    return tangents, F
 
 
 def with_equilibrium(structure: Structure, friction_slope: bool) -> Assembled:
     """As `assembled`.
 
-    **Raises:** `ValueError` in a line if the structure has no equilibrium, unless it is traced.
+    **Raises:** `ValueError` if the structure has no equilibrium, unless it is traced.
     """
     require_single(structure)
-    found = _assembled(structure, flag("friction_slope", friction_slope))
-    supported = None if found.supported is None else concrete(found.supported)
+    system = _assembled(structure, flag("friction_slope", friction_slope))
+    supported = None if system.supported is None else concrete(system.supported)
     if supported is not None and not supported:
         loaded = any(joint.normal_load is not None for joint in structure.joints)
         raise ValueError(NO_PRESSED_EQUILIBRIUM if loaded else NO_EQUILIBRIUM)
-    return found
+    return system
 
 
-def require_equilibrium(x: Any, friction_slope: bool, found: Array) -> None:
-    """Refuse a structure without equilibrium, if that is why what was `found` of it is NaN.
+def require_equilibrium(x: Any, friction_slope: bool, result: Array) -> None:
+    """Refuse a structure without equilibrium, if that is why its `result` is NaN.
 
     Under `jit` and `vmap` it stays NaN: a check of a batch would call back to Python.
 
     **Raises:** `ValueError` as `with_equilibrium`.
     """
-    values = concrete(found) if isinstance(x, Structure) else None
+    values = concrete(result) if isinstance(x, Structure) else None
     if values is not None and values.ndim == 0 and math.isnan(values):
         with_equilibrium(x, friction_slope)
 
@@ -325,8 +325,8 @@ def require_equilibrium(x: Any, friction_slope: bool, found: Array) -> None:
 def _equilibrium(F, K, directions) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Eq. 40: d.x_0 [m] along each of the `directions` (k, n), and a bound on its rounding error.
 
-    x_0 (n,) solves K x_0 = F, the joints being in K and their friction under preload in F. Last,
-    whether there is an x_0 to rounding.
+    x_0 (n,) solves K x_0 = F, the joints being in K and their friction under preload in F. The
+    last result is True if there is an x_0 to rounding.
     """
     x_0 = solve(K, F)
     along = directions @ x_0

@@ -28,26 +28,26 @@ def margin(
 ) -> Float[Array, ""]:
     """Margin of stability [-], a scalar: above 0 exactly where growth_rate < shift [1/s].
 
-    Its scale is that of a damping ratio. Of a scene with lightly damped, well separated modes it
+    Its scale is that of a damping ratio. For a scene with lightly damped, well separated modes it
     is 0.5 to 1 times the least decay rate over the rms natural frequency sqrt((a + b)/2) in
-    contact; of modes within their damping of each other, about 0.3 times. It is analytic in the
-    scene where modes coalesce and where they cross. Only without any damping it is not: there it is
+    contact; for modes within their damping of each other, about 0.3 times. It is analytic in the
+    scene where modes coalesce and where they cross. Only without any damping is it not: there it is
     0 where stable and negative in flutter.
 
-    Of a structure it is the least damping ratio, which has kinks where modes cross: a smooth
+    For a structure, it is the least damping ratio, which has kinks where modes cross: a smooth
     measure of n degrees of freedom takes a Lyapunov equation of size 2n. With a shift the ratios
     are those of the eigenvalues minus the shift. Rigid-body modes do not count without a shift.
 
-    `friction_slope` as in `growth_rate`; NaN where that is.
+    `friction_slope` is as in `growth_rate`; the margin is NaN where the growth rate is.
 
     **Raises:** as `growth_rate`; `TypeError` for a `shift` that is no number.
     """
     kind = jnp.dtype(bool) if shift is None else jnp.result_type(shift)
     if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
         raise TypeError(f"shift must be a real number, got {kind}; friction_slope comes third")
-    found = _margin(scene, shift, friction_slope)
-    require_equilibrium(scene, friction_slope, found)
-    return found
+    value = _margin(scene, shift, friction_slope)
+    require_equilibrium(scene, friction_slope, value)
+    return value
 
 
 @functools.partial(jax.jit, static_argnums=2)
@@ -65,7 +65,7 @@ def damping_ratios(s: Complex[Array, " k"]) -> Float[Array, " k"]:
 
 
 def least_damping_ratio(s: Complex[Array, " k"]) -> Float[Array, ""]:
-    """The least damping ratio of all eigenvalues but those that are 0; 1 if there are none."""
+    """The least damping ratio of all nonzero eigenvalues; 1 if there are none."""
     return jnp.where(s == 0, 1, damping_ratios(s)).min()
 
 
@@ -102,11 +102,11 @@ def margin_of(lin: Linearised, shift: ScalarLike = 0.0) -> Float[Array, ""]:
     c_1, c_2, g = lin.c_1 + 2 * shift, lin.c_2 + 2 * shift, lin.g
     a_3, a_2, a_1, a_0 = c_1 + c_2, a + b + c_1 * c_2, c_1 * b + c_2 * a, a * b + g
     # H_3 and E by their factors: as polynomials in the coefficients they would cancel.
-    apart = (a - b) ** 2 + a_3 * a_1
-    H_3 = c_1 * c_2 * apart - a_3**2 * g
+    separation = (a - b) ** 2 + a_3 * a_1
+    H_3 = c_1 * c_2 * separation - a_3**2 * g
     # With damping of both signs beyond critical, a_2 < 0, H_3 can be positive again: prevent that.
     H_3 = H_3 - a_3 * a_1 * jnp.minimum(a_2, 0)
-    E = apart - 4 * g + 2 * c_1 * c_2 * (a + b) + (c_1 * c_2) ** 2
+    E = separation - 4 * g + 2 * c_1 * c_2 * (a + b) + (c_1 * c_2) ** 2
     u = least(a_3, least(E, 2 * H_3) / 2)
     # A single real eigenvalue passes the shift where a_0 = 0, which takes heavy damping.
     u = least(u * heavy + a_0, u * heavy * a_0) / heavy

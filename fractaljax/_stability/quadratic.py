@@ -61,9 +61,9 @@ def solve(
     )
     omega = _power_of_two(jnp.where(exponent > _NO_EXPONENT, exponent, 0), K.dtype)
     C_error = None if C_error is None else C_error / omega
-    found = _modes(M, C / omega, K / omega / omega, C_error)
-    s = omega * jnp.where(found.rigid, 0, found.z)
-    return Modes(s, found.X.T * units[None], omega * found.error, found.Y / omega * units[None])
+    scaled = _modes(M, C / omega, K / omega / omega, C_error)
+    s = omega * jnp.where(scaled.rigid, 0, scaled.z)
+    return Modes(s, scaled.X.T * units[None], omega * scaled.error, scaled.Y / omega * units[None])
 
 
 def leading(
@@ -75,32 +75,31 @@ def leading(
 ) -> Leading:
     """The `count` eigenvalues with the largest real parts, one of each conjugate pair.
 
-    With first derivatives only: those of a few take far less work than those of all, as `solve`
-    gives them. In a `band` if there is one; where there are fewer, -band[1] fills up,
-    critically damped.
+    With first derivatives only: a few take far less work than all of those that `solve` gives. In
+    a `band` if there is one; if it has fewer, -band[1], critically damped, fills up.
     """
     fixed = jax.tree.map(jax.lax.stop_gradient, (M, C, K))
-    found = jax.tree.map(jax.lax.stop_gradient, solve(*fixed))
-    sought = (found.s.imag >= 0) & in_band(found.s, band)
-    order = jnp.argsort(jnp.where(sought, -found.s.real, jnp.inf))
+    modes = jax.tree.map(jax.lax.stop_gradient, solve(*fixed))
+    sought = (modes.s.imag >= 0) & in_band(modes.s, band)
+    order = jnp.argsort(jnp.where(sought, -modes.s.real, jnp.inf))
     places, rank = order[:count], jnp.argsort(order)
-    others = (sought & (found.s.imag > 0))[None] & (rank[None] != rank[places][:, None])
-    apart = jnp.where(others, jnp.abs(found.s[places][:, None] - found.s[None]), jnp.inf)
-    nearest = jnp.argmin(apart, axis=1)
-    paired = (apart.min(axis=1) < jnp.inf) & (found.s[places].imag > 0)
+    others = (sought & (modes.s.imag > 0))[None] & (rank[None] != rank[places][:, None])
+    distance = jnp.where(others, jnp.abs(modes.s[places][:, None] - modes.s[None]), jnp.inf)
+    nearest = jnp.argmin(distance, axis=1)
+    paired = (distance.min(axis=1) < jnp.inf) & (modes.s[places].imag > 0)
     dM, dC, dK = (X - at for X, at in zip((M, C, K), fixed, strict=True))  # 0, with derivatives
 
-    def moved(places):
-        s, x, y = found.s[places], found.x[places], found.y[places]
+    def eigenvalues(places):
+        s, x, y = modes.s[places], modes.x[places], modes.y[places]
         return s - s**2 * _between(y, dM, x) - s * _between(y, dC, x) - _between(y, dK, x)
 
-    s = jnp.where(sought[places], moved(places), -1 if band is None else -band[1])
-    neighbour = jnp.where(paired & sought[places], moved(nearest), s)
+    s = jnp.where(sought[places], eigenvalues(places), -1 if band is None else -band[1])
+    neighbour = jnp.where(paired & sought[places], eigenvalues(nearest), s)
     return Leading(s, neighbour, jnp.where(paired, rank[nearest] > rank[places], True))
 
 
 def _between(y, X, x) -> jax.Array:
-    """y_i X x_i of every i."""
+    """y_i X x_i for every i."""
     return (y * (x @ X.T.astype(x.dtype))).sum(axis=1)
 
 
@@ -198,11 +197,11 @@ def _lapack(M, C, K):
 def _shift(z, off):
     """(k,): how far errors `off` (k, k) between all pairs can move each eigenvalue."""
     both = jnp.sqrt(off) * jnp.sqrt(off.T)
-    apart = _size(z[None] - z[:, None]) / 1.5
+    distance = _size(z[None] - z[:, None]) / 1.5
     # The eigenvalues of [[0, e], [f, g]] move by e f/g, and by sqrt(e f) where they coincide. The
     # factor 4 is for more than two.
-    moved = 4 * both * jnp.where(both < apart, both / jnp.where(apart > 0, apart, 1), 1)
-    return moved.sum(axis=1) - jnp.diagonal(moved) + jnp.diagonal(off)
+    shifts = 4 * both * jnp.where(both < distance, both / jnp.where(distance > 0, distance, 1), 1)
+    return shifts.sum(axis=1) - jnp.diagonal(shifts) + jnp.diagonal(off)
 
 
 def _pairwise(z, correction, error):
@@ -217,16 +216,16 @@ def _modes_jvp(primals, tangents):
     at = _modes(*primals)
     z, X, Y = at.z, at.X, at.Y
     dM, dC, dK = (dA.astype(X.dtype) for dA in tangents[:3])
-    moved_mass = Y @ (dM @ X)
-    P = -(moved_mass * z[None] ** 2 + Y @ (dC @ X) * z[None] + Y @ (dK @ X))
+    mass_change = Y @ (dM @ X)
+    P = -(mass_change * z[None] ** 2 + Y @ (dC @ X) * z[None] + Y @ (dK @ X))
     # The length of the vectors is free. Of all choices this is the one with w.dv = 0 for the
     # vectors w and v of the states; eigenvalues and normalised shapes do not depend on it.
     same = jnp.eye(len(z), dtype=z.dtype)
-    apart = z[None] - z[:, None]
+    difference = z[None] - z[:, None]
     least = jnp.finfo(z.dtype).eps * (_size(z)[None] + _size(z)[:, None])
-    mixing = P * _inverse(apart + same, least) * (1 - same)
+    mixing = P * _inverse(difference + same, least) * (1 - same)
     none: Any = jnp.zeros_like(at.error), np.zeros(at.rigid.shape, jax.dtypes.float0)
-    return at, _Vectors(jnp.diagonal(P), X @ mixing, -(mixing + moved_mass * z[None]) @ Y, *none)
+    return at, _Vectors(jnp.diagonal(P), X @ mixing, -(mixing + mass_change * z[None]) @ Y, *none)
 
 
 def _inverse(x, least) -> jax.Array:

@@ -19,7 +19,7 @@ _POWERS = {"M": 2, "C": 1, "K": 0}  # of s
 def decomposed(vectors: list[np.ndarray], weight: np.ndarray, cut: float) -> np.ndarray:
     """An orthonormal basis (n, r) in the norm of a lumped mass, of vectors (n, k), complex or not.
 
-    The most important first; those with singular values below `cut` of the largest are left out.
+    The most important first; any with a singular value below `cut` of the largest is left out.
     """
     unit = [weight[:, None] * X for X in vectors]
     unit = [X / np.maximum(np.linalg.norm(X, axis=0), np.finfo(float).tiny) for X in unit]
@@ -29,7 +29,7 @@ def decomposed(vectors: list[np.ndarray], weight: np.ndarray, cut: float) -> np.
 
 
 class Space:
-    """Bases of all that is known, the most important directions first, and their residuals."""
+    """Bases of all snapshots, the most important directions first, and their residuals."""
 
     def __init__(self, snapshots: Snapshots, taken: list[Snapshot], weight, cut, factors):
         structure = snapshots.structure
@@ -51,9 +51,9 @@ class Space:
             L.append(X.T @ self.W)
         D = snapshots.directions.D
         R, L = (np.concatenate([*each, D], axis=1) for each in (R, L))
-        solved = factors.solve(R)
+        solution = factors.solve(R)
         # In parts: a product of L as a complex matrix would take four times the time.
-        self.residuals = L.T @ solved.real + 1j * (L.T @ solved.imag)
+        self.residuals = L.T @ solution.real + 1j * (L.T @ solution.imag)
 
     @property
     def size(self) -> int:
@@ -61,7 +61,7 @@ class Space:
         return self.V.shape[1]
 
     def regular(self, r: int) -> bool:
-        """Whether the r most important directions of both sides meet, so that W^T M V = 1 can be.
+        """True if the r most important directions of both sides meet: W^T M V = 1 can hold.
 
         Right vectors may begin where left ones are small, and vanish where those are large.
         """
@@ -69,7 +69,7 @@ class Space:
         return not self.oblique or size[-1] > _REGULAR
 
     def coarse(self, r: int, smaller: int, tol: float) -> CoarseSpace:
-        """The `smaller` most important directions, in coordinates of those of the r."""
+        """The `smaller` most important directions, in coordinates of the r most important."""
         if not self.oblique:
             V = W = np.eye(r)[:, :smaller]
             return CoarseSpace(V, W, tol)
@@ -91,7 +91,7 @@ class Space:
 
 
 def _paired(M: Any, V: np.ndarray, W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """V and W (n, r), with directions of the other before them where a direction has no partner.
+    """V and W (n, r), preceded by directions of the other one that have no partner.
 
     A right direction that all left ones are orthogonal to, in the sense of M, would be lost.
     """
@@ -101,7 +101,7 @@ def _paired(M: Any, V: np.ndarray, W: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _in_space(rows: np.ndarray, T: np.ndarray) -> np.ndarray:
-    """Rows (k, ...) of all terms, each reduced by T^T (r, size), then those of the joints."""
+    """Rows (k, ...) of all terms, each reduced by T^T (r, size), then the rows of the joints."""
     terms = len(rows) // len(T)
     of_terms, rest = np.split(rows, [terms * len(T)])
     reduced = T.T @ of_terms.reshape(terms, len(T), -1)
@@ -136,8 +136,8 @@ def estimated_errors(
     K += D @ blocks[1] @ D.T
     omega, inverse = reduced.reduction.band[1], np.linalg.inv(M)
     A = np.block([[np.zeros((r, r)), np.eye(r)], [-inverse @ K / omega**2, -inverse @ C / omega]])
-    solved: Any = eig(A, left=True, right=True)
-    z, left, right = solved
+    eigensystem: Any = eig(A, left=True, right=True)
+    z, left, right = eigensystem
     sought = in_band(omega * z, reduced.band) & (z.imag > 0)
     s, q, p = omega * z[sought], right[:r, sought], inverse.T @ left[r:, sought].conj()
     slope = (p * (2 * s * (M @ q) + C @ q)).sum(axis=0)

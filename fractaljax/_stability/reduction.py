@@ -67,9 +67,9 @@ def reduce(
     `over` maps named quantities, parameters or those of joints, to ranges (low, high) in which the
     reduction holds; without any it holds for the quantities as they are. `band` is (low, high) in
     rad/s. In it, every eigenvalue s is right to `tol` |s| at all candidates, by an estimate, and
-    at two fresh points, by comparison: 33 along one quantity, 32 for each of several, 128 at most,
-    besides the corners. Eigenvectors are taken at most at so many `points`. Not looked for are
-    modes with |Re s| > 0.3 |s|, static divergence among them.
+    at two fresh points, by comparison. Candidates are 33 along one quantity, 32 for each of
+    several, 128 at most, besides the corners. Eigenvectors are taken at `points` points at most.
+    Modes with |Re s| > 0.3 |s|, static divergence among them, are not looked for.
 
     The result keeps parameters, joints and their directions, and derivatives; `.full(q)` leads
     back to all degrees of freedom, `.reduction` has the bases, the points and the largest error,
@@ -104,22 +104,22 @@ def reduce(
 
 
 def reduction_errors(reduced: ReducedStructure) -> Float[np.ndarray, " 2*r"]:
-    """How far each eigenvalue of `stability` is off by the reduction, about [1/s].
+    """The approximate error of each eigenvalue of `stability` due to the reduction [1/s].
 
-    In the same order; infinite outside of the band. It is the product of the residuals of the
+    In the same order; infinite outside the band. It is the product of the residuals of the
     right and the left vector (see `reduction.py`): an estimate, right to leading order. Not
     for use under `jit`.
     """
     numbers = joint_numbers(reduced, reduced.reduction.friction_slope)
     s, errors = estimated_errors(reduced, reduced.parameters, np.asarray(numbers))
-    wanted = stability(reduced, reduced.reduction.friction_slope)
-    counted, z = np.asarray(wanted.counted), np.asarray(wanted.eigenvalues)
+    modes = stability(reduced, reduced.reduction.friction_slope)
+    counted, z = np.asarray(modes.counted), np.asarray(modes.eigenvalues)
     if not s.size:
         return np.full(z.shape, np.inf)
-    # One of each conjugate pair is known.
+    # Errors are estimated for one of each conjugate pair.
     z = np.where(np.imag(z) < 0, np.conj(z), z)
-    apart = np.abs(z[:, None] - s[None])
-    return np.where(counted, errors[apart.argmin(axis=1)], np.inf)
+    distance = np.abs(z[:, None] - s[None])
+    return np.where(counted, errors[distance.argmin(axis=1)], np.inf)
 
 
 def _range(name: str, ends: Any) -> tuple[float, float]:
@@ -183,11 +183,11 @@ class _Greedy:
             self.bar.set_postfix_str(f"error {error:.1e}, {reduced.n} degrees of freedom")
             worst, _ = self.candidates[at]
             if error > _SAFE * self.tol:
-                # Where its own vectors are known, what was cut off of them is the error, and where
-                # those of one more point hardly made it smaller, most of it.
-                known = any(np.array_equal(worst, u) for u in self.points)
+                # Where the worst point's own vectors are in the space, what was cut off of them is
+                # the error; where one more point hardly reduced the error, it is most of it.
+                sampled = any(np.array_equal(worst, u) for u in self.points)
                 stuck = error > _STUCK * before and not finer and self.cut >= _LEAST_CUT
-                before, finer = error, known or stuck
+                before, finer = error, sampled or stuck
                 if not finer:
                     self.add(worst)
                 elif self.cut < _LEAST_CUT:
@@ -195,8 +195,8 @@ class _Greedy:
                 else:
                     self.cut *= _FINER
                 continue
-            wanted = {i: s for i, (s, _) in estimates.items()}
-            trimmed = self.trimmed(space, wanted, self.tol)
+            targets = {i: s for i, (s, _) in estimates.items()}
+            trimmed = self.trimmed(space, targets, self.tol)
             reduced, estimate = trimmed or (reduced, error)
             compared = self.compared(reduced)
             if compared <= self.tol:
@@ -205,7 +205,7 @@ class _Greedy:
         reduced.reduction.error = max(estimate, compared)
         least, share = _WORTH
         if self.tol < _COARSE and reduced.n >= least:
-            coarse = self.trimmed(space, wanted, _COARSE)
+            coarse = self.trimmed(space, targets, _COARSE)
             if coarse and coarse[0].n <= share * reduced.n:
                 reduced.reduction.coarse = space.coarse(reduced.n, coarse[0].n, _COARSE)
         return reduced
@@ -215,41 +215,44 @@ class _Greedy:
 
         A spurious mode has an error of its own size, and comes and goes with the directions kept.
         """
-        found: Any = None
+        best: Any = None
         for r in range(space.size, max(space.size - _SIZES, 1), -2):
-            if found is not None and not space.regular(r):
+            if best is not None and not space.regular(r):
                 continue
             reduced = self.reduced(space, r)
             estimates = self.estimates(reduced)
             largest = _largest(estimates.values()).max()
-            if found is None or largest < found[0]:
-                found = largest, reduced, estimates
+            if best is None or largest < best[0]:
+                best = largest, reduced, estimates
             if largest < _SPURIOUS:
                 break
-        return found[1:]
+        return best[1:]
 
     def estimates(self, reduced: ReducedStructure) -> dict[int, _Estimate]:
-        """Eigenvalues and errors at candidates, those first whose error was large before.
+        """Eigenvalues and errors at candidates, the largest errors of before first.
 
         At all of them, unless a few have an error that is too large already.
         """
-        found: dict[int, _Estimate] = {}
+        estimates: dict[int, _Estimate] = {}
         for i in map(int, np.argsort(-self.errors, kind="stable")):
-            if len(found) % _FEW == 0 and max(self.errors[[*found]], default=0) > _SAFE * self.tol:
+            if (
+                len(estimates) % _FEW == 0
+                and max(self.errors[[*estimates]], default=0) > _SAFE * self.tol
+            ):
                 break
-            s, errors = found[i] = self.estimated(reduced, self.candidates[i])
+            s, errors = estimates[i] = self.estimated(reduced, self.candidates[i])
             self.errors[i] = _relative(errors, s)
-        return found
+        return estimates
 
     def trimmed(
-        self, space: Space, wanted: dict[int, np.ndarray], tol: float
+        self, space: Space, targets: dict[int, np.ndarray], tol: float
     ) -> tuple[ReducedStructure, float] | None:
-        """The smallest that has the eigenvalues `wanted` of all candidates, and its error there.
+        """The smallest with the eigenvalues `targets` at all candidates, and its error there.
 
         None if that is the space itself. Sizes are tried at a few candidates, and every one at
         which the smallest that holds there fails is added to them.
         """
-        hard = {int(i): wanted[i] for i in np.argsort(-self.errors)[:_FEW]}
+        hard = {int(i): targets[i] for i in np.argsort(-self.errors)[:_FEW]}
         # In one degree of freedom the two directions of a joint would be one.
         joints = self.snapshots.structure.joints
         fails, holds = int(any(joint.normal is not None for joint in joints)), space.size
@@ -262,25 +265,25 @@ class _Greedy:
             if holds == space.size:
                 return None
             smaller = self.reduced(space, holds)
-            largest, at = self.failing(smaller, wanted, tol)
+            largest, at = self.failing(smaller, targets, tol)
             if at is None:
                 return smaller, largest
-            hard = {at: wanted[at], **hard}
+            hard = {at: targets[at], **hard}
             fails, holds = holds, space.size
 
-    def holds(self, space: Space, r: int, wanted: dict[int, np.ndarray], tol: float) -> bool:
-        """Whether r degrees of freedom have such eigenvalues at candidates."""
-        return space.regular(r) and self.failing(self.reduced(space, r), wanted, tol)[1] is None
+    def holds(self, space: Space, r: int, targets: dict[int, np.ndarray], tol: float) -> bool:
+        """True if r degrees of freedom have the eigenvalues `targets` at their candidates."""
+        return space.regular(r) and self.failing(self.reduced(space, r), targets, tol)[1] is None
 
     def failing(
-        self, reduced: ReducedStructure, wanted: dict[int, np.ndarray], tol: float
+        self, reduced: ReducedStructure, targets: dict[int, np.ndarray], tol: float
     ) -> tuple[float, int | None]:
-        """The largest error at candidates with such eigenvalues, and where one is too large."""
+        """The largest error against `targets` at their candidates, and where one is too large."""
         largest = 0.0
-        for i, s in wanted.items():
+        for i, s in targets.items():
             there, errors = self.estimated(reduced, self.candidates[i])
             # A mode that is lost has no error.
-            largest = max(largest, _relative(errors, there), _apart(there, s))
+            largest = max(largest, _relative(errors, there), _distance(there, s))
             if largest > _SAFE * tol:
                 return largest, i
         return largest, None
@@ -306,12 +309,12 @@ class _Greedy:
         return ReducedStructure(**small, reduction=reduction, mesh=snapshots.structure.mesh)
 
     def estimated(self, reduced, at: tuple[np.ndarray, np.ndarray]):
-        """Eigenvalues and their errors at a point with these numbers of the joints."""
+        """Eigenvalues and their errors at a point with its numbers of the joints."""
         u, numbers = at
         return estimated_errors(reduced, self.snapshots.at(u).parameters, numbers)
 
     def compared(self, reduced) -> float:
-        """The largest error at the worst of fresh points, of |s|, by their own eigenvalues."""
+        """The largest error at the worst fresh points, of |s|, against their own eigenvalues."""
         largest = 0.0
         worst = np.argsort(-_largest([self.estimated(reduced, at) for at in self.fresh]))
         low, high = self.snapshots.band
@@ -325,7 +328,7 @@ class _Greedy:
             edge, frequency = self.tol * np.abs(exact), np.imag(exact)
             well_inside = (frequency > low + edge) & (frequency < high - edge)
             well_inside &= in_band(exact, self.snapshots.band)
-            largest = max(largest, _apart(s, exact[well_inside]))
+            largest = max(largest, _distance(s, exact[well_inside]))
         return largest
 
 
@@ -338,7 +341,7 @@ def _relative(errors: np.ndarray, s: np.ndarray) -> float:
     return float((errors / np.abs(s)).max(initial=0.0))
 
 
-def _apart(found: np.ndarray, wanted: np.ndarray) -> float:
-    """How far the nearest of those found is from each eigenvalue wanted, of |s|, at most."""
-    nearest = np.abs(found[None] - wanted[:, None]).min(axis=1, initial=np.inf)
-    return _relative(nearest, wanted)
+def _distance(s: np.ndarray, targets: np.ndarray) -> float:
+    """The largest distance from a target eigenvalue to the nearest of s, of |s|."""
+    nearest = np.abs(s[None] - targets[:, None]).min(axis=1, initial=np.inf)
+    return _relative(nearest, targets)

@@ -1,6 +1,6 @@
 """The eigenvalue of a structure that grows most, and its derivatives by its own two vectors.
 
-A reduced structure holds a coarse space in which every mode of its band is known to a few digits.
+A reduced structure holds a coarse space that has every mode of its band to a few digits.
 Those that may grow most are refined by two-sided Rayleigh quotient iteration (B. N. Parlett, Math.
 Comput. 28 (1974) 679), which takes an LU factorisation of size n in the place of all eigenvalues of
 size 2n: one to the last digit, each other until it is known to grow less. Where the coarse modes do
@@ -23,7 +23,7 @@ from .band import MOST_DAMPED, in_band
 Matrices = tuple[Float[Array, "n n"], Float[Array, "n n"], Float[Array, "n n"]]
 _STEPS = 6  # of an iteration that triples the digits in each
 _ROUNDING = 64  # units of eps of |s|, where an iteration ends
-_SAME = 1e-9  # of |s|: two modes that are found so near are one, or too near to tell apart
+_SAME = 1e-9  # of |s|: two modes that converge so near are one, or too near to tell apart
 
 
 class _Mode(NamedTuple):
@@ -47,11 +47,11 @@ def _mode(band, coarse, M, C, K) -> _Mode:
         return _of_all(band, M, C, K)
 
     @one_by_one
-    def found(M, C, K):
+    def solution(M, C, K):
         mode, settled = _refined(band, coarse, M, C, K)
         return jax.lax.cond(settled, lambda: mode, lambda: _of_all(band, M, C, K))
 
-    return found(M, C, K)
+    return solution(M, C, K)
 
 
 @_mode.defjvp
@@ -91,7 +91,7 @@ def _of_all(band, M, C, K) -> _Mode:
 
 
 class _Search(NamedTuple):
-    """What is known of the k coarse modes, and the largest refined so far."""
+    """The k coarse modes as refined so far, and the rightmost refined mode."""
 
     refined: Bool[Array, " k"]
     s: Complex[Array, " k"]  # infinite where it is not refined
@@ -101,25 +101,25 @@ class _Search(NamedTuple):
 
 
 def _refined(band, coarse: CoarseSpace, M, C, K) -> tuple[_Mode, Bool[Array, ""]]:
-    """The rightmost mode, and whether it is known to be that.
+    """The rightmost mode, and True if that is certain.
 
-    Every mode z of the coarse space is within `radius` of one of the structure. One is
-    the rightmost if none of those that are not refined can have a larger real part or be it.
+    Every mode z of the coarse space is within `radius` of one of the structure. A refined
+    mode is the rightmost if no unrefined one can have a larger real part or be the same.
     """
     V, W = (jnp.asarray(X, M.dtype) for X in (coarse.V, coarse.W))
     rough: Any = quadratic.solve(*(W.T @ X @ V for X in (M, C, K)))
     z, size = rough.s, jnp.abs(rough.s)
     radius = coarse.tol * size
     wider = (z.imag > band[0] - radius) & (z.imag <= band[1] + radius)
-    known = wider & (jnp.abs(z.real) <= MOST_DAMPED * size + 2 * radius)
+    eligible = wider & (jnp.abs(z.real) <= MOST_DAMPED * size + 2 * radius)
 
-    def wanted(now: _Search) -> Bool[Array, " k"]:
+    def unsettled(now: _Search) -> Bool[Array, " k"]:
         reach = now.error[None] + radius[:, None]
         near = (jnp.abs(now.s[None] - z[:, None]) <= reach).any(axis=1)
-        return known & ~now.refined & (near | (z.real + radius >= now.best.s.real))
+        return eligible & ~now.refined & (near | (z.real + radius >= now.best.s.real))
 
     def refine(now: _Search) -> _Search:
-        i = jnp.argmax(jnp.where(wanted(now), z.real, -jnp.inf))
+        i = jnp.argmax(jnp.where(unsettled(now), z.real, -jnp.inf))
 
         def alone(s, error) -> Bool[Array, ""]:
             return (jnp.abs(now.s - s) > jnp.maximum(now.error + error, _SAME * size[i])).all()
@@ -133,32 +133,32 @@ def _refined(band, coarse: CoarseSpace, M, C, K) -> tuple[_Mode, Bool[Array, ""]
         sound = now.sound & converged & alone(s, error) & (jnp.abs(s - z[i]) <= radius[i])
         better = in_band(s, band) & (s.real > now.best.s.real)
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), mode, now.best)
-        refined, known = now.refined.at[i].set(True), now.s.at[i].set(s)
-        return _Search(refined, known, now.error.at[i].set(error), sound, best)
+        refined, eigenvalues = now.refined.at[i].set(True), now.s.at[i].set(s)
+        return _Search(refined, eigenvalues, now.error.at[i].set(error), sound, best)
 
     none = _Mode(jnp.full((), -jnp.inf, z.dtype), *jnp.zeros((2, len(M)), z.dtype))
-    nothing = jnp.zeros(len(z), bool), jnp.full_like(z, jnp.inf), jnp.zeros_like(size)
-    first = _Search(*nothing, jnp.array(True), none)
-    end = jax.lax.while_loop(lambda now: now.sound & wanted(now).any(), refine, first)
+    unrefined = jnp.zeros(len(z), bool), jnp.full_like(z, jnp.inf), jnp.zeros_like(size)
+    first = _Search(*unrefined, jnp.array(True), none)
+    end = jax.lax.while_loop(lambda now: now.sound & unsettled(now).any(), refine, first)
     return end.best, end.sound & jnp.isfinite(end.best.s.real)
 
 
 def _iterated(
     M, C, K, mode: _Mode, beaten: Callable
 ) -> tuple[_Mode, Float[Array, ""], Bool[Array, ""]]:
-    """A mode by two-sided Rayleigh quotient iteration, its error and whether it converged.
+    """A mode by two-sided Rayleigh quotient iteration, its error, and True if it converged.
 
     The error is below the last change, since digits triple. An eigenvalue that is `beaten` within
     it needs no more of them.
     """
     eps = _ROUNDING * jnp.finfo(M.dtype).eps
 
-    def known(s, moved):
-        return (moved <= eps * jnp.abs(s)) | beaten(s, moved)
+    def settled(s, error):
+        return (error <= eps * jnp.abs(s)) | beaten(s, error)
 
     def going(now):
-        step, mode, moved = now
-        return (step < _STEPS) & (moved >= 0) & ~known(mode.s, moved)
+        step, mode, error = now
+        return (step < _STEPS) & (error >= 0) & ~settled(mode.s, error)
 
     def improve(now):
         step, (s, x, y), _ = now
@@ -170,9 +170,9 @@ def _iterated(
         return step + 1, _Mode(s - change, x, y), jnp.abs(change)
 
     first = 0, mode, jnp.full((), jnp.inf, M.dtype)
-    _, (s, x, y), moved = jax.lax.while_loop(going, improve, first)
+    _, (s, x, y), error = jax.lax.while_loop(going, improve, first)
     y = y / (y @ ((2 * s * M + C) @ x))
-    return _Mode(s, x, y), moved, known(s, moved)
+    return _Mode(s, x, y), error, settled(s, error)
 
 
 def _inverse(lu, order, b, c) -> tuple[jax.Array, jax.Array]:

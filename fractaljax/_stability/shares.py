@@ -71,12 +71,12 @@ def energy_shares(
     Parts are the terms of M, C and K, "K" or "K 1", "K 2", ... where it is a sum, or as `names` has
     them ({"K 2": "pad"}; parts of one name are added up), and the joints by their names. A joint
     acts through its springs, its friction and, unless `friction_slope` is False, the slope of its
-    friction law. `modes` is `stability(x, friction_slope)`, where that is known already.
+    friction law. `modes` is `stability(x, friction_slope)`, if already computed.
 
     The sum of the contributions is the growth rate, as exactly as shapes are known. Where
-    gyroscopic modes coalesce, 2 omega m + Im c passes through 0 and they grow without bound. Of a
+    gyroscopic modes coalesce, 2 omega m + Im c passes through 0 and they grow without bound. For a
     structure that `reduce` made obliquely (`Reduction.W` is not `V`), shares are of forms in its
-    coordinates and no energies.
+    coordinates, not of energies.
 
     **Raises:** `TypeError` for what is neither a scene nor a structure; `ValueError` for a name of
     no part, for modes of another size, and as `stability`.
@@ -98,9 +98,9 @@ def energy_shares(
         raise ValueError(f"names must be of {', '.join(forms)}, got {unknown[0]!r}")
     parts = tuple(dict.fromkeys(names.get(part, part) for part in forms))
     summed: Any = np.zeros((3, len(s), len(parts)), complex)
-    for part, found in forms.items():
+    for part, part_forms in forms.items():
         column = parts.index(names.get(part, part))
-        for total, form in zip(summed, found, strict=True):
+        for total, form in zip(summed, part_forms, strict=True):
             total[:, column] += form
     m, c, k = summed
     omega = s.imag[:, None]
@@ -117,7 +117,7 @@ def energy_shares(
 
 def _forms(structure: Structure, x: np.ndarray, friction_slope: bool) -> dict[str, Any]:
     """(m, c, k) of each part for shapes x (k, n), each a number or (k,)."""
-    found = {}
+    forms = {}
     for place, (name, held) in enumerate(structure.sums.items()):
         terms = list(zip(held.coefficients, held.arrays, strict=True))
         for i, (coefficient, X) in enumerate(terms, start=1):
@@ -125,7 +125,7 @@ def _forms(structure: Structure, x: np.ndarray, friction_slope: bool) -> dict[st
             form = np.einsum("ki,ki->k", x.conj(), x @ np.asarray(X).T)
             form = form * (1.0 if value is None else float(value))
             part = name if len(terms) == 1 else f"{name} {i}"
-            found[part] = [form if place == other else 0.0 for other in range(3)]
+            forms[part] = [form if place == other else 0.0 for other in range(3)]
     attached = np.asarray(joint_numbers(structure, friction_slope))
     for name, joint, by in zip(structure.joint_names, structure.joints, attached, strict=True):
         K_n, K_t, mu, c_t, c_n = map(float, by)
@@ -135,5 +135,5 @@ def _forms(structure: Structure, x: np.ndarray, friction_slope: bool) -> dict[st
         c = c_t * np.abs(t) ** 2 + c_n * np.abs(n) ** 2
         k = K_t * np.abs(t) ** 2 + K_n * np.abs(n) ** 2
         k = k - mu * K_n * t.conj() * n + mu * K_t * n.conj() * t
-        found[f"joint {name}" if name in found else name] = [0.0, c, k]
-    return found
+        forms[f"joint {name}" if name in forms else name] = [0.0, c, k]
+    return forms

@@ -17,13 +17,13 @@ from .sparse_modes import BandModes, band_modes
 
 _LINE = 33  # candidates along one quantity
 _CANDIDATES = 32  # for each of several quantities, besides the corners
-_MOST = 128  # of them
+_MOST = 128  # such candidates, at most
 _CORNERS = 5  # quantities up to which corners are candidates
 _BEYOND = 0.02  # of the band: modes beyond its ends that may enter it
 
 
 class _Directions(NamedTuple):
-    """Those of all joints, tangential ones first, and the place of the normal one of each."""
+    """Directions of all joints, tangential ones first, and the place of each normal one."""
 
     D: np.ndarray  # (n, k)
     normal: tuple[int | None, ...]
@@ -59,8 +59,8 @@ def joint_numbers(structure: Structure, friction_slope: bool) -> Float[Array, "m
     """What each joint adds at the equilibrium: K_n, K_t, mu, c_t, c_n."""
     if not structure.joints:
         return jnp.zeros((0, 5))
-    found = attachments(structure, friction_slope).each
-    return jnp.stack([jnp.stack([*map(jnp.asarray, each)]) for each in found])
+    attached = attachments(structure, friction_slope).each
+    return jnp.stack([jnp.stack([*map(jnp.asarray, each)]) for each in attached])
 
 
 def projected(structure: Structure, V: np.ndarray, W: np.ndarray) -> dict[str, Any]:
@@ -159,18 +159,18 @@ class Snapshots:
         return solve(forces), solve(np.ascontiguousarray(D), "T")
 
     def numbers(self, x: Structure, statics: np.ndarray) -> Callable:
-        """A function of quantities that gives those of the joints (m, 5), see `joint_numbers`."""
+        """A function of the quantities that gives `joint_numbers` (m, 5)."""
         if not x.joints:
             return lambda values: np.zeros((0, 5))
         basis = statics if self.needs_equilibrium else self.directions.D
         V = np.linalg.qr(basis / np.linalg.norm(basis, axis=0))[0]
         small = ParametricStructure(**projected(x, V, V))
 
-        def found(values: Mapping[str, ArrayLike]) -> np.ndarray:
+        def numbers_at(values: Mapping[str, ArrayLike]) -> np.ndarray:
             values = {name: jnp.asarray(value) for name, value in values.items()}
             return np.asarray(joint_numbers(substituted(small, values), self.friction_slope))
 
-        return found
+        return numbers_at
 
     def matrices(self, x: Structure, numbers: np.ndarray) -> tuple[Any, Any, Any]:
         """(M, C, K), sparse, with the joints attached."""
@@ -191,8 +191,8 @@ class Snapshots:
         right, left = self.statics(x)
         low, high = self.band
         wider = low * (1 - _BEYOND), high * (1 + _BEYOND)
-        found = band_modes(self.matrices(x, self.numbers(x, right)({})), wider)
-        return Snapshot(found, right, left)
+        modes = band_modes(self.matrices(x, self.numbers(x, right)({})), wider)
+        return Snapshot(modes, right, left)
 
 
 def plain(x: Structure, name: str) -> Any:

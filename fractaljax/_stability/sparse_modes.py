@@ -60,7 +60,7 @@ class Factors:
 
 
 def side_by_side(function: Callable, arguments: Iterable) -> list[Any]:
-    """What a function gives for each of the arguments, in threads."""
+    """The values of a function for each of the arguments, computed in threads."""
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         return list(pool.map(function, arguments))
 
@@ -68,13 +68,13 @@ def side_by_side(function: Callable, arguments: Iterable) -> list[Any]:
 def band_modes(matrices: tuple[Any, Any, Any], band: tuple[float, float]) -> BandModes:
     """All modes of (M, C, K), sparse (n, n), with Im s in the band (low, high) [rad/s].
 
-    Those that are damped beyond a ratio of about 0.3 may be missed: they are far from the shifts.
+    Modes damped beyond a ratio of about 0.3 may be missed: they are far from the shifts.
 
     **Raises:** `ValueError` if more eigenvalues crowd together than can be found.
     """
     low, high = band
-    found = _within(matrices, low, high, high - low)
-    s, right, left = (np.concatenate([each[i] for each in found], axis=-1) for i in range(3))
+    parts = _within(matrices, low, high, high - low)
+    s, right, left = (np.concatenate([each[i] for each in parts], axis=-1) for i in range(3))
     order = np.argsort(np.imag(s))
     return BandModes(s[order], right[:, order], left[:, order])
 
@@ -110,7 +110,7 @@ def _nearest(matrices, factors: Factors, count: int, transposed: bool):
     n, shift, unit = M.shape[0], factors.shift, abs(factors.shift)
     moving = (C + shift * M).tocsr()
 
-    # Of states (x, s x/unit): halves of one size.
+    # It acts on states (x, s x/unit), with halves of one size.
     def inverse(state):
         x, v = state[:n], state[n:]
         y = factors.solve(-(unit * (M @ v) + moving @ x), transposed)
@@ -119,5 +119,5 @@ def _nearest(matrices, factors: Factors, count: int, transposed: bool):
     start = np.random.default_rng(0).standard_normal(2 * n) + 0j
     linear, arpack = cast(Any, LinearOperator), cast(Any, eigs)
     operator = linear((2 * n, 2 * n), inverse, dtype=complex)
-    found, states = arpack(operator, count, which="LM", v0=start, tol=_TOLERANCE)
-    return shift + 1 / found, states[:n]
+    reciprocals, states = arpack(operator, count, which="LM", v0=start, tol=_TOLERANCE)
+    return shift + 1 / reciprocals, states[:n]

@@ -50,15 +50,15 @@ class Stability(Record):
     """Linear stability of steady sliding, as `stability` returns it, for n degrees of freedom.
 
     `resolutions` bound the rounding error of the real part of each eigenvalue: a smaller real part
-    has no sign. A rigid-body mode of a structure, with K x = 0 within rounding,
-    has an eigenvalue and a damping ratio of exactly 0, and does not count in the margin.
+    has no sign. A rigid-body mode of a structure, with K x = 0 within rounding, has an eigenvalue
+    and a damping ratio of exactly 0, and does not count in the margin.
 
-    `normal_force` is that of each joint under preload, P without a normal direction, and NaN in the
-    source's form; None where no joint is preloaded. Where it is not above 0 the joint is open:
-    there is no steady sliding, and all numbers are NaN.
+    `normal_force` has one entry per joint: its normal force under preload, P without a normal
+    direction, NaN in the source's form; None where no joint is preloaded. Where it is not above 0
+    the joint is open: there is no steady sliding, and all numbers are NaN.
 
-    Of a structure that `reduce` made only the eigenvalues in its band count: they come first, and
-    the others are none of the structure's.
+    For a structure that `reduce` made, only the eigenvalues in its band count: they come first, and
+    the others are not eigenvalues of the structure.
     """
 
     eigenvalues: Complex[Array, " 2*n"]  # [1/s], largest real part first
@@ -79,7 +79,7 @@ class Stability(Record):
 
     @property
     def frequencies(self) -> Float[Array, " 2*n"]:
-        """Of each eigenvalue [Hz]."""
+        """Frequency of each eigenvalue [Hz]."""
         return jnp.abs(self.eigenvalues.imag) / (2 * jnp.pi)
 
     @property
@@ -118,8 +118,8 @@ class Stability(Record):
     def _modes(self) -> list[Mode]:
         if self.eigenvalues.ndim != 1:
             raise ValueError(f"modes are listed of one result, got {self.eigenvalues.shape}")
-        modes, given = [], (self.eigenvalues, self.resolutions, self.shapes, self.counted)
-        for s, resolution, shape, counted in zip(*map(np.asarray, given), strict=True):
+        modes, columns = [], (self.eigenvalues, self.resolutions, self.shapes, self.counted)
+        for s, resolution, shape, counted in zip(*map(np.asarray, columns), strict=True):
             if counted and s.imag >= 0:
                 largest = int(np.abs(shape).argmax())
                 mode = Mode(
@@ -146,15 +146,15 @@ def growth_rate(scene: Mechanism, friction_slope: bool = True) -> Float[Array, "
     Towards coalescing eigenvalues the derivative grows without bound. Exactly there it is infinite,
     and some finite number is returned. NaN where the numbers leave the range in which a sign can
     be told (`dimensionless`), and where a preloaded joint is open at its equilibrium
-    (`Stability.normal_force`). Of a structure also, under `jit` and `vmap`, where there is no
+    (`Stability.normal_force`). For a structure also, under `jit` and `vmap`, where there is no
     equilibrium.
 
     **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`; if a structure without F
     has friction with a slope; and if one has no equilibrium.
     """
-    found = _growth_rate(scene, friction_slope)
-    require_equilibrium(scene, friction_slope, found)
-    return found
+    growth = _growth_rate(scene, friction_slope)
+    require_equilibrium(scene, friction_slope, growth)
+    return growth
 
 
 @functools.partial(exported_jit, static_argnames="friction_slope")
@@ -167,9 +167,9 @@ def _growth_rate(scene, friction_slope):
 
 def stability(scene: Mechanism, friction_slope: bool = True) -> Stability:
     """Eigenvalues of Eq. 43 and what follows from them; arguments and errors as `growth_rate`."""
-    found = _stability(scene, friction_slope)
-    require_equilibrium(scene, friction_slope, found.growth_rate)
-    return found
+    result = _stability(scene, friction_slope)
+    require_equilibrium(scene, friction_slope, result.growth_rate)
+    return result
 
 
 def _of_scene(scene, friction_slope):
@@ -208,7 +208,7 @@ def _stability(scene, friction_slope):
 
 
 def _rank(s, band):
-    """The real part, those outside of the band last."""
+    """The real part; -inf, so last, outside the band."""
     return s.real if band is None else jnp.where(in_band(s, band), s.real, -jnp.inf)
 
 
@@ -232,11 +232,11 @@ def _displacements(lin: Linearised, s, mobility, K_n, K_t) -> Complex[Array, "4 
 def require_computable(
     scene: Scene, friction_slope: bool = True, modes: Stability | None = None
 ) -> None:
-    """Refuse a scene whose growth rate or margin is NaN, naming the quantity that causes it.
+    """Refuse a scene whose growth rate or margin is not finite, naming the quantity behind it.
 
-    `modes` is its `stability`, where that is known already.
+    `modes` is its `stability`, if already computed.
 
-    **Raises:** `ValueError` as said.
+    **Raises:** `ValueError` in that case.
     """
     modes = stability(scene, friction_slope) if modes is None else modes
     if math.isfinite(modes.growth_rate) and math.isfinite(modes.margin):
@@ -248,7 +248,7 @@ def require_computable(
         )
     joint = pressed(scene)
     lin = linearised_at(scene, joint, friction_slope)
-    found = {
+    quantities = {
         "K_n [N/m]": joint.K_n,
         "K_t [N/m]": joint.K_t,
         "the friction at V": sliding_friction(scene),
@@ -258,9 +258,11 @@ def require_computable(
         "the damping of x2 [1/s]": lin.c_2,
         "the coupling mu^2 K_n K_t/m^2 [1/s^4]": lin.g,
     }
-    names = [name for name, value in found.items() if not math.isfinite(value)]
+    names = [name for name, value in quantities.items() if not math.isfinite(value)]
     if not names:  # the largest of damping and coupling as rates
-        rates = dict(zip(list(found)[-3:], (abs(lin.c_1), abs(lin.c_2), lin.g**0.25), strict=True))
+        rates = dict(
+            zip(list(quantities)[-3:], (abs(lin.c_1), abs(lin.c_2), lin.g**0.25), strict=True)
+        )
         names = [max(rates, key=lambda name: float(rates[name]))]
-    value = found[names[0]]
+    value = quantities[names[0]]
     raise ValueError(f"stability cannot be computed in {lin.a.dtype}: {names[0]} is {value:.6g}")

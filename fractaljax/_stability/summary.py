@@ -132,9 +132,9 @@ def stiffness_remark(
 ) -> list[str]:
     """A line if the law of a contact gives it no stiffness, normal or tangential, else none.
 
-    It calls `follows` what is of the mechanism without it.
+    `follows` is its name for the results of the mechanism without the joint.
     """
-    if isinstance(part.contact, FixedContact):  # as it was asked for
+    if isinstance(part.contact, FixedContact):  # a fixed stiffness is as intended
         return []
     pair: Any = stiffness(part) if K is None and isinstance(part, Scene) else K
     K_n, K_t = map(float, pair)
@@ -147,7 +147,7 @@ def stiffness_remark(
 
 
 def stiffness_remarks(x: Scene | Structure, which: str = "", **words: str) -> list[str]:
-    """`stiffness_remark` of every joint, with its words; `which` one follows its name."""
+    """`stiffness_remark` of every joint, with its `words`; `which` follows the joint's name."""
     if isinstance(x, Scene):
         return stiffness_remark(x, None, f"The joint{which}", **words)
     return [

@@ -1,7 +1,7 @@
 """Every mode of a mechanism over one quantity, followed through crossing, veering and coalescence.
 
 Modes at two values are compared as states (x, x'), with left and right eigenvectors: a left state
-of eigenvalue s is w = (y (s M + C), y M), a right one v = (x, s x), and w v = 1. Of modes i and j,
+of eigenvalue s is w = (y (s M + C), y M), a right one v = (x, s x), and w v = 1. For modes i and j,
 
     B_ij = (w_i v_j') (w_j' v_i),    sum_j B_ij = sum_i B_ij = 1,
 
@@ -42,7 +42,7 @@ _HALVINGS = 12  # of a step, at most
 _NEUTRAL = 1e-9  # growth rate, of |s|, that does not count
 _COALESCED = 1e-7  # growth rate, of |s|, that rounding gives to modes that coalesce
 _PART = 0.48  # of a step, its first "half": a round number would meet the places of coalescence
-_INDEPENDENT = 1e4  # condition of shapes below which they are no single one
+_INDEPENDENT = 1e4  # condition of shapes below which they are independent
 _NONE = complex(np.nan, np.nan)
 _TIE = 0.1  # overlaps of two ways to pair modes that differ by less do not decide
 
@@ -60,7 +60,7 @@ class ModeTracks(Record):
     """Modes over p values of one quantity, as `track_modes` returns them: one in each column.
 
     k is the number of modes that are there at any value, the lowest frequency first. NaN stands
-    where a mode is not: outside of the band of a reduced structure, where its joint is open, and
+    where a mode is absent: outside the band of a reduced structure, where its joint is open, and
     for the second of two real eigenvalues where the two are still one conjugate pair.
     """
 
@@ -90,24 +90,23 @@ class ModeTracks(Record):
     def crossings(self) -> list[ModeCrossing]:
         """Where modes start or cease to grow between two of the values, in the order of the values.
 
-        Each is the root of the growth rate of its own mode, to the rounding of the eigenvalues.
-        Where the growth rate is 0 to rounding on one side, as of undamped modes, it is where that
-        ends: the frequencies of two modes meet there. Two changes between neighbouring values are
-        not seen.
+        Each is the root of the growth rate of its mode, to the rounding of the eigenvalues. Where
+        the growth rate is 0 to rounding on one side, as of undamped modes, it is where that ends:
+        the frequencies of two modes meet there. Two changes between neighbouring values are missed.
         """
         from scipy.optimize import brentq
 
         growth = self.growth_rates
         growth = np.where(np.abs(growth) > _NEUTRAL * np.abs(self.eigenvalues), growth, 0)
-        at, found = _modes_of(self.x, self.name, self.friction_slope), []
-        grows, known = growth > 0, np.isfinite(growth)
-        changes = (grows[:-1] != grows[1:]) & known[:-1] & known[1:]
+        at, crossings = _modes_of(self.x, self.name, self.friction_slope), []
+        grows, present = growth > 0, np.isfinite(growth)
+        changes = (grows[:-1] != grows[1:]) & present[:-1] & present[1:]
         for i, k in np.argwhere(changes).tolist():
             begin = at(self.values[i])
-            own = int(np.abs(begin.s - self.eigenvalues[i, k]).argmin())
+            index = int(np.abs(begin.s - self.eigenvalues[i, k]).argmin())
 
-            def eigenvalue(value, begin=begin, own=own):
-                return complex(_step(begin, at(value), at, _HALVINGS)[0].s[own])
+            def eigenvalue(value, begin=begin, index=index):
+                return complex(_step(begin, at(value), at, _HALVINGS)[0].s[index])
 
             ends = self.values[i], self.values[i + 1]
             if growth[i, k] * growth[i + 1, k] < 0:
@@ -117,8 +116,8 @@ class ModeTracks(Record):
                 value = _bisected(lambda value: _grows(eigenvalue(value)), *ends)
             frequency = abs(eigenvalue(value).imag) / (2 * np.pi)
             starts = (growth[i + 1, k] > 0) == (ends[0] < ends[1])
-            found.append(ModeCrossing(k, float(value), frequency, bool(starts)))
-        return found
+            crossings.append(ModeCrossing(k, float(value), frequency, bool(starts)))
+        return crossings
 
     def _shown(self):
         yield f"{self.name}: {len(self.values)} values"
@@ -133,7 +132,7 @@ def _grows(s: complex) -> bool:
 
 
 def _bisected(test: Callable[[float], bool], low: float, high: float) -> float:
-    """Where a test that differs at the ends changes, to the last digit."""
+    """The value where a test that differs at the ends changes, to the last digit."""
     at_low = test(low)
     while True:
         middle = low + (high - low) / 2
@@ -175,18 +174,18 @@ def track_modes(
     at = _modes_of(x, name, friction_slope)
     modes, steps, last = [], [], None
     for value in grid:
-        found, mac = at(value), np.nan
-        if np.isfinite(found.s).all():
+        current, mac = at(value), np.nan
+        if np.isfinite(current.s).all():
             if last is None:
-                found = _aligned(found, found)
+                current = _aligned(current, current)
             else:
-                found, mac = _step(last, found, at, _HALVINGS)
-            # Where modes have just coalesced nothing tells them apart: the next step passes over.
-            unsure = _shown(found) & (np.asarray(mac) < _SURE)
-            together = np.triu(_equal(found.s[unsure], 100), 1).any()
-            last = last if last is not None and together else found
-        modes.append(found)
-        steps.append(np.broadcast_to(mac, found.s.shape))
+                current, mac = _step(last, current, at, _HALVINGS)
+            # Modes that have just coalesced cannot be told apart: the next step passes over.
+            unsure = _shown(current) & (np.asarray(mac) < _SURE)
+            together = np.triu(_equal(current.s[unsure], 100), 1).any()
+            last = last if last is not None and together else current
+        modes.append(current)
+        steps.append(np.broadcast_to(mac, current.s.shape))
     s: Any = np.stack([each.s for each in modes])
     there = np.stack([_shown(each) for each in modes])
     first = there.argmax(axis=0), np.arange(s.shape[1])
@@ -225,11 +224,11 @@ def _states(x: Scene | Structure, name: str, value: Any, friction_slope: bool):
     x = substituted(x, {name: value})
     x = Structure.from_scene(x) if isinstance(x, Scene) else x
     M, C, K, C_error = assembled(x, friction_slope).matrices
-    found = solve(M, C, K, C_error)
-    s, Y = found.s[:, None], found.y
+    modes = solve(M, C, K, C_error)
+    s, Y = modes.s[:, None], modes.y
     left = jnp.concatenate([s * (Y @ M) + Y @ C, Y @ M], axis=1)
-    right = jnp.concatenate([found.x, s * found.x], axis=1)
-    return found.s, right, left, in_band(found.s, x.band)
+    right = jnp.concatenate([modes.x, s * modes.x], axis=1)
+    return modes.s, right, left, in_band(modes.s, x.band)
 
 
 class _Modes(NamedTuple):
@@ -259,13 +258,13 @@ def _step(a: _Modes, b: _Modes, at: Any, halvings: int) -> tuple[_Modes, np.ndar
 
 
 def _doubtful(a: _Modes, b: _Modes, mac: np.ndarray) -> bool:
-    """Whether a mode that is shown has no sure partner, or passes another one."""
+    """True if a mode that is shown has no sure partner, or passes another one."""
     shown = _shown(a) | _shown(b)
     if (mac[shown] < _SURE).any():
         return True
     before, after = (each.s[shown, None] - each.s[None, shown] for each in (a, b))
     passes = np.real(before.conj() * after) < 0
-    # Of equal eigenvalues, the order is rounding's.
+    # Rounding decides the order of equal eigenvalues.
     return bool((passes & ~_equal(a.s[shown]) & ~_equal(b.s[shown])).any())
 
 
@@ -274,7 +273,7 @@ def _shown(modes: _Modes) -> np.ndarray:
 
 
 def _equal(s: np.ndarray, factor: float = 1) -> np.ndarray:
-    """Which eigenvalues (k, k) are the same, but for rounding; none of rigid bodies is."""
+    """True for pairs (k, k) of eigenvalues equal to rounding; never for rigid bodies."""
     size = np.abs(s)
     least = np.minimum(size[:, None], size[None])
     return (np.abs(s[:, None] - s[None]) <= factor * _rounding(s) * least) & (least > 0)
@@ -285,7 +284,7 @@ def _rounding(s: np.ndarray) -> float:
 
 
 def _matched(a: _Modes, b: _Modes, last: bool) -> tuple[_Modes, np.ndarray]:
-    """b in the order of a, and the MAC of each mode; at last by the rule where nothing decides."""
+    """b in the order of a, and the MAC of each mode; the `last` step breaks ties by a rule."""
     from scipy.optimize import linear_sum_assignment
 
     weight = np.minimum(1, np.abs(_overlaps(a, b)))
@@ -312,7 +311,7 @@ def _overlaps(a: _Modes, b: _Modes) -> np.ndarray:
 
 
 def _aligned(a: _Modes, b: _Modes) -> _Modes:
-    """b with those shapes, among all that equal eigenvalues have, that continue the ones of a."""
+    """b with the shapes of equal eigenvalues chosen so that they continue the shapes of a."""
     from scipy.sparse.csgraph import connected_components
 
     equal = _equal(b.s)
