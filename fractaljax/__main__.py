@@ -9,10 +9,11 @@ import threading
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command; returns its exit status.
+    """Run the command; return its exit status.
 
-    0, or 1 for an infeasible design, no limit cycle, a surface that is not fractal or a published
-    number that is not met, or 2 for bad input, or 128 plus the number of the signal that ended it.
+    It is 0; 1 for an infeasible design, no limit cycle, a surface that is not fractal or a
+    published number that is not met; 2 for bad input; or 128 plus the number of the signal that
+    ended it.
     """
     from ._cli.commands import add_cycle, add_scene, add_stability
     from ._cli.contact import add_contact
@@ -48,7 +49,7 @@ def main(argv: list[str] | None = None) -> int:
     ):
         add(commands)
     arguments = parser.parse_args(argv)
-    # A tenth of a command was a search for garbage among the modules, which stay.
+    # Garbage collection among the modules, which stay, took a tenth of a command's time.
     gc.set_threshold(50_000, 20, 50)
     import jax
 
@@ -80,8 +81,8 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def command() -> int:
-    """`main` as a process of its own, which ends without a search for garbage in all it holds."""
-    # While modules load, an exception could be taken for an error of theirs.
+    """Run `main` as a process of its own, which ends without a last garbage collection."""
+    # While modules load, they could take an exception for an error of their own.
     signal.signal(signal.SIGINT, _end_at_once)
     try:
         return main()

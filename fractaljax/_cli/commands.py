@@ -29,7 +29,7 @@ def add_stability(commands) -> None:
 def _stability(arguments) -> int:
     """Print the joint, the critical mode and the eigenvalues of a scene.
 
-    Of a structure (a file with a table of that name): the joints, and the modes that are unstable
+    For a structure (a file with a table of that name): the joints, and the modes that are unstable
     or least damped. With a mesh, pictures of the unstable modes, mode_1.png and so on, or of the
     first one.
     """
@@ -51,7 +51,7 @@ def _stability(arguments) -> int:
 
 
 def _mode_pictures(structure, friction_slope: bool) -> dict[str, bytes]:
-    """The unstable modes on the mesh, the fastest first, or the first of all, by file."""
+    """Pictures of the unstable modes, the fastest first, or of the first of all, by file name."""
     from .. import plot
     from .._mechanism.reduced import ReducedStructure
     from .._stability.stability import stability
@@ -97,8 +97,8 @@ def add_cycle(commands) -> None:
 def _cycle(arguments) -> int:
     """Find the limit cycle that the motion ends in; write cycle.png and cycle.csv.
 
-    Of a scene, or of a structure (a file with a table of that name), and if that has a mesh also
-    motion.png, the motion on it.
+    The file holds a scene or a structure (a table of that name); if it has a mesh, motion.png
+    shows the motion on it.
     """
     import jax
 
@@ -116,19 +116,19 @@ def _cycle(arguments) -> int:
     options = {name: value for name, value in options.items() if value is not None}
     import_pictures()
     with output(arguments.out) as write:
-        cycle = jax.device_get(limit_cycle(scene, **options, throw=False))  # NumPy goes on
+        cycle = jax.device_get(limit_cycle(scene, **options, throw=False))  # NumPy from here on
         exists = CycleResult.converged, CycleResult.inaccurate, CycleResult.unstable
-        found = cycle.result in exists
-        if found:
+        has_cycle = cycle.result in exists
+        if has_cycle:
             figure, table = picture(plot.cycle(cycle)), _orbit_text(cycle).encode()
             files = {"cycle.png": figure, "cycle.csv": table}
             if isinstance(scene, Structure) and scene.mesh is not None:
                 files["motion.png"] = picture(plot.cycle_motion(cycle, scene))
             written = write(files)
     print(cycle_table(scene, cycle))
-    if found:
+    if has_cycle:
         print(written)
-    return 0 if found else 1
+    return 0 if has_cycle else 1
 
 
 def _orbit_text(cycle) -> str:

@@ -48,11 +48,11 @@ def _run(arguments) -> int:
         raise ValueError(f"{arguments.scene}: the law of its contact takes no surface")
     options: dict[str, Any] = {}
     for name in ("area", "L", "L_s"):
-        if (own := getattr(law, name, None)) is not None:
-            options[name] = own
+        if (law_value := getattr(law, name, None)) is not None:
+            options[name] = law_value
     for name in ("area", "L", "L_s", "n", "seeds"):
-        if (given := getattr(arguments, name)) is not None:
-            options[name] = given
+        if (argument := getattr(arguments, name)) is not None:
+            options[name] = argument
     if "area" not in options:
         raise ValueError("--area must be given: the law of the scene knows no nominal area")
     ends = [float(law.P) / 10, float(law.P) * 10]
@@ -64,7 +64,7 @@ def _run(arguments) -> int:
         raise ValueError(f"--points must be at least 2, got {arguments.points}")
     loads = np.geomspace(ends[0], ends[1], arguments.points)
     with output(arguments.out) as write:
-        found = compare_laws(
+        comparison = compare_laws(
             law.surface,
             law.material,
             loads,
@@ -73,7 +73,7 @@ def _run(arguments) -> int:
             **options,
             progress=not arguments.quiet,
         )
-        files = {"contact.png": picture(plot.laws(found))}
-        written = write(files | {"contact.csv": csv_text(*found.rows()).encode()})
-    print(f"{found!r}\n{written}")
+        files = {"contact.png": picture(plot.laws(comparison))}
+        written = write(files | {"contact.csv": csv_text(*comparison.rows()).encode()})
+    print(f"{comparison!r}\n{written}")
     return 0

@@ -105,15 +105,15 @@ def add_design(commands) -> None:
         "--repeat", type=Path, metavar="FILE", help="run again what a run.toml holds, nothing else"
     )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
-    kept = {"repeat", "quiet", "out", "area", "help"}  # beside --repeat
-    own = [action.dest for action in parser._actions if action.dest not in kept]
-    parser.set_defaults(run=_run, own=own)
+    allowed = {"repeat", "quiet", "out", "area", "help"}  # beside --repeat
+    design_options = [action.dest for action in parser._actions if action.dest not in allowed]
+    parser.set_defaults(run=_run, design_options=design_options)
 
 
 def _run(arguments) -> int:
     """Find the nearest design stable against small disturbances; write scene, run and pictures.
 
-    The files: design.toml, run.toml and history.csv. Of a scene with a fractal surface also
+    The files: design.toml, run.toml and history.csv. For a scene with a fractal surface also
     design.png, where D and G are designed, topographies.png with the surfaces before and after, and
     topography.npy with the heights of the designed one [m].
     """
@@ -129,12 +129,15 @@ def _run(arguments) -> int:
         options = _options(arguments)
         x = load_given(arguments.scene, True, options["bounds"], arguments.quiet)
     else:
-        given = [name for name in arguments.own if getattr(arguments, name) not in (None, False)]
-        if given:
-            raise ValueError(f"--repeat takes everything from its file, got {', '.join(given)} too")
+        names = arguments.design_options
+        conflicting = [name for name in names if getattr(arguments, name) not in (None, False)]
+        if conflicting:
+            raise ValueError(
+                f"--repeat takes everything from its file, got {', '.join(conflicting)} too"
+            )
         with remarks():
             x, options = read_design(arguments.repeat)
-    if arguments.area is not None:  # before the work, which an error at its end would lose
+    if arguments.area is not None:  # before the computation, which a late error would lose
         scalar("--area", arguments.area, above=0)
         if not isinstance(x, Scene) or not x.contact.has_surface:
             raise ValueError("--area needs a scene whose contact has a surface")
@@ -159,27 +162,27 @@ def _run(arguments) -> int:
             heights = [f"topography.npy: {side} x {side} heights in m, dx = {dx:g} m"]
         written = write(files)
     *table, promise = str(best).splitlines()
-    rests = [] if isinstance(x, Structure) else _verdict(x, best, arguments.area)
-    print("\n".join([*table, *_remarks(x, options), *rests, written, *heights, promise]))
+    verdict_lines = [] if isinstance(x, Structure) else _verdict(x, best, arguments.area)
+    print("\n".join([*table, *_remarks(x, options), *verdict_lines, written, *heights, promise]))
     return 1 if best.violated else 0
 
 
 def _verdict(x, best, area) -> list[str]:
-    """What the designed scene rests on; where no surface is quiet, what else makes x quiet."""
+    """The verdict on the designed scene; where no surface is quiet, what else makes x quiet."""
     from .._design.verdict import suggest, verdict
 
     keys = ("laws", "tolerance", "envelope", "friction_slope", "seed")
-    asked = {name: best.options[name] for name in keys}
-    found = verdict(best.scene, area=area, **asked)
-    lines = ["", *str(found).splitlines(), ""]
-    if found.incurable and best.violated:
-        cure = suggest(x, target=best.options["target"], friction_slope=asked["friction_slope"])
+    options = {name: best.options[name] for name in keys}
+    result = verdict(best.scene, area=area, **options)
+    lines = ["", *str(result).splitlines(), ""]
+    if result.incurable and best.violated:
+        cure = suggest(x, target=best.options["target"], friction_slope=options["friction_slope"])
         lines += [*str(cure).splitlines(), ""]
     return lines
 
 
 def _options(arguments) -> dict:
-    """The arguments of `design` that a command asks for."""
+    """The arguments of `design`, from those of the command line."""
     from .._design.statement import DEFAULT_BOUNDS
 
     options = {name: getattr(arguments, name) for name in _OPTIONS}
@@ -206,15 +209,15 @@ def _options(arguments) -> dict:
     return options
 
 
-def _tolerance(given: list[str]) -> Any:
-    """Standard deviations by name, or the file of them that `fractaljax identify` writes."""
+def _tolerance(texts: list[str]) -> Any:
+    """Standard deviations by name, or the errors in a file that `fractaljax identify` writes."""
     from .._design.design_file import read_tolerance
 
-    if len(given) == 1 and "=" not in given[0] and given[0].endswith(".toml"):
-        return read_tolerance(given[0])
+    if len(texts) == 1 and "=" not in texts[0] and texts[0].endswith(".toml"):
+        return read_tolerance(texts[0])
     return {
         f"ln {name[2:]}" if name.startswith("ln") else name: number("--tolerance", text)
-        for name, text in pairs_of("--tolerance", given, "NAME=SIGMA").items()
+        for name, text in pairs_of("--tolerance", texts, "NAME=SIGMA").items()
     }
 
 
@@ -225,28 +228,28 @@ def _constraints(arguments) -> list:
         raise ValueError("--sq-lengths needs --sq")
     more: dict = dict(zip(("L", "L_s"), arguments.sq_lengths or (1e-3, 1e-6), strict=True))
     more["friction_slope"] = not arguments.constant_friction
-    found = []
+    limits = []
     for name, (kind, _) in _LIMITS.items():
         text = getattr(arguments, name.replace("-", "_"))
         if text is None:
             continue
         low, _, high = text.partition(":")
-        asked = {"at_least": low, "at_most": high}
-        asked = {end: number(f"--{name}", x) if x else None for end, x in asked.items()}
+        ends = {"at_least": low, "at_most": high}
+        values = {end: number(f"--{name}", x) if x else None for end, x in ends.items()}
         law = getattr(constraints, kind)
         takes = inspect.signature(law).parameters
         for end, only in (
             ("at_most", "a lower limit only: LOW:"),
             ("at_least", "an upper limit only: :HIGH"),
         ):
-            if asked[end] is not None and end not in takes:
+            if values[end] is not None and end not in takes:
                 raise ValueError(f"--{name} has {only}")
-        found.append(law(**{key: x for key, x in (asked | more).items() if key in takes}))
-    return found
+        limits.append(law(**{key: x for key, x in (values | more).items() if key in takes}))
+    return limits
 
 
 def _remarks(x, options) -> list[str]:
-    """What `friction_remark` says of a scene, over its envelope."""
+    """The lines of `friction_remark` for a scene, over its envelope."""
     from .._design.envelope import Envelope
     from .._mechanism.quantities import replaced
     from .._mechanism.scene import Scene

@@ -6,7 +6,7 @@ from pathlib import Path
 from .output import output, picture
 from .parsing import add_out, envelope_of, load_given, pairs_of
 
-_MANY = 5  # warnings, with which a surface is not worth a design
+_MANY = 5  # warnings at which no scene is written
 _OPTIONS = {
     "--dx": {"type": float, "help": "step between heights [m], if not in the file"},
     "--dy": {"type": float, "help": "step across a map [m], if not in the file; default dx"},
@@ -79,72 +79,72 @@ def _run(arguments) -> int:
     if envelope is not None:
         envelope.check(base, ())
     names = ("dx", "dy", "unit", "position_unit", "channel")
-    given = {name: getattr(arguments, name) for name in names}
+    file_options = {name: getattr(arguments, name) for name in names}
     if arguments.columns is not None:
-        given["columns"] = pairs_of("--columns", arguments.columns, "ROLE=COLUMN")
-    read = read_measurement(arguments.file, **given)
-    given = {name: getattr(arguments, name) for name in ("resolution", "stylus_radius")}
+        file_options["columns"] = pairs_of("--columns", arguments.columns, "ROLE=COLUMN")
+    read = read_measurement(arguments.file, **file_options)
+    instrument = {name: getattr(arguments, name) for name in ("resolution", "stylus_radius")}
     with output(arguments.out) as write:
-        found = identify(
+        fit = identify(
             read.z,
             read.dx,
             read.dy,
             band=arguments.band,
             aliased=None if arguments.aliased is None else arguments.aliased == "yes",
             gamma=float(base.contact.surface.gamma),
-            **{name: getattr(read, name) if x is None else x for name, x in given.items()},
+            **{name: getattr(read, name) if x is None else x for name, x in instrument.items()},
         )
-        files, failure = {"identification.png": picture(plot.identification(found).figure)}, None
-        rests: list[str] = []
+        files, failure = {"identification.png": picture(plot.identification(fit).figure)}, None
+        joint_lines: list[str] = []
         try:
-            files["scene.toml"] = _scene_text(base, read, found, arguments.force).encode()
-            files["tolerance.toml"] = _tolerance_text(read, found).encode()
-            rests = _joint(base, found, arguments.area, envelope)
+            files["scene.toml"] = _scene_text(base, read, fit, arguments.force).encode()
+            files["tolerance.toml"] = _tolerance_text(read, fit).encode()
+            joint_lines = _joint(base, fit, arguments.area, envelope)
         except ValueError as error:
             failure = error
         written = write(files)
-    print("\n".join([read.source, read.description, "", str(found), "", *rests, written]))
+    print("\n".join([read.source, read.description, "", str(fit), "", *joint_lines, written]))
     path = arguments.out / "scene.toml"
     if failure is not None:
         if path.exists():
             print(f"{path} is from an earlier run")
         print(f"no scene: {failure}")
         return 1
-    print(f"next: fractaljax design {shlex.quote(str(path))}{_bounds(found)}")
+    print(f"next: fractaljax design {shlex.quote(str(path))}{_bounds(fit)}")
     return 0
 
 
-def _scene_text(base, read, found, force) -> str:
+def _scene_text(base, read, fit, force) -> str:
     """The scene with this surface, and its origin. **Raises:** `ValueError` if there is none."""
     from .._identify.warnings import DISQUALIFYING
 
-    for warning in found.warnings:
+    for warning in fit.warnings:
         if warning.startswith(DISQUALIFYING) and not force:
             raise ValueError(f"{warning} (--force writes one all the same)")
-    if len(found.warnings) >= _MANY and not force:
-        raise ValueError(f"{len(found.warnings)} warnings (--force writes one all the same)")
-    scene = base.replace(surface=found.surface)
+    if len(fit.warnings) >= _MANY and not force:
+        raise ValueError(f"{len(fit.warnings)} warnings (--force writes one all the same)")
+    scene = base.replace(surface=fit.surface)
     comments = [
         f"surface identified from {read.source}",
-        f"D = {found.D:.6g} with standard error {found.D_standard_error:.2g}",
-        f"G = {found.G:.6g} m, standard error of ln G {found.ln_G_standard_error:.2g}",
-        f"from {found.band[0]:.6g} to {found.band[1]:.6g} 1/m",
-        *found.warnings,
+        f"D = {fit.D:.6g} with standard error {fit.D_standard_error:.2g}",
+        f"G = {fit.G:.6g} m, standard error of ln G {fit.ln_G_standard_error:.2g}",
+        f"from {fit.band[0]:.6g} to {fit.band[1]:.6g} 1/m",
+        *fit.warnings,
     ]
     return "\n".join([*(f"# {' '.join(line.split())}" for line in comments), scene.to_toml()])
 
 
-def _tolerance_text(read, found) -> str:
+def _tolerance_text(read, fit) -> str:
     """The errors of D and ln G, for `fractaljax design --tolerance`."""
     from .._design.design_file import tolerance_text
     from .._design.tolerance import Tolerance
 
     source = " ".join(read.source.split())
-    return tolerance_text(Tolerance.of(found), f"errors of D and ln G identified from {source}")
+    return tolerance_text(Tolerance.of(fit), f"errors of D and ln G identified from {source}")
 
 
-def _joint(base, found, area, envelope) -> list[str]:
-    """The joint of the measured surface, with the errors of D and G, and what it rests on."""
+def _joint(base, fit, area, envelope) -> list[str]:
+    """The joint of the measured surface, with the errors from D and G, and its verdict."""
     import jax
     import jax.numpy as jnp
     import numpy as np
@@ -154,32 +154,32 @@ def _joint(base, found, area, envelope) -> list[str]:
     from .._mechanism.scene import stiffness
     from .._stability.stability import growth_rate
 
-    scene = base.replace(surface=found.surface)
+    scene = base.replace(surface=fit.surface)
 
     def joint(x):
-        moved = substituted(scene, {"D": x[0], "G": jnp.exp(x[1])})
-        return jnp.stack([*stiffness(moved), growth_rate(moved)])
+        varied = substituted(scene, {"D": x[0], "G": jnp.exp(x[1])})
+        return jnp.stack([*stiffness(varied), growth_rate(varied)])
 
-    at = jnp.stack([jnp.asarray(found.D), jnp.log(found.G)])
+    at = jnp.stack([jnp.asarray(fit.D), jnp.log(fit.G)])
     values, slopes = map(np.asarray, jax.jit(lambda x: (joint(x), jax.jacfwd(joint)(x)))(at))
-    errors = np.sqrt(np.einsum("ij,jk,ik->i", slopes, np.asarray(found.covariance), slopes))
+    errors = np.sqrt(np.einsum("ij,jk,ik->i", slopes, np.asarray(fit.covariance), slopes))
     names = ("K_n = {} N/m", "K_t = {} N/m", "growth rate {} 1/s")
     shown = zip(names, values, errors, strict=True)
     lines = [name.format(f"{value:.4g} +- {error:.2g}") for name, value, error in shown]
     try:
-        said = str(verdict(scene, tolerance=found, area=area, envelope=envelope))
+        verdict_text = str(verdict(scene, tolerance=fit, area=area, envelope=envelope))
     except ValueError as error:  # errors so large that they leave the domain of the model
-        said = f"no verdict: {error}"
-    return [", ".join(lines), "", *said.splitlines(), ""]
+        verdict_text = f"no verdict: {error}"
+    return [", ".join(lines), "", *verdict_text.splitlines(), ""]
 
 
-def _bounds(found) -> str:
-    """Options of `design` where its default bounds leave the surface out."""
+def _bounds(fit) -> str:
+    """Bounds on D and G for `design`, where its default bounds leave the surface out."""
     from .._design.statement import DEFAULT_BOUNDS
 
     ranges = {
-        "D": (found.D, max(found.D - 0.1, 1 + found.D / 2), min(found.D + 0.1, 1.5 + found.D / 2)),
-        "G": (found.G, found.G / 10, found.G * 10),
+        "D": (fit.D, max(fit.D - 0.1, 1 + fit.D / 2), min(fit.D + 0.1, 1.5 + fit.D / 2)),
+        "G": (fit.G, fit.G / 10, fit.G * 10),
     }
     return "".join(
         f" --{name} {low:.6g} {high:.6g}"

@@ -1,4 +1,4 @@
-"""`fractaljax map`: where a mechanism is quiet, squeals, or does as it was kicked."""
+"""`fractaljax map`: where a mechanism is quiet, squeals, or does what the kick decides."""
 
 from typing import Any
 
@@ -36,7 +36,7 @@ def add_map(commands) -> None:
 def _run(arguments) -> int:
     """Trace the stability boundary and the boundaries of the limit cycles in two quantities.
 
-    Of a scene, or of a structure. Writes map.png and map.csv, with a row for each point of a curve.
+    Takes a scene or a structure. Writes map.png and map.csv, a row for each point of a curve.
     """
     from .. import plot
     from .._dynamics.bifurcation import bifurcation_map
@@ -49,39 +49,39 @@ def _run(arguments) -> int:
     if arguments.starts is not None:
         options["starts"] = arguments.starts
     with output(arguments.out) as write:
-        found = bifurcation_map(x, *windows, **options, progress=not arguments.quiet)
-        figure = picture(plot.bifurcation_map(found).figure)
-        written = write({"map.png": figure, "map.csv": _text(found).encode()})
-    print(f"{found!r}\n{written}")
+        bifurcations = bifurcation_map(x, *windows, **options, progress=not arguments.quiet)
+        figure = picture(plot.bifurcation_map(bifurcations).figure)
+        written = write({"map.png": figure, "map.csv": _text(bifurcations).encode()})
+    print(f"{bifurcations!r}\n{written}")
     return 0
 
 
 def _window(x, which: str, text: str | None) -> tuple[str, float, float]:
-    """A quantity and its window; by default around the fractal dimension or the roughness."""
+    """A quantity and its window; by default around the value of D or G."""
     from .._mechanism.quantities import known_quantities, value_of
 
     if text is None:
         name = {"x": "D", "y": "G"}[which]
         if name not in known_quantities(x):
             raise ValueError(f"--{which} must be {_FORM}: the scene has no {name}")
-        own, (low, high) = float(value_of(x, name)), _AROUND[name]
+        value, (low, high) = float(value_of(x, name)), _AROUND[name]
         if name == "G":
-            return name, own * low, own * high
-        return name, max(2.001, own + low), min(2.999, own + high)
+            return name, value * low, value * high
+        return name, max(2.001, value + low), min(2.999, value + high)
     ((name, window),) = windows_of(f"--{which}", [text], _FORM).items()
     return name, *window
 
 
-def _text(found) -> str:
+def _text(bifurcations) -> str:
     """The curves as a table; a Hopf point has the period of its critical mode and no amplitude."""
-    n = max((curve.amplitude.shape[1] for curve in found.curves), default=0)
+    n = max((curve.amplitude.shape[1] for curve in bifurcations.curves), default=0)
     amplitudes = [f"peak to peak of x{i + 1} [m]" for i in range(n)]
     rows = []
-    for k, branch in enumerate(found.boundary.branches):
+    for k, branch in enumerate(bifurcations.boundary.branches):
         for x, y, f in zip(branch.x, branch.y, branch.frequency, strict=True):
             rows.append([k + 1, "Hopf", x, y, 1 / f if f else "", *[0.0] * n])
-    for k, curve in enumerate(found.curves, len(found.boundary.branches)):
+    for k, curve in enumerate(bifurcations.curves, len(bifurcations.boundary.branches)):
         for row in zip(curve.x, curve.y, curve.period, curve.amplitude, strict=True):
             rows.append([k + 1, curve.kind, *row[:3], *row[3]])
-    titles = ["curve", "kind", found.x[0], found.y[0], "period [s]", *amplitudes]
+    titles = ["curve", "kind", bifurcations.x[0], bifurcations.y[0], "period [s]", *amplitudes]
     return csv_text(titles, rows)

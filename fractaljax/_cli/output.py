@@ -22,11 +22,11 @@ def output(folder: Path) -> Iterator[Callable[[Mapping[str, bytes]], str]]:
     def write(files):
         with _made(folder):
             replaced = write_together({folder / name: files[name] for name in files})
-        said = f"written to {folder}: {', '.join(files)}"
+        line = f"written to {folder}: {', '.join(files)}"
         if not replaced:
-            return said
+            return line
         names = "all" if len(replaced) == len(files) else ", ".join(p.name for p in replaced)
-        return f"{said} ({names} replaced)"
+        return f"{line} ({names} replaced)"
 
     with _made(folder), tempfile.TemporaryFile(dir=folder):
         pass

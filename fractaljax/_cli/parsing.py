@@ -25,23 +25,23 @@ class Version(argparse.Action):
 
 
 class _Once(argparse.Action):
-    """Stores a value, and refuses a second one."""
+    """Store a value, and refuse a second one."""
 
-    given = False
+    stored = False
 
     def __call__(self, parser, namespace, values, option_string=None):
-        if self.given:
+        if self.stored:
             raise argparse.ArgumentError(self, "given more than once")
-        self.given = True
+        self.stored = True
         setattr(namespace, self.dest, values)
 
 
 class _Help(argparse.HelpFormatter):
-    """Shows a whole number as N and any other as X."""
+    """Show a whole number as N and any other as X."""
 
     def _get_default_metavar_for_optional(self, action):
-        own = super()._get_default_metavar_for_optional(action)
-        return {int: "N", float: "X"}.get(action.type, own)  # pyright: ignore[reportArgumentType]
+        default = super()._get_default_metavar_for_optional(action)
+        return {int: "N", float: "X"}.get(action.type, default)  # pyright: ignore[reportArgumentType]
 
 
 class Parser(argparse.ArgumentParser):
@@ -65,7 +65,7 @@ def add_out(parser, folder: str) -> None:
 
 
 def refuse(message: str) -> None:
-    """One line on standard error, and exit status 2."""
+    """Print one line on standard error and exit with status 2."""
     print(f"fractaljax: {' '.join(message.split())}", file=sys.stderr)
     raise SystemExit(2)
 
@@ -99,7 +99,7 @@ def reason(error: Exception) -> str | None:
 
 @contextlib.contextmanager
 def remarks():
-    """Warnings as lines on standard error."""
+    """Print warnings as lines on standard error."""
     with warnings.catch_warnings():
         warnings.simplefilter("always")
         warnings.showwarning = lambda message, *_, **__: print(
@@ -109,14 +109,14 @@ def remarks():
 
 
 def add_scene_file(parser) -> None:
-    """The optional argument `scene`."""
+    """Add the optional argument `scene`."""
     parser.add_argument(
         "scene", nargs="?", type=Path, help="a scene file; else the reference brake"
     )
 
 
 def add_constant_friction(parser) -> None:
-    """The option `--constant-friction`."""
+    """Add the option `--constant-friction`."""
     parser.add_argument(
         "--constant-friction",
         action="store_true",
@@ -130,10 +130,10 @@ def load_given(
     over: Mapping[str, Sequence[float]] | None = None,
     quiet: bool = False,
 ) -> Any:
-    """The scene, or also a structure, in the file that is given; else the reference brake.
+    """The scene in a file, with `structures` also a structure; without a file the reference brake.
 
-    A large sparse structure is reduced as the table [reduction] of its file says, and `over`
-    ranges of quantities besides.
+    A large sparse structure is reduced as the table [reduction] of its file says, also over the
+    ranges of quantities in `over`.
 
     **Raises:** `ValueError` if it has no such table.
     """
@@ -141,29 +141,29 @@ def load_given(
 
     if path is None:
         return brake_scene()
-    found = load_noted(path) if structures else Scene.load(path)
-    if isinstance(found, Scene) or not found.is_sparse:
-        return found
+    mechanism = load_noted(path) if structures else Scene.load(path)
+    if isinstance(mechanism, Scene) or not mechanism.is_sparse:
+        return mechanism
     from .._stability.reduction import reduce
 
-    wanted = reduction_of(path)
-    if "band" not in wanted:
+    options = reduction_of(path)
+    if "band" not in options:
         raise ValueError(
-            f"{path}: {found.n} degrees of freedom need a reduction: run `fractaljax reduce`, or "
-            "add a table [reduction] with band = [low, high] in rad/s"
+            f"{path}: {mechanism.n} degrees of freedom need a reduction: run `fractaljax reduce`, "
+            "or add a table [reduction] with band = [low, high] in rad/s"
         )
-    wanted["over"] = wanted.get("over", {}) | dict(over or {})
-    return reduce(found, **wanted, progress=not quiet)
+    options["over"] = options.get("over", {}) | dict(over or {})
+    return reduce(mechanism, **options, progress=not quiet)
 
 
 def load_noted(path: Path) -> Any:
-    """The scene or structure in a file, whose notes go to standard error."""
+    """The scene or structure in a file; its notes are printed on standard error."""
     from .._mechanism.structure import load
 
-    found = load(path)
-    for note in getattr(found, "notes", ()):
+    mechanism = load(path)
+    for note in getattr(mechanism, "notes", ()):
         print(f"fractaljax: {note}", file=sys.stderr)
-    return found
+    return mechanism
 
 
 def reduction_of(path: Path) -> dict[str, Any]:
@@ -184,20 +184,20 @@ def reduction_of(path: Path) -> dict[str, Any]:
 
 
 def pairs_of(option: str, texts: list[str], form: str) -> dict[str, str]:
-    """Several NAME=VALUE by name; `form` is how the message writes one."""
-    found = {}
+    """The values of several NAME=VALUE by name; an error message shows the `form` of one."""
+    pairs = {}
     for text in texts:
         name, _, value = text.partition("=")
         if not (name and value):
             raise ValueError(f"{option} must be {form}, got {text!r}")
-        if name in found:
+        if name in pairs:
             raise ValueError(f"{option} has {name} more than once")
-        found[name] = value
-    return found
+        pairs[name] = value
+    return pairs
 
 
 def number(option: str, text: str) -> float:
-    """The number that `option` was given as a text."""
+    """The number in the text of an option."""
     try:
         return float(text)
     except ValueError:
@@ -205,7 +205,7 @@ def number(option: str, text: str) -> float:
 
 
 def numbers(option: str, text: str, separator: str) -> list[float]:
-    """The numbers that `option` was given as one text."""
+    """The numbers in the text of an option."""
     return [number(option, value) for value in text.split(separator)]
 
 
@@ -225,14 +225,14 @@ def envelope_of(texts: list[str]) -> Any:
 
 
 def windows_of(option: str, texts: list[str], form: str) -> dict[str, tuple[float, float]]:
-    """Several NAME=LOW:HIGH by name; `form` is how the message writes one."""
-    found = {}
+    """The windows of several NAME=LOW:HIGH by name; an error message shows the `form` of one."""
+    windows = {}
     for name, ends in pairs_of(option, texts, form).items():
         window = numbers(f"{option} {name}", ends, ":")
         if len(window) != 2:
             raise ValueError(f"{option} must be {form}, got '{name}={ends}'")
-        found[name] = (window[0], window[1])
-    return found
+        windows[name] = (window[0], window[1])
+    return windows
 
 
 def kick_size(option: str, text: str) -> float | list[float]:

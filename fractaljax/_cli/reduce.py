@@ -53,9 +53,9 @@ def _run(arguments) -> int:
     if arguments.tol is not None:
         options["tol"] = arguments.tol
     if arguments.over is not None:
-        given = pairs_of("--over", arguments.over, _FORM)
+        ranges = pairs_of("--over", arguments.over, _FORM)
         options["over"] = {
-            name: numbers(f"--over {name}", text, ":") for name, text in given.items()
+            name: numbers(f"--over {name}", text, ":") for name, text in ranges.items()
         }
     if "band" not in options:
         raise ValueError("--band must be LOW:HIGH in rad/s: the file has no table [reduction]")
@@ -66,13 +66,15 @@ def _run(arguments) -> int:
         reduced = reduce(structure, **options, progress=not arguments.quiet)
         files = reduced._files(arguments.out / _FILE)
         written = write({path.name: content for path, content in files.items()})
-    of = reduced.reduction
+    reduction = reduced.reduction
     rows = {
         "degrees of freedom": f"{reduced.n} of {structure.n}",
-        "band [rad/s]": f"{of.band[0]:g} to {of.band[1]:g}",
-        **{f"over {name}": f"{low:g} to {high:g}" for name, (low, high) in of.over.items()},
-        "largest error, of |s|": f"{of.error:.2g}",
-        "points with eigenvectors": f"{len(of.points)}",
+        "band [rad/s]": f"{reduction.band[0]:g} to {reduction.band[1]:g}",
+        **{f"over {name}": f"{low:g} to {high:g}" for name, (low, high) in reduction.over.items()},
+        "largest error, of |s|": f"{reduction.error:.2g}",
+        "points with eigenvectors": f"{len(reduction.points)}",
     }
-    print(f"{table([''], [rows])}\n\n{structure_table(reduced, of.friction_slope)}\n{written}")
+    print(
+        f"{table([''], [rows])}\n\n{structure_table(reduced, reduction.friction_slope)}\n{written}"
+    )
     return 0

@@ -30,18 +30,18 @@ def _run(arguments) -> int:
     from .._validate.validate import validate
 
     if arguments.out is None:
-        found = validate(*arguments.cases, progress=not arguments.quiet)
-        print(found)
-        return 0 if found.agrees else 1
+        validation = validate(*arguments.cases, progress=not arguments.quiet)
+        print(validation)
+        return 0 if validation.agrees else 1
     from .. import plot
 
     with output(arguments.out) as write:
-        found = validate(*arguments.cases, progress=not arguments.quiet)
+        validation = validate(*arguments.cases, progress=not arguments.quiet)
         files = {
             f"{name}.png": picture(plot.validation(case))
-            for name, case in found.cases.items()
+            for name, case in validation.cases.items()
             if case.panels
         }
-        written = write(files | {"validation.csv": csv_text(*found.rows()).encode()})
-    print(f"{found!r}\n{written}")
-    return 0 if found.agrees else 1
+        written = write(files | {"validation.csv": csv_text(*validation.rows()).encode()})
+    print(f"{validation!r}\n{written}")
+    return 0 if validation.agrees else 1

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
 
 _LIMIT = 500.0  # MB of frames in a page
-_SIGNS = {  # of matplotlib's buttons, in place of a font from the network
+_SIGNS = {  # on matplotlib's buttons, instead of a font from the network
     "minus": "-",
     "fast-backward": "⏮",
     "step-backward": "⏪",
@@ -28,7 +28,7 @@ _SIGNS = {  # of matplotlib's buttons, in place of a font from the network
 
 
 def animation_path(path: str | os.PathLike | None) -> Path | None:
-    """**Raises:** `ValueError` for another ending than .gif and .html."""
+    """A `Path`, or None. **Raises:** `ValueError` unless it ends in .gif or .html."""
     path = None if path is None else Path(path)
     if path is not None and path.suffix not in (".gif", ".html"):
         raise ValueError(f"path must end in .gif or .html, got {str(path)!r}")
@@ -38,7 +38,7 @@ def animation_path(path: str | os.PathLike | None) -> Path | None:
 def animated(
     figure: Figure, draw: Callable[[float], Any], frames: int, fps: int, path: Path | None
 ) -> "FuncAnimation":
-    """A period in motion: `draw` takes shares of it from 0 on. With a path also as a file."""
+    """An animated period, of which `draw` takes shares from 0 on; with a path also a file."""
     from matplotlib.animation import FuncAnimation, PillowWriter
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 

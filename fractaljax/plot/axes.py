@@ -1,4 +1,4 @@
-"""What the pictures share: figures, legends, lines, and axes with the name of a quantity."""
+"""Parts that the pictures share: figures, legends, lines, and axes that show a quantity."""
 
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -22,25 +22,25 @@ DIRECTIONS = "along the belt", "normal to the belt"
 
 
 def new_figure(width: float = 8.4, height: float = 6.4) -> Figure:
-    """A figure outside pyplot, for axes of one's own; a notebook shows it. Sizes in inches."""
+    """A figure outside pyplot to add axes to; a notebook shows it. Sizes are in inches."""
     from .figure import Figure
 
     return Figure((width, height))
 
 
 def given_or_new(ax: Axes | None) -> Axes:
-    """The axes that were given, or those of a new figure."""
+    """The axes `ax`, or those of a new figure."""
     return new_figure().add_subplot() if ax is None else ax
 
 
 def legend_above(ax: Axes, handles: Iterable[Artist]) -> None:
-    """The legend above the axes, where it hides nothing."""
+    """Put the legend above the axes, where it hides nothing."""
     place: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.01)}
     ax.legend(handles=list(handles), ncols=3, fontsize="small", frameon=False, **place)
 
 
 def lines(ax: Axes, x: np.ndarray, rows: Iterable[np.ndarray], names: Sequence[str]) -> list[Any]:
-    """A colour and style for each of the rows (n,) or (n, k) over x; the first line of each."""
+    """Draw rows (n,) or (n, k) over x, each in its colour and style; the first line of each."""
     import matplotlib as mpl
 
     colours = mpl.colormaps["viridis"](np.linspace(0, 0.85, len(names)))
@@ -59,7 +59,7 @@ def value_of(x: Any, name: str, value: float) -> str:
 
 
 def over_quantity(ax: Axes, which: str, x: Any, name: str, values: np.ndarray) -> None:
-    """Limits, scale and label of the "x" or "y" axis over the values (n,) of a quantity of x."""
+    """Set limits, scale and label of the "x" or "y" axis for values (n,) of a quantity of x."""
     scale = "log" if geometric(values) else "linear"
     ax.set(**{f"{which}scale": scale, f"{which}label": label(x, name)})
     if values[0] != values[-1]:
@@ -67,7 +67,7 @@ def over_quantity(ax: Axes, which: str, x: Any, name: str, values: np.ndarray) -
 
 
 def geometric(values: Float[np.ndarray, " n"]) -> bool:
-    """Whether values are spaced evenly in the logarithm rather than as they are."""
+    """True if values are spaced evenly in the logarithm rather than linearly."""
     low, high = values.min(), values.max()
     return bool(low > 0 and np.median(values) < (np.sqrt(low * high) + (low + high) / 2) / 2)
 
@@ -78,10 +78,10 @@ def frequency_unit(frequencies: Any) -> tuple[float, str]:
 
 
 class Coordinate(NamedTuple):
-    """What a picture shows of a motion: a displacement row @ x."""
+    """The displacement row @ x that a picture shows."""
 
     row: Float[np.ndarray, " n"]
-    face: int | None  # that slides along it, from 0
+    face: int | None  # index from 0 of the face that slides along it
     symbol: str  # of the displacement
     rate: str  # of its velocity
     meaning: str  # ", " and words, or ""
@@ -90,19 +90,19 @@ class Coordinate(NamedTuple):
 def coordinate(
     system: HybridSystem, direction: int, joint: int | None, times: jax.Array, batch: int
 ) -> Coordinate:
-    """A degree of freedom or t.x of a joint, both from 1, of a motion with `batch` axes.
+    """A degree of freedom or t.x of a joint, both from 1; one motion has `times` of `batch` axes.
 
-    **Raises:** `ValueError` for one that is not there, and for a batch of motions.
+    **Raises:** `ValueError` for an unknown number, and for a batch of motions.
     """
     if times.ndim != batch:
         raise ValueError("a picture shows one motion: index the batch first")
     n = system.n - system.excited
-    name, given, most = "direction", direction, n
+    name, number, most = "direction", direction, n
     if joint is not None:
-        name, given, most = "joint", joint, len(system.faces)
-    if given not in range(1, most + 1):
-        wanted = "1" if most == 1 else "1 or 2" if most == 2 else f"from 1 to {most}"
-        raise ValueError(f"{name} must be {wanted}, got {given!r}")
+        name, number, most = "joint", joint, len(system.faces)
+    if number not in range(1, most + 1):
+        allowed = "1" if most == 1 else "1 or 2" if most == 2 else f"from 1 to {most}"
+        raise ValueError(f"{name} must be {allowed}, got {number!r}")
     rows = np.eye(n) if system.T is None else np.asarray(system.T)[:, :n]
     if joint is not None:
         face = system.faces[joint - 1][0]

@@ -1,4 +1,4 @@
-"""Which motion each start of a two-dimensional section ends in."""
+"""The motion that each start of a two-dimensional section ends in."""
 
 from typing import Any
 
@@ -13,10 +13,10 @@ _COLOURS = {"equilibrium": "#c6dbef", "diverges": "0.25", "undecided": "#d62728"
 
 
 def basin(result: Basin, ax: Axes | None = None) -> Axes:
-    """The outcomes of a section as areas: each point has that of the nearest start.
+    """The outcomes of a section as areas: each point has the outcome of the nearest start.
 
-    For starts that differ in two coordinates only, as in a box with all others fixed.
-    Displacements are in um, in m where one is above 1 cm; velocities are in m/s.
+    The starts differ in two coordinates only, as in a box with all others fixed.
+    Displacements are in um, or in m if one is above 1 cm; velocities are in m/s.
 
     **Raises:** `ValueError` unless exactly two coordinates differ.
     """
@@ -26,13 +26,15 @@ def basin(result: Basin, ax: Axes | None = None) -> Axes:
     from scipy.spatial import KDTree
 
     starts = result.starts
-    moved = np.flatnonzero(np.ptp(starts, axis=0) > 0)
-    if len(moved) != 2:
-        raise ValueError(f"a picture needs starts that differ in 2 coordinates, got {len(moved)}")
+    coordinates = np.flatnonzero(np.ptp(starts, axis=0) > 0)
+    if len(coordinates) != 2:
+        raise ValueError(
+            f"a picture needs starts that differ in 2 coordinates, got {len(coordinates)}"
+        )
     ax, n = given_or_new(ax), starts.shape[1] // 2
     small = np.abs(starts[:, :n]).max() < _SMALL
-    unit = np.where((moved < n) & small, 1e6, 1)
-    points = starts[:, moved] * unit
+    unit = np.where((coordinates < n) & small, 1e6, 1)
+    points = starts[:, coordinates] * unit
     low, high = points.min(axis=0), points.max(axis=0)
     x, y = (low + (high - low) * ((np.arange(_PIXELS) + 0.5) / _PIXELS)[:, None]).T
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
@@ -50,7 +52,7 @@ def basin(result: Basin, ax: Axes | None = None) -> Axes:
         for name, colour in zip(names, colours, strict=True)
         if shares[name]
     ]
-    for which, i in zip("xy", moved.tolist(), strict=True):
+    for which, i in zip("xy", coordinates.tolist(), strict=True):
         name = f"x{i + 1} [{'µm' if small else 'm'}]" if i < n else f"dx{i - n + 1}/dt [m/s]"
         ax.set(**{f"{which}label": name})
     legend_above(ax, handles)

@@ -1,4 +1,4 @@
-"""Where a mechanism is quiet, squeals, or does as it was kicked, over two quantities."""
+"""Where a mechanism is quiet, squeals, or does what the kick decides, over two quantities."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from .._stability.stability import growth_rate
 from .._sweep.sweep import sweep
 from .axes import Axes, given_or_new, legend_above, over_quantity
 
-_POINTS = 160  # a side
+_POINTS = 160  # per axis
 _STYLES: dict[str, tuple[str, str]] = {
     "fold": ("tab:blue", "solid"),
     "grazing": ("tab:green", "dashed"),
@@ -23,8 +23,8 @@ _STYLES: dict[str, tuple[str, str]] = {
 def bifurcation_map(result: BifurcationMap, ax: Axes | None = None) -> Axes:
     """The curves of a map, with ticks towards the stable cycles; a star is the mechanism.
 
-    Where small disturbances grow is shaded. Elsewhere it is quiet where there are no stable cycles,
-    and does as it was kicked where there are.
+    The region where small disturbances grow is shaded. Elsewhere the mechanism is quiet if there
+    are no stable cycles, and the kick decides if there are.
     """
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch

@@ -15,7 +15,7 @@ _MARKERS = {
     "Neimark-Sacker": "v",
     "order of switches": "x",
 }
-_UNITS = (1e6, "µm"), (1e3, "mm"), (1.0, "m")  # the first of at most thousands
+_UNITS = (1e6, "µm"), (1e3, "mm"), (1.0, "m")  # the first in which all values are below 1000
 
 
 def branch(
@@ -24,9 +24,9 @@ def branch(
     """Peak-to-peak amplitude of one degree of freedom over the quantity of a branch.
 
     Stable cycles are solid, unstable ones dashed; markers are the branch's events. `direction` is
-    the degree of freedom, from 1; `label` is that of the abscissa.
+    the degree of freedom, from 1; `label` names the abscissa.
 
-    **Raises:** `ValueError` for a degree of freedom that there is not.
+    **Raises:** `ValueError` for an unknown degree of freedom.
     """
     n = result.amplitude.shape[1]
     if not 1 <= direction <= n:

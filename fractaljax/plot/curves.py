@@ -53,12 +53,12 @@ def stiffness_curves(
     if stiffness not in _STIFFNESS:
         raise ValueError(f"stiffness must be 'K_n' or 'K_t', got {stiffness!r}")
     ax = given_or_new(ax)
-    found = result.values
-    if isinstance(found, tuple):
-        found = found[list(_STIFFNESS).index(stiffness)]
+    measured = result.values
+    if isinstance(measured, tuple):
+        component = measured[list(_STIFFNESS).index(stiffness)]
     else:
-        found = getattr(found, stiffness)
-    values = np.where(np.asarray(found) > 0, found, np.nan)
+        component = getattr(measured, stiffness)
+    values = np.where(np.asarray(component) > 0, component, np.nan)
     handles, marks = _draw(result, values, ax), {}
     for line, place, (marker, words) in _changes(result, handles):
         style: dict[str, Any] = {"mfc": "white", "ms": 6, "ls": "none", "zorder": 3}
@@ -85,7 +85,7 @@ def stiffness(result: Sweep) -> Figure:
 
 
 def _draw(result, values, ax):
-    """The lines of values (n,) or (n, m), on the axis of the first quantity."""
+    """Draw values (n,) or (n, m) over the first quantity; the lines."""
     x, *others = result.points
     names = [value_of(result.scene, result.names[1], y) for y in others[0]] if others else [""]
     over_quantity(ax, "x", result.scene, result.names[0], x)
@@ -93,7 +93,7 @@ def _draw(result, values, ax):
 
 
 def _changes(result, drawn):
-    """Line, place and mark of the last stiff point before a regime begins or after it ends."""
+    """Yield line, place and mark of the last stiff point before a regime or the first after it."""
     regime = getattr(result.values, "regime", None)
     if regime is None:
         return

@@ -89,11 +89,11 @@ def cycle(result: LimitCycle) -> Figure:
 
 
 def _sticking(cycle, face):
-    """Times [s] at which each sticking begins and ends; the last may end in the next period."""
+    """Yield times [s] at which sticking begins and ends; the last may end in the next period."""
     if cycle.regularisation_error != 0:  # the regularised law creeps instead
         return
-    own = [switch for switch in cycle.switches() if switch.direction == face + 1]
-    for switch, following in zip(own, own[1:] + own[:1], strict=True):
+    switches = [switch for switch in cycle.switches() if switch.direction == face + 1]
+    for switch, following in zip(switches, switches[1:] + switches[:1], strict=True):
         if switch.after == "stick":
             yield switch.time, following.time
 

@@ -11,7 +11,7 @@ from .axes import Axes, Figure, given_or_new, legend_above, new_figure
 from .cycle import phase_portrait, spectrum
 
 _TANGENTS = 6
-_TANGENT = 0.09  # half its length, as a share of the axis
+_TANGENT = 0.09  # half the length of one, as a share of the axis
 
 
 def cycles(
@@ -22,7 +22,7 @@ def cycles(
     The keys name the rows, and all rows have the same axes. The displacement is that of
     `phase_portrait`.
 
-    **Raises:** `ValueError` for none, and as `phase_portrait`.
+    **Raises:** `ValueError` if there are no cycles, and as `phase_portrait`.
     """
     if not results:
         raise ValueError("there must be at least one limit cycle to draw")
@@ -39,7 +39,7 @@ def cycles(
             low, high = np.transpose([getattr(ax, f"get_{which}lim")() for ax in column])
             for ax in column:
                 ax.set(**{f"{which}lim": (low.min(), high.max())})
-    for ax in spectra:  # their stems stand on the common axis
+    for ax in spectra:  # stems start from the common lower limit
         (stems,) = ax.collections
         bottom, _ = ax.get_ylim()
         stems.set_segments([[(f, bottom), (f, a)] for (f, _), (_, a) in stems.get_segments()])
@@ -54,13 +54,13 @@ def amplitudes(
     label: str,
     slopes: ArrayLike | None = None,
 ) -> Axes:
-    """Peak-to-peak amplitudes [um] of a batch of cycles over a quantity, of all directions.
+    """Peak-to-peak amplitudes [um] of all directions over a quantity, for a batch of cycles.
 
     `over` (n,) are the values of the quantity, `label` its name with its unit, and `slopes` (n,)
-    the derivative of the amplitude of direction 1 by it [m per unit], drawn as some tangents.
-    Gaps are members without a cycle.
+    the derivative of the amplitude of direction 1 with respect to it [m per unit], drawn as a few
+    tangents. Gaps are members without a cycle.
 
-    **Raises:** `ValueError` for another batch than `over` (n,) says, or slopes of another shape.
+    **Raises:** `ValueError` for a batch or slopes whose shape is not that of `over` (n,).
     """
     x = np.asarray(over, float)
     if x.ndim != 1 or results.period.shape != x.shape:

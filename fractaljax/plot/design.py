@@ -17,7 +17,7 @@ from .._sweep.sweep import sweep
 from .axes import Axes, given_or_new, legend_above, over_quantity
 from .maps import regime_of, shade_regimes, shade_unsteady
 
-_POINTS = 240  # a side
+_POINTS = 240  # per axis
 _WINDOW = {"D": (2.1, 2.9), "G": (1e-12, 1e-8)}
 _DECADES = 4  # of growth rates, from the largest down
 
@@ -33,7 +33,7 @@ def stability_map(
 ) -> Axes:
     """Growth rate [1/s] over the first two quantities of `bounds`, by default D and G [m].
 
-    With the stability boundary and, of a fractal contact, its regimes. `target` [1/s] and
+    It shows the stability boundary and the regimes of a fractal contact. `target` [1/s] and
     `K_n_min` [N/m] add the lines of these limits.
 
     **Raises:** `ValueError` for a quantity that the scene does not have.
@@ -58,7 +58,7 @@ def stability_map(
     inelastic = (
         np.asarray(regime != Regime.elastic_plastic) if fractal else np.zeros_like(K_n, bool)
     )
-    # Outside the elastic-plastic regime a growth rate is that of another mechanism.
+    # Outside the elastic-plastic regime the growth rate belongs to another mechanism.
     none = np.isnan(growth)
     valid = np.ma.masked_where(inelastic | none, growth)
     if valid.count() and valid.max() > 0:
@@ -99,9 +99,9 @@ def design(result: Design, ax: Axes | None = None) -> Axes:
         (result.initial, "o", 6, "white", "given surface"),
         (result.scene, "*", 11, "tab:cyan", final),
     ):
-        own: Any = own_quantities(scene)
+        quantities: Any = own_quantities(scene)
         style: dict[str, Any] = {"ms": size, "mfc": colour, "mec": "k", "ls": "none", "zorder": 5}
-        at = [[float(own[name].value)] for name in names]
+        at = [[float(quantities[name].value)] for name in names]
         handles += ax.plot(*at, marker, label=words, clip_on=False, **style)
     old: Any = ax.get_legend()
     legend_above(ax, [*old.legend_handles, *handles])

@@ -1,4 +1,4 @@
-"""The designs of a family of mechanisms over what tells its members apart."""
+"""The designs of a family of mechanisms over the quantities that differ between its members."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from .._design.many import DesignMany
 from .._mechanism.quantities import label, own_quantities, require_known
 from .axes import Axes, given_or_new, legend_above
 
-_DIMENSIONS = 2  # of a grid that is drawn as one
+_DIMENSIONS = 2  # of a grid that is drawn as a map
 
 
 def design_map(
@@ -25,7 +25,7 @@ def design_map(
     mechanisms; `quantity`, a designed one, by default the first. Over two quantities it is a map of
     a grid of members, or points; over one a line. Members without a design are crosses.
 
-    **Raises:** `ValueError` for a name that there is not.
+    **Raises:** `ValueError` for an unknown name.
     """
     quantity = next(iter(designs.quantities)) if quantity is None else quantity
     if quantity not in designs.quantities:
@@ -34,8 +34,8 @@ def design_map(
         require_known(designs.member, name)
     ax, met = given_or_new(ax), np.asarray(designs.met)
     values = np.where(met, designs[quantity], np.nan)
-    words, own = label(designs.member, quantity), own_quantities(designs.member)
-    scale = quantity in own and own[quantity].log
+    words, quantities = label(designs.member, quantity), own_quantities(designs.member)
+    scale = quantity in quantities and quantities[quantity].log
     axes: list[np.ndarray] = [designs.given(name) for name in ((x,) if y is None else (x, y))]
     if y is None:
         order = np.argsort(axes[0], axis=None)

@@ -18,10 +18,10 @@ def distribution(
     """The share [-] of each set of samples (n,) that lies below every value, a line for each.
 
     `label` names the quantity with its unit, the keys name the sets, and `limit` is a value to
-    mark: of growth rates at 0, one minus the share is the probability of squeal.
+    mark: for growth rates at 0, one minus the share is the probability of squeal.
 
-    **Raises:** `ValueError` for none, a set that is empty or not of shape (n,), and values that are
-    not finite.
+    **Raises:** `ValueError` if there are no sets, for a set that is empty or not of shape (n,), and
+    for values that are not finite.
     """
     if not samples:
         raise ValueError("there must be at least one set of samples to draw")

@@ -1,4 +1,4 @@
-"""A page to play with: sliders over the quantities of a scene, in one file that needs no network.
+"""A page with sliders over the quantities of a scene, in one file that needs no network.
 
 Growth rate, frequency, mode and stiffness are computed in the browser, by the program of the
 package translated to JavaScript. Limit cycles are computed here, on a grid.
@@ -52,13 +52,13 @@ from .maps import regime_of
 
 _AROUND = {"D": (-0.05, 0.05), "G": (0.5, 2.0), "P": (0.5, 2.0), "mu": (0.5, 1.5)}
 _AROUND |= {"K_n": (0.5, 2.0), "K_t/K_n": (0.5, 1.5)}  # added to D, else factors
-_STOPS = 120  # of a slider, or a few more
+_STOPS = 120  # positions of a slider, or a few more
 WAVELENGTHS = 1e-3, 1e-6  # [m], of Sq; the surface is drawn over the longest
 _PIXELS, _DIRECTIONS = 96, 10  # of the picture of the surface
 _SAMPLES = 96  # of one period of a limit cycle
 _BATCH, _MOST_RETURNS = 32, 500
 _NODES = 13, 5, 3  # of limit cycles over the first quantity, the second, and each of the others
-_MAP, _LONG = (150, 75), 1000  # points of the map along a side; lines from where there are fewer
+_MAP, _LONG = (150, 75), 1000  # points of the map per axis, the fewer for a program of more lines
 _SHADES = ["growth_rate", "plastic", "slip"]  # what the map shows, in the order of the leaves
 _CYCLE = ("period", "amplitude_1", "amplitude_2", "stick")
 
@@ -70,8 +70,8 @@ class Axis(NamedTuple):
     label: str  # meaning and symbol
     unit: str
     log: bool
-    nodes: np.ndarray  # where limit cycles are computed; the own value is among them
-    own: int  # index of the own value
+    nodes: np.ndarray  # where limit cycles are computed; the scene's value is among them
+    start: int  # index of the scene's value
     refine: int  # stops of the slider in each interval between nodes
 
     @property
@@ -95,12 +95,12 @@ def explore(
     """Write a page with a slider for each of `windows`, in one .html file that needs no network.
 
     `windows` are quantities by name, as the axes of `sweep`, each (low, high), two or more:
-    `D=(2.35, 2.45)`. By default D, G, P and mu, those that the scene has, or K_n, K_t/K_n and mu.
+    `D=(2.35, 2.45)`. By default those of D, G, P and mu that the scene has, or K_n, K_t/K_n and mu.
     The first two span the map of growth rates.
 
-    The page shows what `stability` and `stiffness` give at every place of the sliders, to rounding:
-    it runs the same program, translated. It also shows the mode in motion, a surface with its
-    D and G, and limit cycles from a small disturbance. These are computed here, where sliding
+    The page shows what `stability` and `stiffness` give at every position of the sliders, to
+    rounding: it runs the same program, translated. It also shows the mode in motion, a surface with
+    its D and G, and limit cycles from a small disturbance. These are computed here, where sliding
     squeals, on a grid of 13 values of the first quantity, 5 of the second and 3 of the others, or
     as many as `cycles` says by name, and the value of the scene. Where it squeals in between the
     page shows the nearest and says so. `cycles=False` leaves them out: seconds, not minutes.
@@ -130,10 +130,10 @@ def page(
         return point(substituted(scene, dict(zip(names, q, strict=True))))
 
     def shade(*q):
-        found = numbers(*q)
-        return {name: found[name] for name in _SHADES}
+        values = numbers(*q)
+        return {name: values[name] for name in _SHADES}
 
-    # First: it refuses a law before cycles are searched for.
+    # Before the search for cycles, since it may refuse the law.
     program = javascript(shade, len(axes), "shade")
     programs = javascript(numbers, len(axes), "point") + program
     shown: Any = jax.eval_shape(numbers, *[0.0] * len(axes))
@@ -142,7 +142,7 @@ def page(
             {
                 **{key: getattr(axis, key) for key in ("name", "label", "unit", "log", "refine")},
                 "stops": axis.stops.tolist(),
-                "start": axis.own * axis.refine,
+                "start": axis.start * axis.refine,
             }
             for axis in axes
         ],
@@ -162,7 +162,7 @@ def page(
     template = (
         resources.files("fractaljax.plot").joinpath("explore.html").read_text(encoding="utf-8")
     )
-    return re.sub(r"@(\w+)@", lambda found: text[found[1]], template)
+    return re.sub(r"@(\w+)@", lambda placeholder: text[placeholder[1]], template)
 
 
 def explored(
@@ -190,7 +190,7 @@ def explored(
 
 
 def point(scene: Scene) -> dict[str, Any]:
-    """The numbers that a page shows of a scene, by name, each a scalar.
+    """The numbers that a page shows for a scene, by name, each a scalar.
 
     "coupling" and "first" are the factors of (s^2 + c_1 s + a) x1 = mu K_n/m x2, for the mode.
     """
@@ -198,7 +198,7 @@ def point(scene: Scene) -> dict[str, Any]:
     lin = linearised_at(scene, joint, True)
     s = rightmost_root(lin)
     re, im = s.real, s.imag
-    found = {
+    numbers = {
         "growth_rate": re,
         "frequency": im / (2 * math.pi),
         "K_n": K_n,
@@ -212,13 +212,13 @@ def point(scene: Scene) -> dict[str, Any]:
     }
     if scene.contact.fractal:
         regime = regime_of(scene)
-        found["plastic"] = regime == Regime.fully_plastic
-        found["slip"] = regime == Regime.gross_slip
+        numbers["plastic"] = regime == Regime.fully_plastic
+        numbers["slip"] = regime == Regime.gross_slip
     if scene.contact.has_surface:
         surface = scene.contact.surface
-        found |= {"D": surface.D, "G": surface.G, "gamma": surface.gamma}
-        found["Sq"] = roughness(surface, *WAVELENGTHS).Sq
-    return found
+        numbers |= {"D": surface.D, "G": surface.G, "gamma": surface.gamma}
+        numbers["Sq"] = roughness(surface, *WAVELENGTHS).Sq
+    return numbers
 
 
 @functools.partial(jax.jit, static_argnums=1)
@@ -228,38 +228,38 @@ def points_at(scene: Any, names: tuple[str, ...], values: Any) -> dict[str, Any]
 
 
 def _default(scene: Scene) -> dict[str, tuple[float, float]]:
-    known = known_quantities(scene)
-    names = [name for name in ("D", "G", "P", "mu") if name in known]
+    quantities = known_quantities(scene)
+    names = [name for name in ("D", "G", "P", "mu") if name in quantities]
     if "D" not in names:
-        names = [name for name in ("K_n", "K_t/K_n", "mu") if name in known]
+        names = [name for name in ("K_n", "K_t/K_n", "mu") if name in quantities]
     windows = {}
     for name in names:
-        own, (low, high) = float(value_of(scene, name)), _AROUND[name]
+        value, (low, high) = float(value_of(scene, name)), _AROUND[name]
         if name == "D":
-            windows[name] = max(2.001, own + low), min(2.999, own + high)
+            windows[name] = max(2.001, value + low), min(2.999, value + high)
         else:
-            windows[name] = own * low, own * high
+            windows[name] = value * low, value * high
     return windows
 
 
 def _axis(scene: Scene, name: str, window: Any, count: int) -> Axis:
     ends = np.asarray(axis_values(scene, name, window))
-    own = float(value_of(scene, name))
+    value = float(value_of(scene, name))
     if ends.shape != (2,) or not ends[0] < ends[1]:
         raise ValueError(f"{name} must be (low, high), got {window!r}")
-    if not ends[0] <= own <= ends[1]:
-        raise ValueError(f"the window of {name} must hold its value, {own:g}, got {window!r}")
+    if not ends[0] <= value <= ends[1]:
+        raise ValueError(f"the window of {name} must hold its value, {value:g}, got {window!r}")
     quantity = own_quantities(scene).get(name)
     log = quantity is not None and quantity.log
     space: Any = np.geomspace if log else np.linspace
     nodes = space(*ends, count)
     nodes[[0, -1]] = ends
-    k = int(np.abs(nodes - own).argmin())
-    if abs(nodes[k] - own) <= 1e-9 * (ends[1] - ends[0]):  # a node, up to rounding
-        nodes[k] = own
+    k = int(np.abs(nodes - value).argmin())
+    if abs(nodes[k] - value) <= 1e-9 * (ends[1] - ends[0]):  # a node, up to rounding
+        nodes[k] = value
     else:
-        nodes = np.sort(np.append(nodes, own))
-    place, refine = int(np.searchsorted(nodes, own)), math.ceil(_STOPS / (len(nodes) - 1))
+        nodes = np.sort(np.append(nodes, value))
+    place, refine = int(np.searchsorted(nodes, value)), math.ceil(_STOPS / (len(nodes) - 1))
     words = label(scene, name).rsplit(" [", 1)[0]
     return Axis(name, words, unit(scene, name), log, nodes, place, refine)
 
@@ -280,7 +280,7 @@ def _base64(values: Any, kind: type) -> str:
 
 
 def _waves(scene: Scene) -> dict[str, Any]:
-    """The sum of Eq. 13 over directions for each frequency, which D and G only weigh."""
+    """The sum of Eq. 13 over directions for each frequency; D and G only weight these sums."""
     surface, (L, L_s) = scene.contact.surface, WAVELENGTHS
     waves = surface_waves(float(surface.gamma), _PIXELS)
     return {
@@ -299,32 +299,32 @@ def surface_waves(gamma: float, n: int) -> np.ndarray:
     phases = 2 * np.pi * np.asarray(random_phases(jax.random.key(0), count, _DIRECTIONS))
     angles = np.pi * np.arange(1, _DIRECTIONS + 1) / _DIRECTIONS
     i = np.arange(n) / n
-    found = np.empty((count, n, n))
+    waves = np.empty((count, n, n))
     for k in range(count):
         x, y = 2 * np.pi * gamma**k * i[:, None, None], 2 * np.pi * gamma**k * i[None, :, None]
         turned = x * np.cos(angles) + y * np.sin(angles) + phases[k]
-        found[k] = (np.cos(phases[k]) - np.cos(turned)).sum(axis=-1)
-    return found
+        waves[k] = (np.cos(phases[k]) - np.cos(turned)).sum(axis=-1)
+    return waves
 
 
 # --- limit cycles ---------------------------------------------------------------------------
 
 
 def _cycles(scene, axes: Sequence[Axis], progress: bool) -> dict[str, Any]:
-    """Limit cycles at the nodes where sliding squeals, and words for the others."""
+    """Limit cycles at the nodes where sliding squeals, and the outcomes at the others in words."""
     from tqdm import tqdm
 
     names = tuple(axis.name for axis in axes)
     nodes = np.array(list(itertools.product(*(axis.nodes for axis in axes))))
-    found = points_at(scene, names, nodes)
+    steady = points_at(scene, names, nodes)
     words = [
         "quiet: small disturbances die out",
         "fully plastic: the joint has no stiffness",
         "gross slip: the joint has no tangential stiffness",
         "no steady sliding",
     ]
-    growth = np.asarray(found["growth_rate"])
-    kinds = [np.asarray(found["plastic"]), np.asarray(found["slip"]), np.isnan(growth)]
+    growth = np.asarray(steady["growth_rate"])
+    kinds = [np.asarray(steady["plastic"]), np.asarray(steady["slip"]), np.isnan(growth)]
     state = np.select(kinds, [1, 2, 3], 0).astype(np.int32)
     row = np.full(len(nodes), -1, np.int32)
     numbers: list[Any] = []
@@ -335,17 +335,17 @@ def _cycles(scene, axes: Sequence[Axis], progress: bool) -> dict[str, Any]:
             some = squeals[begin : begin + _BATCH]
             # A short batch repeats its nodes: one shape compiles once.
             batch = nodes[np.resize(some, _BATCH)]
-            result, *of = _batch_of_cycles(scene, names, batch)
-            of = [np.asarray(each) for each in of]
+            result, *arrays = _batch_of_cycles(scene, names, batch)
+            arrays = [np.asarray(array) for array in arrays]
             for i, node in enumerate(some):
-                said = CycleResult[jax.tree.map(lambda x, i=i: x[i], result)]
-                if said not in words:
-                    words.append(said)
-                state[node] = words.index(said)
-                if np.isfinite(of[0][i, 0]):
+                outcome = CycleResult[jax.tree.map(lambda x, i=i: x[i], result)]
+                if outcome not in words:
+                    words.append(outcome)
+                state[node] = words.index(outcome)
+                if np.isfinite(arrays[0][i, 0]):
                     row[node] = len(numbers)
-                    numbers.append(of[0][i])
-                    orbits.append(of[1][i])
+                    numbers.append(arrays[0][i])
+                    orbits.append(arrays[1][i])
             bar.update(len(some))
     return {
         "nodes": [axis.nodes.tolist() for axis in axes],
@@ -361,11 +361,11 @@ def _cycles(scene, axes: Sequence[Axis], progress: bool) -> dict[str, Any]:
 
 @functools.partial(exported_jit, static_argnames="names")
 def _batch_of_cycles(scene, names, nodes):
-    """Result, the numbers of `_CYCLE` and orbits (samples, [x1, v1]) of a batch of nodes."""
+    """Results, the numbers of `_CYCLE` and orbits (samples, [x1, v1]) for a batch of nodes."""
 
     def one(q):
-        moved = substituted(scene, dict(zip(names, q, strict=True)))
-        cycle = limit_cycle(moved, max_returns=_MOST_RETURNS, throw=False)
+        varied = substituted(scene, dict(zip(names, q, strict=True)))
+        cycle = limit_cycle(varied, max_returns=_MOST_RETURNS, throw=False)
         _, states = cycle.orbit(_SAMPLES)
         numbers = cycle.period, *cycle.amplitude, cycle.stick_fraction[0]
         return cycle.result, jnp.stack(numbers), states[:, jnp.array([0, 2])]

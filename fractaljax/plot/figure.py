@@ -15,7 +15,7 @@ class Figure(matplotlib.figure.Figure):
         super().__init__(figsize=size, layout="constrained")
 
     def png(self, dpi: float) -> bytes:
-        """The pixels of `savefig` as a PNG file, in less time: that would draw everything twice."""
+        """The pixels of `savefig` as a PNG file, in less time: `savefig` draws everything twice."""
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.image import imsave
 
@@ -24,7 +24,7 @@ class Figure(matplotlib.figure.Figure):
         try:
             canvas = FigureCanvasAgg(self)
             canvas.draw()
-            # Better compression takes longer than all the rest.
+            # Stronger compression would take longer than the drawing.
             more = {"format": "png", "dpi": dpi, "pil_kwargs": {"compress_level": 1}}
             imsave(picture, canvas.buffer_rgba(), **more)
         finally:
@@ -32,5 +32,5 @@ class Figure(matplotlib.figure.Figure):
         return picture.getvalue()
 
     def _repr_png_(self) -> bytes:
-        """What Jupyter asks for where a figure is the last expression of a cell."""
+        """The PNG that Jupyter shows for a figure as the last expression of a cell."""
         return self.png(self.dpi)

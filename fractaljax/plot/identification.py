@@ -11,7 +11,7 @@ from .axes import Axes, given_or_new, legend_above
 
 
 def power_spectrum(result: Identification, ax: Axes | None = None) -> Axes:
-    """The measured one-sided spectrum over frequency; that of a map over |(f_x, f_y)|."""
+    """The measured one-sided spectrum over frequency, for a map over |(f_x, f_y)|."""
     ax, spectrum = given_or_new(ax), result.spectrum
     ax.loglog(spectrum.f, spectrum.power, "-", color="0.72", lw=0.9, label="measured", zorder=1)
     ax.set_xlabel("frequency f [1/m]")

@@ -1,7 +1,7 @@
 """Functions of numbers as JavaScript: their jaxprs, line by line.
 
-A page without Python then computes by the equations of the package, not by a copy of them. An array
-is a line for each of its numbers.
+A page without Python then computes by the equations of the package, not by a copy of them. Each
+number of an array has a line of its own.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,7 +22,7 @@ _CALLS = {name: f"Math.{name}" for name in _MATH}
 _CALLS |= {"is_finite": "Number.isFinite", "erf": "erf"}
 _OTHERS = "neg", "not", "square", "integer_pow", "select_n", "stop_gradient", "copy", "copy_p"
 _ELEMENTWISE = {*_INFIX, *_CALLS, *_OTHERS, "convert_element_type"}
-# What only puts numbers of arrays in other places.
+# Operations that only rearrange the numbers of arrays.
 _MOVES = (
     "broadcast_in_dim",
     "reshape",
@@ -57,8 +57,8 @@ def javascript(function: Callable[..., Any], count: int, name: str) -> str:
     """
     closed = jax.make_jaxpr(function)(*[jnp.zeros(())] * count)
     program = _Program()
-    given = [f"q[{i}]" for i in range(count)]
-    results = program.run(closed.jaxpr, [_literal(x) for x in closed.consts], given)
+    inputs = [f"q[{i}]" for i in range(count)]
+    results = program.run(closed.jaxpr, [_literal(x) for x in closed.consts], inputs)
     body = "".join(f"const {key}={text};\n" for key, text in program.needed(results))
     used = _ERF if "=erf(" in body else ""
     return f"function {name}(q){{\n{used}{body}return [{','.join(results)}];\n}}\n"
@@ -78,25 +78,25 @@ class _Program:
         return self.names[text]
 
     def needed(self, results: Sequence[str]):
-        wanted = {key for key in results if key in self.lines}
-        for key in reversed(self.lines):  # what a line needs stands before it
-            if key in wanted:
-                wanted.update(self.lines[key][1])
-        return [(key, text) for key, (text, _) in self.lines.items() if key in wanted]
+        required = {key for key in results if key in self.lines}
+        for key in reversed(self.lines):  # a line needs only lines before it
+            if key in required:
+                required.update(self.lines[key][1])
+        return [(key, text) for key, (text, _) in self.lines.items() if key in required]
 
-    def run(self, jaxpr: Any, consts: Sequence[Any], given: Sequence[Any]) -> list[Any]:
-        known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *given], strict=True))
+    def run(self, jaxpr: Any, consts: Sequence[Any], inputs: Sequence[Any]) -> list[Any]:
+        environment = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *inputs], strict=True))
 
         def value(atom):
-            return _literal(atom.val) if hasattr(atom, "val") else known[atom]
+            return _literal(atom.val) if hasattr(atom, "val") else environment[atom]
 
         for eqn in jaxpr.eqns:
-            found = self.step(eqn, [value(atom) for atom in eqn.invars])
-            known.update(zip(eqn.outvars, found, strict=True))
+            results = self.step(eqn, [value(atom) for atom in eqn.invars])
+            environment.update(zip(eqn.outvars, results, strict=True))
         return [value(atom) for atom in jaxpr.outvars]
 
     def step(self, eqn: Any, values: list[Any]) -> list[Any]:
-        """The names of the results of one equation; of a complex number those of its parts."""
+        """The names of the results of one equation; for a complex number, of its two parts."""
         kind, params = eqn.primitive.name, eqn.params
         inner = next((params[key] for key in _INSIDE if key in params), None)
         if inner is not None and kind not in ("scan", "while", "cond"):
@@ -128,7 +128,7 @@ class _Program:
         return [self.each(eqn, lambda row: _expression(eqn, kind, row), parts.shape[:-1], parts)]
 
     def each(self, eqn: Any, text_of: Callable[[list[str]], str | None], shape, parts) -> Any:
-        """A line for each number of a result of this shape, from what it needs (*shape, k)."""
+        """A line for each number of a result of this shape, from its k operands (*shape, k)."""
         out = eqn.outvars[0].aval
         names = np.empty(shape, object)
         for place in np.ndindex(*shape):
@@ -150,7 +150,7 @@ def _refusal(eqn: Any) -> ValueError:
 
 
 def _moved(eqn: Any, arrays: list[np.ndarray]) -> np.ndarray:
-    """The numbers of arrays in their new places, found by moving their indices."""
+    """The numbers of arrays in their new places, from the same operation on their indices."""
     ends = np.cumsum([0, *(array.size for array in arrays)])
     indices = [
         jnp.arange(start, stop).reshape(array.shape)
@@ -207,7 +207,7 @@ def _consts(inner: Any) -> Sequence[Any]:
 
 
 def _literal(value: Any) -> Any:
-    """A number as JavaScript writes it, or an array of such."""
+    """A number as JavaScript writes it, or an array of such texts."""
     value = np.asarray(value)
     if value.shape:
         texts = np.empty(value.shape, object)

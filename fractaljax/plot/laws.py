@@ -21,7 +21,7 @@ def law_curves(result: LawComparison, ax: Axes | None = None, *, show: str = "K_
     `show` is "K_n", "alpha" (d ln K_n/d ln P, with published values), "ratio" (K_t/K_n) or "share"
     (real over nominal area).
 
-    **Raises:** `ValueError` for another.
+    **Raises:** `ValueError` for any other `show`.
     """
     if show not in _PANELS:
         raise ValueError(f"show must be one of {', '.join(_PANELS)}, got {show!r}")
@@ -69,7 +69,7 @@ def laws(result: LawComparison) -> Figure:
 
 
 def _values(result, curve, show):
-    """The numbers (k,) of one curve, NaN where there are none; None where the law has none."""
+    """The values (k,) of one curve, NaN where one is undefined; None if the law has none."""
     if show == "ratio":
         if curve.K_t is None:
             return None

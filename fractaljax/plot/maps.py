@@ -19,9 +19,9 @@ _SHADES = {
 def growth_map(result: Sweep, ax: Axes | None = None) -> Axes:
     """Growth rate [1/s] as labelled contours: filled where it squeals, dashed where it does not.
 
-    From a sweep of `stability` or of `growth_rate`. Hatched where a fractal contact is not
-    elastic-plastic: there the growth rate is that of another mechanism; and, by a hatch of its own,
-    where it is NaN, as where a preloaded joint has no closed equilibrium.
+    The sweep is of `stability` or of `growth_rate`. Hatched where a fractal contact is not
+    elastic-plastic: there the growth rate belongs to another mechanism; and, with another hatch,
+    where it is NaN, for example where a preloaded joint has no closed equilibrium.
 
     **Raises:** `ValueError` unless the sweep has two axes, each with two values or more.
     """
@@ -39,9 +39,9 @@ def growth_map(result: Sweep, ax: Axes | None = None) -> Axes:
 def frequency_map(result: Sweep, ax: Axes | None = None, *, mode: int = 1) -> Axes:
     """Frequency [kHz] of a mode of a sweep of `stability`, and the stability boundary.
 
-    Mode 1 has the lowest frequency. Hatched as in `growth_map`.
+    Mode 1 has the lowest frequency. Hatches are as in `growth_map`.
 
-    **Raises:** `ValueError` for a mode that there is not, and as `growth_map`.
+    **Raises:** `ValueError` for an unknown mode, and as `growth_map`.
     """
     from matplotlib.ticker import MaxNLocator
 
@@ -59,8 +59,8 @@ def frequency_map(result: Sweep, ax: Axes | None = None, *, mode: int = 1) -> Ax
 def stability_chart(result: Sweep, ax: Axes | None = None) -> Axes:
     """The number of unstable modes over one or two quantities, from a sweep of `stability`.
 
-    Over two with labelled contours of the growth rate [1/s] and the stability boundary, as in
-    `growth_map`; over one with the growth rate and its zero. A real part within rounding of 0 is
+    Over two, it has labelled contours of the growth rate [1/s] and the stability boundary, as in
+    `growth_map`; over one, the growth rate and its zero. A real part within rounding of 0 is
     not unstable. The measure of the sweep may be any object with the `growth_rate`, `eigenvalues`,
     `resolutions` and `counted` of a `Stability`.
 
@@ -94,8 +94,8 @@ def unstable_modes(result: Sweep) -> np.ma.MaskedArray:
     needed = "growth_rate", "eigenvalues", "resolutions", "counted"
     if not all(hasattr(result.values, name) for name in needed):
         raise ValueError("a chart needs a sweep of stability")
-    found: Any = [np.asarray(getattr(result.values, name)) for name in needed]
-    growth, s, error, counted = found
+    arrays: Any = [np.asarray(getattr(result.values, name)) for name in needed]
+    growth, s, error, counted = arrays
     grows = counted & (s.imag >= 0) & (s.real > error)
     return np.ma.masked_where(np.isnan(growth), grows.sum(axis=-1))
 
@@ -114,7 +114,7 @@ def vibration_modes(result: Sweep) -> tuple[np.ndarray, np.ndarray]:
 
 
 def shade_regimes(ax: Axes, x: np.ndarray, y: np.ndarray, regime: Regime) -> list[Artist]:
-    """Hatch where a joint (n, m) is fully plastic or slips as a whole; what the legend shows."""
+    """Hatch where a joint (n, m) is fully plastic or slips as a whole; the legend's handles."""
     return [
         handle
         for words, (member, grey, hatch) in _SHADES.items()
@@ -128,7 +128,7 @@ def shade_unsteady(ax: Axes, x: np.ndarray, y: np.ndarray, none: np.ndarray) -> 
 
 
 def _shade(ax, x, y, inside, words: str, grey: str, hatch: str) -> list[Artist]:
-    """Hatch where `inside` (n, m) holds, a point and what is half way to its neighbours."""
+    """Hatch where `inside` (n, m) holds, from each point half way to its neighbours."""
     from matplotlib.patches import Patch
 
     if not inside.any():
@@ -144,7 +144,7 @@ def regime_of(scene: Scene) -> Regime:
 
 
 def _start(result, ax):
-    """Axes, the growth rate (n, m), masked where inelastic or NaN, and what is hatched."""
+    """The axes, the growth rate (n, m) masked where inelastic or NaN, and handles of hatches."""
     shape = tuple(map(len, result.points))
     if len(shape) != 2 or min(shape) < 2:
         raise ValueError(f"a map needs two axes of two values or more, got a grid of {shape}")
@@ -166,21 +166,21 @@ def _start(result, ax):
 
 
 def _no_number(result) -> np.ndarray:
-    """Where the growth rate of a sweep is NaN."""
+    """True where the growth rate of a sweep is NaN."""
     return np.isnan(np.asarray(getattr(result.values, "growth_rate", result.values)))
 
 
 def _fill(result, ax, values, levels, name, skip=0):
     import matplotlib as mpl
 
-    # So pale that black lines and labels stay readable.
+    # Pale enough that black lines and labels stay readable.
     colours = mpl.colormaps[name](np.linspace(0.05, 0.6, len(levels) - 1))
     ax.contourf(*result.points, values.T, levels, colors=colours)
     _label(result, ax, values, levels[skip:], linestyles="solid")
 
 
 def _count(ax, x, y, count, transform):
-    """Colours of a number of modes (y, x), and their scale."""
+    """Draw a number of modes (y, x) in colours, with their scale."""
     import matplotlib as mpl
     from matplotlib.colors import BoundaryNorm, ListedColormap
 
@@ -204,7 +204,7 @@ def _label(result, ax, values, levels, linestyles):
 
 
 def _finish(result, ax, growth, handles, title):
-    """The stability boundary; above the axes the title at the left, the legend at the right."""
+    """Draw the stability boundary, and above the axes the title (left) and legend (right)."""
     from matplotlib.lines import Line2D
 
     if growth.min() < 0 < growth.max():

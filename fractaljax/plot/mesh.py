@@ -9,7 +9,7 @@ from jaxtyping import Float
 from .._mechanism.mesh import Mesh
 from .axes import new_figure
 
-_SHARE = 0.03  # of the size of a mesh, to which the largest displacement is drawn
+_SHARE = 0.03  # largest displacement as drawn, over the size of the mesh
 
 
 def scale_of(mesh: Mesh, largest: float) -> float:
@@ -20,9 +20,9 @@ def scale_of(mesh: Mesh, largest: float) -> float:
 def draw_mesh(
     mesh: Mesh, ax: Any, reach: float, colours: Float[np.ndarray, " nodes"], most: float
 ) -> tuple[Any, Any, Callable[[np.ndarray], None]]:
-    """Axes, the cells on them, and a function that displaces the nodes by (nodes, dim) [m].
+    """The axes, the cells on them, and a function that moves the nodes by (nodes, dim) [m].
 
-    Displacements are of at most `reach` [m]; colours from 0 to `most` are means over each cell.
+    Displacements are at most `reach` [m]; colours from 0 to `most` are means over each cell.
     """
     from matplotlib.collections import PolyCollection
 
@@ -59,12 +59,12 @@ def draw_mesh(
 
 
 def projection(mesh: Mesh) -> str | None:
-    """Of the axes that a mesh is drawn on."""
+    """The projection of the axes that a mesh is drawn on."""
     return "3d" if mesh.solid else None
 
 
 def mesh_height(mesh: Mesh) -> float:
-    """Of a figure 8.4 inches wide [inches]."""
+    """The height of a figure 8.4 inches wide [inches]."""
     if mesh.solid:
         return 6.4
     width, height = np.ptp(mesh.points, axis=0)

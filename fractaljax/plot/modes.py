@@ -32,7 +32,7 @@ def mode_lines(
 ) -> Axes:
     """Real part or frequency of all modes over y, a colour for each of the values `at` of x.
 
-    Without `at` four of them. The nearest values of the sweep are shown: nothing is interpolated.
+    Without `at`, four of them. The nearest values of the sweep are shown, without interpolation.
 
     **Raises:** `ValueError` for a quantity that is neither "real" nor "frequency".
     """
@@ -101,5 +101,5 @@ def _layers(result, quantity):
     if quantity not in _LABELS:
         raise ValueError(f"quantity must be 'real' or 'frequency', got {quantity!r}")
     real, frequency = vibration_modes(result)
-    # Ordered by itself each quantity has layers that cross no more than they must.
+    # Sorted separately, each quantity has layers that cross as little as possible.
     return np.sort(real, axis=-1) if quantity == "real" else frequency / 1e3

@@ -42,16 +42,15 @@ def cycle_motion(
 ) -> Figure:
     """A limit cycle at one time: the deformed mesh, and what each joint does over the period.
 
-    `structure` is that of the cycle; a reduced one leads to the mesh of the full one. `points`,
-    `dofs` and `cells` are as in `complex_mode`, by default those of the structure's mesh. `at` is
-    the time as a share of the period, from `state` on. Displacements are those from the mean over
-    the period, times `scale`, by default that which draws the largest as 3 % of the size of the
-    mesh; the colour is the largest of each node over the period. A mark on the mesh is at the mean
-    place of the nodes that a joint's
-    directions touch, in the colour of its contact state.
+    `structure` is the one of the cycle; for a reduced one, the mesh of the full one is drawn.
+    `points`, `dofs` and `cells` are as in `complex_mode`, by default from the structure's mesh.
+    `at` is the time as a share of the period, from `state` on. Displacements are from the mean over
+    the period, times `scale`, which by default draws the largest as 3 % of the size of the mesh;
+    the colour is the largest displacement of each node over the period. A mark on the mesh is at
+    the mean place of the nodes that a joint's directions touch, in the colour of its contact state.
 
-    **Raises:** `ValueError` if there is no limit cycle, for a batch, a regularised cycle, another
-    structure's and a mesh that does not fit.
+    **Raises:** `ValueError` if there is no limit cycle, for a batch, a regularised cycle, the cycle
+    of another structure and a mesh that does not fit.
     """
     at = float(scalar("at", at, at_least=0, below=1))
     figure, draw = _picture(_motion(cycle, structure, points, dofs, cells, 1), scale)
@@ -73,9 +72,9 @@ def animate_cycle(
 ) -> "FuncAnimation":
     """One period of a limit cycle in motion on its mesh, as matplotlib's animation.
 
-    Frame j is that of `cycle_motion` at j/frames of the period. `path` ends in .gif for a picture,
-    or in .html for one page with its frames and buttons inside, which needs no network. Other
-    arguments and errors are as of `cycle_motion`.
+    Frame j is the picture of `cycle_motion` at j/frames of the period. `path` ends in .gif for a
+    picture, or in .html for one page with its frames and buttons inside, which needs no network.
+    Other arguments and errors are as for `cycle_motion`.
 
     **Raises:** `ValueError` for another ending; `OSError` if the file cannot be written.
     """
@@ -91,15 +90,15 @@ def animate_cycle(
 class _Motion(NamedTuple):
     mesh: Mesh
     period: float
-    moved: Float[np.ndarray, "k nodes dim"]  # from the mean, at evenly spaced times
+    displacements: Float[np.ndarray, "k nodes dim"]  # from the mean, at evenly spaced times
     states: Float[np.ndarray, "k m"]  # of contact, at the same times
     spans: list[list[tuple[float, float, int]]]  # of each joint: begin, duration [s], state
     names: tuple[str, ...]  # of the joints
     places: Float[np.ndarray, "m nodes"] | None  # weights that sum to 1
 
     def step(self, share: float) -> int:
-        """Which of the times is nearest to a share of the period."""
-        return round(share * len(self.moved)) % len(self.moved)
+        """The index of the time nearest to a share of the period."""
+        return round(share * len(self.displacements)) % len(self.displacements)
 
 
 def _motion(
@@ -118,16 +117,16 @@ def _motion(
             f"joints, got {structure.n} and {len(structure.joints)}"
         )
     reduced = structure.reduction if isinstance(structure, ReducedStructure) else None
-    given = {"points": points, "dofs": dofs, "cells": cells}
-    missing = [name for name, array in given.items() if array is None]
-    if len(missing) < len(given):
+    mesh_arrays = {"points": points, "dofs": dofs, "cells": cells}
+    missing = [name for name, array in mesh_arrays.items() if array is None]
+    if len(missing) < len(mesh_arrays):
         if missing:
             raise ValueError(f"a mesh needs {' and '.join(missing)} as well")
         mesh = Mesh(points, dofs, cells)
     elif (mesh := structure.mesh) is None:
         raise ValueError("structure has no mesh: give points, dofs and cells")
     mesh.require(n if reduced is None else len(reduced.V))
-    # The mean and the largest displacements take more times than are shown.
+    # The mean and the largest displacements need more times than are shown.
     count = frames * -(-_SAMPLES // frames)
     x = np.asarray(cycle.orbit(count)[1])[:, :n]
     x = x - x.mean(axis=0)
@@ -151,14 +150,14 @@ def _motion(
 
 
 def _places(mesh: Mesh, touched: np.ndarray) -> np.ndarray:
-    """The share of each node in the place of each joint (m, nodes), NaN of one beside the mesh."""
+    """The weights of nodes in the place of each joint (m, nodes), NaN for a joint off the mesh."""
     weights = np.where(mesh.dofs < 0, 0, touched[:, mesh.dofs]).sum(axis=2)
     total = weights.sum(axis=1, keepdims=True)
     return np.where(total > 0, weights / np.where(total > 0, total, 1), np.nan)
 
 
 def _spans(cycle: LimitCycle, face: int, start: float) -> Iterator[tuple[float, float, int]]:
-    """Begin [s], duration [s] and contact state, one after the other over a period."""
+    """Yield begin [s], duration [s] and contact state, one after the other over a period."""
     values = {name: value for value, name in STATE_NAMES.items()}
     begin, state = 0.0, int(start)
     for switch in cycle.switches():
@@ -174,7 +173,7 @@ def _spans(cycle: LimitCycle, face: int, start: float) -> Iterator[tuple[float, 
 def _picture(motion: _Motion, scale: float | None) -> tuple[Figure, Callable[[float], Any]]:
     """The figure, and a function that draws a share of the period."""
     mesh, count = motion.mesh, len(motion.names)
-    amplitudes = np.linalg.norm(motion.moved, axis=2).max(axis=0)
+    amplitudes = np.linalg.norm(motion.displacements, axis=2).max(axis=0)
     largest = float(amplitudes.max()) or 1.0
     factor = scale_of(mesh, largest) if scale is None else float(scalar("scale", scale, above=0))
     heights = mesh_height(mesh), 1.1 + min(0.26 * count, 4.0)
@@ -193,11 +192,11 @@ def _picture(motion: _Motion, scale: float | None) -> tuple[Figure, Callable[[fl
 
     def draw(share: float) -> Any:
         k = motion.step(share)
-        moved = factor * motion.moved[k]
-        move(moved)
+        displacements = factor * motion.displacements[k]
+        move(displacements)
         cursor.set_xdata([share, share])
         if motion.places is not None:
-            at = motion.places @ (mesh.points + moved)
+            at = motion.places @ (mesh.points + displacements)
             if mesh.solid:
                 marks._offsets3d = tuple(at.T)
             else:
@@ -209,7 +208,7 @@ def _picture(motion: _Motion, scale: float | None) -> tuple[Figure, Callable[[fl
 
 
 def _lanes(ax: Axes, motion: _Motion) -> Any:
-    """The contact states of each joint over the period, and a line to show the time with."""
+    """Draw the contact states of each joint over the period; a line that marks the time."""
     from matplotlib.patches import Patch
 
     for i, spans in enumerate(motion.spans):

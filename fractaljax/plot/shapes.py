@@ -33,18 +33,18 @@ def complex_mode(
 ) -> Axes:
     """The displacement Re(shape exp(i phase)) of a mode: a deformed mesh coloured by amplitude.
 
-    `mode` is a shape (n,), or a `Stability` whose shape `index` is taken; of a reduced structure,
+    `mode` is a shape (n,), or a `Stability` whose shape `index` is taken; for a reduced structure,
     `reduced.full(modes.shapes[index])`. `points` (nodes, 2) or (nodes, 3) [m] are the places of the
     nodes, `dofs`, of the same shape, the degree of freedom of each displacement, -1 where it is
     held, and `cells` (cells, 3) or (cells, 4) the nodes of triangles or quadrilaterals, the outer
-    ones of a solid. `ax` of a solid has to be 3D. `scale` is the factor of the displacements, by
-    default that which draws the largest amplitude as 3 % of the size of the mesh. The
-    colour is the greatest displacement of the nodes over a period, divided by the largest of all.
+    ones of a solid. For a solid, `ax` has to be 3D. `scale` is the factor of the displacements; by
+    default the largest amplitude is drawn as 3 % of the size of the mesh. The colour is the
+    greatest displacement of each node over a period, divided by the largest of all.
 
     Without `points` there is a bar for each degree of freedom, coloured by its phase, within a pale
     one that shows its amplitude.
 
-    **Raises:** `ValueError` for a batch, an index that is not there, and a mesh that does not fit.
+    **Raises:** `ValueError` for a batch, an unknown index, and a mesh that does not fit.
     """
     ax, draw = _picture(mode, index, ax, points, dofs, cells, scale)
     draw(phase)
@@ -66,7 +66,7 @@ def animate_mode(
     """One period of a mode in motion, Re(shape exp(i omega t)), as matplotlib's animation.
 
     Frame j has the phase omega t = 2 pi j/frames; growth is left out. Other arguments and errors
-    are as of `complex_mode`. `path` ends in .gif for a picture, or in .html for one page with its
+    are as for `complex_mode`. `path` ends in .gif for a picture, or in .html for one page with its
     frames and buttons inside, which needs no network.
 
     **Raises:** `ValueError` for another ending; `OSError` if the file cannot be written.
@@ -80,7 +80,7 @@ def animate_mode(
 
 
 def _amplitudes(motion: Complex[np.ndarray, "nodes dim"]) -> Float[np.ndarray, " nodes"]:
-    """The greatest displacements over a period: the long half axes of ellipses."""
+    """The greatest displacements over a period: the semi-major axes of ellipses."""
     squares = (np.abs(motion) ** 2).sum(axis=1), np.abs((motion**2).sum(axis=1))
     return np.sqrt(sum(squares) / 2)
 
@@ -88,7 +88,7 @@ def _amplitudes(motion: Complex[np.ndarray, "nodes dim"]) -> Float[np.ndarray, "
 def _picture(
     mode: Any, index: int, ax: Any, points: Any, dofs: Any, cells: Any, scale: float | None
 ) -> tuple[Any, Callable[[float], Any]]:
-    """Axes, and a function that draws a phase on them."""
+    """The axes, and a function that draws a phase on them."""
     shape, words, names = _shape_of(mode, index)
     if points is None:
         ax, move = _bars(shape, names, given_or_new(ax))
@@ -107,7 +107,7 @@ def _picture(
 
 
 def _shape_of(mode: Any, index: int) -> tuple[np.ndarray, list[str], Any]:
-    """A shape (n,), what is known of its mode, and the names of its degrees of freedom."""
+    """A shape (n,), the numbers of its mode, and the names of its degrees of freedom."""
     if not isinstance(mode, Stability):
         shape = np.asarray(mode)
         if shape.ndim != 1 or shape.dtype.kind not in "fciu":

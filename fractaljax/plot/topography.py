@@ -40,7 +40,7 @@ def topographies(design: Design, **options: Any) -> Figure:
 
 
 def drawn_topographies(design: Design, surfaces: Topographies) -> Figure:
-    """As `topographies`, of surfaces that are known already."""
+    """As `topographies`, of surfaces that are computed already."""
     heights = [_about_mean(z) for z in (surfaces.before, surfaces.after)]
     low, high = min(z.min() for z in heights), max(z.max() for z in heights)
     figure = new_figure(11.2, 5.4)

@@ -12,8 +12,8 @@ _NAMED = 9  # modes in the legend
 def mode_tracks(tracks: ModeTracks) -> Figure:
     """Growth rate [1/s] and frequency of all modes over the quantity; returns the figure.
 
-    A mode is drawn thick where it is unstable. Of more than nine modes only those that are unstable
-    somewhere have a colour, and the axes show their range; the others are grey.
+    A mode is drawn thick where it is unstable. If there are more than nine, only modes that are
+    unstable somewhere have a colour, and the axes show their range; the others are grey.
     """
     x, growth = tracks.values, tracks.growth_rates
     unstable = growth > _ROUNDING * np.abs(tracks.eigenvalues)

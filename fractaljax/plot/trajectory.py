@@ -13,8 +13,8 @@ def trajectory(
 ) -> Axes:
     """A displacement [um] over time [ms], and where it sticks.
 
-    It is that of the degree of freedom `direction`, or t.x of the `joint` of that number; both
-    count from 1.
+    The displacement is that of the degree of freedom `direction`, or t.x of joint number `joint`;
+    both count from 1.
 
     **Raises:** `ValueError` for an unknown direction or joint, a batch, or a simulation with
     `saveat`.

@@ -17,7 +17,7 @@ _STYLES = "solid", "dashed", "dashdot", "dotted"
 
 
 def validation(case: ValidatedCase) -> Figure:
-    """The curves of one published case: theirs as marks, or dashed, ours as lines; the figure.
+    """The curves of a published case: theirs as marks or dashed, ours as lines; the figure.
 
     **Raises:** `ValueError` for a case that did not run.
     """

@@ -28,14 +28,14 @@ _POINTS = 128  # of a side of the surface
 
 
 def explore(scene: Scene, **windows: tuple[float, float]) -> Any:
-    """Sliders over the quantities of a scene, for a notebook: the widget to end a cell in.
+    """Sliders over the quantities of a scene, for a notebook: a widget to end a cell with.
 
-    `windows` are as of `plot.explore`, which writes a page for those without Python. Beside the
+    `windows` are as for `plot.explore`, which writes a page for those without Python. Beside the
     sliders are the numbers of `stability` and `stiffness`, the map of the first two quantities with
     the point on it, the surface and the mode. A button finds the limit cycle.
 
-    **Raises:** `ImportError` unless ipywidgets is installed; else as `plot.explore`, but that any
-    contact law will do.
+    **Raises:** `ImportError` unless ipywidgets is installed; else as `plot.explore`, except that
+    any contact law is accepted.
     """
     try:
         import ipywidgets
@@ -60,16 +60,16 @@ def explore(scene: Scene, **windows: tuple[float, float]) -> Any:
         pictures["mode"].value = _mode(here)
         if "surface" in pictures:
             pictures["surface"].value = _surface(here)
-        motion.layout.display = "none"  # that of the place before
+        motion.layout.display = "none"  # it belongs to the last position
 
     def find(_: Any) -> None:
         words.value = "searching"
-        found = limit_cycle(replaced(scene, values()), throw=False)
-        words.value = html.escape(CycleResult[found.result])
-        if np.isfinite(found.period):
-            size = ", ".join(f"{x:.5g}" for x in found.amplitude)
-            words.value += f": peak to peak {size} m, {found.frequency:.5g} Hz"
-            motion.value, motion.layout.display = _png(draw_cycle(found)), "block"
+        cycle = limit_cycle(replaced(scene, values()), throw=False)
+        words.value = html.escape(CycleResult[cycle.result])
+        if np.isfinite(cycle.period):
+            size = ", ".join(f"{x:.5g}" for x in cycle.amplitude)
+            words.value += f": peak to peak {size} m, {cycle.frequency:.5g} Hz"
+            motion.value, motion.layout.display = _png(draw_cycle(cycle)), "block"
 
     for slider in sliders.values():
         slider.observe(update, names="value")
@@ -84,7 +84,7 @@ def _slider(ipywidgets: Any, axis: Axis) -> Any:
     unit = "" if axis.unit == "-" else f" [{axis.unit}]"
     return ipywidgets.SelectionSlider(
         options=[(f"{stop:.5g}", float(stop)) for stop in axis.stops],
-        index=axis.own * axis.refine,
+        index=axis.start * axis.refine,
         description=f"{axis.name}{unit}",
         continuous_update=False,  # a drag computes where it ends
     )
@@ -108,7 +108,7 @@ def _table(scene: Scene) -> str:
 
 
 class _Map:
-    """The map of the first two quantities; it is drawn anew where another quantity changes."""
+    """The map of the first two quantities, drawn again when another quantity changes."""
 
     def __init__(self, axes: list[Axis]):
         self.names = [axis.name for axis in axes[:2]]

@@ -163,7 +163,7 @@ def test_stops_hold_the_nodes_and_the_scene():
         stops = axis.stops
         assert (np.diff(stops) > 0).all() and len(stops) > 100
         assert (stops[:: axis.refine] == axis.nodes).all()
-        assert stops[axis.own * axis.refine] == own
+        assert stops[axis.start * axis.refine] == own
     assert len(axes[1].nodes) == 5 and axes[1].nodes[[0, -1]].tolist() == [1e-10, 1e-9]
 
 
