@@ -21,7 +21,7 @@ def add_stability(commands) -> None:
         "--out",
         type=Path,
         metavar="FOLDER",
-        help=f"of the pictures of a structure with a mesh; default {_MODES}",
+        help=f"folder for pictures of the modes of a structure with a mesh; default {_MODES}",
     )
     parser.set_defaults(run=_stability)
 

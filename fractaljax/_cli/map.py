@@ -25,7 +25,7 @@ def add_map(commands) -> None:
     parser.add_argument(
         "--radius",
         metavar="R",
-        help="of the kicks that look for cycles, in units of V/omega and V, 5 by default; or a "
+        help="size of the kicks that look for cycles, in units of V/omega and V, 5 by default; or a "
         "list of semi-axes in m and m/s, X1,X2,V1,V2",
     )
     parser.add_argument("--starts", type=int, help="how many kicks; default 128")
