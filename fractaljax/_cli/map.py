@@ -25,8 +25,8 @@ def add_map(commands) -> None:
     parser.add_argument(
         "--radius",
         metavar="R",
-        help="size of the kicks that look for cycles, in units of V/omega and V, 5 by default; or a "
-        "list of semi-axes in m and m/s, X1,X2,V1,V2",
+        help="size of the kicks that look for cycles, in units of V/omega and V, 5 by default; or "
+        "a list of semi-axes in m and m/s, X1,X2,V1,V2",
     )
     parser.add_argument("--starts", type=int, help="how many kicks; default 128")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")

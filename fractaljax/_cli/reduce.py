@@ -22,7 +22,7 @@ def add_reduce(commands) -> None:
     parser.add_argument(
         "--band",
         metavar="LOW:HIGH",
-        help="range of the eigenvalues to keep, in rad/s; else that of the file's table [reduction]",
+        help="range of the eigenvalues to keep, in rad/s; default that of the file's [reduction]",
     )
     parser.add_argument(
         "--over",
