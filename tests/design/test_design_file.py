@@ -1,5 +1,6 @@
 """A saved design says what was asked and what came of it, and runs again to the last bit."""
 
+import dataclasses
 import math
 import re
 import tomllib
@@ -180,7 +181,7 @@ def test_functions_that_are_not_in_the_file(robust, tmp_path):
 
 def test_numbers_that_toml_can_hold_and_no_endless_file(robust, tmp_path):
     """Not a number and infinity are written as TOML knows them."""
-    odd = type(robust)(**{**vars(robust), "value": math.nan, "growth_rate": -math.inf})
+    odd = dataclasses.replace(robust, value=math.nan, growth_rate=-math.inf)
     odd.save(tmp_path / "run.toml")
     result = tomllib.loads((tmp_path / "run.toml").read_text())["result"]
     assert math.isnan(result["value"]) and result["growth_rate"] == -math.inf
