@@ -23,7 +23,9 @@ from .sequential import Row, sequential
 
 _APART = 0.15  # least distance of two starts, in scaled variables
 _PENALTY = 10.0  # of unmet requirements, by which starts are ranked
-_AT_BOUND = 1e-6  # a variable closer to a bound, with a slope outwards, is held by it
+# A variable closer to a bound, with a slope outwards, is held by it, and a residual closer to 0 is
+# active if it has a multiplier.
+_AT_BOUND = 1e-6
 _NEGLIGIBLE = 1e-7  # share of the largest multiplier that is none
 _REGULAR = 1e-12
 _STEP = 0.2  # power of eps: the step of differences, in scaled variables
@@ -177,6 +179,9 @@ def _implicit_jvp(primals, tangents):
     f_slope, A = by_design(u)
     shifts = by_problem(u)[1]
     active = multipliers > _NEGLIGIBLE * jnp.max(multipliers)
+    # Rounding leaves others a multiplier, too.
+    near = max(_AT_BOUND, 10 * problem.rounding)
+    active = active & (values(problem, u)[1] >= -near)
     slope = f_slope + jnp.where(active, multipliers, 0) @ A
     # A variable that a bound holds does not move, and a requirement that is not active holds none.
     held = ((u <= _AT_BOUND) & (slope > 0)) | ((u >= 1 - _AT_BOUND) & (slope < 0))

@@ -82,6 +82,25 @@ def test_derivatives_are_those_of_designs_solved_again():
 
 
 @pytest.mark.slow
+def test_inside_of_all_limits_none_holds_the_design():
+    """Where nothing is active the slope is that of a free minimum, here known."""
+
+    def aim(x):
+        D, ln_G = x.contact.surface.D, jnp.log(x.contact.surface.G)
+        return 100 * (D - 2.45 - 1e-5 * (x.contact.P - 1900)) ** 2 + (ln_G + 22.6) ** 2
+
+    def designed(P):
+        asked: Any = {"target": 1e5, "K_n_min": 0.0, **QUIET}
+        found = fj.design_many(SCENE.replace(P=P), BOUNDS, aim, **asked)
+        return found.D, jnp.log(found.G), found.residuals
+
+    assert np.max(designed(jnp.asarray(2000.0))[2]) < -1e-3
+    slopes = jax.jacfwd(designed)(2000.0)
+    assert slopes[0] == pytest.approx(1e-5, rel=1e-6)
+    assert slopes[1] == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.slow
 def test_derivatives_of_a_batch_mark_members_that_fail():
     """Mapped, they are finite but where there is no design."""
 
