@@ -146,7 +146,8 @@ def design_many(
       meaning under `jax.jit`, `jax.grad` and `jax.vmap`, where all members are one program.
 
     A member without a design does not stop the others: its `result` says so, its quantities are
-    those of the best design found, and derivatives by it are NaN. The growth rate of a structure as
+    those of the best design found, and derivatives by it are NaN. In single precision derivatives
+    are good to a digit. The growth rate of a structure as
     the objective has kinks where modes change places, at which a search may end: then `design` is
     the better choice. Envelopes and limits on cycles are left to `design`.
 
