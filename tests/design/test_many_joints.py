@@ -224,7 +224,7 @@ def test_a_brake_in_few_modes_has_nearly_its_growth_rates():
     def objective(x):
         return x.joints[0].contact.P
 
-    assert in_few_modes(dataclasses.replace(problem, objective=objective), us) is None
+    assert in_few_modes(problem.with_fields(objective=objective), us) is None
     few_joints = several_joints(4)
     small = fj.DesignProblem(few_joints, bounds_of(few_joints), **STATED)
     assert in_few_modes(small, np.asarray(small.start)[None]) is None
