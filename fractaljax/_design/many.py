@@ -147,9 +147,9 @@ def design_many(
 
     A member without a design does not stop the others: its `result` says so, its quantities are
     those of the best design found, and derivatives by it are NaN. In single precision derivatives
-    are good to a digit. The growth rate of a structure as
-    the objective has kinks where modes change places, at which a search may end: then `design` is
-    the better choice. Envelopes and limits on cycles are left to `design`.
+    are good to a digit. The growth rate of a structure as the objective has kinks where modes
+    change places, at which a search may end: then `design` is the better choice. Envelopes and
+    limits on cycles are left to `design`.
 
     **Raises:** as `design`, and `ValueError` for members of different kinds.
     """

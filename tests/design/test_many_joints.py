@@ -1,6 +1,5 @@
 """Designs over the surfaces of many joints, each of which has limits of its own."""
 
-import dataclasses
 import functools
 from typing import Any
 
