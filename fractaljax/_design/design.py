@@ -34,7 +34,6 @@ from .envelope import Envelope, condition_text
 from .evaluator import Evaluation, evaluator_of
 from .few_modes import in_few_modes
 from .limit import LeastGrowth, least_growth
-from .optimum import limited_columns
 from .problem import DesignProblem
 from .quiet import VERIFIED, Kicks, quiet
 from .result import DesignResult
@@ -392,8 +391,7 @@ def design(
         rough = None if landing else in_few_modes(problem, us)
         search = Search(evaluator, landing, 1.0 if objective is None else scale, rough)
         if optimiser is not None:
-            limited = np.isin(np.arange(len(problem.asked)), limited_columns(problem))
-            ends, merit = descend(evaluator, us, optimiser, limited, search.scale)
+            ends, merit = descend(evaluator, us, optimiser, problem.limited, search.scale)
             us = distinct(ends, merit, _DESCENDED)
         path, after, failed, lowest = search.best(us, progress)
         limit = None if lowest is None else least_growth(search, *lowest)

@@ -1,7 +1,7 @@
 """Objective and requirements of designs, under one condition or the worst or average of many."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,12 +9,15 @@ import numpy as np
 from .._base.parts import brief, scalar
 from .envelope import ALONE, Envelope
 from .problem import DesignProblem
-from .rows import evaluate, paired
+from .rows import evaluate, linearise, paired
 
 _LIKELY = 8  # conditions in a first guess at the worst
 _NEW = 1e-7  # by which a condition must be worse than the working ones
 _NEAR = 0.05  # a requirement met by more than this on the grid is met between its points
 _TEMPERATURE = 0.02  # temperature of the smooth maximum over an envelope
+
+
+Rows = Callable[[DesignProblem, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,6 +97,24 @@ class Evaluator:
         """The rows and Jacobians that a design must satisfy, from rows (m, 1 + k) at conditions."""
         return rows, jacobians
 
+    def rows_for(self, u: np.ndarray) -> Rows:
+        """The row (1 + k,) that counts, and its Jacobian, as a function of problem and design.
+
+        Each column is at the condition that is worst for it in the design u (v,).
+        """
+        places = self.envelope.values(self.evaluate(u[None]).places[0])
+        conditions, which = np.unique(places, axis=0, return_inverse=True)
+        which = which.ravel()
+        if self.envelope is ALONE:  # one condition of all columns, also of those without a name
+            which = np.zeros(len(self.problem.asked), int)
+        columns = np.arange(len(which))
+
+        def rows(problem, u):
+            values, jacobians, _ = linearise(problem, *paired(u[None], conditions))
+            return values[which, columns], jacobians[which, columns]
+
+        return rows
+
     def exchange(self, us: np.ndarray, working: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Conditions (m, c) at which each of us (n, v) is worse than at all its working ones."""
         evaluation, new = self.evaluate(us), []
@@ -145,6 +166,14 @@ class OnAverage(Evaluator):
     def average(self, rows, jacobians):
         row, weights = self._average(rows)
         return row[None], np.einsum("mk,mkv->kv", weights, jacobians)[None]
+
+    def rows_for(self, u):
+        def rows(problem, u):
+            values, jacobians, _ = linearise(problem, *paired(u[None], self.working))
+            row, slopes = self.average(values, jacobians)
+            return row[0], slopes[0]
+
+        return rows
 
     def exchange(self, us, working):
         return [conditions[:0] for conditions in working]

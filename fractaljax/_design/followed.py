@@ -61,8 +61,7 @@ class FollowedCycles:
 
     def columns(self, problem) -> list[tuple[int, CycleConstraint]]:
         """The columns of a row that depend on cycles: requirements, perhaps the objective."""
-        first = 1 + problem.requirements - len(problem.constraints)
-        first -= 0 if problem.cuts is None else len(problem.cuts.reach)
+        first = problem.growth_columns.stop + len(problem.contacts)
         columns = [
             (first + i, constraint)
             for i, constraint in enumerate(problem.constraints)

@@ -57,13 +57,16 @@ class Functions:
         return c, slopes
 
 
-def finite(rows: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows with finite numbers in place of undefined ones, and slopes with zeros."""
-    rows = np.nan_to_num(rows, nan=UNKNOWN, posinf=UNKNOWN, neginf=-UNKNOWN)
-    return rows, np.nan_to_num(slopes, posinf=0, neginf=0)
+def finite(rows: Any, slopes: Any, xp: Any = np) -> tuple[Any, Any]:
+    """Rows with finite numbers in place of undefined ones, and slopes with zeros.
+
+    `xp` is NumPy, or JAX's where they are traced.
+    """
+    rows = xp.nan_to_num(rows, nan=UNKNOWN, posinf=UNKNOWN, neginf=-UNKNOWN)
+    return rows, xp.nan_to_num(slopes, posinf=0, neginf=0)
 
 
-def compressed(c: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def compressed(c: Any, slopes: Any, xp: Any = np) -> tuple[Any, Any]:
     """Residuals (k,) and slopes (k, v), by logarithms where they are beyond order one."""
-    size = np.maximum(np.abs(c), 1)
-    return np.where(size > 1, np.sign(c) * (1 + np.log(size)), c), slopes / size[:, None]
+    size = xp.maximum(xp.abs(c), 1)
+    return xp.where(size > 1, xp.sign(c) * (1 + xp.log(size)), c), slopes / size[:, None]

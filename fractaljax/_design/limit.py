@@ -14,8 +14,7 @@ import numpy as np
 
 from .._base.parts import Record
 from .envelope import condition_text
-from .evaluator import Evaluation, Evaluator, OnAverage
-from .rows import linearise
+from .evaluator import Evaluation
 from .search import Search
 
 _ACTIVE = 1e-4  # a residual, or a scaled variable, is at its limit within this
@@ -90,7 +89,7 @@ def least_growth(
     problem = search.evaluator.problem
     target, scale = float(problem.target), float(problem.growth_scale)
     count = 1 + len(problem.residual_names)
-    growing, others = search.growing[:count], search.others[:count]
+    growing, others = problem.growing[:count], search.others[:count]
     growth, unmet = search.growth_and_rest(evaluation)
     if not (unmet <= 0).any():
         paths, evaluation = search.least_unmet([path[-1] for path in paths])
@@ -134,10 +133,10 @@ def _held_by(search: Search, u: np.ndarray, aim: np.ndarray, limited: np.ndarray
     from scipy.optimize import nnls
 
     problem = search.evaluator.problem
-    row, slopes = _linearised(search.evaluator, u)
+    row, slopes = search.evaluator.rows_for(u)(problem, u)
     names = ["objective", *problem.residual_names]
     row, slopes = row[: len(names)], slopes[: len(names)]
-    growing = search.growing[: len(names)]
+    growing = problem.growing[: len(names)]
     with np.errstate(over="ignore"):  # far from any target
         scale = np.where(growing, float(problem.growth_scale) * np.cosh(row), 1.0)
     slopes = slopes * scale[:, None]
@@ -163,20 +162,3 @@ def _held_by(search: Search, u: np.ndarray, aim: np.ndarray, limited: np.ndarray
     left = float(np.linalg.norm(matrix @ multipliers) * unit)
     held = {name: float(x) for name, x in zip(labels, multipliers, strict=True) if x > 0}
     return held, left, steepest
-
-
-def _linearised(evaluator: Evaluator, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The row (1 + k,) that counts at a design, and its derivatives (1 + k, v)."""
-    problem = evaluator.problem
-    if isinstance(evaluator, OnAverage):
-        conditions = evaluator.working
-        us = np.repeat(u[None], len(conditions), axis=0)
-        row, slopes = evaluator.average(*linearise(problem, us, conditions)[:2])
-        return row[0], slopes[0]
-    places = evaluator.evaluate(u[None]).places[0]  # where each column is worst
-    conditions, which = np.unique(evaluator.envelope.values(places), axis=0, return_inverse=True)
-    us = np.repeat(u[None], len(conditions), axis=0)
-    rows, slopes = linearise(problem, us, conditions)[:2]
-    columns = np.arange(len(places))
-    which = which.ravel()
-    return rows[which, columns], slopes[which, columns]

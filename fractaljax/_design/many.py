@@ -22,7 +22,7 @@ from .constraints import CycleConstraint
 from .growing_modes import MODES_MOST
 from .optimum import Optimum, optimum
 from .problem import DesignProblem
-from .result import DesignResult
+from .result import DesignResult, is_met
 from .statement import DEFAULT_BOUNDS
 
 _BATCH = 256  # mechanisms side by side on a device; of structures
@@ -48,7 +48,7 @@ class DesignMany(Record):
     @property
     def met(self) -> Array:
         """True for each member whose design meets every requirement."""
-        return (self.result == DesignResult.found) | (self.result == DesignResult.unchanged)
+        return is_met(self.result)
 
     @property
     def member(self) -> Any:
@@ -153,10 +153,17 @@ def design_many(
 
     **Raises:** as `design`, and `ValueError` for members of different kinds.
     """
-    request: dict[str, Any] = dict(objective=objective, target=target, K_n_min=K_n_min)
-    request |= dict(constraints=constraints, laws=laws, tolerance=tolerance, quantile=quantile)
-    request |= dict(
-        friction_slope=friction_slope, area_ratio_min=area_ratio_min, slip_ratio_max=slip_ratio_max
+    request: dict[str, Any] = dict(
+        objective=objective,
+        constraints=constraints,
+        target=target,
+        K_n_min=K_n_min,
+        laws=laws,
+        tolerance=tolerance,
+        quantile=quantile,
+        area_ratio_min=area_ratio_min,
+        slip_ratio_max=slip_ratio_max,
+        friction_slope=friction_slope,
     )
     for each in (objective, *constraints):
         if isinstance(each, CycleConstraint):
@@ -195,18 +202,9 @@ def design_many(
         each = _BATCH_OF_STRUCTURES if isinstance(first, Structure) else _BATCH
         if checked.scatter is not None:  # each design is as many as its quadrature has nodes
             each = max(1, each // len(checked.scatter.weights))
+        how: dict[str, Any] = dict(each=each, batch_size=batch_size, progress=progress)
         optima, targets = run(
-            program,
-            stacked,
-            grid,
-            first,
-            design_many,
-            batch_size,
-            progress,
-            out,
-            devices,
-            None,
-            each,
+            program, stacked, grid, first, design_many, **how, out=out, devices=devices
         )
     optima, targets = jax.tree.map(lambda a: a.reshape(shape + a.shape[1:]), (optima, targets))
     return DesignMany(

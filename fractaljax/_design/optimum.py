@@ -17,8 +17,9 @@ from jaxtyping import Array, Bool, Float
 
 from .._base.parts import Record, nan_where
 from .._base.ranges import low_discrepancy
-from .problem import UNKNOWN, DesignProblem
-from .result import DesignResult
+from .functions import compressed, finite
+from .problem import DesignProblem
+from .result import DesignResult, is_met
 from .sequential import Row, sequential
 
 _APART = 0.15  # least distance of two starts, in scaled variables
@@ -49,8 +50,7 @@ def optimum(problem: DesignProblem, starts: int, lattice: int, steps: int) -> Op
     """
     frozen = jax.lax.stop_gradient(problem)
     u, multipliers, result = jax.lax.stop_gradient(_search(frozen, starts, lattice, steps))
-    is_optimal = (result == DesignResult.found) | (result == DesignResult.unchanged)
-    u = _implicit(problem, u, multipliers, is_optimal)
+    u = _implicit(problem, u, multipliers, is_met(result))
     u = nan_where(result == DesignResult.undetermined, u)
     row, numbers = problem.at(u, problem.own_condition)
     if problem.scatter is not None:
@@ -68,7 +68,7 @@ def optimum(problem: DesignProblem, starts: int, lattice: int, steps: int) -> Op
 
 def _search(problem: DesignProblem, starts: int, lattice: int, steps: int):
     """The best design (v,), the multipliers of its residuals, and the result."""
-    limited, is_named = limited_columns(problem), problem.asked
+    limited, is_named = problem.limited, problem.asked
     slack = max(1e-9, problem.rounding)
     slack = jnp.where(is_named[limited], slack, 0.01 * slack).astype(problem.low.dtype)
     start = jnp.clip(problem.start, 0, 1)
@@ -79,14 +79,14 @@ def _search(problem: DesignProblem, starts: int, lattice: int, steps: int):
     us = jnp.asarray(low_discrepancy(lattice, len(start)), start.dtype)
     us = jnp.concatenate([start[None], us])
     rows = jax.vmap(lambda u: row_of(u)[is_named])(us)
-    finite = jnp.all(jnp.isfinite(rows), axis=1)
+    screened = jnp.all(jnp.isfinite(rows), axis=1)
     scale: Any = jnp.ones_like(start[0])
     if problem.objective is not None:
-        values = jnp.where(finite, rows[:, 0], jnp.nan)
+        values = jnp.where(screened, rows[:, 0], jnp.nan)
         scale = jnp.nanquantile(values, 0.9) - jnp.nanquantile(values, 0.1)
         scale = jnp.where(scale > 0, scale, 1)
     merit = rows[:, 0] / scale + _PENALTY * jnp.sum(jnp.maximum(rows[:, 1:], 0), axis=1)
-    merit = jnp.where(finite, merit, jnp.inf)
+    merit = jnp.where(screened, merit, jnp.inf)
     first = us[_distinct(us, merit, starts)]
 
     def linearised(u) -> Row:
@@ -96,13 +96,9 @@ def _search(problem: DesignProblem, starts: int, lattice: int, steps: int):
 
         slopes, row = jax.jacfwd(values, has_aux=True)(u)
         named = row[is_named]
-        row = jnp.nan_to_num(row, nan=UNKNOWN, posinf=UNKNOWN, neginf=-UNKNOWN)
-        slopes = jnp.nan_to_num(slopes, nan=0, posinf=0, neginf=0)
-        c, A = row[limited] + slack, slopes[limited]
-        # By logarithms where they are beyond order one.
-        size = jnp.maximum(jnp.abs(c), 1)
-        c = jnp.where(size > 1, jnp.sign(c) * (1 + jnp.log(size)), c)
-        return Row(row[0] / scale, c, slopes[0] / scale, A / size[:, None], named)
+        row, slopes = finite(row, slopes, jnp)
+        c, A = compressed(row[limited] + slack, slopes[limited], jnp)
+        return Row(row[0] / scale, c, slopes[0] / scale, A, named)
 
     curvature = 2.0 if problem.objective is None else 1.0
     ends, ended, multipliers = jax.vmap(lambda u: sequential(linearised, u, curvature, steps))(
@@ -120,28 +116,13 @@ def _search(problem: DesignProblem, starts: int, lattice: int, steps: int):
     u, multipliers = ends[best], multipliers[best] * scale
     unchanged: Any = jnp.zeros_like(met[0])
     if problem.objective is None:
-        unchanged = finite[0] & jnp.all(rows[0, 1:] <= 0)
+        unchanged = screened[0] & jnp.all(rows[0, 1:] <= 0)
         u = jnp.where(unchanged, problem.start, u)
         multipliers = jnp.where(unchanged, 0, multipliers)
     result = DesignResult.where(jnp.any(met), DesignResult.found, DesignResult.infeasible)
     result = DesignResult.where(unchanged, DesignResult.unchanged, result)
-    none = ~(jnp.any(finite) | jnp.any(has_number))
+    none = ~(jnp.any(screened) | jnp.any(has_number))
     return u, multipliers, DesignResult.where(none, DesignResult.undetermined, result)
-
-
-def limited_columns(problem: DesignProblem) -> np.ndarray:
-    """The columns of a row that are requirements.
-
-    Smooth residuals stand for growth rates where there are some; what is minimised needs no limit.
-    """
-    columns = np.arange(len(problem.asked))
-    growing = np.isin(columns, columns[problem.growth_columns])
-    limited = problem.asked & (columns > 0)
-    if problem.least_growth:
-        limited &= ~growing
-    elif problem.smooth:
-        limited = limited & ~growing | ~problem.asked
-    return columns[limited]
 
 
 def _distinct(us, merit, count: int) -> Array:
@@ -164,11 +145,11 @@ def _implicit(problem: DesignProblem, u, multipliers, is_optimal: Bool[Array, ""
 @_implicit.defjvp
 def _implicit_jvp(primals, tangents):
     problem, u, multipliers, is_optimal = primals
-    columns = limited_columns(problem)
+    limited = problem.limited
 
     def values(problem, u):
         row = problem.at(u, problem.own_condition)[0]
-        return row[0], row[columns]
+        return row[0], row[limited]
 
     def by_design(u):
         return jax.jacfwd(lambda u: values(problem, u))(u)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from .._base.parts import is_traced, nan_where, whole
+from .._base.parts import is_traced, nan_where, refused, whole
 from .._base.programs import exported_jit
 from .._contact.contact import Contact
 from .._mechanism.mechanism import Mechanism
@@ -122,14 +122,22 @@ class DesignProblem(eqx.Module):
         friction_slope: bool = True,
         modes: int | None = None,
     ):
-        request: dict[str, Any] = dict(objective=objective, constraints=constraints, target=target)
-        request |= dict(K_n_min=K_n_min, laws=laws, envelope=envelope, tolerance=tolerance)
-        request |= dict(
-            quantile=quantile, area_ratio_min=area_ratio_min, slip_ratio_max=slip_ratio_max
+        fields = stated_fields(
+            x,
+            bounds,
+            objective=objective,
+            constraints=constraints,
+            target=target,
+            K_n_min=K_n_min,
+            laws=laws,
+            envelope=envelope,
+            tolerance=tolerance,
+            quantile=quantile,
+            area_ratio_min=area_ratio_min,
+            slip_ratio_max=slip_ratio_max,
+            friction_slope=friction_slope,
         )
-        for name, value in stated_fields(
-            x, bounds, friction_slope=friction_slope, **request
-        ).items():
+        for name, value in fields.items():
             setattr(self, name, value)
         self.modes, self.smooth, self.cuts = 0, False, None
         if isinstance(x, Structure):
@@ -171,10 +179,9 @@ class DesignProblem(eqx.Module):
         u = jnp.asarray(u, self.low.dtype)
         if u.shape != self.low.shape:
             raise ValueError(f"u must have the shape {self.low.shape}, got {u.shape}")
-        # A mechanism that is none has no slopes either.
-        u = nan_where(
-            jnp.stack([jnp.isnan(leaf).any() for leaf in jax.tree.leaves(self.x)]).any(), u
-        )
+        bad = refused(self.x)
+        assert bad is not None  # traced, by `loss` and `residuals`
+        u = nan_where(bad, u)  # so that slopes are NaN, too
         if self.grid is not None:
             rows = jax.vmap(lambda condition: self.at(u, condition)[0])(self.grid)
             return jnp.max(rows[:, self.asked], axis=0)
@@ -309,6 +316,26 @@ class DesignProblem(eqx.Module):
         """Where in a row the growth rates are, of the modes by each law."""
         first = 1 + self.model_residuals
         return slice(first, first + max(self.modes, 1) * (1 + len(self.laws)))
+
+    @property
+    def growing(self) -> np.ndarray:
+        """Which columns (1 + k,) of a row are growth rates."""
+        growing = np.zeros(len(self.asked), bool)
+        growing[self.growth_columns] = True
+        return growing
+
+    @property
+    def limited(self) -> np.ndarray:
+        """Which columns (1 + k,) of a row a search keeps at most 0.
+
+        Smooth residuals stand for growth rates where there are some.
+        """
+        columns = np.arange(len(self.asked))
+        if self.least_growth:
+            # What is minimised needs no limit of its own.
+            objectives = self.growing & (columns < self.growth_columns.start + self.modes)
+            return (columns > 0) & self.asked & ~objectives
+        return (columns > 0) & ~(self.growing & self.smooth)
 
     @property
     def joint_columns(self) -> np.ndarray:

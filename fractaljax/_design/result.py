@@ -1,5 +1,7 @@
 """How a design ends."""
 
+from typing import Any
+
 import equinox as eqx
 
 
@@ -10,3 +12,8 @@ class DesignResult(eqx.Enumeration):
     unchanged = "unchanged: the given surface meets every requirement already"
     infeasible = "infeasible: no surface inside the bounds was found to meet every requirement"
     undetermined = "undetermined: nowhere inside the bounds is there a growth rate"
+
+
+def is_met(result: Any) -> Any:
+    """True where a design, or each of a batch, meets every requirement."""
+    return (result == DesignResult.found) | (result == DesignResult.unchanged)

@@ -199,7 +199,7 @@ class Search:
 
         The largest of all growth rates is minimised, whatever the target.
         """
-        growing, others = self.growing, self.others
+        growing, others = self.evaluator.problem.growing, self.others
         paths = self._ways([start[None] for start in starts], growing, others)
         if self.solver is None:
             return paths, self._ends(paths)
@@ -218,19 +218,14 @@ class Search:
     def growth_and_rest(self, evaluation: Evaluation) -> tuple[np.ndarray, np.ndarray]:
         """The largest residuals (n,) of growth rates, and of all other requirements."""
         k = evaluation.rows.shape[1]
-        growing, others = (evaluation.rows[:, mask[:k]] for mask in (self.growing, self.others))
+        masks = self.evaluator.problem.growing, self.others
+        growing, others = (evaluation.rows[:, mask[:k]] for mask in masks)
         return growing.max(axis=1), others.max(axis=1, initial=-np.inf)
-
-    @property
-    def growing(self) -> np.ndarray:
-        """Which columns of a row are growth rates."""
-        columns = np.arange(len(self.evaluator.problem.asked))
-        return np.isin(columns, columns[self.evaluator.problem.growth_columns])
 
     @property
     def others(self) -> np.ndarray:
         """Which columns of a row are requirements, but of growth rates."""
-        others = self.evaluator.problem.asked & ~self.growing
+        others = self.evaluator.problem.asked & ~self.evaluator.problem.growing
         others[0] = False  # the objective
         return others
 
@@ -246,17 +241,13 @@ class Search:
         problem = self.evaluator.problem
         is_named = problem.asked
         columns = np.arange(len(is_named))
-        aim, limited = columns == 0, columns > 0
+        aim, limited = columns == 0, problem.limited
         if violated is not None:
             aim[is_named] = np.append(False, violated)
-            limited &= is_named & (columns < aim.argmax())
+            limited = is_named & (columns > 0) & (columns < aim.argmax())
         elif problem.least_growth:
-            # The largest of many modes has kinks where they change places; each has none. What
-            # is minimised needs no limit of its own.
-            objectives = self.growing & (columns < problem.growth_columns.start + problem.modes)
-            aim, limited = ~is_named, limited & is_named & ~objectives
-        elif problem.smooth:
-            limited &= ~self.growing
+            # The largest of many modes has kinks where they change places; each has none.
+            aim = ~is_named
         return self._ways(paths, aim, limited, progress, restored, stages)
 
     def _ways(self, paths, aim, limited, progress=False, restored=False, stages=None):

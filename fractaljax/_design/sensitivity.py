@@ -19,9 +19,7 @@ from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import moved_by, own_quantities, replaced, unit, value_of
 from .._mechanism.structure import Structure
 from .evaluator import Evaluator, OnAverage
-from .optimum import limited_columns
 from .problem import DesignProblem
-from .rows import linearise
 
 _STEP = 0.25  # power of eps: of a variable in its bounds, of a quantity as a share of it
 _ACTIVE = 1e-5  # a residual that is met by less than this may be active
@@ -70,23 +68,24 @@ class Sensitivity(Record):
         return "\n".join([aligned(lines), f"multipliers: {costs or 'none'}"])
 
 
-Rows = Callable[[DesignProblem, np.ndarray], tuple[np.ndarray, np.ndarray]]
-
-
 def sensitivity_of(
     x: Mechanism,
     designed: Mechanism,
     state: Callable[[Mechanism], DesignProblem],
     evaluator: Evaluator,
 ) -> Sensitivity | None:
-    """That of the design of x, whose problem `state` states, as `evaluator` counts it.
+    """How the design of x moves; `state` states the problem of another x.
 
     None where it cannot be told: where the conditions of an optimum do not hold, as at a kink, and
     where a requirement is at its worst inside of an envelope, at a condition that would move too.
     """
-    problem = state(x)
+    problem = evaluator.problem
     u = problem.scaled(designed)
-    rows, columns = _rows_of(evaluator, u)
+    rows = evaluator.rows_for(u)
+    # What stands for a growth rate is not evaluated over an envelope.
+    columns = np.flatnonzero(problem.asked)[1:]
+    if not problem.conditions:
+        columns = np.flatnonzero(problem.limited)
     row, jacobian = rows(problem, u)
     c, A = row[columns], jacobian[columns]
     optimal = _multipliers(jacobian[0], c, A, u)
@@ -136,30 +135,6 @@ def sensitivity_of(
     costs |= {f"{name} >= lower bound": float(m) for name, m, _ in bounds if m > 0}
     costs |= {f"{name} <= upper bound": float(m) for name, _, m in bounds if m > 0}
     return Sensitivity(slopes=changes, multipliers=costs, ranges=ranges, x=designed)
-
-
-def _rows_of(evaluator: Evaluator, u: np.ndarray) -> tuple[Rows, np.ndarray]:
-    """A function: the row that counts, at conditions fixed for u, and its Jacobian; its columns."""
-    problem = evaluator.problem
-    plain = not problem.conditions
-    conditions = evaluator.working
-    columns = limited_columns(problem) if plain else np.flatnonzero(problem.asked)[1:]
-    which = np.zeros(len(problem.asked), int)
-    average = isinstance(evaluator, OnAverage)
-    if not plain and not average:
-        values = evaluator.envelope.values(evaluator.evaluate(u[None]).places[0])
-        conditions, places = np.unique(values, axis=0, return_inverse=True)
-        which[problem.asked] = places.ravel()
-
-    def rows(problem, u):
-        us = np.repeat(u[None], len(conditions), axis=0)
-        values, jacobians, _ = linearise(problem, us, conditions)
-        if average:
-            values, jacobians = evaluator.average(values, jacobians)
-        every = np.arange(values.shape[1])
-        return values[which[every], every], jacobians[which[every], every]
-
-    return rows, columns
 
 
 def _multipliers(slope, c, A, u) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:

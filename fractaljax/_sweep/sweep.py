@@ -88,9 +88,8 @@ def sweep(
     names = tuple(grid)
     whole: Any = with_optional(x, names)  # pyright: ignore[reportArgumentType]
     program = Program(measure, names, whole, list(grid.values()))
-    values = run(
-        program, whole, grid, x, measure, batch_size, progress, out, devices, executor, _each(x)
-    )
+    how: dict[str, Any] = dict(each=_each(x), batch_size=batch_size, progress=progress, out=out)
+    values = run(program, whole, grid, x, measure, **how, devices=devices, executor=executor)
     return Sweep(values, tuple(grid.values()), names, x)
 
 
@@ -100,12 +99,13 @@ def run(
     grid: Mapping[str, np.ndarray],
     x: Any,
     measure: Callable[[Any], Any],
+    *,
+    each: int,
     batch_size: int | None,
     progress: bool,
     out: str | os.PathLike | None,
     devices: Sequence[Any] | None,
-    executor: Any,
-    each: int,
+    executor: Any = None,
 ) -> Any:
     """The pytree of a program's arrays over a grid, in batches; arguments and errors as `sweep`.
 

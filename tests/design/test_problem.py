@@ -143,3 +143,23 @@ def test_load_curves_are_kept(form):
     problem = stated(scene, {"D": (2.3, 2.6)}, K_n_min=None)
     found = describe(problem, problem.scaled(scene)[None])
     assert found["growth_rate"][0] == pytest.approx(float(fj.growth_rate(scene)), rel=1e-9)
+
+
+@pytest.mark.slow
+def test_limits_of_a_search_are_all_but_what_is_minimised():
+    """The growth rates of a structure by another law are limited, those that are minimised not."""
+    structure = fractal_joints()
+    law = fj.AsperityContact(
+        structure.joints[0].contact.surface, structure.joints[0].contact.material, 1500.0, L_s=1e-6
+    )
+    least = fj.DesignProblem(
+        structure, {"left.D": (2.3, 2.8)}, fj.growth_rate, laws=[law], K_n_min=0.0, modes=2
+    )
+    names = ["objective", *least.residual_names]
+    limited = [names[i] for i in np.flatnonzero(least.limited)]
+    assert [name for name in limited if "growth" in name] == [
+        "growth_rate <= target by AsperityContact",
+        "growth_rate of mode 2 <= target by AsperityContact",
+    ]
+    nearest = least.with_fields(objective=None)
+    assert not nearest.limited[nearest.growth_columns].any() and nearest.limited[-1]

@@ -7,6 +7,7 @@ import pytest
 
 from fractaljax._design.quadratic_step import quadratic_step
 from fractaljax._design.sequential import Row, sequential
+from minima import MINIMA
 
 RHO = 10.0
 
@@ -53,43 +54,20 @@ def problem(f, c):
     """The row of functions of one design."""
 
     def row(u):
-        (f_u, c_u), (g, A) = (f(u), c(u)), jax.jacfwd(lambda u: (f(u), c(u)))(u)
+        def values(u):
+            return f(u), jnp.stack(c(u))
+
+        (f_u, c_u), (g, A) = values(u), jax.jacfwd(values)(u)
         return Row(f_u, c_u, g, A, c_u)
 
     return row
 
 
-@pytest.mark.parametrize(
-    ("f", "c", "solution"),
-    [
-        # Outside a circle, nearest to a point inside it: along the radius.
-        (
-            lambda u: (u[0] - 0.6) ** 2 + (u[1] - 0.5) ** 2,
-            lambda u: jnp.stack([0.09 - (u[0] - 0.5) ** 2 - (u[1] - 0.5) ** 2]),
-            (0.8, 0.5),
-        ),
-        # Two curves meet in a corner.
-        (
-            lambda u: u[0] + 2 * u[1],
-            lambda u: jnp.stack([0.25 - u[0] * u[1], u[0] ** 2 - 0.36]),
-            (0.6, 0.25 / 0.6),
-        ),
-        # The bounds alone decide.
-        (lambda u: u[0] - u[1], lambda u: jnp.stack([-1 + 0 * u[0]]), (0.0, 1.0)),
-        # Nothing decides: a smooth minimum inside.
-        (
-            lambda u: (u[0] - 0.3) ** 2 + 5 * (u[1] - 0.7 - u[0] ** 2 / 2) ** 2,
-            lambda u: jnp.stack([-1 + 0 * u[0]]),
-            (0.3, 0.745),
-        ),
-        # A multiplier of 50, above the penalty that a search begins with.
-        (
-            lambda u: 50 * (u[0] - 0.2) ** 2 / 0.8,
-            lambda u: jnp.stack([0.6 - u[0]]),
-            (0.6, None),
-        ),
-    ],
-)
+# With a multiplier of 50, above the penalty that a search begins with.
+DEAR = (lambda u: 50 * (u[0] - 0.2) ** 2 / 0.8, lambda u: (0.6 - u[0],), (0.6, None))
+
+
+@pytest.mark.parametrize(("f", "c", "solution"), [*MINIMA, DEAR])
 def test_known_solutions(f, c, solution):
     """Curved, cornered, bounded and free minima, and one that is dear, from random starts."""
     starts = jnp.asarray(np.random.default_rng(0).uniform(size=(6, 2)))

@@ -16,6 +16,7 @@ from fractaljax._design.lockstep import in_lockstep
 from fractaljax._design.search import Search
 from fractaljax._design.solvers import slsqp
 from fractaljax._design.starts import choose_starts, designs_near, screened_designs
+from minima import MINIMA
 from tools import reference_scene
 
 
@@ -30,38 +31,14 @@ def functions_of(f, c, slack=0.0):
     return Functions(rows_at, np.arange(k) == 0, np.arange(k) > 0, slack, 1.0, extra=False)
 
 
-@pytest.mark.parametrize(
-    ("f", "c", "solution"),
-    [
-        # Outside a circle, nearest to a point inside it: along the radius.
-        (
-            lambda u: (u[0] - 0.6) ** 2 + (u[1] - 0.5) ** 2,
-            lambda u: np.array([0.09 - (u[0] - 0.5) ** 2 - (u[1] - 0.5) ** 2]),
-            (0.8, 0.5),
-        ),
-        # Two curves meet in a corner, where residuals are far from order one.
-        (
-            lambda u: u[0] + 2 * u[1],
-            lambda u: 1e3 * np.array([0.25 - u[0] * u[1], u[0] ** 2 - 0.36]),
-            (0.6, 0.25 / 0.6),
-        ),
-        # The bounds alone decide.
-        (lambda u: u[0] - u[1], lambda u: np.array([-1 + 0 * u[0]]), (0.0, 1.0)),
-        # Nothing decides: a smooth minimum inside.
-        (
-            lambda u: (u[0] - 0.3) ** 2 + 5 * (u[1] - 0.7 - u[0] ** 2 / 2) ** 2,
-            lambda u: np.array([-1 + 0 * u[0]]),
-            (0.3, 0.745),
-        ),
-    ],
-)
+@pytest.mark.parametrize(("f", "c", "solution"), MINIMA)
 def test_known_solutions(f, c, solution):
     """Curved, cornered, bounded and free minima, with as few evaluations as a solver asks for."""
     bounds, ends = np.tile([0.0, 1.0], (2, 1)), []
     for start in np.random.default_rng(0).uniform(size=(6, 2)):
         functions = functions_of(f, c)
         u = slsqp(functions.objective, functions.constraints, start, bounds)
-        if (c(u) <= 1e-6).all():
+        if (np.array(c(u)) <= 1e-6).all():
             ends.append((f(u), *u))
             assert len(functions.seen) == len(np.unique(functions.seen, axis=0)) < 200
     np.testing.assert_allclose(min(ends)[1:], solution, atol=1e-6)
