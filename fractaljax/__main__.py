@@ -56,10 +56,8 @@ def main(argv: list[str] | None = None) -> int:
     from ._base.programs import kept_programs
 
     jax.config.update("jax_enable_x64", True)
-    if signal.getsignal(signal.SIGINT) is _end_at_once:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        with kept_programs(), _terminable():
+        with _interruptible(), kept_programs(), _terminable():
             status = arguments.run(arguments)
         if sys.stdout is not None:  # None where it was closed from the start
             sys.stdout.flush()
@@ -94,6 +92,48 @@ def _end_at_once(*_) -> None:
     """End an interrupted command before it has begun."""
     os.write(2, b"fractaljax: interrupted, nothing written\n")
     os._exit(128 + signal.SIGINT)
+
+
+@contextlib.contextmanager
+def _interruptible():
+    """Let Ctrl-C end a command that runs by itself, whatever it meets.
+
+    An exception is lost in a callback of the garbage collector, so that it waits for the end of
+    one; and a library may make an error of its own of it.
+    """
+    if signal.getsignal(signal.SIGINT) is not _end_at_once:
+        yield
+        return
+    collecting = interrupted = False
+
+    def begin(phase, _):
+        nonlocal collecting
+        collecting |= phase == "start"
+
+    def end(phase, _):
+        nonlocal collecting
+        collecting &= phase == "start"
+
+    def interrupt(*_):
+        nonlocal interrupted
+        if collecting:
+            threading.Timer(0.01, os.kill, (os.getpid(), signal.SIGINT)).start()
+            return
+        interrupted = True
+        raise KeyboardInterrupt
+
+    gc.callbacks.insert(0, begin)
+    gc.callbacks.append(end)
+    signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield
+    except Exception as error:
+        if interrupted:
+            raise KeyboardInterrupt from error
+        raise
+    finally:
+        gc.callbacks.remove(begin)
+        gc.callbacks.remove(end)
 
 
 @contextlib.contextmanager

@@ -283,6 +283,44 @@ def test_module_in_double_precision():
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no signals between processes")
+@pytest.mark.parametrize("place", ["in_a_collection", "in_a_library"])
+def test_an_interrupt_is_not_lost(tmp_path, place):
+    """Neither where Python only reports an exception nor where a library makes another of it."""
+    script = f"""
+import gc, os, signal, sys, time
+from fractaljax._cli import commands
+from fractaljax.__main__ import command
+
+def interrupt(*_):
+    if interrupt in gc.callbacks:
+        gc.callbacks.remove(interrupt)
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(0.001)  # here the signal is handled
+
+def in_a_collection(arguments):
+    gc.callbacks.append(interrupt)
+    gc.collect()
+    time.sleep(5)
+    return 0
+
+def in_a_library(arguments):
+    try:
+        interrupt()
+    except KeyboardInterrupt:
+        raise ValueError("an error of its own")
+
+commands._stability = {place}
+sys.argv = ["fractaljax", "stability"]
+sys.exit(command())
+"""
+    run = subprocess.run(
+        [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert (run.returncode, run.stdout) == (130, "")
+    assert run.stderr == "fractaljax: interrupted, nothing written\n"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no signals between processes")
 @pytest.mark.parametrize("after", [0.0, 0.1, 0.3, 0.6])
 def test_an_interrupt_at_any_time_is_one_line(tmp_path, after):
     """Also while the modules load, in the first second."""
