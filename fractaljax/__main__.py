@@ -53,11 +53,11 @@ def main(argv: list[str] | None = None) -> int:
     gc.set_threshold(50_000, 20, 50)
     import jax
 
-    from ._base.programs import kept_programs
+    from ._base.programs import keep_programs
 
     jax.config.update("jax_enable_x64", True)
     try:
-        with _interruptible(), kept_programs(), _terminable():
+        with _interruptible(), keep_programs(), _terminable():
             status = arguments.run(arguments)
         if sys.stdout is not None:  # None where it was closed from the start
             sys.stdout.flush()

@@ -14,7 +14,7 @@ from jax import export
 import fractaljax as fj
 from fractaljax._design import rows
 from fractaljax._dynamics import basin, itinerary
-from fractaljax._dynamics.limit_cycle import posed
+from fractaljax._dynamics.limit_cycle import scale_problem
 from fractaljax._stability import boundary, tracks
 from fractaljax._sweep import batches
 from mechanisms import PROBLEMS
@@ -69,9 +69,9 @@ def test_public_programs_lower_for_cuda(name):
 
 # Each compiles the search again, whose NaN the other cycles show; here what it is given has it.
 SYSTEMS = {
-    "limit_cycle, pressed": of(lambda x: posed(x, None), PRESSED),
-    "limit_cycle, excited": of(lambda x: posed(x, FORCE)),
-    "limit_cycle of a structure": of(lambda x: posed(x, None), STRUCTURE),
+    "limit_cycle, pressed": of(lambda x: scale_problem(x, None), PRESSED),
+    "limit_cycle, excited": of(lambda x: scale_problem(x, FORCE)),
+    "limit_cycle of a structure": of(lambda x: scale_problem(x, None), STRUCTURE),
 }
 SEARCHED = [name for name in PROGRAMS if name not in (*SYSTEMS, "limit_cycle, batch")]
 

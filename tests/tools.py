@@ -114,7 +114,7 @@ def run_command(capsys, *arguments) -> tuple[Any, str, str]:
     (tests/base/test_programs.py): here they would be compiled once more for that.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(programs, "kept_programs", contextlib.nullcontext)
+        patch.setattr(programs, "keep_programs", contextlib.nullcontext)
         try:
             status = main([str(argument) for argument in arguments])
         except SystemExit as stop:

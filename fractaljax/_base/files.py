@@ -74,7 +74,7 @@ def write_together(files: Mapping[Any, bytes], *, durable: bool = True) -> list[
     return replaced
 
 
-def left_behind(target: Path, file: Path) -> bool:
+def is_partial_copy(target: Path, file: Path) -> bool:
     """True if `file` is a partial copy of `target` that a killed `write_whole` left."""
     return file.name.startswith(f".{target.name}-")
 

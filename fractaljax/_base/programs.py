@@ -67,7 +67,7 @@ def quick_compilation() -> dict[str, Any]:
 
 
 def exported_jit(function: Callable, static_argnames: str | tuple[str, ...] = ()) -> Callable:
-    """`jax.jit` whose exported program is kept on disk inside `kept_programs`."""
+    """`jax.jit` whose exported program is kept on disk inside `keep_programs`."""
     jitted = jax.jit(function, static_argnames=static_argnames)
     static = (static_argnames,) if isinstance(static_argnames, str) else static_argnames
     signature = inspect.signature(function)
@@ -227,7 +227,7 @@ def _surroundings() -> str:
 
 
 @contextlib.contextmanager
-def kept_programs() -> Iterator[None]:
+def keep_programs() -> Iterator[None]:
     """Keep programs in the user's cache folder, or in JAX_COMPILATION_CACHE_DIR; never raise.
 
     Only a folder that no one else can write to is used, since its content is executed.

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from .output import csv_text, import_pictures, output, picture
-from .parsing import add_constant_friction, add_out, add_scene_file, load_given
+from .parsing import add_constant_friction, add_out, add_scene_file, load_mechanism
 
 _SAMPLES = 512  # of one period
 _MODES, _MODES_MOST = "fractaljax-stability", 8  # folder of the pictures of modes, and how many
@@ -36,7 +36,10 @@ def _stability(arguments) -> int:
     from .._mechanism.structure import Structure
     from .._stability.summary import stability_table, structure_table
 
-    subject, slope = load_given(arguments.scene, structures=True), not arguments.constant_friction
+    subject, slope = (
+        load_mechanism(arguments.scene, structures=True),
+        not arguments.constant_friction,
+    )
     table: Any = structure_table if isinstance(subject, Structure) else stability_table
     if getattr(subject, "mesh", None) is None:
         if arguments.out is not None:
@@ -109,7 +112,7 @@ def _cycle(arguments) -> int:
     from .._mechanism.structure import Structure
     from .._stability.stability import require_computable
 
-    scene = load_given(arguments.scene, structures=True)
+    scene = load_mechanism(arguments.scene, structures=True)
     if isinstance(scene, Scene):
         require_computable(scene)
     options = {name: getattr(arguments, name) for name in ("start", "rtol", "max_returns")}

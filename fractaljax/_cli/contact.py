@@ -3,7 +3,7 @@
 from typing import Any
 
 from .output import csv_text, output, picture
-from .parsing import add_out, add_scene_file, load_given, numbers
+from .parsing import add_out, add_scene_file, load_mechanism, numbers
 
 _OPTIONS: dict[str, dict[str, Any]] = {
     "--area": {"type": float, "help": "nominal area of the joint [m^2], if not in the scene"},
@@ -42,7 +42,7 @@ def _run(arguments) -> int:
     from .. import plot
     from .._contact.compare import compare_laws
 
-    scene = load_given(arguments.scene)
+    scene = load_mechanism(arguments.scene)
     law, friction = scene.contact, scene.friction
     if not law.has_surface:
         raise ValueError(f"{arguments.scene}: the law of its contact takes no surface")

@@ -9,12 +9,12 @@ from .parsing import (
     add_constant_friction,
     add_out,
     add_scene_file,
-    envelope_of,
     kick_size,
-    load_given,
+    load_mechanism,
     number,
     numbers,
-    pairs_of,
+    parse_envelope,
+    parse_pairs,
     remarks,
 )
 
@@ -127,7 +127,7 @@ def _run(arguments) -> int:
 
     if arguments.repeat is None:
         options = _options(arguments)
-        x = load_given(arguments.scene, True, options["bounds"], arguments.quiet)
+        x = load_mechanism(arguments.scene, True, options["bounds"], arguments.quiet)
     else:
         names = arguments.design_options
         conflicting = [name for name in names if getattr(arguments, name) not in (None, False)]
@@ -194,7 +194,7 @@ def _options(arguments) -> dict:
     if arguments.bounds is None:
         options["bounds"] = DEFAULT_BOUNDS | options["bounds"]
     else:
-        for name, text in pairs_of("--bounds", arguments.bounds, _SEVERAL["bounds"][0]).items():
+        for name, text in parse_pairs("--bounds", arguments.bounds, _SEVERAL["bounds"][0]).items():
             options["bounds"][name] = tuple(numbers(f"--bounds {name}", text, ":"))
     options["constraints"] = _constraints(arguments)
     if arguments.quiet_within is not None:
@@ -203,7 +203,7 @@ def _options(arguments) -> dict:
         kind, _, value = arguments.risk.partition(":")
         options["risk"] = (kind, number("--risk", value)) if value else kind
     if arguments.envelope is not None:
-        options["envelope"] = envelope_of(arguments.envelope)
+        options["envelope"] = parse_envelope(arguments.envelope)
     if arguments.tolerance is not None:
         options["tolerance"] = _tolerance(arguments.tolerance)
     return options
@@ -217,7 +217,7 @@ def _tolerance(texts: list[str]) -> Any:
         return read_tolerance(texts[0])
     return {
         f"ln {name[2:]}" if name.startswith("ln") else name: number("--tolerance", text)
-        for name, text in pairs_of("--tolerance", texts, "NAME=SIGMA").items()
+        for name, text in parse_pairs("--tolerance", texts, "NAME=SIGMA").items()
     }
 
 

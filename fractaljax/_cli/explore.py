@@ -1,7 +1,7 @@
 """`fractaljax explore`: a page with sliders over the quantities of a scene."""
 
 from .output import output
-from .parsing import add_out, add_scene_file, load_given, windows_of
+from .parsing import add_out, add_scene_file, load_mechanism, parse_windows
 
 _FORM = "NAME=LOW:HIGH"
 
@@ -34,8 +34,8 @@ def _run(arguments) -> int:
     """
     from ..plot.explore import page
 
-    scene = load_given(arguments.scene)
-    windows = windows_of("--over", arguments.over, _FORM)
+    scene = load_mechanism(arguments.scene)
+    windows = parse_windows("--over", arguments.over, _FORM)
     with output(arguments.out) as write:
         text = page(scene, windows, not arguments.no_cycles, not arguments.quiet)
         written = write({"explore.html": text.encode()})

@@ -4,7 +4,7 @@ import shlex
 from pathlib import Path
 
 from .output import output, picture
-from .parsing import add_out, envelope_of, load_given, pairs_of
+from .parsing import add_out, load_mechanism, parse_envelope, parse_pairs
 
 _MANY = 5  # warnings at which no scene is written
 _OPTIONS = {
@@ -70,18 +70,18 @@ def _run(arguments) -> int:
     from .._identify.files import read_measurement
     from .._identify.identify import identify
 
-    base = load_given(arguments.scene)
+    base = load_mechanism(arguments.scene)
     if not base.contact.has_surface:
         raise ValueError(f"{arguments.scene}: the law of its contact takes no surface")
     if arguments.area is not None:
         scalar("--area", arguments.area, above=0)
-    envelope = None if arguments.envelope is None else envelope_of(arguments.envelope)
+    envelope = None if arguments.envelope is None else parse_envelope(arguments.envelope)
     if envelope is not None:
         envelope.check(base, ())
     names = ("dx", "dy", "unit", "position_unit", "channel")
     file_options = {name: getattr(arguments, name) for name in names}
     if arguments.columns is not None:
-        file_options["columns"] = pairs_of("--columns", arguments.columns, "ROLE=COLUMN")
+        file_options["columns"] = parse_pairs("--columns", arguments.columns, "ROLE=COLUMN")
     read = read_measurement(arguments.file, **file_options)
     instrument = {name: getattr(arguments, name) for name in ("resolution", "stylus_radius")}
     with output(arguments.out) as write:

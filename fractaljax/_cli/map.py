@@ -3,7 +3,7 @@
 from typing import Any
 
 from .output import csv_text, output, picture
-from .parsing import add_out, add_scene_file, kick_size, load_given, windows_of
+from .parsing import add_out, add_scene_file, kick_size, load_mechanism, parse_windows
 
 _FORM = "NAME=LOW:HIGH"
 _AROUND = {"D": (-0.05, 0.05), "G": (0.5, 2.0)}  # of the default window: added, and a factor
@@ -41,7 +41,7 @@ def _run(arguments) -> int:
     from .. import plot
     from .._dynamics.bifurcation import bifurcation_map
 
-    x = load_given(arguments.scene, structures=True, quiet=arguments.quiet)
+    x = load_mechanism(arguments.scene, structures=True, quiet=arguments.quiet)
     windows = [_window(x, which, getattr(arguments, which)) for which in ("x", "y")]
     options: dict[str, Any] = {}
     if arguments.radius is not None:
@@ -58,17 +58,17 @@ def _run(arguments) -> int:
 
 def _window(x, which: str, text: str | None) -> tuple[str, float, float]:
     """A quantity and its window; by default around the value of D or G."""
-    from .._mechanism.quantities import known_quantities, value_of
+    from .._mechanism.quantities import quantity_names, value_of
 
     if text is None:
         name = {"x": "D", "y": "G"}[which]
-        if name not in known_quantities(x):
+        if name not in quantity_names(x):
             raise ValueError(f"--{which} must be {_FORM}: the scene has no {name}")
         value, (low, high) = float(value_of(x, name)), _AROUND[name]
         if name == "G":
             return name, value * low, value * high
         return name, max(2.001, value + low), min(2.999, value + high)
-    ((name, window),) = windows_of(f"--{which}", [text], _FORM).items()
+    ((name, window),) = parse_windows(f"--{which}", [text], _FORM).items()
     return name, *window
 
 

@@ -124,7 +124,7 @@ def add_constant_friction(parser) -> None:
     )
 
 
-def load_given(
+def load_mechanism(
     path: Path | None,
     structures: bool = False,
     over: Mapping[str, Sequence[float]] | None = None,
@@ -146,7 +146,7 @@ def load_given(
         return mechanism
     from .._stability.reduction import reduce
 
-    options = reduction_of(path)
+    options = parse_reduction(path)
     if "band" not in options:
         raise ValueError(
             f"{path}: {mechanism.n} degrees of freedom need a reduction: run `fractaljax reduce`, "
@@ -166,7 +166,7 @@ def load_noted(path: Path) -> Any:
     return mechanism
 
 
-def reduction_of(path: Path) -> dict[str, Any]:
+def parse_reduction(path: Path) -> dict[str, Any]:
     """The table [reduction] of a structure's file: band, tol and over, if it has them.
 
     **Raises:** `ValueError` for another key.
@@ -183,7 +183,7 @@ def reduction_of(path: Path) -> dict[str, Any]:
     return table
 
 
-def pairs_of(option: str, texts: list[str], form: str) -> dict[str, str]:
+def parse_pairs(option: str, texts: list[str], form: str) -> dict[str, str]:
     """The values of several NAME=VALUE by name; an error message shows the `form` of one."""
     pairs = {}
     for text in texts:
@@ -209,12 +209,12 @@ def numbers(option: str, text: str, separator: str) -> list[float]:
     return [number(option, value) for value in text.split(separator)]
 
 
-def envelope_of(texts: list[str]) -> Any:
+def parse_envelope(texts: list[str]) -> Any:
     """The `Envelope` of --envelope: NAME=LOW:HIGH, or NAME=V1,V2,V3 measured together."""
     from .._design.envelope import Envelope
 
     ranges, samples = {}, {}
-    for name, text in pairs_of("--envelope", texts, "NAME=LOW:HIGH").items():
+    for name, text in parse_pairs("--envelope", texts, "NAME=LOW:HIGH").items():
         into, separator = (ranges, ":") if ":" in text else (samples, ",")
         into[name] = numbers(f"--envelope {name}", text, separator)
         if len(into[name]) < 2:
@@ -224,10 +224,10 @@ def envelope_of(texts: list[str]) -> Any:
     return Envelope(ranges, samples)
 
 
-def windows_of(option: str, texts: list[str], form: str) -> dict[str, tuple[float, float]]:
+def parse_windows(option: str, texts: list[str], form: str) -> dict[str, tuple[float, float]]:
     """The windows of several NAME=LOW:HIGH by name; an error message shows the `form` of one."""
     windows = {}
-    for name, ends in pairs_of(option, texts, form).items():
+    for name, ends in parse_pairs(option, texts, form).items():
         window = numbers(f"{option} {name}", ends, ":")
         if len(window) != 2:
             raise ValueError(f"{option} must be {form}, got '{name}={ends}'")

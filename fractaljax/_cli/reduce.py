@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from .output import output
-from .parsing import add_out, load_noted, numbers, pairs_of, reduction_of
+from .parsing import add_out, load_noted, numbers, parse_pairs, parse_reduction
 
 _FORM = "NAME=LOW:HIGH"
 _FILE = "reduced.toml"
@@ -47,13 +47,13 @@ def _run(arguments) -> int:
     from .._stability.reduction import reduce
     from .._stability.summary import structure_table
 
-    options: dict[str, Any] = reduction_of(arguments.structure)
+    options: dict[str, Any] = parse_reduction(arguments.structure)
     if arguments.band is not None:
         options["band"] = numbers("--band", arguments.band, ":")
     if arguments.tol is not None:
         options["tol"] = arguments.tol
     if arguments.over is not None:
-        ranges = pairs_of("--over", arguments.over, _FORM)
+        ranges = parse_pairs("--over", arguments.over, _FORM)
         options["over"] = {
             name: numbers(f"--over {name}", text, ":") for name, text in ranges.items()
         }

@@ -57,7 +57,7 @@ class Contact(Part):
             register(law, cls, CONTACTS)
 
     def __check_init__(self):
-        if self.of_the_package:
+        if self.built_in:
             return
         make_arrays(self)
         if (P := getattr(self, "P", None)) is not None:
@@ -69,7 +69,7 @@ class Contact(Part):
                 refuse(self, bad)
 
     @property
-    def of_the_package(self) -> bool:
+    def built_in(self) -> bool:
         """True for a built-in law, whose `__init__` checks its numbers."""
         return type(self).__module__.rpartition(".")[0] == __name__.rpartition(".")[0]
 

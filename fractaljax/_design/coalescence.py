@@ -18,7 +18,7 @@ from .._stability.quadratic import Leading
 _SEPARATION = 0.01  # ((s_1 - s_2)/s)^2 of two modes whose residuals are of order one
 
 
-def of_neighbours(
+def neighbour_residuals(
     modes: Leading, target: Float[Array, ""], scale: Float[Array, ""]
 ) -> Float[Array, " k"]:
     """Residuals of k modes, all at most 0 exactly where no growth rate is above the target.
@@ -42,7 +42,7 @@ def of_scene(
     target: Float[Array, ""],
     scale: Float[Array, ""],
 ) -> list[Float[Array, ""]]:
-    """As `of_neighbours`, for the two modes of a scene, from its Hurwitz determinant."""
+    """As `neighbour_residuals`, for the two modes of a scene, from its Hurwitz determinant."""
     # (s^2 + c_1 s + a)(s^2 + c_2 s + b) + g at s + target: s^4 + q_3 s^3 + q_2 s^2 + q_1 s + q_0.
     lin = linearised(scene, friction_slope)
     c_1, c_2 = lin.c_1 + 2 * target, lin.c_2 + 2 * target

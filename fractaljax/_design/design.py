@@ -31,7 +31,7 @@ from . import constraints as limits
 from .descent import descend, distinct
 from .design_file import STATED, design_files, read_design
 from .envelope import Envelope, condition_text
-from .evaluator import Evaluation, evaluator_of
+from .evaluator import Evaluation, make_evaluator
 from .few_modes import in_few_modes
 from .limit import LeastGrowth, least_growth
 from .problem import DesignProblem
@@ -39,7 +39,7 @@ from .quiet import VERIFIED, Kicks, quiet
 from .result import DesignResult
 from .rows import describe
 from .search import Found, Search
-from .sensitivity import Sensitivity, sensitivity_of
+from .sensitivity import Sensitivity, design_sensitivity
 from .solvers import Solver, slsqp
 from .starts import choose_starts, designs_around, screened_designs
 from .statement import DEFAULT_BOUNDS
@@ -112,8 +112,8 @@ class Design(Record):
             return None
         problem = stated(self.initial, self.options)
         state = functools.partial(stated, options=self.options, modes=problem.modes or None)
-        evaluator = evaluator_of(problem, self.options["envelope"], self.options["risk"])
-        return sensitivity_of(self.initial, self.scene, state, evaluator)
+        evaluator = make_evaluator(problem, self.options["envelope"], self.options["risk"])
+        return design_sensitivity(self.initial, self.scene, state, evaluator)
 
     @property
     def has_surface(self) -> bool:
@@ -375,7 +375,7 @@ def design(
             )
         kicks = Kicks.of(x, quiet_within, seed, progress)
         options["quiet_within"] = kicks.within
-    evaluator = evaluator_of(problem, envelope, risk)
+    evaluator = make_evaluator(problem, envelope, risk)
     count, designs = screened(problem, starts, lattice)
     start = np.asarray(problem.start, float)
     before = evaluator.evaluate(start[None])
@@ -383,7 +383,7 @@ def design(
         require_computable(x, problem.friction_slope)
 
     def solve(problem):
-        evaluator = evaluator_of(problem, envelope, risk)
+        evaluator = make_evaluator(problem, envelope, risk)
         us, scale = choose_starts(start, designs, evaluator.screen(designs), count)
         if problem.cycles is not None:
             scale = abs(float(before.values[0])) or 1.0

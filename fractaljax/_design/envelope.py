@@ -15,7 +15,7 @@ import numpy as np
 from .._base.parts import Record, brief, scalar
 from .._base.ranges import within
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import known_quantities, own_quantities, replaced
+from .._mechanism.quantities import quantity_names, replaced, stored_quantities
 
 _SIDES = {1: 33, 2: 11, 3: 6, 4: 4, 5: 3, 6: 3}  # points along each range, by their number
 _INNER_SIDES = {1: 16, 2: 6, 3: 4, 4: 3, 5: 2, 6: 2}  # the same for an average over conditions
@@ -94,10 +94,10 @@ class Envelope(Record):
 
     def check(self, x: Mechanism, designed: Sequence[str]) -> None:
         """Refuse names that `x` lacks or that are designed, and values outside a domain."""
-        quantities = own_quantities(x)
+        quantities = stored_quantities(x)
         available = [
             name
-            for name in known_quantities(x)
+            for name in quantity_names(x)
             if name not in quantities or quantities[name].value is not None
         ]
         for name in self.names:

@@ -73,13 +73,13 @@ class Evaluator:
         """Approximate objective and residuals (n, 1 + k) of us (n, v), for the choice of starts."""
         # Cycles are followed from the starts only.
         rough = dataclasses.replace(self, problem=self.problem.with_fields(cycles=None))
-        return rough._at_all(us, self.likely).max(axis=1)[:, self.problem.asked]
+        return rough._at_all(us, self.likely).max(axis=1)[:, self.problem.named_columns]
 
     def evaluate(self, us: np.ndarray) -> Evaluation:
         """Evaluate designs us (n, v) over all conditions."""
         grid = self.envelope.grid()
         each = self._at_all(us, self.envelope.values(grid))
-        each = each[:, :, self.problem.asked]
+        each = each[:, :, self.problem.named_columns]
         places, rows = grid[each.argmax(axis=1)], each.max(axis=1)
         near = rows > -_NEAR
         near[:, 0] = self.problem.objective is not None
@@ -106,7 +106,7 @@ class Evaluator:
         conditions, which = np.unique(places, axis=0, return_inverse=True)
         which = which.ravel()
         if self.envelope is ALONE:  # one condition of all columns, also of those without a name
-            which = np.zeros(len(self.problem.asked), int)
+            which = np.zeros(len(self.problem.named_columns), int)
         columns = np.arange(len(which))
 
         def rows(problem, u):
@@ -120,7 +120,7 @@ class Evaluator:
         evaluation, new = self.evaluate(us), []
         counts = [len(conditions) for conditions in working]
         working_rows = self._at(np.repeat(us, counts, axis=0), np.concatenate(working))
-        working_rows = working_rows[:, self.problem.asked]
+        working_rows = working_rows[:, self.problem.named_columns]
         pieces = np.split(working_rows, np.cumsum(counts)[:-1])
         for rows, places, piece in zip(evaluation.rows, evaluation.places, pieces, strict=True):
             worse = rows > piece.max(axis=0) + _NEW
@@ -186,7 +186,7 @@ class OnAverage(Evaluator):
         return row, weights
 
 
-def evaluator_of(problem: DesignProblem, envelope: Envelope | None, risk: Any) -> Evaluator:
+def make_evaluator(problem: DesignProblem, envelope: Envelope | None, risk: Any) -> Evaluator:
     """The evaluator of designs over the conditions of an envelope, with `risk` as in `design`."""
     match risk:
         case "worst":

@@ -47,7 +47,7 @@ def _growing(problem: DesignProblem, us):
     """Right and left vectors (n, dofs, k) of the modes that grow most, and the diagonals of M."""
 
     def one(u):
-        _, x = problem.stiffened(problem.moved(u, problem.own_condition))
+        _, x = problem.stiffened(problem.mechanism_at(u, problem.nominal_condition))
         attached = assembled(x, problem.friction_slope, refuse=False)
         modes = solve(*attached[:3])
         sought = jnp.argsort(jnp.where(modes.s.imag >= 0, -modes.s.real, jnp.inf))

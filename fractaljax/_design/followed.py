@@ -153,7 +153,7 @@ def _itself(constraint: CycleConstraint, value: jax.Array) -> jax.Array:
 
 
 def _mechanism(problem, u):
-    return problem.moved(jnp.asarray(u, problem.low.dtype), problem.own_condition)
+    return problem.mechanism_at(jnp.asarray(u, problem.low.dtype), problem.nominal_condition)
 
 
 @exported_jit
@@ -162,7 +162,7 @@ def _followed(problem, u, segments: Segments):
     rtol = check_rtol(None, u.dtype)
 
     def measured(u):
-        system = hybrid_system(problem.moved(u, problem.own_condition))
+        system = hybrid_system(problem.mechanism_at(u, problem.nominal_condition))
         frozen = jax.lax.stop_gradient(system)
         lane = jax.tree.map(lambda x: x[..., None], segments)  # the only one
         active, reach = jnp.array([True]), jnp.array([jnp.inf], u.dtype)

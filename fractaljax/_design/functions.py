@@ -24,7 +24,9 @@ class Functions:
     slack: float | np.ndarray  # (1 + k,)
     scale: float  # of the objective
     extra: bool
-    seen: list[np.ndarray] = dataclasses.field(default_factory=list)  # where rows were evaluated
+    evaluated: list[np.ndarray] = dataclasses.field(
+        default_factory=list
+    )  # where rows were evaluated
     _known: dict[bytes, Any] = dataclasses.field(default_factory=dict)
 
     def at(self, z):
@@ -34,7 +36,7 @@ class Functions:
             rows, jacobians = finite(*self.rows_at(u))
             scale = np.where(np.arange(rows.shape[1]) == 0, self.scale, 1)
             self._known[u.tobytes()] = rows / scale, jacobians / scale[:, None]
-            self.seen.append(u.copy())
+            self.evaluated.append(u.copy())
         return self._known[u.tobytes()]
 
     def objective(self, z):

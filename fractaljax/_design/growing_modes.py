@@ -10,7 +10,7 @@ from .._base.programs import exported_jit
 from .._base.ranges import low_discrepancy
 from .._stability.linearise import assembled
 from .._stability.quadratic import leading
-from .joints import under
+from .joints import with_contact_law
 from .rows import paired, rows_in_batches
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ def modes_to_keep(problem: "DesignProblem") -> int:
     )
     modes = max(2, min(MODES_MOST, problem.x.n))
     looking = problem.with_fields(modes=modes)
-    pairs = paired(designs, np.asarray(problem.own_condition)[None])
+    pairs = paired(designs, np.asarray(problem.nominal_condition)[None])
     growing = rows_in_batches(_rates, looking, *pairs) > float(problem.target)
     return min(int(growing.sum(axis=2).max()) + 2, modes)
 
@@ -37,9 +37,9 @@ def _rates(problem: "DesignProblem", us, conditions):
     """The largest growth rates (n, laws, modes), NaN where there is no steady sliding."""
 
     def one(u, condition):
-        x = problem.moved(u, condition)
+        x = problem.mechanism_at(u, condition)
         rates = []
-        for each in (problem.stiffened(x)[1], *(under(x, law) for law in problem.laws)):
+        for each in (problem.stiffened(x)[1], *(with_contact_law(x, law) for law in problem.laws)):
             attached = assembled(each, problem.friction_slope, refuse=False)
             modes = leading(*attached[:3], problem.modes, x.band)
             rates.append(jnp.where(attached.lost, jnp.nan, modes.s.real))

@@ -21,7 +21,7 @@ _INSIDE, _INSIDE_STEPS = 0.01, 40  # margin within the limits, and most steps to
 Limits = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
-def limits_of_joints(problem: DesignProblem) -> Limits:
+def make_joint_limits(problem: DesignProblem) -> Limits:
     """A function of designs (n, v): their residuals (n, r) of joints alone, and Jacobians.
 
     Each design is at a condition (n, c). Stiffness enters by its logarithm, which changes evenly
@@ -37,14 +37,16 @@ def limits_of_joints(problem: DesignProblem) -> Limits:
     return limits
 
 
-def within_joints(problem: DesignProblem, us: np.ndarray, conditions: np.ndarray) -> np.ndarray:
+def restore_joint_limits(
+    problem: DesignProblem, us: np.ndarray, conditions: np.ndarray
+) -> np.ndarray:
     """Designs us (n, v) moved until every joint is inside its limits, as far as possible.
 
     The limits apply at all conditions (m, c). With many joints a random design nearly always has
     one outside, where growth rates are meaningless. The limits take no eigenvalues. The method is
     that of Levenberg and Marquardt.
     """
-    limits, (n, v) = limits_of_joints(problem), us.shape
+    limits, (n, v) = make_joint_limits(problem), us.shape
 
     def lacking(us):
         residuals, slopes = limits(*paired(us, conditions))
@@ -74,8 +76,8 @@ def _limits_of_joints(leaves, us, conditions, structure):
     problem: DesignProblem = jax.tree.unflatten(structure, leaves)
 
     def required(u, condition, shift=None):
-        joints = joints_of(problem.moved(u, condition, shift))
-        model, stiff = problem.of_joints(
+        joints = joints_of(problem.mechanism_at(u, condition, shift))
+        model, stiff = problem.joint_residuals(
             states_of({name: joints[name] for name in problem.contacts})
         )
         return jnp.stack([*model, *stiff])

@@ -14,7 +14,7 @@ from .._contact.contact import Contact, on_the_same_joint
 from .._contact.fixed import FixedContact
 from .._mechanism.joint import Joint
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import joints_of, moved_by, own_quantities
+from .._mechanism.quantities import joints_of, stored_quantities, target_quantities
 from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
 from .._stability.band import in_band
@@ -22,7 +22,7 @@ from .._stability.band import in_band
 _FEW = 2  # joints, up to which each has a separate program
 
 
-def of_joint(name: str) -> str:
+def joint_prefix(name: str) -> str:
     """The prefix of the quantities of a joint; empty for a scene."""
     return f"{name}." if name else ""
 
@@ -111,7 +111,7 @@ def with_contacts(x: Mechanism, contacts: Mapping[str, Contact]) -> Any:
     return eqx.tree_at(lambda structure: structure.joints, x, tuple(joints.values()))
 
 
-def under(x: Mechanism, law: Contact) -> Any:
+def with_contact_law(x: Mechanism, law: Contact) -> Any:
     """`x` with another contact law for its surface, material and load.
 
     For a structure, in every joint whose contact has a surface; errors as `with_contacts`.
@@ -124,14 +124,14 @@ def under(x: Mechanism, law: Contact) -> Any:
     return with_contacts(x, contacts)
 
 
-def moved_contacts(x, names) -> tuple[str, ...]:
+def changed_contacts(x, names) -> tuple[str, ...]:
     """The contacts with a law whose stiffness depends on these quantities."""
-    affected = {each for name in names for each in moved_by(x, name)}
+    affected = {each for name in names for each in target_quantities(x, name)}
     contacts = []
     for name, part in joints_of(x).items():
-        quantities = {*own_quantities(part.contact), *own_quantities(part.friction)}
+        quantities = {*stored_quantities(part.contact), *stored_quantities(part.friction)}
         law = not isinstance(part.contact, FixedContact)
-        if law and affected & {of_joint(name) + each for each in quantities}:
+        if law and affected & {joint_prefix(name) + each for each in quantities}:
             contacts.append(name)
     return tuple(contacts)
 

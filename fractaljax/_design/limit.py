@@ -90,10 +90,10 @@ def least_growth(
     target, scale = float(problem.target), float(problem.growth_scale)
     count = 1 + len(problem.residual_names)
     growing, others = problem.growing[:count], search.others[:count]
-    growth, unmet = search.growth_and_rest(evaluation)
+    growth, unmet = search.split_residuals(evaluation)
     if not (unmet <= 0).any():
         paths, evaluation = search.least_unmet([path[-1] for path in paths])
-        growth, unmet = search.growth_and_rest(evaluation)
+        growth, unmet = search.split_residuals(evaluation)
     possible, rates = unmet <= 0, target + scale * np.sinh(growth)
     best = int(np.lexsort((rates, ~possible, np.maximum(unmet, 0) * ~possible))[0])
     u, residuals = paths[best][-1], evaluation.residuals[best]

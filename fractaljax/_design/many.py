@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Float
 from .._base.parts import Record, brief, flag, is_traced, whole
 from .._contact.contact import Contact
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import own_quantities, replaced, require_one, value_of
+from .._mechanism.quantities import replaced, require_one, stored_quantities, value_of
 from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
 from .._sweep.program import Program
@@ -55,7 +55,7 @@ class DesignMany(Record):
         """The first of the mechanisms as given."""
         return _members(self.mechanisms)[0]
 
-    def given(self, name: str) -> np.ndarray:
+    def mechanism_quantity(self, name: str) -> np.ndarray:
         """The values of a quantity of the mechanisms as given, in the shape of the batch."""
         first, stacked, shape = _members(self.mechanisms)
         return np.asarray(_values(first, stacked, name)).reshape(shape)
@@ -66,7 +66,7 @@ class DesignMany(Record):
         Those without a number are as given.
         """
         values = {
-            name: np.where(np.isnan(column), self.given(name), column)
+            name: np.where(np.isnan(column), self.mechanism_quantity(name), column)
             for name, column in self.quantities.items()
         }
         if not isinstance(self.mechanisms, (list, tuple)):
@@ -232,7 +232,7 @@ def _members(xs: Any) -> tuple[Any, list[Array], tuple[int, ...]]:
         return xs[0], [jnp.stack(each) for each in leaves], (len(xs),)
     if not isinstance(xs, Scene | Structure):
         raise TypeError(f"xs must be a mechanism with arrays, or a list, got {brief(xs)}")
-    named = own_quantities(xs)
+    named = stored_quantities(xs)
     if isinstance(xs, Structure):  # a plain name is that of several joints
         named = {name: named[name] for name in named if "." in name or name in xs.parameters}
     many = {

@@ -52,10 +52,10 @@ def optimum(problem: DesignProblem, starts: int, lattice: int, steps: int) -> Op
     u, multipliers, result = jax.lax.stop_gradient(_search(frozen, starts, lattice, steps))
     u = _implicit(problem, u, multipliers, is_met(result))
     u = nan_where(result == DesignResult.undetermined, u)
-    row, numbers = problem.at(u, problem.own_condition)
+    row, numbers = problem.at(u, problem.nominal_condition)
     if problem.scatter is not None:
-        numbers = problem.with_fields(scatter=None).at(u, problem.own_condition)[1]
-    named = row[problem.asked]
+        numbers = problem.with_fields(scatter=None).at(u, problem.nominal_condition)[1]
+    named = row[problem.named_columns]
     return Optimum(
         u=u,
         quantities=problem.quantities(u),
@@ -68,13 +68,13 @@ def optimum(problem: DesignProblem, starts: int, lattice: int, steps: int) -> Op
 
 def _search(problem: DesignProblem, starts: int, lattice: int, steps: int):
     """The best design (v,), the multipliers of its residuals, and the result."""
-    limited, is_named = problem.limited, problem.asked
+    limited, is_named = problem.limited, problem.named_columns
     slack = max(1e-9, problem.rounding)
     slack = jnp.where(is_named[limited], slack, 0.01 * slack).astype(problem.low.dtype)
     start = jnp.clip(problem.start, 0, 1)
 
     def row_of(u):
-        return problem.at(u, problem.own_condition)[0]
+        return problem.at(u, problem.nominal_condition)[0]
 
     us = jnp.asarray(low_discrepancy(lattice, len(start)), start.dtype)
     us = jnp.concatenate([start[None], us])
@@ -148,7 +148,7 @@ def _implicit_jvp(primals, tangents):
     limited = problem.limited
 
     def values(problem, u):
-        row = problem.at(u, problem.own_condition)[0]
+        row = problem.at(u, problem.nominal_condition)[0]
         return row[0], row[limited]
 
     def by_design(u):

@@ -25,7 +25,7 @@ from .._mechanism.structure import Structure
 from .._stability.linearise import assembled
 from .._stability.quadratic import leading
 from .._stability.stability import growth_rate
-from .coalescence import of_neighbours, of_scene
+from .coalescence import neighbour_residuals, of_scene
 from .constraints import Constraint, CycleConstraint
 from .cuts import Cuts
 from .envelope import Envelope
@@ -33,10 +33,10 @@ from .followed import FollowedCycles
 from .growing_modes import MODES_MOST, modes_to_keep
 from .joints import (
     is_fractal,
-    of_joint,
+    joint_prefix,
     slips,
     states_of,
-    under,
+    with_contact_law,
     with_stiffness,
 )
 from .statement import stated_fields
@@ -81,7 +81,7 @@ class DesignProblem(eqx.Module):
     low: Float[Array, " v"]  # bounds of the variables, logarithms of scales
     high: Float[Array, " v"]
     start: Float[Array, " v"]  # the given design, scaled
-    own_condition: Float[Array, " c"]  # what the quantities of the envelope are in `x`
+    nominal_condition: Float[Array, " c"]  # what the quantities of the envelope are in `x`
     target: Float[Array, ""]  # largest growth rate allowed [1/s]
     growth_scale: Float[Array, ""]
     K_n_min: tuple[Float[Array, ""], ...]  # of each of the contacts
@@ -172,7 +172,7 @@ class DesignProblem(eqx.Module):
 
     def mechanism(self, u: Float[ArrayLike, " v"]) -> Any:
         """The scene or structure of a design."""
-        return self.moved(jnp.asarray(u, self.low.dtype), self.own_condition)
+        return self.mechanism_at(jnp.asarray(u, self.low.dtype), self.nominal_condition)
 
     def _named_row(self, u) -> Float[Array, " k"]:
         """Objective and residuals, the largest of those at all conditions."""
@@ -184,8 +184,8 @@ class DesignProblem(eqx.Module):
         u = nan_where(bad, u)  # so that slopes are NaN, too
         if self.grid is not None:
             rows = jax.vmap(lambda condition: self.at(u, condition)[0])(self.grid)
-            return jnp.max(rows[:, self.asked], axis=0)
-        row = self.at(u, self.own_condition)[0][self.asked]
+            return jnp.max(rows[:, self.named_columns], axis=0)
+        row = self.at(u, self.nominal_condition)[0][self.named_columns]
         if self.cycles is None:
             return row
         x = self.mechanism(u)
@@ -206,7 +206,7 @@ class DesignProblem(eqx.Module):
         values = values + jax.lax.stop_gradient(jnp.where(near, inside - values, 0))
         return dict(zip(self.names, values, strict=True))
 
-    def moved(self, u: Float[Array, " v"], condition: Float[Array, " c"], shift=None) -> Any:
+    def mechanism_at(self, u: Float[Array, " v"], condition: Float[Array, " c"], shift=None) -> Any:
         """The scene or structure at scaled variables u, a condition and perhaps a shift (k,)."""
         values = self.quantities(u) | dict(zip(self.conditions, condition, strict=True))
         if self.scatter is not None and shift is not None:
@@ -215,17 +215,19 @@ class DesignProblem(eqx.Module):
 
     def _row(self, u, condition, shift=None):
         """Objective and residuals (1 + k,), and the numbers that describe a design, by name."""
-        x = self.moved(u, condition, shift)
+        x = self.mechanism_at(u, condition, shift)
         states, stiff_x = self.stiffened(x)
         smooth, rates = [], []
-        for each in (stiff_x, *(under(x, law) for law in self.laws)):
+        for each in (stiff_x, *(with_contact_law(x, law) for law in self.laws)):
             if self.modes:
                 # The rates are NaN where there is no steady sliding; LAPACK gets numbers even so.
                 attached = assembled(each, self.friction_slope, refuse=False)
                 leading_modes = leading(*attached[:3], self.modes, x.band)
                 rates += list(jnp.where(attached.lost, jnp.nan, leading_modes.s.real))
                 if not self.least_growth:
-                    smooth += list(of_neighbours(leading_modes, self.target, self.growth_scale))
+                    smooth += list(
+                        neighbour_residuals(leading_modes, self.target, self.growth_scale)
+                    )
                 elif each is stiff_x:
                     smooth += list(jnp.arcsinh(leading_modes.s.real / self.growth_scale))
             else:
@@ -234,7 +236,7 @@ class DesignProblem(eqx.Module):
                     each, self.friction_slope, rates[-1], self.target, self.growth_scale
                 )
         growth = rates[0]
-        model, stiff = self.of_joints(states)
+        model, stiff = self.joint_residuals(states)
         pressing = [jnp.arcsinh((rate - self.target) / self.growth_scale) for rate in rates]
         # Cycles are followed outside of this program.
         others = [
@@ -256,7 +258,7 @@ class DesignProblem(eqx.Module):
         for name, state in states.items():
             for key in ("K_n", "K_t", "log_area_ratio", "slip_ratio"):
                 if getattr(state, key) is not None:
-                    numbers[of_joint(name) + key] = getattr(state, key)
+                    numbers[joint_prefix(name) + key] = getattr(state, key)
         row = [jnp.asarray(value, growth.dtype), *model, *pressing, *stiff, *others]
         return jnp.stack(row + smooth * self.smooth), numbers
 
@@ -275,7 +277,7 @@ class DesignProblem(eqx.Module):
         }
         return states, with_stiffness(x, constant_states)
 
-    def of_joints(self, states: Mapping[str, Any]) -> tuple[list[Array], list[Array]]:
+    def joint_residuals(self, states: Mapping[str, Any]) -> tuple[list[Array], list[Array]]:
         """Residuals of contacts in known states: inside the model, and stiff enough."""
         model, stiff = [], []
         for name, K_n_min in zip(self.contacts, self.K_n_min, strict=True):
@@ -320,7 +322,7 @@ class DesignProblem(eqx.Module):
     @property
     def growing(self) -> np.ndarray:
         """Which columns (1 + k,) of a row are growth rates."""
-        growing = np.zeros(len(self.asked), bool)
+        growing = np.zeros(len(self.named_columns), bool)
         growing[self.growth_columns] = True
         return growing
 
@@ -330,23 +332,23 @@ class DesignProblem(eqx.Module):
 
         Smooth residuals stand for growth rates where there are some.
         """
-        columns = np.arange(len(self.asked))
+        columns = np.arange(len(self.named_columns))
         if self.least_growth:
             # What is minimised needs no limit of its own.
             objectives = self.growing & (columns < self.growth_columns.start + self.modes)
-            return (columns > 0) & self.asked & ~objectives
+            return (columns > 0) & self.named_columns & ~objectives
         return (columns > 0) & ~(self.growing & self.smooth)
 
     @property
     def joint_columns(self) -> np.ndarray:
-        """Which columns (1 + k,) of a row `limits_of_joints` gives."""
-        columns = np.arange(len(self.asked))
+        """Which columns (1 + k,) of a row `make_joint_limits` gives."""
+        columns = np.arange(len(self.named_columns))
         last = self.growth_columns.stop
         stiff = (columns >= last) & (columns < last + len(self.contacts))
         return stiff | ((columns > 0) & (columns <= self.model_residuals))
 
     @property
-    def asked(self) -> np.ndarray:
+    def named_columns(self) -> np.ndarray:
         """Which columns (1 + k,) of a row are the objective and the requirements by name."""
         named, laws = 1 + self.requirements, 1 + len(self.laws)
         smooth = self.modes if self.least_growth else (self.modes or 2) * laws

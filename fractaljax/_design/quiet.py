@@ -124,7 +124,7 @@ def quiet(
 
     def scenes(design: Found):
         u = jnp.asarray(design.path[-1])
-        return [problem.moved(u, jnp.asarray(at)) for at in kicked_at(design, envelope)]
+        return [problem.mechanism_at(u, jnp.asarray(at)) for at in kicked_at(design, envelope)]
 
     for _ in range(_EXCHANGES):
         if design.evaluation.worst[0] > 0:
@@ -198,7 +198,7 @@ def _ends(
 
     at = quantity(u[i])
     window = min(quantity(0), at), max(quantity(1), at)  # rounding may put it outside
-    x = problem.moved(jnp.asarray(u), jnp.asarray(condition))
+    x = problem.mechanism_at(jnp.asarray(u), jnp.asarray(condition))
     try:
         branch = continue_cycle(x, name, window, cycle)
     except ValueError:  # the cycle cannot be followed
@@ -214,7 +214,7 @@ def _ends(
     run = np.arange(first, 1 + unlike[unlike > index].min(initial=len(stable) - 1))
 
     def value(u, event: BranchEvent):
-        return event.value_at(problem.moved(u, jnp.asarray(condition)))
+        return event.value_at(problem.mechanism_at(u, jnp.asarray(condition)))
 
     planes: list[tuple[np.ndarray, float] | None] = []
     for sign, edge in ((-1, window[0]), (1, window[1])):

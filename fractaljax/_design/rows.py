@@ -40,7 +40,7 @@ def evaluate(problem: "DesignProblem", us: np.ndarray, conditions: np.ndarray) -
 def describe(problem: "DesignProblem", us: np.ndarray) -> dict[str, np.ndarray]:
     """Quantities and results (n,) of designs us (n, v), as they are, without scatter."""
     nominal = problem.with_fields(scatter=None)
-    return linearise(nominal, *paired(us, np.asarray(problem.own_condition)[None]))[2]
+    return linearise(nominal, *paired(us, np.asarray(problem.nominal_condition)[None]))[2]
 
 
 def paired(us: np.ndarray, conditions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from .evaluator import Evaluation, Evaluator, OnAverage
 from .functions import Functions, compressed, finite
-from .joint_limits import limits_of_joints, within_joints
+from .joint_limits import make_joint_limits, restore_joint_limits
 from .lockstep import in_lockstep
 from .problem import DesignProblem
 from .rows import linearise
@@ -78,7 +78,7 @@ class Search:
         problem = self.evaluator.problem
         slack = max(1e-6 if problem.robust else 1e-9, problem.rounding)
         # What stands for a growth rate far below the frequency varies with the square of both.
-        return np.where(problem.asked, slack, 0.01 * slack)
+        return np.where(problem.named_columns, slack, 0.01 * slack)
 
     def best(self, starts: np.ndarray, progress: bool):
         """The way (s, v) to the best end of all, what it is, and how many starts (n, v) failed.
@@ -95,7 +95,7 @@ class Search:
                 # close to the target.
                 near = paths[int(evaluation.worst.argmin())][-1]
                 lowest = self.least_growth([*starts, near])
-                growth, unmet = self.growth_and_rest(lowest[1])
+                growth, unmet = self.split_residuals(lowest[1])
                 least = int(np.where(unmet <= 0, growth, np.inf).argmin())
                 if unmet[least] <= 0 < growth[least]:
                     return lowest[0][least], lowest[1].of(least), len(starts), lowest
@@ -203,7 +203,7 @@ class Search:
         paths = self._ways([start[None] for start in starts], growing, others)
         if self.solver is None:
             return paths, self._ends(paths)
-        lost = np.flatnonzero(self.growth_and_rest(self._ends(paths))[1] > 0).tolist()
+        lost = np.flatnonzero(self.split_residuals(self._ends(paths))[1] > 0).tolist()
         again = [starts[i][None] for i in lost]
         for i, way in zip(lost, self._ways(again, growing, others, restored=True), strict=True):
             paths[i] = way
@@ -215,7 +215,7 @@ class Search:
         paths = self._ways([start[None] for start in starts], others, np.zeros_like(others))
         return paths, self._ends(paths)
 
-    def growth_and_rest(self, evaluation: Evaluation) -> tuple[np.ndarray, np.ndarray]:
+    def split_residuals(self, evaluation: Evaluation) -> tuple[np.ndarray, np.ndarray]:
         """The largest residuals (n,) of growth rates, and of all other requirements."""
         k = evaluation.rows.shape[1]
         masks = self.evaluator.problem.growing, self.others
@@ -225,7 +225,7 @@ class Search:
     @property
     def others(self) -> np.ndarray:
         """Which columns of a row are requirements, but of growth rates."""
-        others = self.evaluator.problem.asked & ~self.evaluator.problem.growing
+        others = self.evaluator.problem.named_columns & ~self.evaluator.problem.growing
         others[0] = False  # the objective
         return others
 
@@ -239,7 +239,7 @@ class Search:
         meets those before them. If `restored`, by the nearest design that violates all the least.
         """
         problem = self.evaluator.problem
-        is_named = problem.asked
+        is_named = problem.named_columns
         columns = np.arange(len(is_named))
         aim, limited = columns == 0, problem.limited
         if violated is not None:
@@ -310,7 +310,7 @@ class Search:
                 end = self._solved(functions, path[-1], how)
             else:
                 end, merit = self._stepped(functions, path[-1], how, working, ask)
-            path += [*functions.seen, end]
+            path += [*functions.evaluated, end]
             new = ask((self.evaluator.exchange, path[-1], working))
             if not len(new):
                 break
@@ -364,7 +364,7 @@ class Search:
             return compressed(residuals + slack, slopes)
 
         if keep and limits(start)[0].max() > 0:
-            start = within_joints(problem, start[None], working)[0]
+            start = restore_joint_limits(problem, start[None], working)[0]
         # A distance gives up little for a growth rate.
         distance = not extra and problem.objective is None
         curvature, penalty = (2.0 / self.scale, 2.0) if distance else (0.0, 10.0)
@@ -400,7 +400,7 @@ class Search:
 
     @functools.cached_property
     def _limits_of_joints(self):
-        return limits_of_joints(self.evaluator.problem)
+        return make_joint_limits(self.evaluator.problem)
 
 
 def _at_each(function, us, working) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -16,7 +16,7 @@ import numpy as np
 from .._base.parts import Record
 from .._base.table import aligned
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import moved_by, own_quantities, replaced, unit, value_of
+from .._mechanism.quantities import replaced, stored_quantities, target_quantities, unit, value_of
 from .._mechanism.structure import Structure
 from .evaluator import Evaluator, OnAverage
 from .problem import DesignProblem
@@ -68,7 +68,7 @@ class Sensitivity(Record):
         return "\n".join([aligned(lines), f"multipliers: {costs or 'none'}"])
 
 
-def sensitivity_of(
+def design_sensitivity(
     x: Mechanism,
     designed: Mechanism,
     state: Callable[[Mechanism], DesignProblem],
@@ -83,7 +83,7 @@ def sensitivity_of(
     u = problem.scaled(designed)
     rows = evaluator.rows_for(u)
     # What stands for a growth rate is not evaluated over an envelope.
-    columns = np.flatnonzero(problem.asked)[1:]
+    columns = np.flatnonzero(problem.named_columns)[1:]
     if not problem.conditions:
         columns = np.flatnonzero(problem.limited)
     row, jacobian = rows(problem, u)
@@ -113,7 +113,7 @@ def sensitivity_of(
     values = {name: float(value_of(designed, name)) for name in problem.names}
     span = np.asarray(problem.high - problem.low, float).tolist()
     changes: dict[str, dict[str, float]] = {name: {} for name in problem.names}
-    ranges, quantities = {}, own_quantities(x)
+    ranges, quantities = {}, stored_quantities(x)
     for name in _held(x, problem):
         by = _difference(lambda x: slopes(state(x), u), x, name, size)
         if by is None:
@@ -162,11 +162,15 @@ def _multipliers(slope, c, A, u) -> tuple[np.ndarray, np.ndarray, np.ndarray] | 
 
 def _held(x: Mechanism, problem: DesignProblem) -> list[str]:
     """The quantities that neither the design nor the envelope moves."""
-    quantities = own_quantities(x)
+    quantities = stored_quantities(x)
     names = [name for name in quantities if quantities[name].value is not None]
     if isinstance(x, Structure):  # a plain name is that of several joints
         names = [name for name in names if "." in name or name in x.parameters]
-    varied = {each for name in (*problem.names, *problem.conditions) for each in moved_by(x, name)}
+    varied = {
+        each
+        for name in (*problem.names, *problem.conditions)
+        for each in target_quantities(x, name)
+    }
     return [name for name in names if name not in varied]
 
 
@@ -204,7 +208,7 @@ def _named(problem: DesignProblem, columns, multipliers, jacobian) -> dict[str, 
     for column, multiplier in zip(columns.tolist(), multipliers.tolist(), strict=True):
         if not multiplier > 0:
             continue
-        if problem.asked[column]:
+        if problem.named_columns[column]:
             name = names[column - 1]
         else:
             slope, rates = jacobian[column], jacobian[growing]

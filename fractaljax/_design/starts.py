@@ -3,7 +3,7 @@
 import numpy as np
 
 from .._base.ranges import low_discrepancy
-from .joint_limits import within_joints
+from .joint_limits import restore_joint_limits
 from .problem import DesignProblem
 
 _PENALTY = 10.0  # of unmet requirements, by which starts are ranked
@@ -30,8 +30,8 @@ def designs_around(
     """
     drawn = np.random.default_rng(seed).random((count, len(centre)))
     share = np.resize(shares, count)[:, None]
-    condition = np.asarray(problem.own_condition)[None]
-    return within_joints(problem, centre + share * (drawn - centre), condition)
+    condition = np.asarray(problem.nominal_condition)[None]
+    return restore_joint_limits(problem, centre + share * (drawn - centre), condition)
 
 
 def designs_near(problem: DesignProblem, best: np.ndarray, count: int, again: int) -> np.ndarray:
@@ -48,8 +48,8 @@ def designs_near(problem: DesignProblem, best: np.ndarray, count: int, again: in
         np.sqrt(3 * np.mean((best - start) ** 2))
     )  # as far as `best`, and a share
     way = np.resize(_BACK, count)[:, None] * (best - start)
-    condition = np.asarray(problem.own_condition)[None]
-    return within_joints(problem, np.clip(start + way + size * drawn, 0, 1), condition)
+    condition = np.asarray(problem.nominal_condition)[None]
+    return restore_joint_limits(problem, np.clip(start + way + size * drawn, 0, 1), condition)
 
 
 def choose_starts(start: np.ndarray, designs: np.ndarray, rows: np.ndarray, count: int):

@@ -13,11 +13,11 @@ from .._dynamics.scaled import degrees_of_freedom, hybrid_system
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import (
     joints_of,
-    known_quantities,
-    own_quantities,
+    quantity_names,
     replaced,
     require_independent,
     require_one,
+    stored_quantities,
     value_of,
     with_optional,
 )
@@ -25,7 +25,7 @@ from .._mechanism.scene import Scene
 from .constraints import Constraint, CycleConstraint, Plain
 from .envelope import Envelope
 from .followed import FollowedCycles
-from .joints import least_damping, moved_contacts, under
+from .joints import changed_contacts, least_damping, with_contact_law
 from .tolerance import Scatter, Tolerance, nodes
 
 DEFAULT_BOUNDS: dict[str, tuple[float, float]] = {"D": (2.1, 2.9), "G": (1e-12, 1e-8)}
@@ -67,7 +67,7 @@ def stated_fields(
     ):
         raise ValueError("laws of a structure need a joint whose contact has a surface")
     for law in laws:
-        under(x, law)  # refuses one that a joint cannot have
+        with_contact_law(x, law)  # refuses one that a joint cannot have
     envelope = None if envelope is None else Envelope.of(envelope)
     tolerance = None if tolerance is None else Tolerance.of(tolerance)
     bounds = checked_bounds(x, bounds)
@@ -103,9 +103,9 @@ def stated_fields(
         xp.where(scales, xp.log(xp.where(scales, each, 1)), each) for each in (low, high, start)
     )
     damping, frequency = least_damping(x)
-    own_condition = xp.asarray([value_of(x, name) for name in conditions], float)
+    nominal_condition = xp.asarray([value_of(x, name) for name in conditions], float)
     x = with_optional(x, tuple(everything))
-    contacts = moved_contacts(x, bounds)
+    contacts = changed_contacts(x, bounds)
     least = 0.0 if K_n_min is None else scalar("K_n_min", K_n_min, at_least=0)
     dtype = jax.tree.leaves(x)[0].dtype
     numbers |= dict(
@@ -113,7 +113,7 @@ def stated_fields(
         low=low,
         high=high,
         start=(start - low) / (high - low),
-        own_condition=own_condition,
+        nominal_condition=nominal_condition,
         target=-damping / 2 if target is None else scalar("target", target),
         growth_scale=xp.maximum(damping, 1e-4 * frequency),
         K_n_min=(least,) * len(contacts),
@@ -163,7 +163,7 @@ def checked_bounds(x: Mechanism, bounds: Mapping[str, Sequence[float]]) -> dict[
     """Bounds by name, each (lower, upper), in their domain and around the value that `x` has."""
     if not isinstance(bounds, Mapping):
         raise TypeError(f"bounds must be a mapping, got {brief(bounds)}")
-    names = known_quantities(x)
+    names = quantity_names(x)
     for name in bounds:
         if name not in names:
             raise ValueError(f"bounds on {brief(name)}: there are {', '.join(names)}")
@@ -189,5 +189,5 @@ def checked_bounds(x: Mechanism, bounds: Mapping[str, Sequence[float]]) -> dict[
 
 
 def _is_scale(x, name) -> bool:
-    quantities = own_quantities(x)
+    quantities = stored_quantities(x)
     return name in quantities and quantities[name].log

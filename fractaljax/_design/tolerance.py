@@ -21,11 +21,11 @@ from .._base.parts import Record, brief, is_traced, number, scalar
 from .._base.ranges import low_discrepancy
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import (
-    known_quantities,
-    moved_by,
+    quantity_names,
     replaced,
     require_independent,
     substituted,
+    target_quantities,
     value_of,
     with_optional,
 )
@@ -115,7 +115,7 @@ class Tolerance(Record):
         That of a fractal dimension is truncated instead. `ranges` are those inside which a quantity
         is moved otherwise.
         """
-        names = known_quantities(x)
+        names = quantity_names(x)
         for name, (label, sigma) in zip(
             self.quantities, self.standard_deviations.items(), strict=True
         ):
@@ -216,7 +216,7 @@ def _largest(dtype) -> float:
 
 def _moved_by(x: Mechanism, name: str) -> list[str]:
     """The name itself; of a structure those of all joints that a plain name moves."""
-    return sorted(moved_by(x, name)) if isinstance(x, Structure) else [name]
+    return sorted(target_quantities(x, name)) if isinstance(x, Structure) else [name]
 
 
 def nodes(dimensions: int) -> tuple[np.ndarray, np.ndarray]:

@@ -14,7 +14,7 @@ from jax.scipy.special import ndtr, ndtri
 from jaxtyping import Array
 
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import own_quantities
+from .._mechanism.quantities import stored_quantities
 from .._surface.surface import Surface
 
 REACH = 6.0  # standard deviations that must stay inside the domain of a quantity
@@ -25,7 +25,7 @@ _MEANING = dataclasses.fields(Surface)[0].metadata["meaning"]
 
 def is_fractal_dimension(x: Mechanism, name: str) -> bool:
     """True if a quantity is the D of a surface, of all joints or of one."""
-    quantities = own_quantities(x)
+    quantities = stored_quantities(x)
     return name in quantities and quantities[name].meaning == _MEANING
 
 

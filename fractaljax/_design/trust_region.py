@@ -69,7 +69,7 @@ class Local(NamedTuple):
         """By how much the most violated requirement is."""
         return max(0.0, float(self.unmet.max(initial=0)))
 
-    def moved(self, step: np.ndarray, curvature: np.ndarray) -> "Local":
+    def predict(self, step: np.ndarray, curvature: np.ndarray) -> "Local":
         """What the slopes make of a step, with the curvature (v, v) in the value."""
         return self._replace(
             value=self.value + self.slope @ step + step @ curvature @ step / 2,
@@ -78,7 +78,7 @@ class Local(NamedTuple):
             unmet=self.unmet + self.unmet_slopes @ step,
         )
 
-    def bent(self, step: np.ndarray, there: "Local") -> "Local":
+    def correct(self, step: np.ndarray, there: "Local") -> "Local":
         """The same, with residuals shifted so that the slopes give after `step` what is there."""
         return self._replace(
             aimed=there.aimed - self.aimed_slopes @ step,
@@ -126,7 +126,7 @@ def _descended(at, u, learnt, limits, curvature, accuracy, radius, penalty):
     while steps < accuracy.steps and radius >= accuracy.radius:
         exact = max(_EXACT * accuracy.gain * abs(here.merit(penalty)), _LEAST)
         step, bounds, held = _step(here, limits, u, learnt, radius, penalty, exact)
-        expected = here.moved(step, learnt)
+        expected = here.predict(step, learnt)
         promised = here.merit(penalty) - expected.merit(penalty)
         if held is None or promised <= 0:  # none was found inside the limits
             radius /= 4
@@ -137,14 +137,14 @@ def _descended(at, u, learnt, limits, curvature, accuracy, radius, penalty):
         ratio = (here.merit(penalty) - there.merit(penalty)) / promised
         if ratio < _POOR and there.excess > expected.excess:
             other, *others = _step(
-                here.bent(step, there), limits, u, learnt, radius, penalty, exact
+                here.correct(step, there), limits, u, learnt, radius, penalty, exact
             )
             small = np.abs(other - step).max() <= _CORRECTION * np.abs(step).max()
             if small and others[1] is not None:
                 end, steps = at(u + other), steps + 1
                 if end.merit(penalty) < min(here.merit(penalty), there.merit(penalty)):
                     step, (bounds, held), there = other, others, end
-                    expected = here.moved(step, learnt)
+                    expected = here.predict(step, learnt)
                     ratio = (here.merit(penalty) - there.merit(penalty)) / promised
         learnt = _learnt(here, there, expected, step, bounds, held, learnt, curvature, penalty)
         length = float(np.abs(step).max())

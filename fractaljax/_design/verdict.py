@@ -20,7 +20,7 @@ from .._contact.fractal import FractalContact
 from .._contact.persson import PerssonContact, mindlin_ratio
 from .._mechanism.joint import Joint
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import joints_of, known_quantities, require_one, unit, value_of
+from .._mechanism.quantities import joints_of, quantity_names, require_one, unit, value_of
 from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
 from .._stability.linearise import linearised
@@ -28,7 +28,7 @@ from .._stability.quartic import rightmost_root
 from .._stability.stability import growth_rate, stability
 from .design import DesignResult, design
 from .envelope import Envelope
-from .joints import under, with_contacts
+from .joints import with_contact_law, with_contacts
 from .quiet import Kicks
 from .summary import growth_text
 from .tolerance import Tolerance, squeal_probability
@@ -60,7 +60,7 @@ class Verdict(Record):
 
     questions: tuple[Question, ...]
     incurable: bool  # whether the slope of the friction feeds in more than all damping takes out
-    not_asked: tuple[str, ...] = ()  # what `verdict` would ask with other arguments, in brackets
+    omitted: tuple[str, ...] = ()  # what `verdict` would ask with other arguments, in brackets
 
     @property
     def rests_on(self) -> tuple[str, ...]:
@@ -85,13 +85,13 @@ class Verdict(Record):
                 "takes out. See `suggest`."
             )
         if self.quiet:
-            lines.append("Quiet in all that was asked." if self.not_asked else "Quiet in all.")
+            lines.append("Quiet in all that was asked." if self.omitted else "Quiet in all.")
         elif self.questions[0].quiet:
             lines.append(f"Quiet, but it rests on: {'; '.join(self.rests_on)}.")
         else:
             lines.append("Not quiet.")
-        if self.not_asked:
-            lines.append(f"Not asked: {', '.join(self.not_asked)}.")
+        if self.omitted:
+            lines.append(f"Not asked: {', '.join(self.omitted)}.")
         return "\n".join(lines)
 
 
@@ -130,7 +130,7 @@ def verdict(
     for i, law in enumerate(laws):
         require_kind(f"laws[{i}]", law, Contact)
     cases = [("", f"as it is ({laws_in_use})", x), *_other_load(x, friction_slope)]
-    by = [(type(law).__name__, under(x, law)) for law in laws]
+    by = [(type(law).__name__, with_contact_law(x, law)) for law in laws]
     if area is not None:
         by += [(kind.__name__, with_contacts(x, laws)) for kind, laws in _laws_of(x, area)]
     cases += [(laws_in_use, f"by {name}", other) for name, other in by]
@@ -156,8 +156,8 @@ def verdict(
     others = "area" if any(part.contact.has_surface for part in parts.values()) else "laws"
     options = {f"other contact laws ({others})": by, "scatter (tolerance)": tolerance is not None}
     options["kicks (quiet_within)"] = quiet_within is not None
-    not_asked = tuple(name for name, was in options.items() if not was)
-    return Verdict(tuple(questions), incurable, not_asked)
+    omitted = tuple(name for name, was in options.items() if not was)
+    return Verdict(tuple(questions), incurable, omitted)
 
 
 def _other_load(x: Mechanism, friction_slope: bool) -> list[tuple[str, str, Mechanism]]:
@@ -366,7 +366,7 @@ def _suggested(scene: Scene) -> dict[str, tuple[float, float]]:
     values = {name: float(value_of(scene, name)) for name in ("xi_1", "xi_2", "mu", "V")}
     bounds = {name: (values[name], max(_DAMPING, 2 * values[name])) for name in ("xi_1", "xi_2")}
     bounds["mu"] = values["mu"] / _RANGE, values["mu"]
-    names = known_quantities(scene)
+    names = quantity_names(scene)
     if {"mu_s", "mu_m"} <= set(names) and scene.friction.mu_m < scene.friction.mu_s:
         bounds["mu_m"] = float(scene.friction.mu_m), float(scene.friction.mu_s)
     for name in ("P", "V"):

@@ -59,7 +59,7 @@ def growth_of(system: HybridSystem, orbit: PeriodicOrbit) -> Float[Array, " g"]:
 
     The multipliers of an excitation, which are 1, are left out too. Without an orbit it is NaN.
     """
-    jacobian = system.own(jnp.swapaxes(system.own(orbit.jacobian), 0, 1))
+    jacobian = system.mechanism_state(jnp.swapaxes(system.mechanism_state(orbit.jacobian), 0, 1))
     log = log_spectral_radius(jnp.swapaxes(jacobian, 0, 1), SQUARINGS)
     return jnp.where(orbit.converged, log, jnp.nan)
 

@@ -84,8 +84,8 @@ class Assessment(eqx.Module):
     ok: Bool[Array, " B"]  # the motion approaches the previous orbit
     ready: Bool[Array, " B"]  # lanes whose candidates are to be solved
     gap: Float[Array, " B"]  # between the returns that nearly repeat
-    given: Candidates
-    seen: Float[Array, "2n k B"]  # states at the last returns
+    candidates: Candidates
+    states: Float[Array, "2n k B"]  # states at the last returns
     exists: Bool[Array, "k B"]
     scale: Float[Array, " B"]
     y: Float[Array, "2n B"]  # from which the run continues
@@ -251,8 +251,8 @@ def assess(
         ok=ok,
         ready=ready,
         gap=gap,
-        given=candidates,
-        seen=states,
+        candidates=candidates,
+        states=states,
         exists=exists,
         scale=scale,
         y=y_on,
@@ -264,7 +264,7 @@ def concluded(
     assessment: Assessment, previous: Progress, orbit: Segments, has_new_orbit, accepted
 ) -> Progress:
     """Progress of all lanes after the round; `has_new_orbit` marks running lanes with a new one."""
-    now = _distance(assessment.seen, assessment.exists, orbit)
+    now = _distance(assessment.states, assessment.exists, orbit)
     # At this distance the multipliers decide whether the orbit attracts.
     ok = assessment.ok | (has_new_orbit & (now < accepted * assessment.scale))
     new = assessment.progress

@@ -11,7 +11,7 @@ from .._base.parts import number
 from .._mechanism.mechanism import Mechanism
 from .cycle import CycleResult, LimitCycle
 from .excitation import Excitation
-from .limit_cycle import checked, posed, refined, solved
+from .limit_cycle import check_arguments, find_cycle, refine_cycle, scale_problem
 from .scaled import degrees_of_freedom, hybrid_system
 
 
@@ -37,10 +37,10 @@ def attractors(
     starts = number("starts", jnp.asarray(starts, dtype=float))
     if starts.ndim != 2 or starts.shape[1] != 2 * n:
         raise ValueError(f"starts must have shape (k, {2 * n}), got {starts.shape}")
-    returns, segments, static = checked(mechanism, starts, excitation, rtol, max_returns)
-    system, growth = posed(mechanism, excitation)
+    returns, segments, static = check_arguments(mechanism, starts, excitation, rtol, max_returns)
+    system, growth = scale_problem(mechanism, excitation)
     cycles = jax.vmap(
-        lambda start: solved(system, growth, start, returns, segments=segments, **static)
+        lambda start: find_cycle(system, growth, start, returns, segments=segments, **static)
     )(starts)
     distinct: list[LimitCycle] = []
     for i in range(len(starts)):
@@ -49,7 +49,7 @@ def attractors(
             continue
         if bool(cycle.result == CycleResult.inaccurate):
             # Refined alone it gets the segments it needs. It may then equal a listed one.
-            cycle = refined(cycle, (system, growth, cycle.state, returns), segments, static)
+            cycle = refine_cycle(cycle, (system, growth, cycle.state, returns), segments, static)
             if any(_same(cycle, other) for other in distinct):
                 continue
         distinct.append(cycle)

@@ -431,7 +431,7 @@ def _label_all(system, lanes, orbits, reasons, search, modes, max_returns, progr
             searched[i] = True
             # At a return the time of an excitation is 0 again.
             state = lanes.seen[:, i] if lanes.returns[i] else lanes.y[:, i]
-            cycle = search(system.own(jnp.asarray(state)) * system.units)
+            cycle = search(system.mechanism_state(jnp.asarray(state)) * system.units)
             result, before = cycle.result, len(orbits.cycles)
             if bool((result == CycleResult.converged) | (result == CycleResult.inaccurate)):
                 lanes.label[i] = orbits.number(cycle)

@@ -33,7 +33,7 @@ class BifurcationMap(Record):
     unfollowed: tuple[BranchEvent, ...]  # events of the branches for which no curve was found
 
     @property
-    def own(self) -> tuple[float, float]:
+    def nominal(self) -> tuple[float, float]:
         """Values of the two quantities of the mechanism itself."""
         first, second = (float(value_of(self.mechanism, name)) for name, *_ in (self.x, self.y))
         return first, second

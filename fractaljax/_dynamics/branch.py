@@ -12,8 +12,8 @@ from .._base.parts import Record, brief, concrete, number, require_kind, scalar,
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import (
     require_inside,
-    require_known,
     require_one,
+    require_quantity,
     value_of,
     with_optional,
 )
@@ -177,7 +177,7 @@ def continue_cycle(
 
 def checked_window(x: Mechanism, name: str, window) -> tuple[float, float]:
     """The ends of a window of a quantity of x."""
-    require_known(x, name)
+    require_quantity(x, name)
     if not (isinstance(window, (tuple, list)) and len(window) == 2):
         raise ValueError(f"window must be (low, high), got {brief(window)}")
     low, high = (float(scalar(f"window of {name}", end)) for end in window)
@@ -196,13 +196,13 @@ def _from_cycle(follower: Follower, cycle):
         raise ValueError("start must be one limit cycle that exists")
     if cycle._system.excited or not isinstance(cycle._orbit, Orbit):
         raise ValueError("start must be a cycle without excitation and regularisation")
-    solution = solution_of(cycle, follower.x, own_place(follower.x, follower.window))
-    return follower.both_ways(lambda: _begun(follower, solution, held=True))
+    solution = solution_of(cycle, follower.x, starting_position(follower.x, follower.window))
+    return follower.follow_both_directions(lambda: _begun(follower, solution, held=True))
 
 
 def _from_event(follower: Follower, event: BranchEvent):
     """Follow both ways from a cycle beside an event; from a Hopf point, along its cycles."""
-    q = own_place(follower.x, follower.window)
+    q = starting_position(follower.x, follower.window)
     solution = event._cycle
     if solution is None:
         return _from_hopf(follower, q)
@@ -217,10 +217,10 @@ def _from_event(follower: Follower, event: BranchEvent):
                     return shooting, corrected[0], shooting.curves.tangent(corrected[1])
         raise ValueError("no cycle beside start was found")
 
-    return follower.both_ways(begun)
+    return follower.follow_both_directions(begun)
 
 
-def own_place(x: Mechanism, window: Window) -> float:
+def starting_position(x: Mechanism, window: Window) -> float:
     """Place in the window of the mechanism's value of the quantity."""
     value = float(value_of(x, window.name))
     q = float(window.place(value))

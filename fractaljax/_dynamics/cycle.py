@@ -111,7 +111,7 @@ class Orbit(eqx.Module):
         """Extremes of displacements, velocities and normal forces."""
         n = system.n - system.excited
         rows, offset = _normal_rows(system)
-        state_rows = system.own(jnp.eye(2 * system.n, dtype=rows.dtype))
+        state_rows = system.mechanism_state(jnp.eye(2 * system.n, dtype=rows.dtype))
         values = extreme_values(system, self.segments, jnp.concatenate([state_rows, rows]))
         if not system.joints:
             return Ranges(values[:, : 2 * n] * system.units[None], jnp.zeros((0, 2), rows.dtype))
@@ -161,7 +161,7 @@ class Orbit(eqx.Module):
             return so_far + jump[:, None] * jnp.sum(c[:, None] * so_far, axis=0)[None], None
 
         monodromy = jax.lax.scan(chain, eye, (local.A, jump.T, local.c.T))[0]
-        return system.own(system.own(monodromy).T).T
+        return system.mechanism_state(system.mechanism_state(monodromy).T).T
 
     def _segment(self, times) -> Int[Array, " n"]:
         ends = jax.lax.stop_gradient(jnp.cumsum(self.segments.duration))
@@ -286,7 +286,9 @@ class LimitCycle(Record):
         """The root mean square of each dx/dt over a period [m/s], of one cycle."""
         system = self._system
         if isinstance(self._orbit, Orbit):
-            square = system.own(mean_square(system, self._orbit.segments)) * system.units**2
+            square = (
+                system.mechanism_state(mean_square(system, self._orbit.segments)) * system.units**2
+            )
             square = jnp.where(jnp.isfinite(self.period), square, jnp.nan)
         else:
             square = jnp.mean(self.orbit(_SAMPLES)[1] ** 2, axis=0)
@@ -388,4 +390,4 @@ def _sampled(orbit, system: HybridSystem, period, n: int):
     share = jnp.arange(n) / n
     y = orbit.at(system, share * period * system.omega)
     y = jnp.where(jnp.isfinite(period), y, jnp.nan)
-    return share * period, (system.own(y) * system.units[:, None]).T
+    return share * period, (system.mechanism_state(y) * system.units[:, None]).T

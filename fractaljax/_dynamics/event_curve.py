@@ -14,7 +14,7 @@ from .._mechanism.quantities import (
     require_independent,
     with_optional,
 )
-from .branch import BranchEvent, checked_window, own_place
+from .branch import BranchEvent, checked_window, starting_position
 from .follow import BranchEnd, Follower
 from .itinerary import Family
 from .pinned import Event, Pinned
@@ -125,7 +125,7 @@ def continue_event(
     family = Family(frozen, first, step, event._rtol)
     follower = _CurveFollower(family, points)
     held = Event.of(condition, detail, solution)
-    solution = solution._replace(x=frozen, r=own_place(frozen, second))
+    solution = solution._replace(x=frozen, r=starting_position(frozen, second))
 
     def begun():
         pinned = Pinned(family, second, held, solution, solution.phases, solution.times)
@@ -134,7 +134,7 @@ def continue_event(
             raise ValueError("event must be one of a branch of x itself")
         return pinned, corrected[0], pinned.curves.tangent(corrected[1])
 
-    start, end = follower.both_ways(begun)
+    start, end = follower.follow_both_directions(begun)
     places = np.array([point.place for point in follower.points])
     rows: dict[str, Any] = {
         key: np.array([point.row[key] for point in follower.points])

@@ -102,7 +102,7 @@ class Follower:
 
     # --- following ---
 
-    def both_ways(self, begun: Callable) -> tuple[BranchEnd, BranchEnd]:
+    def follow_both_directions(self, begun: Callable) -> tuple[BranchEnd, BranchEnd]:
         """Add the points on both sides of a solution; return the reason for either end.
 
         `begun()` builds its equations, and returns them with the unknowns and the tangent there.

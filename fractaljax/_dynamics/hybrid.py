@@ -132,7 +132,7 @@ class HybridSystem(eqx.Module):
         """The number of degrees of freedom, including that of an excitation."""
         return self.F.shape[0]
 
-    def own(self, y) -> Array:
+    def mechanism_state(self, y) -> Array:
         """The mechanism's part (2n, ...) of states, without the excitation."""
         if not self.excited:
             return y

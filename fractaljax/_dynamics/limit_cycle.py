@@ -44,7 +44,7 @@ _RESULTS = (
 
 # Kept out of the cycle's program, which another contact law then does not compile again.
 @exported_jit
-def posed(mechanism: Mechanism, excitation) -> tuple[HybridSystem, Float[Array, ""]]:
+def scale_problem(mechanism: Mechanism, excitation) -> tuple[HybridSystem, Float[Array, ""]]:
     """The scaled system, and its growth rate at the equilibrium."""
     system = excited_system(mechanism, excitation)
     # An excited motion does not end in equilibrium.
@@ -53,7 +53,7 @@ def posed(mechanism: Mechanism, excitation) -> tuple[HybridSystem, Float[Array, 
 
 
 @functools.partial(exported_jit, static_argnames=("of_scene", "segments", "rtol"))
-def solved(
+def find_cycle(
     system: HybridSystem, growth, start, max_returns, *, of_scene: bool, segments: int, rtol: float
 ) -> LimitCycle:
     frozen, growth = jax.lax.stop_gradient((system, growth))
@@ -84,7 +84,7 @@ def solved(
 
     return LimitCycle(
         period=only(period) / system.omega,
-        state=only(system.own(y[:, 0]) * system.units),
+        state=only(system.mechanism_state(y[:, 0]) * system.units),
         error=only(error),
         returns=attractor.period_returns,
         regularisation_error=only(jnp.zeros_like(error)),
@@ -95,7 +95,7 @@ def solved(
     )
 
 
-def refined(cycle: LimitCycle, arguments: tuple, count: int, static: dict) -> LimitCycle:
+def refine_cycle(cycle: LimitCycle, arguments: tuple, count: int, static: dict) -> LimitCycle:
     """A cycle solved with `count` segments, solved again with as many as a long period needs.
 
     Only for one cycle, outside of a compiled program.
@@ -108,11 +108,11 @@ def refined(cycle: LimitCycle, arguments: tuple, count: int, static: dict) -> Li
         if not too_long and not bool(cycle.result == CycleResult.inaccurate):
             break
         count *= 8
-        cycle = solved(*arguments, segments=count, **static)
+        cycle = find_cycle(*arguments, segments=count, **static)
     return cycle
 
 
-def checked(mechanism, start, excitation, rtol, max_returns, segments=None):
+def check_arguments(mechanism, start, excitation, rtol, max_returns, segments=None):
     """Options of a search: `max_returns` as a number, segment count, and what is static."""
     n, joints = degrees_of_freedom(mechanism), joints_of(mechanism)
     if excitation is not None:
@@ -185,11 +185,11 @@ def limit_cycle(
     """
     start = None if start is None else start_state(start, degrees_of_freedom(mechanism))
     inputs = mechanism, start, excitation
-    returns, count, static = checked(*inputs, rtol, max_returns, segments)
-    arguments = *posed(mechanism, excitation), start, returns
-    cycle = solved(*arguments, segments=count, **static)
+    returns, count, static = check_arguments(*inputs, rtol, max_returns, segments)
+    arguments = *scale_problem(mechanism, excitation), start, returns
+    cycle = find_cycle(*arguments, segments=count, **static)
     if segments is None:
-        cycle = refined(cycle, arguments, count, static)
+        cycle = refine_cycle(cycle, arguments, count, static)
     if regularisation is not None:
         from .regularised import regularised_cycle
 

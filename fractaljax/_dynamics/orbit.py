@@ -147,7 +147,7 @@ def solve_periodic_orbits(
     # Durations in other lanes may be anything.
     duration = jnp.where(active[None], segments.duration, 0)
     if system.excited:
-        y = y.at[:, :1].set(system.with_excitation(system.own(y[:, :1]), 0.0))
+        y = y.at[:, :1].set(system.with_excitation(system.mechanism_state(y[:, :1]), 0.0))
     start = y[:, 0]
     many = jnp.max(jnp.sum(used & active[None], axis=0))
     eps, big = jnp.finfo(y.dtype).eps, jnp.finfo(y.dtype).max

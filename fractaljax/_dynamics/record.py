@@ -139,7 +139,7 @@ class Record(Steps):
         oldest = (self.oldest + count) % self.length
         return Record(steps, oldest, y, s, guard, sums, reach, valid)
 
-    def moved(self, y, where) -> "Record":
+    def continue_from(self, y, where) -> "Record":
         """The record with states y; no earlier step is valid `where` these are another motion."""
         valid = jnp.where(where, 0, self.count)
         return eqx.tree_at(lambda record: (record.y, record.count), self, (y, valid))

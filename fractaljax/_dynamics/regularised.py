@@ -104,7 +104,7 @@ def _settle(system: HybridSystem, eps, y, solver, rtol, max_steps):
 
     def next_period(y, _):
         solution = run(y, system.excitation_period, rtol=rtol, max_steps=max_steps)
-        y = system.with_excitation(system.own(solution.ys[0]), 0.0)
+        y = system.with_excitation(system.mechanism_state(solution.ys[0]), 0.0)
         reached = solution.result == diffrax.RESULTS.successful
         return y, (y, system.excitation_period, reached)
 
@@ -178,13 +178,15 @@ def regularised_cycle(
     def excited_gap(y, args):
         system, eps = args
         full, period = system.with_excitation(y, 0.0), returns * system.excitation_period
-        return system.own(solve(system, eps, full, period, rtol=rtol, **options).ys[0]) - y
+        return (
+            system.mechanism_state(solve(system, eps, full, period, rtol=rtol, **options).ys[0]) - y
+        )
 
     # Looser than the integration, whose adaptive steps make the gap rough.
     newton = optimistix.Newton(rtol=looser, atol=looser)
     function, unknown = gap, guess
     if system.excited:
-        function, unknown = excited_gap, system.own(guess[0])
+        function, unknown = excited_gap, system.mechanism_state(guess[0])
     root = optimistix.root_find(function, newton, unknown, (system, eps), max_steps=16, throw=False)
     if system.excited:
         y = system.with_excitation(root.value, 0.0)
@@ -199,7 +201,7 @@ def regularised_cycle(
     solution = solve(system, eps, y, period, rtol=rtol, saveat=DENSE, **options)
     times, states = nodes(solution)
     rates = jax.vmap(lambda y: field(0.0, y, (system, eps)))(states)
-    ranges = system.own(extremes(times, states, rates).T).T * system.units[None]
+    ranges = system.mechanism_state(extremes(times, states, rates).T).T * system.units[None]
     n = system.n
     w = jax.vmap(lambda y: system.sliding(y[n:]))(states)
     change = -jax.vmap(lambda rate: system.along(rate[n:]))(rates)
@@ -242,7 +244,7 @@ def regularised_cycle(
 
     return LimitCycle(
         period=only(numbers[0]),
-        state=only(system.own(y) * system.units),
+        state=only(system.mechanism_state(y) * system.units),
         error=only(error),
         returns=returns,
         regularisation_error=only(difference),
@@ -253,6 +255,6 @@ def regularised_cycle(
             solution,
             Ranges(ranges, forces),
             Fractions(jnp.stack(stuck), jnp.where(opens, below, 0), jnp.where(opens, 0, below)),
-            system.own(system.own(monodromy).T).T,
+            system.mechanism_state(system.mechanism_state(monodromy).T).T,
         ),
     )

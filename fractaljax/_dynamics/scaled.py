@@ -222,7 +222,7 @@ def scaled_start(system: HybridSystem, start: Array | None) -> Float[Array, " 2n
     if start is None:
         kick = system.section_direction
         kick = jnp.concatenate([kick / jnp.sum(kick**2), jnp.zeros_like(kick)])
-        y = system.own(system.equilibrium() + kick)
+        y = system.mechanism_state(system.equilibrium() + kick)
     else:
         y = start / system.units
     return jax.lax.stop_gradient(system.with_excitation(y, 0.0))

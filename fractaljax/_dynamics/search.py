@@ -181,7 +181,7 @@ def _find(
                 record,
                 assessment.ready,
                 assessment.gap,
-                assessment.given,
+                assessment.candidates,
                 orbit,
                 error,
                 options=options,
@@ -193,7 +193,7 @@ def _find(
         orbit, error, accepted = jax.lax.cond(jnp.any(assessment.ready), solve_ready, lambda: none)
         progress = concluded(assessment, progress, orbit, accepted, options.accepted)
         return (
-            record.moved(assessment.y, assessment.extrapolates),
+            record.continue_from(assessment.y, assessment.extrapolates),
             progress,
             orbit,
             error,

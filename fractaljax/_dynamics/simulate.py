@@ -95,13 +95,13 @@ class Trajectory(Record):
             y = jax.vmap(self._solution.evaluate, out_axes=1)(
                 (times - self.times[0]) * system.omega
             )
-            return (system.own(y) * scale[:, None]).T
+            return (system.mechanism_state(y) * scale[:, None]).T
         k = self._step(times)
         after = (times - self.times[k]) * system.omega
         start = (self.states[k] / scale[None]).T
         start = system.with_excitation(start, self.times[k] * system.omega)
         y = flow(system, start, after, self.contact_states[k].T)
-        return (system.own(y) * scale[:, None]).T
+        return (system.mechanism_state(y) * scale[:, None]).T
 
     def _step(self, times) -> Int[Array, " k"]:
         """The steps that contain these times."""
@@ -206,7 +206,7 @@ def _repeat(system: HybridSystem, y, t0, end, steps: _Steps) -> Trajectory:
     states = jnp.concatenate([y[None], states]).T
     return Trajectory(
         times=t0 + jnp.concatenate([jnp.zeros(1, y.dtype), times]) / system.omega,
-        states=(system.own(states) * system.units[:, None]).T,
+        states=(system.mechanism_state(states) * system.units[:, None]).T,
         contact_states=jnp.concatenate([steps.s[:, :1].T, after]),
         result=steps.result,
         _system=system,
@@ -268,7 +268,7 @@ def _regularised(
     result = SimulationResult.where(far, SimulationResult.diverged, result)
     return Trajectory(
         times=times,
-        states=(system.own(states.T) * system.units[:, None]).T,
+        states=(system.mechanism_state(states.T) * system.units[:, None]).T,
         contact_states=contact_states,
         result=result,
         _system=system if saveat is None else None,

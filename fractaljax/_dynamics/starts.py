@@ -16,7 +16,7 @@ _MOST_STARTS = 1_000_000
 @exported_jit
 def _centre(system: HybridSystem) -> tuple[Array, Array]:
     """The equilibrium without an excitation (2n,), and the units (2n,)."""
-    return system.own(system.equilibrium()), system.units
+    return system.mechanism_state(system.equilibrium()), system.units
 
 
 def starts_of(system, n, low, high, starts, seed, radius) -> Float[np.ndarray, "k 2n"]:

@@ -52,7 +52,7 @@ class Band(NamedTuple):
     warnings: tuple[str, ...]
 
 
-def given_band(band: Any, spectrum: Spectrum, length: float, ratio: float, top: float) -> Band:
+def check_band(band: Any, spectrum: Spectrum, length: float, ratio: float, top: float) -> Band:
     """The user's band [1/m]. **Raises:** `ValueError` if it is empty or outside the data."""
     try:
         low, high = (float(end) for end in band)

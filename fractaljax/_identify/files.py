@@ -12,7 +12,7 @@ from .grid import map_on_grid, profile_on_grid
 from .header import height_scale, step
 from .measurement import Measurement, measurement
 from .text import Table, read_table, text_encoding
-from .units import agreed, known_unit, scale
+from .units import agreed, scale, unit_named
 
 _TEXTS, _ARRAYS = {".csv", ".tsv", ".txt", ".dat", ".xyz", ".asc"}, {".npy", ".npz"}
 _MOST_TEXT, _MOST_ARRAYS, _MOST = 2**28, 2**30, 2**31  # bytes; the last for instrument formats
@@ -92,7 +92,7 @@ def _from_table(path, whole: Table, table: Table, dx, dy, unit, position_unit) -
     try:
         metre = height_scale(settings, units[-1], unit)
     except ValueError as error:
-        is_length = units[-1] is None or known_unit(units[-1]) is not None
+        is_length = units[-1] is None or unit_named(units[-1]) is not None
         raise (error if is_length else unclear(whole, error)) from None
     if "factor" in settings:
         source += f", heights times {metre:g} m by its header"

@@ -4,7 +4,7 @@ import dataclasses
 import math
 import re
 
-from .units import Unit, known_unit, metres, scale
+from .units import Unit, metres, scale, unit_named
 
 _LARGEST_BARE = 1e-3  # m: up to it, a size without a unit is in metres if the factor is
 _SETTING = re.compile(r"\W*([^\W\d][^=:;,\t]*)[=:;,\t]\s*(\S.*?)\s*")
@@ -90,8 +90,8 @@ def height_scale(settings: Settings, column_unit: str | None, user_unit: Unit) -
     factor, data = settings.get("factor"), settings.get("unit")
     said = column_unit or (data.unit if data else None)
     if factor is None or factor.number is None:
-        is_length = said is None or known_unit(said) is not None
-        if not is_length and user_unit is not None and not known_unit(str(user_unit).strip()):
+        is_length = said is None or unit_named(said) is not None
+        if not is_length and user_unit is not None and not unit_named(str(user_unit).strip()):
             return metres(user_unit)
         if not is_length and column_unit is None and data:
             of = f"the metres of one {said}"
@@ -101,13 +101,13 @@ def height_scale(settings: Settings, column_unit: str | None, user_unit: Unit) -
         raise ValueError(
             f"{factor.line} does not say its unit: give that of the heights after it (--unit m)"
         )
-    if factor.unit is not None and known_unit(factor.unit) is None:
+    if factor.unit is not None and unit_named(factor.unit) is None:
         raise ValueError(
             f"{factor.line} does not lead to a length: take it out of the header, and give the"
             " metres of one number as unit (--unit 2.9e-8)"
         )
     metre = factor.number * scale(factor.unit, user_unit, "heights", "--unit")
-    if said and known_unit(said) and abs(metre - metres(said)) > 1e-6 * metre:
+    if said and unit_named(said) and abs(metre - metres(said)) > 1e-6 * metre:
         raise ValueError(f"{factor.line} contradicts the heights' unit {said}: take one out")
     return metre
 
@@ -122,7 +122,7 @@ def step(settings: Settings, axis: str, user_step: float | None, unit: Unit) -> 
     pixel, factor = settings.get(axis), settings.get("factor")
     if pixel is None or pixel.number is None:
         return None
-    if pixel.unit and known_unit(pixel.unit):
+    if pixel.unit and unit_named(pixel.unit):
         return pixel.number * metres(pixel.unit)
     if pixel.unit is None and unit is not None:
         return pixel.number * metres(unit)

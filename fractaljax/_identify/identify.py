@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from .._base.parts import Record
 from .._base.table import table
 from .._surface.surface import Surface
-from .band import HIGHEST, LOWEST, PER_RESOLUTION, chosen_band, given_band
+from .band import HIGHEST, LOWEST, PER_RESOLUTION, check_band, chosen_band
 from .fit import PowerLaw
 from .gaps import without_gaps
 from .measurement import Measurement
@@ -152,7 +152,7 @@ def identify(
         chosen = chosen_band(spectrum, length, ratio, usable)
         reach = min(top, HIGHEST[spectrum.kind] * spectrum.nyquist)
     else:
-        chosen = given_band(band, spectrum, length, ratio, top)
+        chosen = check_band(band, spectrum, length, ratio, top)
         reach = chosen.high
     if aliased is not None:
         chosen = chosen._replace(

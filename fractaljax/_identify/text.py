@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from .header import Settings, is_setting, read_settings, sets_something
-from .units import known_unit
+from .units import unit_named
 
 _SEPARATORS = (";", "\t", ",", None)  # None: white space
 _COMMENTS = ("#", "%", "//", "!")
@@ -143,7 +143,7 @@ def _units(header: list[str], separator: str | None, columns: int) -> list[str |
         units = [_unit(cell.strip('"')) for cell in _cells(line, separator) if cell]
         if len(units) == columns and any(units):
             return units
-    alone = {unit for unit in map(_unit, lines) if unit and known_unit(unit)}
+    alone = {unit for unit in map(_unit, lines) if unit and unit_named(unit)}
     return [alone.pop() if len(alone) == 1 else None] * columns
 
 
@@ -165,7 +165,7 @@ def _plain(header: list[str]) -> list[str]:
 
 def _without_unit(title: str) -> str:
     match = _UNIT.search(title)
-    if match and (match[1] or known_unit(match[2])):
+    if match and (match[1] or unit_named(match[2])):
         unit = 1 if match[1] else 2
         title = title[: match.start(unit)].rstrip("([/_ ").removesuffix(" in").rstrip()
     return "" if _BITS.fullmatch(title) or title == "-" else title.strip()
@@ -176,4 +176,4 @@ def _unit(title: str) -> str | None:
     match = _UNIT.search(title)
     if match is None:
         return None
-    return match[1] or (match[2] if known_unit(match[2]) else None)
+    return match[1] or (match[2] if unit_named(match[2]) else None)

@@ -10,7 +10,7 @@ UNITS |= dict.fromkeys(("µm", "μm", "micron", "microns", "micrometer", "microm
 UNITS |= {"nanometer": 1e-9, "nanometre": 1e-9, "angstrom": 1e-10}
 
 
-def known_unit(word: str) -> str | None:
+def unit_named(word: str) -> str | None:
     """The key of `UNITS` for a word, in any case if it has more than two letters, or None."""
     spellings = (word, word.lower() if len(word) > 2 else word)
     return next((spelling for spelling in spellings if spelling in UNITS), None)
@@ -23,7 +23,7 @@ def metres(unit: str | float, of: str = "") -> float:
 
     **Raises:** `ValueError` listing the known units.
     """
-    key = known_unit(str(unit).strip())
+    key = unit_named(str(unit).strip())
     if key is not None:
         return UNITS[key]
     with contextlib.suppress(ValueError):

@@ -54,7 +54,7 @@ def friction_for(contact: Contact, friction: Friction) -> Friction:
     """
     require_kind("contact", contact, Contact)
     require_kind("friction", friction, Friction)
-    if not contact.of_the_package and contact.depends_on_friction:
+    if not contact.built_in and contact.depends_on_friction:
         bad = refused_stiffness(contact, friction.mu_s, friction.mu_m)
         if bad is not None:
             friction = refused_where(bad, friction)

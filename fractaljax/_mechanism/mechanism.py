@@ -18,7 +18,7 @@ class Mechanism(Part):
         """A checked copy with the applicable changes."""
 
     @abc.abstractmethod
-    def _known(self) -> list[str]:
+    def _quantity_names(self) -> list[str]:
         """The names that `replace` takes."""
 
     def replace(self, **changes: Any) -> Self:
@@ -37,8 +37,8 @@ class Mechanism(Part):
         """
         new = self._rebuilt(changes)
         for name in changes:
-            if name not in new._known():
-                kind, listed = type(self).__name__.lower(), ", ".join(new._known())
+            if name not in new._quantity_names():
+                kind, listed = type(self).__name__.lower(), ", ".join(new._quantity_names())
                 raise ValueError(f"{kind} has no quantity {name!r}; it has {listed}")
         return new
 

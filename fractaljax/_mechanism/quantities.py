@@ -66,13 +66,17 @@ class Quantity(NamedTuple):
     log: bool  # positive, and compared by ratios
 
 
-def own_quantities(x: Part | Structure) -> dict[str, Quantity]:
+def stored_quantities(x: Part | Structure) -> dict[str, Quantity]:
     """The numbers stored in a scene, a structure or a part by name, without the parts."""
     stored = {}
     if isinstance(x, Structure):
         for name, joint in zip(x.joint_names, x.joints, strict=True):
-            of_joint = own_quantities(joint)
-            stored = of_joint | stored | {f"{name}.{plain}": of_joint[plain] for plain in of_joint}
+            joint_prefix = stored_quantities(joint)
+            stored = (
+                joint_prefix
+                | stored
+                | {f"{name}.{plain}": joint_prefix[plain] for plain in joint_prefix}
+            )
         parameters = {
             name: Quantity(value, "-", "parameter", False) for name, value in x.parameters.items()
         }
@@ -80,7 +84,7 @@ def own_quantities(x: Part | Structure) -> dict[str, Quantity]:
     for field in dataclasses.fields(x):
         value, meant = getattr(x, field.name), field.metadata
         if isinstance(value, Part):
-            stored |= own_quantities(value)
+            stored |= stored_quantities(value)
         elif "unit" in meant:
             stored[quantity_name(field)] = Quantity(
                 value, meant["unit"], meant["meaning"], meant.get("log", False)
@@ -88,14 +92,14 @@ def own_quantities(x: Part | Structure) -> dict[str, Quantity]:
     return stored
 
 
-def known_quantities(x: Mechanism) -> list[str]:
+def quantity_names(x: Mechanism) -> list[str]:
     """The names that `replaced` takes: stored quantities, then the derived ones of a scene."""
-    return list(dict.fromkeys([*own_quantities(x), *_derived(x)]))
+    return list(dict.fromkeys([*stored_quantities(x), *_derived(x)]))
 
 
-def require_known(x: Mechanism, name: str) -> None:
+def require_quantity(x: Mechanism, name: str) -> None:
     """Refuse a name that is neither a stored nor a derived quantity, and list the valid names."""
-    names = known_quantities(x)
+    names = quantity_names(x)
     if name not in names:
         kind = "structure" if isinstance(x, Structure) else "scene"
         raise ValueError(f"{kind} has no quantity {name!r}; it has {', '.join(names)}")
@@ -105,19 +109,19 @@ def require_independent(x: Mechanism, names: Sequence[str]) -> None:
     """Refuse two names that set the same quantity, such as K_t and K_t/K_n, or D and left.D."""
     for i, name in enumerate(names):
         for other in names[:i]:
-            if not moved_by(x, other).isdisjoint(moved_by(x, name)):
+            if not target_quantities(x, other).isdisjoint(target_quantities(x, name)):
                 raise ValueError(f"quantities must be independent, got {other} and {name}")
 
 
-def moved_by(x: Mechanism, name: str) -> set[str]:
+def target_quantities(x: Mechanism, name: str) -> set[str]:
     """The stored quantities that a name sets, with joint names in a structure."""
-    stored = own_quantities(x)
+    stored = stored_quantities(x)
     if name not in stored:
         targets = set(_DERIVED[name].set(x, 1.0))
         if (
             isinstance(x, Scene) and "friction" in targets
         ):  # scaled as a whole: any coefficient in it may be its scale
-            law = own_quantities(x.friction)
+            law = stored_quantities(x.friction)
             targets |= {each for each in law if law[each].unit == "-"}
         return targets
     if isinstance(x, Structure) and "." not in name and name not in x.parameters:
@@ -131,10 +135,10 @@ def value_of(x: Mechanism, name: str) -> Float[Array, ""]:
     **Raises:** `ValueError` for an optional quantity without a value, and for a plain name whose
     value differs between the joints of a structure.
     """
-    stored = own_quantities(x)
+    stored = stored_quantities(x)
     if name not in stored:
         return _DERIVED[name].get(x)
-    values = {each: stored[each].value for each in sorted(moved_by(x, name))}
+    values = {each: stored[each].value for each in sorted(target_quantities(x, name))}
     first, *others = values.values()
     if first is None or any(value is None for value in others):
         raise ValueError(f"{name} is not given")
@@ -152,7 +156,7 @@ def replaced(x: Mechanism, values: Mapping[str, ArrayLike]) -> Any:
     **Raises:** `ValueError` for values outside their domain; traced values become NaN instead.
     """
     derived = _derived(x)
-    stored = own_quantities(x)
+    stored = stored_quantities(x)
     checked = {
         name: value if name in stored else number(name, value, **derived[name].domain)
         for name, value in values.items()
@@ -172,7 +176,7 @@ def require_inside(x: Mechanism, axes: Mapping[str, np.ndarray]) -> None:
     # decide. The exception is mu(V), by which `mu` scales the friction law.
     _require_all_inside(x, ends)
     if FRICTION in axes and isinstance(x, Scene):
-        law = {"V", *own_quantities(x.friction)}
+        law = {"V", *stored_quantities(x.friction)}
         among = {name: values for name, values in axes.items() if name in law}
         if among:
             _require_all_inside(x, {FRICTION: ends[FRICTION], **among})
@@ -216,15 +220,15 @@ def with_optional(x: Mechanism, names: Sequence[str]) -> Any:
 
     None cannot be substituted, and it decides what a program computes.
     """
-    stored = own_quantities(x)
-    targets = {name for chosen in names for name in moved_by(x, chosen)}
+    stored = stored_quantities(x)
+    targets = {name for chosen in names for name in target_quantities(x, chosen)}
     missing = {name: 1.0 for name in targets & stored.keys() if stored[name].value is None}
     return x.replace(**missing) if missing else x
 
 
 def _settings(x, values):
     """The changes for `replace` or `substitute` that set quantities to these values."""
-    stored = own_quantities(x)
+    stored = stored_quantities(x)
     settings = {name: value for name, value in values.items() if name in stored}
     if len(settings) == len(values):
         return settings
@@ -242,7 +246,7 @@ def axis_values(x: Mechanism, name: str, values: ArrayLike | Sequence[float]) ->
 
     **Raises:** `ValueError` for an unknown name and values that are not one-dimensional.
     """
-    require_known(x, name)
+    require_quantity(x, name)
     # Lists are read by NumPy; arrays may be traced and are kept.
     values = number(name, values if isinstance(values, (Array, np.ndarray)) else np.array(values))
     if values.ndim != 1 or not values.size:
@@ -252,13 +256,13 @@ def axis_values(x: Mechanism, name: str, values: ArrayLike | Sequence[float]) ->
 
 def unit(x: Mechanism, name: str) -> str:
     """The unit of a quantity, "-" for a ratio."""
-    stored = own_quantities(x)
+    stored = stored_quantities(x)
     return stored[name].unit if name in stored else "-"
 
 
 def meaning(x: Mechanism, name: str) -> str:
     """The meaning of a quantity in words."""
-    stored = own_quantities(x)
+    stored = stored_quantities(x)
     if name not in stored:
         return _DERIVED[name].meaning
     return stored[name].meaning.split(";")[0].split(",")[0]
@@ -266,7 +270,7 @@ def meaning(x: Mechanism, name: str) -> str:
 
 def label(x: Mechanism, name: str) -> str:
     """Axis label of a quantity: its meaning, symbol and unit."""
-    stored = own_quantities(x)
+    stored = stored_quantities(x)
     if name not in stored:
         return f"{meaning(x, name)} [-]"
     return f"{meaning(x, name)} {name} [{stored[name].unit}]"
@@ -344,5 +348,7 @@ def _derived(x: Mechanism) -> Mapping[str, _Derived]:
     if not isinstance(x, Scene):
         return {}
     contact = x.contact
-    settable = hasattr(contact, "stiffness_ratio") or {"K_n", "K_t"} <= {*own_quantities(contact)}
+    settable = hasattr(contact, "stiffness_ratio") or {"K_n", "K_t"} <= {
+        *stored_quantities(contact)
+    }
     return {name: _DERIVED[name] for name in _DERIVED if settable or name != STIFFNESS_RATIO}

@@ -73,7 +73,7 @@ class Scene(Mechanism):
     def _rebuilt(self, changes):
         return rebuild(self, changes)
 
-    def _known(self):
+    def _quantity_names(self):
         return list(quantities(self))
 
     @classmethod

@@ -276,7 +276,7 @@ class Structure(Mechanism):
         held = self.sums[name]
         return list(zip(held.coefficients, held.matrices, strict=True))
 
-    def _known(self):
+    def _quantity_names(self):
         names = ["M", "C", "K", "F", *self.parameters]
         for name, joint in zip(self.joint_names, self.joints, strict=True):
             names += [*quantities(joint), *(f"{name}.{plain}" for plain in quantities(joint))]

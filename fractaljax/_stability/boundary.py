@@ -21,11 +21,11 @@ from .._continuation import Continuation, Curve, CurveEnd, trace
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import (
     joints_of,
-    own_quantities,
     require_independent,
     require_inside,
-    require_known,
     require_one,
+    require_quantity,
+    stored_quantities,
     substituted,
     with_friction_times,
     with_optional,
@@ -180,7 +180,7 @@ def _window(scene, which, window) -> Window:
     if not (isinstance(window, (tuple, list)) and len(window) == 3 and isinstance(window[0], str)):
         raise ValueError(f"{which} must be (name, low, high), got {window!r}")
     name, *ends = window
-    require_known(scene, name)
+    require_quantity(scene, name)
     low, high = (float(scalar(f"{which} limit", end)) for end in ends)
     if not low < high:
         raise ValueError(f"{which} must go from a lower to a higher value, got {window!r}")
@@ -189,7 +189,7 @@ def _window(scene, which, window) -> Window:
 
 def _decisive(scene, name, low, high) -> np.ndarray:
     """The values of a range that decide if all of it is inside the domain of the scene."""
-    quantities = own_quantities(scene)
+    quantities = stored_quantities(scene)
     # mu(V), by which "mu" scales the friction law, is least at V = v_m: perhaps between the ends.
     other = {"V": "v_m", "v_m": "V"}.get(name)
     value = quantities[other].value if other in quantities else None

@@ -160,7 +160,7 @@ class _Joint(NamedTuple):
     mu: jax.Array
 
     @property
-    def of_equilibrium(self) -> bool:
+    def needs_equilibrium(self) -> bool:
         """True if it needs the static displacements."""
         return self.n is not None and (self.P is not None or self.slope is not None)
 
@@ -189,7 +189,7 @@ def attachments(structure: Structure, friction_slope: bool) -> Attachments:
         slope = joint.friction.slope(joint.V) if slopes and joint.V is not None else None
         joints.append(_Joint(K_n, K_t, P, slope, t, n, mu))
     loaded = any(joint.P is not None for joint in joints)
-    places = [i for i, joint in enumerate(joints) if joint.of_equilibrium]
+    places = [i for i, joint in enumerate(joints) if joint.needs_equilibrium]
     displaced, supported = {}, None  # by joint: t.x_0 and n.x_0, and their errors
     if places:
         for joint in joints:

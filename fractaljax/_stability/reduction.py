@@ -26,7 +26,7 @@ from .._base.parts import flag, require_kind, scalar, whole
 from .._mechanism.quantities import (
     replaced,
     require_independent,
-    require_known,
+    require_quantity,
     substituted,
     with_optional,
 )
@@ -90,7 +90,7 @@ def reduce(
         raise ValueError(f"band must be (low, high) in rad/s, 0 <= low < high, got {band!r}")
     ranges = {name: _range(name, ends) for name, ends in (over or {}).items()}
     for name in ranges:
-        require_known(structure, name)
+        require_quantity(structure, name)
     require_independent(structure, list(ranges))
     for ends in zip(*ranges.values(), strict=True):
         replaced(structure, dict(zip(ranges, ends, strict=True)))

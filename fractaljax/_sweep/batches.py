@@ -36,7 +36,7 @@ class Batches:
 
     def end(self, k: int, begun: Sequence[jax.Array]) -> list[np.ndarray]:
         """The leaves (*shape of block k, ...) once they are computed."""
-        shape, size = self._blocks.own_shape(k), self._blocks.size(k)
+        shape, size = self._blocks.block_shape(k), self._blocks.size(k)
         return [np.asarray(leaf)[:size].reshape(*shape, *leaf.shape[1:]) for leaf in begun]
 
 

@@ -37,18 +37,18 @@ class Blocks:
         ends = zip(self.place(k), self.block, self.shape, strict=True)
         return tuple(slice(i * size, min((i + 1) * size, n)) for i, size, n in ends)
 
-    def own_shape(self, k: int) -> tuple[int, ...]:
+    def block_shape(self, k: int) -> tuple[int, ...]:
         """The shape of block k."""
         return tuple(axis.stop - axis.start for axis in self.index(k))
 
     def size(self, k: int) -> int:
         """The number of points of block k."""
-        return math.prod(self.own_shape(k))
+        return math.prod(self.block_shape(k))
 
     def points(self, k: int, number: int) -> list[np.ndarray]:
         """Where the points of block k lie on each axis (number,); the last one repeats."""
         within = np.minimum(np.arange(number), self.size(k) - 1)
-        places = np.unravel_index(within, self.own_shape(k))
+        places = np.unravel_index(within, self.block_shape(k))
         return [place + axis.start for place, axis in zip(places, self.index(k), strict=True)]
 
 

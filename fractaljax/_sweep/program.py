@@ -122,7 +122,7 @@ def settings() -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def under(settings: Mapping[str, Any]) -> Iterator[None]:
+def use_settings(settings: Mapping[str, Any]) -> Iterator[None]:
     """Let this thread trace and run programs under the settings of another one."""
     with contextlib.ExitStack() as stack:
         for name, value in settings.items():

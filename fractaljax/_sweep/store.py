@@ -23,7 +23,7 @@ import numpy as np
 
 from .._base.parts import one_line
 from .._base.versions import versions, versions_differ
-from .._mechanism.quantities import known_quantities, meaning, unit
+from .._mechanism.quantities import meaning, quantity_names, unit
 from .blocks import Blocks
 from .program import Program, array_digest
 
@@ -89,7 +89,7 @@ class Store:
                 group = zarr().open_group(beside, mode="w", zarr_format=3, attributes=words)
                 for name, (quantity, values) in zip(names, axes.items(), strict=True):
                     words = {}
-                    if quantity in known_quantities(scene):
+                    if quantity in quantity_names(scene):
                         words = {"long_name": meaning(scene, quantity)}
                         words["units"] = unit(scene, quantity)
                     _add(group, name, values.dtype, values.shape, values.shape, [name], words)

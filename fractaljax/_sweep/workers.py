@@ -21,7 +21,7 @@ from .._base.parts import brief, one_line
 from .._base.versions import version_text
 from .batches import Batches, mesh_of
 from .blocks import Blocks
-from .program import Program, settings, under
+from .program import Program, settings, use_settings
 
 Computed = Generator[
     tuple[int, list[np.ndarray]], None, None
@@ -75,7 +75,7 @@ class Job:
 
     def compute(self, k: int) -> list[np.ndarray]:
         """The leaves (*shape of batch k, ...)."""
-        with under(self._settings):
+        with use_settings(self._settings):
             with _lock:
                 batches = self._batches or _prepared(self)
                 begun = batches.begin(k)

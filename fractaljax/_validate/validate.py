@@ -108,7 +108,7 @@ def validate(*cases: str, progress: bool = True) -> Validation:
     """
     from tqdm import tqdm
 
-    chosen = [known_case(name) for name in cases] or list(known_cases().values())
+    chosen = [case_named(name) for name in cases] or list(case_names().values())
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise ValueError('validate needs 64 bits: jax.config.update("jax_enable_x64", True)')
     validated = {}
@@ -121,18 +121,18 @@ def validate(*cases: str, progress: bool = True) -> Validation:
 
 
 @functools.cache
-def known_cases() -> dict[str, Case]:
+def case_names() -> dict[str, Case]:
     """All published cases by name, in the order of the gallery."""
     modules = (importlib.import_module(f"{__package__}.{name}") for name in _MODULES)
     return {case.name: case for module in modules for case in module.CASES}
 
 
-def known_case(name: str) -> Case:
+def case_named(name: str) -> Case:
     """The case with this name.
 
     **Raises:** `ValueError` for an unknown name.
     """
-    published = known_cases()
+    published = case_names()
     if name not in published:
         raise ValueError(f"no case {name!r}; the cases are {', '.join(published)}")
     return published[name]

@@ -28,7 +28,7 @@ def new_figure(width: float = 8.4, height: float = 6.4) -> Figure:
     return Figure((width, height))
 
 
-def given_or_new(ax: Axes | None) -> Axes:
+def ensure_axes(ax: Axes | None) -> Axes:
     """The axes `ax`, or those of a new figure."""
     return new_figure().add_subplot() if ax is None else ax
 
@@ -58,7 +58,7 @@ def value_of(x: Any, name: str, value: float) -> str:
     return f"{name} = {value:.3g} {unit(x, name)}".removesuffix(" -")
 
 
-def over_quantity(ax: Axes, which: str, x: Any, name: str, values: np.ndarray) -> None:
+def set_quantity_axis(ax: Axes, which: str, x: Any, name: str, values: np.ndarray) -> None:
     """Set limits, scale and label of the "x" or "y" axis for values (n,) of a quantity of x."""
     scale = "log" if geometric(values) else "linear"
     ax.set(**{f"{which}scale": scale, f"{which}label": label(x, name)})

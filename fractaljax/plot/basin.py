@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from .._dynamics.basin import Basin
-from .axes import Axes, given_or_new, legend_above
+from .axes import Axes, ensure_axes, legend_above
 
 _PIXELS = 400  # along each axis
 _SMALL = 1e-2  # [m]
@@ -31,7 +31,7 @@ def basin(result: Basin, ax: Axes | None = None) -> Axes:
         raise ValueError(
             f"a picture needs starts that differ in 2 coordinates, got {len(coordinates)}"
         )
-    ax, n = given_or_new(ax), starts.shape[1] // 2
+    ax, n = ensure_axes(ax), starts.shape[1] // 2
     small = np.abs(starts[:, :n]).max() < _SMALL
     unit = np.where((coordinates < n) & small, 1e6, 1)
     points = starts[:, coordinates] * unit

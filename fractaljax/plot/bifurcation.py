@@ -8,7 +8,7 @@ from .._base.ranges import within
 from .._dynamics.bifurcation import BifurcationMap
 from .._stability.stability import growth_rate
 from .._sweep.sweep import sweep
-from .axes import Axes, given_or_new, legend_above, over_quantity
+from .axes import Axes, ensure_axes, legend_above, set_quantity_axis
 
 _POINTS = 160  # per axis
 _STYLES: dict[str, tuple[str, str]] = {
@@ -30,7 +30,7 @@ def bifurcation_map(result: BifurcationMap, ax: Axes | None = None) -> Axes:
     from matplotlib.patches import Patch
     from matplotlib.patheffects import withTickedStroke
 
-    ax, windows = given_or_new(ax), (result.x, result.y)
+    ax, windows = ensure_axes(ax), (result.x, result.y)
     places = np.linspace(0, 1, _POINTS)
     x, y = (within(low, high, places) for _, low, high in windows)
     axes: Any = {result.x[0]: x, result.y[0]: y}
@@ -58,8 +58,8 @@ def bifurcation_map(result: BifurcationMap, ax: Axes | None = None) -> Axes:
         ticks: dict[str, Any] = {"color": "0.4", "marker": "|", "ls": "none"}
         handles.append(Line2D([], [], label="ticks: stable cycles on this side", **ticks))
     star: dict[str, Any] = {"ms": 11, "mfc": "tab:cyan", "mec": "k", "ls": "none", "zorder": 5}
-    handles += ax.plot(*([value] for value in result.own), "*", label="the mechanism", **star)
+    handles += ax.plot(*([value] for value in result.nominal), "*", label="the mechanism", **star)
     for which, (name, *_), values in zip("xy", windows, (x, y), strict=True):
-        over_quantity(ax, which, result.mechanism, name, values)
+        set_quantity_axis(ax, which, result.mechanism, name, values)
     legend_above(ax, handles)
     return ax

@@ -6,7 +6,7 @@ import numpy as np
 
 from .._base.ranges import within
 from .._stability.boundary import Boundary, BoundaryEnd
-from .axes import Axes, given_or_new, legend_above, over_quantity
+from .axes import Axes, ensure_axes, legend_above, set_quantity_axis
 
 
 def boundary(result: Boundary, ax: Axes | None = None) -> Axes:
@@ -15,9 +15,9 @@ def boundary(result: Boundary, ax: Axes | None = None) -> Axes:
     from matplotlib.lines import Line2D
     from matplotlib.patheffects import withTickedStroke
 
-    ax = given_or_new(ax)
+    ax = ensure_axes(ax)
     for which, (name, low, high) in (("x", result.x), ("y", result.y)):
-        over_quantity(ax, which, result.scene, name, within(low, high, np.array([0, 0.5, 1])))
+        set_quantity_axis(ax, which, result.scene, name, within(low, high, np.array([0, 0.5, 1])))
     if not result.branches:
         words = "it squeals" if result.squeals else "stable"
         ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", va="center")

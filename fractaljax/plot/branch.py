@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from .._dynamics.branch import Branch
-from .axes import Axes, given_or_new, legend_above
+from .axes import Axes, ensure_axes, legend_above
 
 _MARKERS = {
     "fold": "s",
@@ -31,7 +31,7 @@ def branch(
     n = result.amplitude.shape[1]
     if not 1 <= direction <= n:
         raise ValueError(f"direction must be from 1 to {n}, got {direction}")
-    ax = given_or_new(ax)
+    ax = ensure_axes(ax)
     x, y = result.parameter, result.amplitude[:, direction - 1]
     factor, unit = next(row for row in _UNITS if y.max() * row[0] < 1e3 or row[1] == "m")
     y = y * factor

@@ -9,11 +9,11 @@ from .._sweep.result import Sweep
 from .axes import (
     Axes,
     Figure,
-    given_or_new,
+    ensure_axes,
     legend_above,
     lines,
     new_figure,
-    over_quantity,
+    set_quantity_axis,
     value_of,
 )
 
@@ -30,7 +30,7 @@ def curves(result: Sweep, ax: Axes | None = None, *, label: str) -> Axes:
     values = np.asarray(result)
     if values.ndim != len(result.names) or values.ndim > 2:
         raise ValueError(f"curves need scalars over one or two axes, got shape {values.shape}")
-    ax = given_or_new(ax)
+    ax = ensure_axes(ax)
     handles = _draw(result, values, ax)
     ax.set_ylabel(label)
     if values.ndim == 2:
@@ -52,7 +52,7 @@ def stiffness_curves(
 
     if stiffness not in _STIFFNESS:
         raise ValueError(f"stiffness must be 'K_n' or 'K_t', got {stiffness!r}")
-    ax = given_or_new(ax)
+    ax = ensure_axes(ax)
     measured = result.values
     if isinstance(measured, tuple):
         component = measured[list(_STIFFNESS).index(stiffness)]
@@ -88,7 +88,7 @@ def _draw(result, values, ax):
     """Draw values (n,) or (n, m) over the first quantity; the lines."""
     x, *others = result.points
     names = [value_of(result.scene, result.names[1], y) for y in others[0]] if others else [""]
-    over_quantity(ax, "x", result.scene, result.names[0], x)
+    set_quantity_axis(ax, "x", result.scene, result.names[0], x)
     return lines(ax, x, values.reshape(x.size, -1).T, names)
 
 

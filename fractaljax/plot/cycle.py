@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from .._dynamics.cycle import CycleResult, LimitCycle
-from .axes import Axes, Figure, coordinate, given_or_new, legend_above, new_figure
+from .axes import Axes, Figure, coordinate, ensure_axes, legend_above, new_figure
 
 _HARMONICS = 20  # for every return of a period
 _FLOOR = 1e-6  # of the strongest harmonic; weaker ones lie below the axis
@@ -23,7 +23,7 @@ def phase_portrait(
     joint.
     """
     shown = _coordinate(cycle, direction, joint)
-    ax = given_or_new(ax)
+    ax = ensure_axes(ax)
     period, n = float(cycle.period), len(shown.row)
     t, states = (np.asarray(x) for x in cycle.orbit())
     x, v = states[:, :n] @ shown.row * 1e6, states[:, n:] @ shown.row
@@ -56,7 +56,7 @@ def spectrum(
     **Raises:** as `phase_portrait`.
     """
     shown = _coordinate(cycle, direction, joint)
-    ax, most = given_or_new(ax), _HARMONICS * int(cycle.returns)
+    ax, most = ensure_axes(ax), _HARMONICS * int(cycle.returns)
     frequencies, amplitudes = (np.asarray(x)[:most] for x in cycle.harmonics(shown.row[None]))
     f, a = frequencies / 1e3, amplitudes[:, 0] * 1e6
     bottom = max(a.min() / 2, a.max() * _FLOOR)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from .._dynamics.cycle import LimitCycle
-from .axes import Axes, Figure, given_or_new, legend_above, new_figure
+from .axes import Axes, Figure, ensure_axes, legend_above, new_figure
 from .cycle import phase_portrait, spectrum
 
 _TANGENTS = 6
@@ -66,7 +66,7 @@ def amplitudes(
     if x.ndim != 1 or results.period.shape != x.shape:
         shapes = f"{x.shape} and {results.period.shape}"
         raise ValueError(f"over must have the shape (n,) of the batch, got {shapes}")
-    ax = given_or_new(ax)
+    ax = ensure_axes(ax)
     amplitude = np.asarray(results.amplitude) * 1e6
     handles = []
     for i, row in enumerate(amplitude.T):

@@ -9,12 +9,12 @@ import numpy as np
 from .._base.ranges import within
 from .._contact.contact import Regime
 from .._design.design import Design
-from .._mechanism.quantities import own_quantities
+from .._mechanism.quantities import stored_quantities
 from .._mechanism.scene import Scene, stiffness
 from .._mechanism.structure import Structure
 from .._stability.stability import growth_rate
 from .._sweep.sweep import sweep
-from .axes import Axes, given_or_new, legend_above, over_quantity
+from .axes import Axes, ensure_axes, legend_above, set_quantity_axis
 from .maps import regime_of, shade_regimes, shade_unsteady
 
 _POINTS = 240  # per axis
@@ -42,7 +42,7 @@ def stability_map(
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    ax, window = given_or_new(ax), dict(bounds or {})
+    ax, window = ensure_axes(ax), dict(bounds or {})
     window = window if len(window) > 1 else _WINDOW | window
     places = np.linspace(0, 1, _POINTS)
     axes: Any = {name: within(*ends, places) for name, ends in list(window.items())[:2]}
@@ -82,7 +82,7 @@ def stability_map(
             ax.contour(x, y, field.T, [level], colors="k", linestyles=style, linewidths=width)
             handles.append(Line2D([], [], color="k", ls=style, lw=width, label=words))
     for which, name in zip("xy", axes, strict=True):
-        over_quantity(ax, which, scene, name, axes[name])
+        set_quantity_axis(ax, which, scene, name, axes[name])
     legend_above(ax, handles)
     return ax
 
@@ -99,7 +99,7 @@ def design(result: Design, ax: Axes | None = None) -> Axes:
         (result.initial, "o", 6, "white", "given surface"),
         (result.scene, "*", 11, "tab:cyan", final),
     ):
-        quantities: Any = own_quantities(scene)
+        quantities: Any = stored_quantities(scene)
         style: dict[str, Any] = {"ms": size, "mfc": colour, "mec": "k", "ls": "none", "zorder": 5}
         at = [[float(quantities[name].value)] for name in names]
         handles += ax.plot(*at, marker, label=words, clip_on=False, **style)

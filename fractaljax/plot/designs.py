@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from .._design.many import DesignMany
-from .._mechanism.quantities import label, own_quantities, require_known
-from .axes import Axes, given_or_new, legend_above
+from .._mechanism.quantities import label, require_quantity, stored_quantities
+from .axes import Axes, ensure_axes, legend_above
 
 _DIMENSIONS = 2  # of a grid that is drawn as a map
 
@@ -31,12 +31,14 @@ def design_map(
     if quantity not in designs.quantities:
         raise ValueError(f"quantity must be one of {', '.join(designs.quantities)}, got {quantity}")
     for name in (x,) if y is None else (x, y):
-        require_known(designs.member, name)
-    ax, met = given_or_new(ax), np.asarray(designs.met)
+        require_quantity(designs.member, name)
+    ax, met = ensure_axes(ax), np.asarray(designs.met)
     values = np.where(met, designs[quantity], np.nan)
-    words, quantities = label(designs.member, quantity), own_quantities(designs.member)
+    words, quantities = label(designs.member, quantity), stored_quantities(designs.member)
     scale = quantity in quantities and quantities[quantity].log
-    axes: list[np.ndarray] = [designs.given(name) for name in ((x,) if y is None else (x, y))]
+    axes: list[np.ndarray] = [
+        designs.mechanism_quantity(name) for name in ((x,) if y is None else (x, y))
+    ]
     if y is None:
         order = np.argsort(axes[0], axis=None)
         ax.plot(axes[0].ravel()[order], values.ravel()[order], "o-", ms=3, lw=1.4)

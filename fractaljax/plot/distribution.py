@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import ArrayLike
 
-from .axes import Axes, given_or_new, legend_above
+from .axes import Axes, ensure_axes, legend_above
 
 
 def distribution(
@@ -29,7 +29,7 @@ def distribution(
     for name, values in checked.items():
         if values.ndim != 1 or not values.size or not np.isfinite(values).all():
             raise ValueError(f"samples {name!r} must be finite numbers (n,)")
-    ax = given_or_new(ax)
+    ax = ensure_axes(ax)
     handles = []
     for i, (name, values) in enumerate(checked.items()):
         style = ("solid", "dashed", "dashdot", "dotted")[i % 4]

@@ -28,13 +28,13 @@ from .._dynamics.cycle import CycleResult
 from .._dynamics.limit_cycle import limit_cycle
 from .._mechanism.quantities import (
     axis_values,
-    known_quantities,
     label,
-    own_quantities,
+    quantity_names,
     require_independent,
     require_inside,
-    require_known,
+    require_quantity,
     sliding_friction,
+    stored_quantities,
     substituted,
     unit,
     value_of,
@@ -178,7 +178,7 @@ def explored(
     if len(windows) < 2:
         raise ValueError(f"explore needs two quantities or more, got {', '.join(windows)}")
     for name in windows:
-        require_known(scene, name)
+        require_quantity(scene, name)
     require_independent(scene, tuple(windows))
     counts = dict(zip(windows, [*_NODES, *[_NODES[-1]] * len(windows)], strict=False))
     counts |= cycles if isinstance(cycles, Mapping) else {}
@@ -228,7 +228,7 @@ def points_at(scene: Any, names: tuple[str, ...], values: Any) -> dict[str, Any]
 
 
 def _default(scene: Scene) -> dict[str, tuple[float, float]]:
-    quantities = known_quantities(scene)
+    quantities = quantity_names(scene)
     names = [name for name in ("D", "G", "P", "mu") if name in quantities]
     if "D" not in names:
         names = [name for name in ("K_n", "K_t/K_n", "mu") if name in quantities]
@@ -249,7 +249,7 @@ def _axis(scene: Scene, name: str, window: Any, count: int) -> Axis:
         raise ValueError(f"{name} must be (low, high), got {window!r}")
     if not ends[0] <= value <= ends[1]:
         raise ValueError(f"the window of {name} must hold its value, {value:g}, got {window!r}")
-    quantity = own_quantities(scene).get(name)
+    quantity = stored_quantities(scene).get(name)
     log = quantity is not None and quantity.log
     space: Any = np.geomspace if log else np.linspace
     nodes = space(*ends, count)

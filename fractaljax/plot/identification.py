@@ -7,12 +7,12 @@ import numpy as np
 from .._identify.identify import Identification
 from .._identify.spectrum import theoretical_spectrum
 from .._surface.surface import Surface
-from .axes import Axes, given_or_new, legend_above
+from .axes import Axes, ensure_axes, legend_above
 
 
 def power_spectrum(result: Identification, ax: Axes | None = None) -> Axes:
     """The measured one-sided spectrum over frequency, for a map over |(f_x, f_y)|."""
-    ax, spectrum = given_or_new(ax), result.spectrum
+    ax, spectrum = ensure_axes(ax), result.spectrum
     ax.loglog(spectrum.f, spectrum.power, "-", color="0.72", lw=0.9, label="measured", zorder=1)
     ax.set_xlabel("frequency f [1/m]")
     of = "of the profile" if spectrum.kind == "profile" else "of the map, over |f|"

@@ -8,7 +8,7 @@ from .._contact.contact import Regime
 from .._mechanism.scene import Scene
 from .._sweep.result import Sweep
 from .._sweep.sweep import sweep
-from .axes import Artist, Axes, given_or_new, over_quantity
+from .axes import Artist, Axes, ensure_axes, set_quantity_axis
 
 _SHADES = {
     "fully plastic": (Regime.fully_plastic, "0.80", "//"),
@@ -71,14 +71,14 @@ def stability_chart(result: Sweep, ax: Axes | None = None) -> Axes:
 
     count = unstable_modes(result)
     if count.ndim == 1:
-        ax, ((name, x),) = given_or_new(ax), result.axes.items()
+        ax, ((name, x),) = ensure_axes(ax), result.axes.items()
         if len(x) < 2:
             raise ValueError("a chart needs two values or more, got one")
         growth = np.asarray(result.values.growth_rate)
         _count(ax, x, np.array([0.0, 1.0]), np.stack([count, count]), ax.get_xaxis_transform())
         ax.axhline(0, color="k", lw=0.8)
         ax.plot(x, growth, color="k", lw=2)
-        over_quantity(ax, "x", result.scene, name, x)
+        set_quantity_axis(ax, "x", result.scene, name, x)
         ax.set_ylabel("growth rate [1/s]")
         return ax
     ax, growth, handles = _start(result, ax)
@@ -148,10 +148,10 @@ def _start(result, ax):
     shape = tuple(map(len, result.points))
     if len(shape) != 2 or min(shape) < 2:
         raise ValueError(f"a map needs two axes of two values or more, got a grid of {shape}")
-    ax = given_or_new(ax)
+    ax = ensure_axes(ax)
     x, y = result.points
-    over_quantity(ax, "x", result.scene, result.names[0], x)
-    over_quantity(ax, "y", result.scene, result.names[1], y)
+    set_quantity_axis(ax, "x", result.scene, result.names[0], x)
+    set_quantity_axis(ax, "y", result.scene, result.names[1], y)
     none = _no_number(result)
     growth = np.ma.masked_where(none, getattr(result.values, "growth_rate", result.values))
 

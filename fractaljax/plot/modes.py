@@ -10,11 +10,11 @@ from .._sweep.result import Sweep
 from .axes import (
     Axes,
     Figure,
-    given_or_new,
+    ensure_axes,
     legend_above,
     lines,
     new_figure,
-    over_quantity,
+    set_quantity_axis,
     value_of,
 )
 from .maps import frequency_map, growth_map, vibration_modes
@@ -37,14 +37,14 @@ def mode_lines(
     **Raises:** `ValueError` for a quantity that is neither "real" nor "frequency".
     """
     layers, (x, y) = _layers(result, quantity), result.points
-    ax = given_or_new(ax)
+    ax = ensure_axes(ax)
     at = np.linspace(0, x[-1], 5)[1:] if at is None else at
     rows = [int(np.abs(x - value).argmin()) for value in at]
     if quantity == "real":
         ax.axhline(0, color="k", lw=0.8)
     names = [value_of(result.scene, result.names[0], x[i]) for i in rows]
     handles = lines(ax, y, layers[rows], names)
-    over_quantity(ax, "x", result.scene, result.names[1], y)
+    set_quantity_axis(ax, "x", result.scene, result.names[1], y)
     ax.set_ylabel(f"{_LABELS[quantity]} of all modes")
     legend_above(ax, handles)
     return ax

@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 
 from .._design.pareto import Front
-from .axes import Axes, given_or_new, legend_above
+from .axes import Axes, ensure_axes, legend_above
 
 
 def pareto(front: Front, ax: Axes | None = None) -> Axes:
     """First against second objective, in their own units, coloured by the fractal dimension."""
-    ax = given_or_new(ax)
+    ax = ensure_axes(ax)
     handles: list[Any] = ax.plot(front.first, front.second, color="0.6", lw=1.1, label="front")
     order = np.argsort(front.D)
     first, second = front.first[order], front.second[order]

@@ -11,7 +11,7 @@ from .._base.parts import whole
 from .._mechanism.mesh import Mesh
 from .._stability.stability import Stability
 from .animation import animated, animation_path
-from .axes import Axes, frequency_unit, given_or_new
+from .axes import Axes, ensure_axes, frequency_unit
 from .mesh import draw_mesh, scale_of
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def _picture(
     """The axes, and a function that draws a phase on them."""
     shape, words, names = _shape_of(mode, index)
     if points is None:
-        ax, move = _bars(shape, names, given_or_new(ax))
+        ax, move = _bars(shape, names, ensure_axes(ax))
     else:
         if dofs is None or cells is None:
             raise ValueError("points need dofs and cells beside them")

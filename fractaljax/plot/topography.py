@@ -7,7 +7,7 @@ from jaxtyping import ArrayLike, Float
 
 from .._design.design import Design
 from .._surface.topography import Topographies
-from .axes import Axes, Figure, given_or_new, new_figure
+from .axes import Axes, Figure, ensure_axes, new_figure
 
 
 def topography(
@@ -25,7 +25,7 @@ def topography(
     steps = dx, dx if dy is None else dy
     if not all(np.isfinite(step) and step > 0 for step in steps):
         raise ValueError(f"dx and dy must be above 0, got {steps[0]!r} and {steps[1]!r}")
-    ax, heights = given_or_new(ax), _about_mean(z)
+    ax, heights = ensure_axes(ax), _about_mean(z)
     image = _draw(ax, heights, steps, np.nanmin(heights), np.nanmax(heights))
     ax.figure.colorbar(image, ax=ax, pad=0.02).set_label("height about the mean [µm]")
     return ax

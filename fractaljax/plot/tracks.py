@@ -3,7 +3,7 @@
 import numpy as np
 
 from .._stability.tracks import ModeTracks
-from .axes import Figure, frequency_unit, legend_above, lines, new_figure, over_quantity
+from .axes import Figure, frequency_unit, legend_above, lines, new_figure, set_quantity_axis
 
 _ROUNDING = 1e-9  # of |s|: a smaller growth rate has no sign
 _NAMED = 9  # modes in the legend
@@ -24,7 +24,7 @@ def mode_tracks(tracks: ModeTracks) -> Figure:
     layers = {"growth rate [1/s]": growth, f"frequency [{hertz}]": tracks.frequencies * factor}
     handles = []
     for ax, (words, values) in zip(panels, layers.items(), strict=True):
-        over_quantity(ax, "x", tracks.x, tracks.name, x)
+        set_quantity_axis(ax, "x", tracks.x, tracks.name, x)
         ax.plot(x, np.delete(values, chosen, axis=1), color="0.75", lw=0.8)
         mine = values[:, chosen].T
         handles = lines(ax, x, mine, [f"mode {i + 1}" for i in chosen])

@@ -3,7 +3,7 @@
 import numpy as np
 
 from .._dynamics.simulate import Trajectory
-from .axes import Axes, coordinate, given_or_new, legend_above
+from .axes import Axes, coordinate, ensure_axes, legend_above
 
 _SAMPLES = 6000
 
@@ -20,7 +20,7 @@ def trajectory(
     `saveat`.
     """
     shown = coordinate(result._continuous(), direction, joint, result.times, batch=1)
-    ax, times = given_or_new(ax), np.asarray(result.times)
+    ax, times = ensure_axes(ax), np.asarray(result.times)
     t = np.sort(np.concatenate([np.linspace(times[0], times[-1], _SAMPLES), times]))
     x = np.asarray(result.at(t))[:, : len(shown.row)] @ shown.row * 1e6
     step = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 1)

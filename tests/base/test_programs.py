@@ -180,12 +180,12 @@ def test_private_folder_of_the_user(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     shared_with_a_group = os.umask(0o002)
     try:
-        with programs.kept_programs():
+        with programs.keep_programs():
             assert float(program(2.0)["value"]) == 4
     finally:
         os.umask(shared_with_a_group)
     folder = tmp_path / "cache" / "fractaljax" / "compiled"
-    with programs.kept_programs():
+    with programs.keep_programs():
         assert programs._folder == folder / "programs"
     assert programs._folder is None  # of a process that does more than one command
     assert [getattr(jax.config, name) for name in SETTINGS] == [str(folder), 0]
@@ -193,7 +193,7 @@ def test_private_folder_of_the_user(tmp_path, monkeypatch):
     for place, mode in ((folder, 0o700), (folder / "programs", 0o700), (kept, 0o600)):
         assert stat.S_IMODE(place.stat().st_mode) == mode
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))  # one that is set stays
-    with programs.kept_programs():
+    with programs.keep_programs():
         assert programs._folder == tmp_path / "programs"
     assert getattr(jax.config, SETTINGS[0]) == str(tmp_path)
 
@@ -216,7 +216,7 @@ def test_no_folder(tmp_path, monkeypatch, why):
     if why == "of another user":
         owner = os.getuid()
         monkeypatch.setattr(os, "getuid", lambda: owner + 1)
-    with programs.kept_programs():
+    with programs.keep_programs():
         assert getattr(jax.config, SETTINGS[0]) is None is programs._folder
 
 

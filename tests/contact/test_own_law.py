@@ -11,7 +11,7 @@ import pytest
 
 import fractaljax as fj
 from fractaljax._contact.laws import CONTACTS
-from fractaljax._mechanism.quantities import replaced, require_known
+from fractaljax._mechanism.quantities import replaced, require_quantity
 from tools import both_gradients, refusals
 
 BRAKE = fj.brake_scene()
@@ -240,7 +240,7 @@ test_refusals = refusals(
             r"^K_n of Softened\(.*\) must be at least 0, got -100000000\.0$",
         ),
         (
-            lambda: require_known(BRAKE.replace(contact=Steep(30.0)), "K_t/K_n"),
+            lambda: require_quantity(BRAKE.replace(contact=Steep(30.0)), "K_t/K_n"),
             "^scene has no quantity 'K_t/K_n'; it has mu_s",
         ),
     ],

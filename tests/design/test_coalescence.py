@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import brentq, minimize_scalar
 
 import fractaljax as fj
-from fractaljax._design.coalescence import of_neighbours, of_scene
+from fractaljax._design.coalescence import neighbour_residuals, of_scene
 from fractaljax._stability.quadratic import leading
 
 W = 100.0  # square of the mean frequency
@@ -40,7 +40,7 @@ def test_residuals_have_the_signs_of_growth_rates():
     @jax.vmap
     def both(C, K, target):
         found = leading(jnp.eye(n), C, K, n)
-        return found.s.real.max() - target, of_neighbours(found, target, jnp.array(0.1))
+        return found.s.real.max() - target, neighbour_residuals(found, target, jnp.array(0.1))
 
     above, residuals = map(np.asarray, both(C, K, target))
     clear = np.abs(above) > 1e-9
@@ -83,7 +83,7 @@ def test_residuals_are_smooth_through_coalescence():
     @jax.value_and_grad
     def residual(m):
         found = leading(jnp.eye(2), c * jnp.eye(2), flutter(c, p, m).K, 2)
-        return of_neighbours(found, jnp.array(target), jnp.array(0.01)).max()
+        return neighbour_residuals(found, jnp.array(target), jnp.array(0.01)).max()
 
     r, mean = target + c / 2, W - c**2 / 4
     root = np.sqrt(mean**2 - p**2 + m**2)

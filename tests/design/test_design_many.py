@@ -139,7 +139,7 @@ def test_a_member_that_fails_marks_itself():
     assert found.met.tolist() == [True, False, True, True]
     assert found.D[0] == found.D[3]
     np.testing.assert_array_equal(found.designed().contact.surface.D, found.D)
-    np.testing.assert_array_equal(found.given("mu_s"), [0.41, 3.0, 0.3, 0.41])
+    np.testing.assert_array_equal(found.mechanism_quantity("mu_s"), [0.41, 3.0, 0.3, 0.41])
     assert "infeasible" in repr(found)
 
 

@@ -35,12 +35,12 @@ def rows(problem, u):
     """Objective and residuals, and their Jacobian, at one design."""
     u = np.atleast_1d(np.asarray(u, float))
     row, jacobian, _ = linearise(problem, u[None], np.zeros((1, 0)))
-    return row[0, problem.asked], jacobian[0, problem.asked]
+    return row[0, problem.named_columns], jacobian[0, problem.named_columns]
 
 
 def searched(problem, u):
     """The cycle that the search finds at a design."""
-    x = problem.moved(jnp.asarray(u), problem.own_condition)
+    x = problem.mechanism_at(jnp.asarray(u), problem.nominal_condition)
     return fj.limit_cycle(x, throw=False)
 
 

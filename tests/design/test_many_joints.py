@@ -10,7 +10,7 @@ import scipy.linalg
 import fractaljax as fj
 from fractaljax._design.design import screened, solver_of
 from fractaljax._design.few_modes import in_few_modes
-from fractaljax._design.joint_limits import limits_of_joints
+from fractaljax._design.joint_limits import make_joint_limits
 from fractaljax._design.joints import state_of, states_of
 from fractaljax._design.rows import evaluate, linearise
 from fractaljax._design.solvers import slsqp
@@ -69,15 +69,15 @@ def test_designs_that_are_screened_are_inside_the_limits_of_all_joints():
     problem = fj.DesignProblem(x, bounds_of(x), **STATED)
     drawn = screened_designs(12, 8)
     nothing = np.zeros((len(drawn), 0))  # of an envelope
-    residuals, slopes = limits_of_joints(problem)(drawn, nothing)
+    residuals, slopes = make_joint_limits(problem)(drawn, nothing)
     assert (residuals.max(axis=1) <= 0).mean() < 0.1
     _, moved = screened(problem, 8, 12)
     assert ((moved >= 0) & (moved <= 1)).all()
-    within = limits_of_joints(problem)(moved, nothing[: len(moved)])[0]
+    within = make_joint_limits(problem)(moved, nothing[: len(moved)])[0]
     assert (within.max(axis=1) <= 0).mean() > 0.7
     # A few designs, one by one, are as those of a batch.
     for few, many in zip(
-        limits_of_joints(problem)(drawn[:3], nothing[:3]), (residuals, slopes), strict=True
+        make_joint_limits(problem)(drawn[:3], nothing[:3]), (residuals, slopes), strict=True
     ):
         np.testing.assert_allclose(few, many[:3], rtol=1e-10, atol=1e-12)
     # One in three is near the given design.
@@ -106,15 +106,15 @@ def test_limits_of_joints_are_those_of_each_condition(tolerance):
     problem = fj.DesignProblem(x, bounds_of(x), **STATED | asked)
     us = np.asarray(problem.start) + np.linspace(-0.05, 0.05, 6) * [[1], [-1], [0.5]]
     conditions = np.array([[0.4, 1e3], [0.6, 2e3], [0.5, 1.5e3]])
-    found, slopes = limits_of_joints(problem)(us, conditions)
+    found, slopes = make_joint_limits(problem)(us, conditions)
     rows = evaluate(problem, us, conditions)[:, problem.joint_columns]
     k = problem.model_residuals
     np.testing.assert_allclose(found[:, :k], rows[:, :k], rtol=1e-12)
     np.testing.assert_allclose(-np.expm1(-found[:, k:]), rows[:, k:], rtol=1e-12)
     # The same design under another condition is another.
-    assert np.abs(limits_of_joints(problem)(us, conditions[::-1])[0] - found).max() > 0.01
+    assert np.abs(make_joint_limits(problem)(us, conditions[::-1])[0] - found).max() > 0.01
     step = 1e-6 * np.cos(np.arange(6.0))
-    ends = [limits_of_joints(problem)(us + way * step, conditions)[0] for way in (1, -1)]
+    ends = [make_joint_limits(problem)(us + way * step, conditions)[0] for way in (1, -1)]
     np.testing.assert_allclose(slopes @ step, (ends[0] - ends[1]) / 2, rtol=1e-6, atol=1e-12)
 
 
@@ -196,9 +196,9 @@ def test_rows_and_slopes_of_loads_friction_and_parameters_of_a_brake():
             slopes[:, i], wanted, rtol=1e-5, atol=1e-5 * np.abs(wanted).max()
         )
         limits = [
-            limits_of_joints(problem)((u + way)[None], nothing)[0][0] for way in (step, -step)
+            make_joint_limits(problem)((u + way)[None], nothing)[0][0] for way in (step, -step)
         ]
-        by = limits_of_joints(problem)(u[None], nothing)[1][0][:, i]
+        by = make_joint_limits(problem)(u[None], nothing)[1][0][:, i]
         np.testing.assert_allclose(by, (limits[0] - limits[1]) / 2e-5, rtol=1e-6, atol=1e-7)
         assert (np.abs(by).max() > 0) == ("." in name)
 

@@ -150,7 +150,7 @@ def test_requirements_that_contradict_one_another_are_named():
 @pytest.mark.slow
 def test_every_law_has_its_modes():
     """A structure of two joints under its own law and another: rates as of each by itself."""
-    from fractaljax._design.joints import under
+    from fractaljax._design.joints import with_contact_law
     from fractaljax._design.rows import evaluate
 
     x: Any = fractal_joints()
@@ -163,14 +163,14 @@ def test_every_law_has_its_modes():
     k = problem.modes
     row = evaluate(problem, np.asarray(problem.start)[None], np.zeros((1, 0)))[0]
     growing = np.sinh(row[problem.growth_columns]) * float(problem.growth_scale)
-    assert len(growing) == 2 * k and len(problem.asked) == len(row)
+    assert len(growing) == 2 * k and len(problem.named_columns) == len(row)
     names = problem.residual_names[problem.model_residuals :]
     assert names[k] == "growth_rate <= target by AsperityContact"
-    for mechanism, rates in ((x, growing[:k]), (under(x, law), growing[k:])):
+    for mechanism, rates in ((x, growing[:k]), (with_contact_law(x, law), growing[k:])):
         s: Any = np.asarray(fj.stability(mechanism).eigenvalues)
         wanted = np.sort(s[s.imag >= 0].real)[::-1][:k]
         np.testing.assert_allclose(rates + float(problem.target), wanted, rtol=1e-8)
-    for joint, own in zip(under(x, law).joints, x.joints, strict=True):
+    for joint, own in zip(with_contact_law(x, law).joints, x.joints, strict=True):
         assert repr(joint.contact.surface) == repr(own.contact.surface)
         assert joint.contact.P == own.contact.P
         assert joint.contact.L_s == law.L_s
@@ -181,17 +181,17 @@ def test_every_law_has_its_modes():
 def test_a_structure_is_designed_under_two_laws():
     x: Any = fractal_joints()
     law = fj.AsperityContact(fj.Surface(2.2, 1e-9), x.joints[0].contact.material, 1.0, 1e-5)
-    from fractaljax._design.joints import under
+    from fractaljax._design.joints import with_contact_law
 
     bounds: dict[str, tuple[float, float]] = {"D": (2.15, 2.85), "G": (1e-12, 1e-8)}
     bounds = {
         f"{joint}.{name}": ends for joint in ("left", "right") for name, ends in bounds.items()
     }
-    own, other = (float(fj.growth_rate(y)) for y in (x, under(x, law)))
+    own, other = (float(fj.growth_rate(y)) for y in (x, with_contact_law(x, law)))
     target = min(own, other) - 0.1 * abs(min(own, other))
     best: Any = fj.design(
         x, bounds, None, target, 0.0, laws=[law], starts=4, lattice=6, progress=False
     )
-    rates = [float(fj.growth_rate(y)) for y in (best.scene, under(best.scene, law))]
+    rates = [float(fj.growth_rate(y)) for y in (best.scene, with_contact_law(best.scene, law))]
     assert (best.violated == ()) == (max(rates) <= target + 1e-6)
     assert best.violated == () or best.least_growth.growth_rate > target

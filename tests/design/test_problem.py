@@ -76,7 +76,7 @@ def test_names_are_in_the_order_of_the_residuals():
         "coarse",
         "K_n >= 5e+08 N/m",
     ]
-    row = problem.at(problem.start, problem.own_condition)[0][problem.asked]
+    row = problem.at(problem.start, problem.nominal_condition)[0][problem.named_columns]
     assert row[0] == 0 and row[-2] == pytest.approx(2.4 - 2.42) and row.shape == (8,)
 
 
@@ -105,7 +105,7 @@ def test_scaled_variables_and_the_default_target():
         list(problem.quantities(jnp.full(3, 0.5)).values()), [2.55, 2000, 0.4]
     )
     np.testing.assert_allclose(problem.scaled(fj.brake_scene()), problem.start, rtol=1e-12)
-    moved = problem.moved(jnp.array([0.2, 0.5, 1.0]), problem.own_condition)
+    moved = problem.mechanism_at(jnp.array([0.2, 0.5, 1.0]), problem.nominal_condition)
     assert pytest.approx(2000) == moved.contact.P and moved.friction.mu_s == pytest.approx(0.5)
     # Of a scene in closed form; of the same as a structure by its eigenvalues without friction.
     scene = fj.brake_scene()
@@ -127,7 +127,7 @@ def test_residuals_inform_on_both_sides_of_regime_boundaries():
     assert jnp.all(jacobians[0, growth] == 0) and jnp.all(jnp.abs(jacobians[0, area]) > 1)
     assert jnp.all(jnp.abs(jacobians[1, slip]) > 1)
     for u, jacobian in zip(us, jacobians, strict=True):
-        reverse = jax.jacrev(lambda u: problem.at(u, problem.own_condition)[0])(jnp.asarray(u))
+        reverse = jax.jacrev(lambda u: problem.at(u, problem.nominal_condition)[0])(jnp.asarray(u))
         np.testing.assert_allclose(jacobian, reverse, rtol=1e-9, atol=1e-9)
 
 

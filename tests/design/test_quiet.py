@@ -164,7 +164,7 @@ def test_a_plane_is_the_tangent_of_where_the_cycle_ends():
     errors = []
     for step in (0.01, -0.01):
         along = u + np.array([0.0, step])
-        moved = problem.moved(jnp.asarray(along), jnp.zeros(0))
+        moved = problem.mechanism_at(jnp.asarray(along), jnp.zeros(0))
         (graze,) = fj.continue_cycle(moved, "V", (1.4, 2.2)).grazings
         end = problem.scaled(moved.replace(V=graze.value))
         errors.append(normals[1] @ (end - u) - gaps[1] / 1.005)

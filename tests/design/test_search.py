@@ -40,7 +40,7 @@ def test_known_solutions(f, c, solution):
         u = slsqp(functions.objective, functions.constraints, start, bounds)
         if (np.array(c(u)) <= 1e-6).all():
             ends.append((f(u), *u))
-            assert len(functions.seen) == len(np.unique(functions.seen, axis=0)) < 200
+            assert len(functions.evaluated) == len(np.unique(functions.evaluated, axis=0)) < 200
     np.testing.assert_allclose(min(ends)[1:], solution, atol=1e-6)
 
 
@@ -105,9 +105,9 @@ def test_starts_are_those_given_and_one_in_every_basin():
 
 def test_new_starts_are_near_the_best_and_every_other_round_on_the_way_back(monkeypatch):
     """Back to the given design only where the distance from it is the objective."""
-    monkeypatch.setattr(starting, "within_joints", lambda problem, us, conditions: us)
+    monkeypatch.setattr(starting, "restore_joint_limits", lambda problem, us, conditions: us)
     own, best = np.full(18, 0.5), np.full(18, 0.5) + 0.1 * np.cos(np.arange(18.0))
-    stated: Any = SimpleNamespace(objective=None, start=own, own_condition=np.zeros(0))
+    stated: Any = SimpleNamespace(objective=None, start=own, nominal_condition=np.zeros(0))
     distance = np.linalg.norm(best - own)
     near, back = (designs_near(stated, best, 12, again) for again in (2, 3))
     assert (np.abs(near - best).max(axis=1) <= 8 * [0.06] + 4 * [0.15]).all()

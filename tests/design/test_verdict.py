@@ -78,7 +78,7 @@ def test_quiet_in_all():
         "Quiet in all that was asked.",
         "Not asked: scatter (tolerance), kicks (quiet_within).",
     ]
-    assert fj.verdict(quiet).not_asked[0] == "other contact laws (laws)"
+    assert fj.verdict(quiet).omitted[0] == "other contact laws (laws)"
     assert [question.name for question in found.questions] == [
         "as it is (FixedContact)",
         "by FixedContact",
@@ -103,7 +103,7 @@ def test_largest_kick_survived():
     scene = motionless_scene()
     law, scatter = [fj.FixedContact(1e7, 5e6)], {"mu": 1e-3}
     found = fj.verdict(scene, laws=law, tolerance=scatter, quiet_within=0.5, progress=False)
-    assert found.not_asked == () and repr(found).splitlines()[-1] == "Quiet in all."
+    assert found.omitted == () and repr(found).splitlines()[-1] == "Quiet in all."
     assert found.questions[-1][:4] == (
         "smaller kicks",
         "kicks within 0.5",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from fractaljax._identify.band import chosen_band, given_band, noise_model
+from fractaljax._identify.band import check_band, chosen_band, noise_model
 from fractaljax._identify.spectrum import Spectrum
 from fractaljax._identify.stylus import tip_limit
 
@@ -50,11 +50,11 @@ def test_chosen_band(measured, top, low, high, warning):
 )
 def test_a_bad_band_is_refused(band):
     with pytest.raises(ValueError, match="band must "):
-        given_band(band, spectrum(), LENGTH, RATIO, NYQUIST)
+        check_band(band, spectrum(), LENGTH, RATIO, NYQUIST)
 
 
 def test_a_given_band_is_kept():
-    found = given_band((3e3, 2e5), spectrum(), LENGTH, RATIO, 1e5)
+    found = check_band((3e3, 2e5), spectrum(), LENGTH, RATIO, 1e5)
     assert (found.low, found.high) == (3e3, 2e5)
     assert found.warnings == ("the band goes beyond the instrument's limit of 1e+05 1/m",)
     with pytest.raises(ValueError, match="the instrument's limit of 3000 1/m leaves no band"):

@@ -9,14 +9,14 @@ import fractaljax as fj
 from fractaljax._mechanism import quantities
 from fractaljax._mechanism.quantities import (
     axis_values,
-    known_quantities,
     label,
-    own_quantities,
+    quantity_names,
     replaced,
     require_independent,
     require_inside,
-    require_known,
+    require_quantity,
     sliding_friction,
+    stored_quantities,
     substituted,
     unit,
     value_of,
@@ -37,7 +37,7 @@ def mu_of(mu_s, mu_m, v_m, V):
 
 
 def test_quantities_with_names_units_and_values():
-    own = own_quantities(BRAKE)
+    own = stored_quantities(BRAKE)
     assert own["D"].value == 2.4 and own["V"].value == 0.15
     assert (own["omega_1"].unit, own["P"].meaning) == ("rad/s", "normal load")
     assert own["stiffness_ratio"].value is None
@@ -46,8 +46,8 @@ def test_quantities_with_names_units_and_values():
     assert not {"contact", "surface", "friction"} & own.keys()
     # mu once, also where the scene stores it.
     names = ["K_n", "K_t", "P", "mu", "m", "omega_1", "omega_2", "xi_1", "xi_2", "F", "V"]
-    assert known_quantities(CONSTANT) == [*names, "K_t/K_n", "omega_1/omega_2"]
-    assert known_quantities(BRAKE)[-3:] == ["K_t/K_n", "omega_1/omega_2", "mu"]
+    assert quantity_names(CONSTANT) == [*names, "K_t/K_n", "omega_1/omega_2"]
+    assert quantity_names(BRAKE)[-3:] == ["K_t/K_n", "omega_1/omega_2", "mu"]
     assert [unit(BRAKE, name) for name in ("G", "V", "mu", "K_t/K_n")] == ["m", "m/s", "-", "-"]
     assert label(BRAKE, "D") == "fractal dimension D [-]"
     assert label(CONSTANT, "mu") == "friction coefficient mu [-]"
@@ -71,14 +71,14 @@ def test_two_names_of_one_quantity_and_unknown_ones_are_refused():
     require_independent(BRAKE, ("mu", "V", "v_m", "K_t/K_n", "D"))
     for name in ("nonsense", "contact"):
         with pytest.raises(ValueError, match=f"no quantity '{name}'; it has K_n, K_t, P, mu"):
-            require_known(CONSTANT, name)
+            require_quantity(CONSTANT, name)
 
 
 def test_a_structure_has_the_numbers_of_its_joints():
     structure = two_joints(4)
-    own = own_quantities(structure)
+    own = stored_quantities(structure)
     assert own["right.K_n"].value == 5e6 and own["K_n"].value == 3e6 and own["K_n"].log
-    assert known_quantities(structure)[0] == "K_n" and not {"M", "F", "mu"} & own.keys()
+    assert quantity_names(structure)[0] == "K_n" and not {"M", "F", "mu"} & own.keys()
     assert unit(structure, "left.V") == "m/s"
     assert label(structure, "left.V") == "sliding velocity left.V [m/s]"
     moved = substituted(structure, {"V": 0.25, "right.K_n": 7e6})
@@ -90,7 +90,7 @@ def test_a_structure_has_the_numbers_of_its_joints():
     with pytest.raises(ValueError, match=r"^K_n differs between the joints: name left.K_n and"):
         value_of(structure, "K_n")
     with pytest.raises(ValueError, match="structure has no quantity 'G'; it has K_n, K_t, "):
-        require_known(structure, "G")
+        require_quantity(structure, "G")
     with pytest.raises(ValueError, match=r"must be independent, got V and left\.V"):
         require_independent(structure, ("V", "left.V"))
     require_independent(structure, ("left.V", "right.V"))

@@ -15,7 +15,7 @@ def test_blocks_cover_a_grid_once(shape):
         found, seen = blocks(shape, most), []
         for k in range(found.number):
             own = points[found.index(k)]
-            assert own.shape == found.own_shape(k) and own.size == found.size(k) <= found.most
+            assert own.shape == found.block_shape(k) and own.size == found.size(k) <= found.most
             repeated = np.append(own, [own.flat[-1]] * (found.most + 2 - own.size))
             np.testing.assert_array_equal(points[*found.points(k, found.most + 2)], repeated)
             seen.append(own.ravel())

@@ -57,7 +57,7 @@ def only(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
 
     def know(case):
-        monkeypatch.setattr(module, "known_cases", lambda: {case.name: case})
+        monkeypatch.setattr(module, "case_names", lambda: {case.name: case})
 
     return know
 
@@ -184,7 +184,7 @@ def test_command_ends_with_1_where_one_differs(capsys, only, case):
 
 
 def test_every_case_names_its_source_and_is_on_the_page():
-    known = module.known_cases()
+    known = module.case_names()
     modules = [sys.modules[f"fractaljax._validate.{name}"] for name in module._MODULES]
     assert len(known) == sum(len(each.CASES) for each in modules)
     for name, case in known.items():
