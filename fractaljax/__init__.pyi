@@ -76,6 +76,7 @@ from ._friction import (
 from ._identify.files import read_measurement as read_measurement
 from ._identify.identify import Identification as Identification, identify as identify
 from ._identify.measurement import Measurement as Measurement
+from ._identify.spectrum_of import spectrum_of as spectrum_of
 from ._mechanism.damping import modal_damping as modal_damping, rayleigh_damping as rayleigh_damping
 from ._mechanism.matrix_file import Matrices as Matrices, read_matrices as read_matrices
 from ._mechanism.mesh import Mesh as Mesh
@@ -109,7 +110,15 @@ from ._stability.tracks import (
     ModeTracks as ModeTracks,
     track_modes as track_modes,
 )
-from ._surface.roughness import Roughness as Roughness, roughness as roughness
+from ._surface.measured_spectrum import MeasuredSpectrum as MeasuredSpectrum
+from ._surface.roughness import (
+    Roughness as Roughness,
+    SpectralMoments as SpectralMoments,
+    roughness as roughness,
+    spectral_moments as spectral_moments,
+)
+from ._surface.self_affine import SelfAffine as SelfAffine
+from ._surface.spectrum import Spectrum as Spectrum
 from ._surface.surface import Surface as Surface
 from ._surface.topography import topography as topography
 from ._sweep.result import Sweep as Sweep

@@ -78,8 +78,8 @@ def part_table(part: Part, laws: Laws) -> dict[str, Any]:
     for field in dataclasses.fields(part):
         name, value = quantity_name(field), getattr(part, field.name)
         if isinstance(value, Part):
-            law = name in laws
-            table[name] = law_table(name, value, laws) if law else part_table(value, laws)
+            one_kind = name not in laws or type(value) is field.type
+            table[name] = part_table(value, laws) if one_kind else law_table(name, value, laws)
         elif "unit" in field.metadata:
             table[name] = Noted(value, "{unit}: {meaning}".format(**field.metadata))
         else:
@@ -146,13 +146,15 @@ def read_part(kind: type[Part], table: Mapping[str, Any], laws: Laws, name: str 
     or outside its domain.
     """
     where, inside = (f"[{name}]", f"{name}.") if name else ("the file", "")
-    fields = {quantity_name(field): field.type for field in dataclasses.fields(kind)}
+    fields = {quantity_name(field): field for field in dataclasses.fields(kind)}
     refuse_unknown(where, table, fields)
     arguments, parameters = dict(table), inspect.signature(kind.__init__).parameters
-    for key, inner in fields.items():
+    for key, field in fields.items():
+        inner = field.type
         if key in laws or (isinstance(inner, type) and issubclass(inner, Part)):
             below = table_at(table, key, inside)
             if key in laws:
+                below = _usual_law(field, laws[key]) | below
                 arguments[key] = read_law(key, below, laws, f"{inside}{key}")
             else:
                 arguments[key] = read_part(cast(type[Part], inner), below, laws, f"{inside}{key}")
@@ -168,6 +170,13 @@ def read_law(key: str, table: Mapping[str, Any], laws: Laws, name: str) -> Any:
     """The part whose `law_table` is in the table `name` of a file; errors as `read_part`."""
     below = dict(table)
     return read_part(_kind(name, below.pop("law", ""), laws[key]), below, laws, name)
+
+
+def _usual_law(field: dataclasses.Field, kinds: Mapping[str, type[Part]]) -> dict[str, str]:
+    """The law of a table that names none: that of the field's only kind, or its usual one."""
+    names = [law for law, kind in kinds.items() if kind is field.type]
+    usual = field.metadata.get("law", names[0] if names else None)
+    return {} if usual is None else {"law": usual}
 
 
 def _kind(name: str, law: Any, kinds: Mapping[str, type[Part]]) -> type[Part]:

@@ -167,7 +167,17 @@ def _load_curve(law: Any, mu_s, mu_m) -> LoadCurve:
 
 
 def on_the_same_joint(law: Contact, contact: Contact) -> Contact:
-    """`law` with the surface, the material and the load of `contact`, as far as both have them."""
+    """`law` with the surface, the material and the load of `contact`, as far as both have them.
+
+    **Raises:** `ValueError` if their surfaces are of two kinds.
+    """
+    surfaces = [getattr(x, "surface", None) for x in (law, contact)]
+    kinds = [type(x).__name__ for x in surfaces if x is not None]
+    if len(set(kinds)) == 2:
+        raise ValueError(
+            f"{type(law).__name__} has a {kinds[0]} and the joint a {kinds[1]}: laws are compared"
+            " on the same kind of surface"
+        )
     shared = [
         name
         for name in ("surface", "material", "P")

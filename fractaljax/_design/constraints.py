@@ -22,7 +22,7 @@ from .._mechanism.mechanism import Mechanism
 from .._mechanism.scene import Scene, stiffness
 from .._stability.margin import least_damping_ratio
 from .._stability.stability import stability
-from .._surface.roughness import root_mean_square_height
+from .._surface.roughness import root_mean_square
 from .._surface.surface import Surface
 
 Limit = Any  # a scalar, or None where there is none
@@ -185,7 +185,7 @@ class RealContactArea(_LogConstraint):
 class Roughness(_LogConstraint):
     """Sq [m] of the surface within limits, over wavelengths from L to L_s < L [m].
 
-    See `root_mean_square_height`.
+    See `root_mean_square`.
     """
 
     L: Float[Array, ""]
@@ -209,7 +209,7 @@ class Roughness(_LogConstraint):
             raise ValueError(f"L_s must be below L, got {L_s!r} and {L!r}")
 
     def measure(self, scene):
-        return root_mean_square_height(_surface(scene, self.symbol), self.L, self.L_s)
+        return root_mean_square(_surface(scene, self.symbol), self.L, self.L_s)
 
 
 class DampingRatio(Constraint):

@@ -129,8 +129,10 @@ class Design(Record):
         for constraint in self.options["constraints"]:
             if isinstance(constraint, limits.Roughness):
                 return float(constraint.L), float(constraint.L_s)
-        if isinstance(self.scene, Scene) and isinstance(self.scene.contact, PerssonContact):
-            return float(self.scene.contact.L), float(self.scene.contact.L_s)
+        contact: Any = self.scene.contact if isinstance(self.scene, Scene) else None
+        if isinstance(contact, PerssonContact) and contact.L is not None:
+            band: Any = contact.L, contact.L_s
+            return float(band[0]), float(band[1])
         return _WAVELENGTHS
 
     def roughness(

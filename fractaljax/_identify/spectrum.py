@@ -89,7 +89,7 @@ def map_power(z: np.ndarray, dx: float, dy: float) -> tuple[np.ndarray, ...]:
     """f_x (n,), f_y (m/2+1,), two-dimensional power [m^4] and count per mode, Hann's window."""
     n, m = z.shape
     rows, columns = (np.sin(np.pi * (np.arange(k) + 0.5) / k) ** 2 for k in (n, m))
-    z = _remove_plane(z) * rows[:, None] * columns
+    z = remove_plane(z) * rows[:, None] * columns
     power = dx * dy * np.abs(np.fft.rfft2(z)) ** 2 / ((rows @ rows) * (columns @ columns))
     fx, fy = np.fft.fftfreq(n, dx), np.fft.rfftfreq(m, dy)
     # A mode and its mirror image are one, and both are listed where f_y is 0 or Nyquist's.
@@ -100,7 +100,7 @@ def map_power(z: np.ndarray, dx: float, dy: float) -> tuple[np.ndarray, ...]:
     return fx, fy, power, count
 
 
-def _remove_plane(z):
+def remove_plane(z):
     """A map minus its least-squares plane."""
     x, y = (np.arange(n) - (n - 1) / 2 for n in z.shape)
     z = z - z.mean()

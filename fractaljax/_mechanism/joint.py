@@ -27,12 +27,14 @@ from .._base.toml import Laws
 from .._contact.contact import MU_M_MAX, Contact, refused_stiffness
 from .._contact.laws import CONTACTS
 from .._friction import LAWS, Friction
+from .._surface.spectra import SPECTRA
 
 # Classes by their names in files.
 JOINT_LAWS: Laws = {
     "contact": CONTACTS,
     "friction": LAWS,
     "of": LAWS,  # the law that a `Scaled` law scales
+    "surface": SPECTRA,
 }
 
 PRELOAD_NOTE = (

@@ -1,1 +1,1 @@
-"""Fractal surfaces: their parameters, heights on a grid, roughness."""
+"""Surfaces: spectra, heights on a grid, roughness."""

@@ -1,13 +1,22 @@
 """Machined surfaces, described by their fractal parameters."""
 
+import math
+from typing import final
+
 import jax.numpy as jnp
 from jaxtyping import ArrayLike
 
-from .._base.parts import Numbers, Part, number, quantity
+from .._base.parts import Numbers, number, quantity
+from .spectrum import Pieces, Spectrum
 
 
-class Surface(Part):
+@final
+class Surface(Spectrum):
     """A fractal surface in the Yan-Komvopoulos form of the Weierstrass-Mandelbrot function.
+
+    As a spectrum it is m = G^(2D-4) f^(2D-6)/2 at the frequency f = q/(2 pi), self-affine with
+    H = 3 - D, without an end: where lengths matter, the longest and the shortest wavelength are
+    stated beside it.
 
     **Raises:** `ValueError` unless 2 < D < 3, G > 0 and gamma > 1.
     """
@@ -20,6 +29,19 @@ class Surface(Part):
         self.D = number("D", D, above=2, below=3)
         self.G = number("G", G, above=0)
         self.gamma = number("gamma", gamma, above=1)
+
+    def m(self, q):
+        # G^(2D-4) alone may underflow.
+        wavelength = 2 * math.pi / jnp.asarray(q)
+        return (wavelength * (self.G / wavelength) ** (self.D - 2)) ** 2 / 2
+
+    def between(self, L, L_s) -> Pieces:
+        """The waves of Eq. 13 from L to L_s, with half a step of gamma beyond first and last."""
+        log_gamma = jnp.log(self.gamma)
+        q = 2 * math.pi / (L * jnp.exp(log_gamma / 2))
+        width = frequency_count(self.gamma, L / L_s) * log_gamma
+        edges = jnp.stack([q, q * jnp.exp(width)])
+        return Pieces(edges, self.m(q)[None], 2 * (self.D - 2)[None])
 
 
 def frequency_count(gamma, ratio, xp=jnp):

@@ -1,9 +1,9 @@
-"""Surfaces as heights on a grid: the Weierstrass-Mandelbrot sum of Eq. 13.
+"""Surfaces as heights on a grid: of Eq. 13, or with random phases by another spectrum.
 
-Since sqrt(x^2 + y^2) cos(atan2(y, x) - a) = x cos a + y sin a, each wave of Eq. 13 is
-cos(k_x x + phi) cos(k_y y) - sin(k_x x + phi) sin(k_y y), and the double sum over a grid is a
-product of matrices. It is computed a block of waves at a time to bound memory. Phases are
-counted in cycles, so that whole cycles can be dropped exactly.
+The Weierstrass-Mandelbrot sum of Eq. 13: since sqrt(x^2 + y^2) cos(atan2(y, x) - a) =
+x cos a + y sin a, each wave is cos(k_x x + phi) cos(k_y y) - sin(k_x x + phi) sin(k_y y), and the
+double sum over a grid is a product of matrices. It is computed a block of waves at a time to bound
+memory. Phases are counted in cycles, so that whole cycles can be dropped exactly.
 """
 
 import functools
@@ -27,6 +27,7 @@ from .._base.parts import (
     whole,
 )
 from .._base.programs import exported_jit
+from .spectrum import Spectrum
 from .surface import Surface, frequency_count
 
 _BLOCK = 256  # waves in one product of matrices
@@ -43,7 +44,7 @@ class Topographies(NamedTuple):
 
 
 def topography(
-    surface: Surface,
+    surface: Spectrum,
     L: ScalarLike,
     n: int,
     *,
@@ -52,30 +53,47 @@ def topography(
     M: int = 10,
     periodic: bool = False,
 ) -> Float[Array, "n n"]:
-    """Heights z [m] of a surface on a square grid: z[i, j] is Eq. 13 at x = i L/n, y = j L/n.
+    """Heights z [m] of a surface on a square grid, z[i, j] at x = i L/n, y = j L/n.
 
-    Wavelengths run from L [m] down to L_s [m] (default 2 L/n, the shortest that the grid
-    resolves), with M directions each. `key` draws the phases: the same key gives the same surface,
-    and a smaller L_s adds waves without moving the others.
+    Those of a `Surface` are Eq. 13. Any other spectrum gets one wave of random phase at each
+    wavevector of a period, L of a periodic topography and 2 L of another, that the grid resolves:
+    their amplitudes are those of the spectrum, so that Sq is too, on the period. `lay` is along x.
 
-    `periodic` makes opposite edges meet, as contact solvers by FFT require. The vector
-    gamma^n (cos a, sin a) of each wave is rounded to whole waves k per L along x and y, none
-    shorter than L_s, and its amplitude follows its own wavelength: |k|^(D-3) in place of
-    gamma^((D-3)n). The phases are the same. With M = 10, `roughness` stays right to 0.3 percent in
-    Sdq, and in Sq to 1 percent at gamma = 1.5, 8 at gamma = 2. A derivative in gamma leaves the
-    waves in place.
+    **Arguments:**
+
+    - `surface`: a `Surface`, `SelfAffine`, `MeasuredSpectrum` or a spectrum of one's own.
+    - `L`: side of the square [m]; of a `Surface` also its longest wavelength.
+    - `n`: points along a side.
+    - `key`: of `jax.random`, which draws the phases: the same key gives the same surface.
+    - `L_s`: shortest wavelength [m] of a `Surface`, by default 2 L/n, the shortest that the grid
+      resolves. A smaller one adds waves without moving the others.
+    - `M`: directions of each frequency of a `Surface`, 10 by default.
+    - `periodic`: opposite edges meet, as contact solvers by FFT require; False by default.
+
+    In a periodic `Surface` the vector gamma^n (cos a, sin a) of each wave is rounded to whole waves
+    k per L along x and y, none shorter than L_s, and its amplitude follows its own wavelength:
+    |k|^(D-3) in place of gamma^((D-3)n). The phases are the same. With M = 10, `roughness` stays
+    right to 0.3 percent in Sdq, and in Sq to 1 percent at gamma = 1.5, 8 at gamma = 2. A derivative
+    in gamma leaves the waves in place.
 
     Differentiable in D, G, gamma and L; `jit` and `vmap` work over D, G and key. The number of
     waves is structure: gamma must be known at trace time, and so must L and L_s if L_s is given.
     In float32 the error is at most 2e-5 Sq.
 
     **Raises:** `ValueError` unless 0 < L_s <= L, n >= 2 and M >= 1, both whole, for an array of
-    surfaces or keys, and if there is not enough memory; `TypeError` for a wrong type, and for a
-    traced gamma, L or L_s.
+    surfaces or keys, for L_s beside another spectrum, and if there is not enough memory;
+    `TypeError` for a wrong type, and for a traced gamma, L or L_s.
     """
-    require_kind("surface", surface, Surface)
+    require_kind("surface", surface, Spectrum)
     require_scalar(surface)
     n, M, periodic = whole("n", n, 2), whole("M", M, 1), flag("periodic", periodic)
+    if not isinstance(surface, Surface):
+        if L_s is not None:
+            kind = type(surface).__name__
+            raise ValueError(f"L_s is for a Surface; a {kind} has a shortest wavelength of its own")
+        require_memory(f"a topography of {n} x {n} points", 8 * n * n * (8 if periodic else 32))
+        _require_key(key)
+        return _random_phases(surface, scalar("L", L, above=0), key, n, periodic)
     dtype = surface.D.dtype
     require_memory(f"a topography of {n} x {n} points", dtype.itemsize * n * (3 * n + 4 * _BLOCK))
     L = scalar("L", L, above=0)
@@ -133,6 +151,24 @@ def _require_concrete(name: str, value: jax.Array) -> np.ndarray:
             " it: keep it out of the arguments of jit and vmap"
         )
     return values
+
+
+@functools.partial(jax.jit, static_argnums=(3, 4))
+def _random_phases(spectrum: Spectrum, L, key, n: int, periodic: bool):
+    """A wave of random phase at every wavevector, of mean square C (2 pi/period)^2/(2 pi)^2."""
+    points = n if periodic else 2 * n
+    period = L * (points / n)
+    waves = jnp.fft.rfft2(jax.random.normal(key, (points, points), period.dtype))
+    size = jnp.abs(waves)
+    phases = waves / jnp.where(size > 0, size, 1)
+    q_x, q_y = 2 * np.pi * np.fft.fftfreq(points), 2 * np.pi * np.fft.rfftfreq(points)
+    step = points / period
+    constant = (q_x[:, None] == 0) & (q_y[None] == 0)
+    C = spectrum.C_at(
+        jnp.asarray(np.where(constant, 1, q_x[:, None])) * step, jnp.asarray(q_y[None]) * step
+    )
+    amplitude = jnp.where(constant | (C <= 0), 0, jnp.sqrt(jnp.where(C > 0, C, 1)) / period)
+    return jnp.fft.irfft2(phases * amplitude, s=(points, points))[:n, :n] * points**2
 
 
 @functools.partial(exported_jit, static_argnames="n")

@@ -17,7 +17,7 @@ from fractaljax._design.constraints import (
     RealContactArea,
     Roughness,
 )
-from fractaljax._surface.roughness import root_mean_square_height
+from fractaljax._surface.roughness import root_mean_square
 from tools import both_modes, reference_scene, refusals, state_matrix
 
 ALL = {
@@ -66,7 +66,7 @@ def test_values_and_signs(scene):
         1 - float(state.K_n) / 4e8,
         1 - share / 0.3,
         max(math.log(2e-6 / state.A_r), math.log(state.A_r / 3e-6)),
-        math.log(root_mean_square_height(scene.contact.surface, 1e-3, 1e-6) / 2e-6),
+        math.log(root_mean_square(scene.contact.surface, 1e-3, 1e-6) / 2e-6),
         math.asinh((1e-3 - damping) / 1e-3),
         max(1 - frequencies.min() / 1000, frequencies.max() / 5000 - 1),
     ]

@@ -444,7 +444,7 @@ def test_constraints_are_named_when_active(scene):
 
     def roughness(best):
         surface = best.scene.contact.surface
-        return float(fj.constraints.root_mean_square_height(surface, 1e-3, 1e-6))
+        return float(fj.constraints.root_mean_square(surface, 1e-3, 1e-6))
 
     limit = 0.9 * roughness(plain)
     smooth = fj.constraints.Roughness(at_most=limit, L=1e-3, L_s=1e-6)

@@ -18,7 +18,7 @@ BOUNDS = {"D": (2.3, 2.8), "G": (1e-11, 1e-9)}
 
 def fineness(scene):
     """-ln Sq over the lengths of a profile: a rough surface is cheap."""
-    return -jnp.log(constraints.root_mean_square_height(scene.contact.surface, 1e-3, 1e-6))
+    return -jnp.log(constraints.root_mean_square(scene.contact.surface, 1e-3, 1e-6))
 
 
 @pytest.fixture(scope="module")

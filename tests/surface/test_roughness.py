@@ -12,7 +12,7 @@ from scipy.integrate import quad
 from scipy.special import j0
 
 import fractaljax as fj
-from fractaljax._surface.roughness import root_mean_square_height, roughness
+from fractaljax._surface.roughness import root_mean_square, roughness
 from tools import both_modes, refusals
 
 L, N, KEYS, GAMMA, G = 1e-3, 48, 150, 1.5, 1e-10
@@ -94,14 +94,14 @@ def test_batches_and_powers_of_gamma():
     for ratio, count in [(1.5**7, 8), (1.5**7 * 0.999, 7), (1.5**7 * 1.001, 8), (1.01, 1)]:
         waves = sum(1.5 ** (2 * (2.5 - 3) * n) for n in range(count))
         expected = 1e-3 * (1e-10 / 1e-3) ** 0.5 * math.sqrt(math.log(1.5) / 2 * waves)
-        found = root_mean_square_height(fj.Surface(2.5, G), 1e-3, 1e-3 / ratio)
+        found = root_mean_square(fj.Surface(2.5, G), 1e-3, 1e-3 / ratio)
         assert found == pytest.approx(expected, rel=1e-13)
     for gamma in (1.3, 1.7):  # rounded either way
         surface = fj.Surface(2.5, G, gamma)
         single = jax.tree.map(lambda x: x.astype(jnp.float32), surface)
         L_s = L / gamma ** np.arange(1.0, 20.0)
-        double = root_mean_square_height(surface, L, L_s)
-        np.testing.assert_allclose(root_mean_square_height(single, L, L_s), double, rtol=1e-5)
+        double = root_mean_square(surface, L, L_s)
+        np.testing.assert_allclose(root_mean_square(single, L, L_s), double, rtol=1e-5)
 
 
 def waves(D, L_s=L / 8):
