@@ -1,4 +1,5 @@
 from . import plot as plot
+from ._base.file_limits import FileLimits as FileLimits
 from ._base.parts import quantity as quantity
 from ._base.programs import quick_compilation as quick_compilation
 from ._contact.asperity import AsperityContact as AsperityContact
@@ -73,9 +74,12 @@ from ._friction import (
     HyperbolicStribeck as HyperbolicStribeck,
     Stribeck as Stribeck,
 )
+from ._identify.analysis import SpectralAnalysis as SpectralAnalysis
 from ._identify.files import read_measurement as read_measurement
 from ._identify.identify import Identification as Identification, identify as identify
 from ._identify.measurement import Measurement as Measurement
+from ._identify.preparation import Preprocessing as Preprocessing
+from ._identify.warnings import WarningThresholds as WarningThresholds
 from ._mechanism.damping import modal_damping as modal_damping, rayleigh_damping as rayleigh_damping
 from ._mechanism.matrix_file import Matrices as Matrices, read_matrices as read_matrices
 from ._mechanism.mesh import Mesh as Mesh

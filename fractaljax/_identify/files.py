@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .._base.file_limits import FileLimits
 from .._base.numpy_file import read_npy, read_npz
 from .columns import choose, unclear
 from .grid import map_on_grid, profile_on_grid
@@ -15,7 +16,6 @@ from .text import Table, read_table, text_encoding
 from .units import agreed, scale, unit_named
 
 _TEXTS, _ARRAYS = {".csv", ".tsv", ".txt", ".dat", ".xyz", ".asc"}, {".npy", ".npz"}
-_MOST_TEXT, _MOST_ARRAYS, _MOST = 2**28, 2**30, 2**31  # bytes; the last for instrument formats
 _GWYDDION = b"# Value units:"  # in the header of its text export, which has sizes and units
 
 
@@ -28,6 +28,7 @@ def read_measurement(
     position_unit: str | float | None = None,
     channel: str | int | None = None,
     columns: Mapping[str, str | int] | None = None,
+    limits: FileLimits = FileLimits(),
 ) -> Measurement:
     """Read a profile or a map of heights.
 
@@ -35,7 +36,7 @@ def read_measurement(
     height), three (x, y, height on a rectangular grid) or more (a map, each line along x).
     `.npy`: heights (n,) or (n, m), x along the first axis. `.npz`: z, dx and perhaps dy in metres.
     Everything else is read by the SurfaceTopography package. At most 256 MiB of text are read,
-    1 GiB of arrays, and 2 GiB in an instrument's format.
+    1 GiB of arrays, and 2 GiB in an instrument's format, or what `limits` says.
 
     `dx`, `dy` [m] are steps, `unit` that of heights and `position_unit` that of positions (default
     `unit`), for files that do not state them. They must not contradict the file. A unit may be a
@@ -55,26 +56,27 @@ def read_measurement(
     """
     path = Path(path)
     size, suffix = path.stat().st_size, path.suffix.lower()
-    most = _MOST_TEXT if suffix in _TEXTS else _MOST_ARRAYS if suffix in _ARRAYS else _MOST
+    is_text, is_array = suffix in _TEXTS, suffix in _ARRAYS
+    most = limits.text if is_text else limits.arrays if is_array else limits.instrument
     try:
         if not path.is_file():
             raise ValueError("it is not a regular file")
         if size > most:
             raise ValueError(f"it is too large: at most {most >> 20} MiB are read")
-        content = path.read_bytes() if suffix in _TEXTS | _ARRAYS else b""
-        encoding = text_encoding(content) if suffix in _TEXTS else None
+        content = path.read_bytes() if is_text or is_array else b""
+        encoding = text_encoding(content) if is_text else None
         if _GWYDDION in content[:4096]:
             encoding = None
         if encoding is None and columns is not None:
             raise ValueError(f"it is no table of text, got columns {dict(columns)!r}")
-        if encoding is None and suffix not in _ARRAYS:
+        if encoding is None and not is_array:
             from .instrument_file import read_instrument_file
 
-            return read_instrument_file(path, dx, dy, unit, channel)
+            return read_instrument_file(path, dx, dy, unit, channel, limits)
         if channel is not None:
             raise ValueError(f"it has no channels, got channel {channel!r}")
         if encoding is None:
-            return _read_arrays(path, content, dx, dy, unit)
+            return _read_arrays(path, content, dx, dy, unit, limits.arrays)
         table = choose(whole := read_table(content, encoding), columns)
         return _from_table(path, whole, table, dx, dy, unit, position_unit)
     except (ValueError, TypeError) as error:
@@ -121,9 +123,9 @@ def _from_table(path, whole: Table, table: Table, dx, dy, unit, position_unit) -
     return measurement(z, agreed("dx", grid_dx, dx), dy, source)
 
 
-def _read_arrays(path, content, dx, dy, unit) -> Measurement:
+def _read_arrays(path, content, dx, dy, unit, most) -> Measurement:
     if path.suffix.lower() == ".npz":
-        arrays = read_npz(content, _MOST_ARRAYS)
+        arrays = read_npz(content, most)
         if not {"z", "dx"} <= set(arrays):
             raise ValueError(f"it must hold z and dx in metres, got {', '.join(arrays)}")
         z, stored_unit = arrays["z"], "m"

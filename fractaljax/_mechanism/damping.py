@@ -8,7 +8,7 @@ from jaxtyping import ArrayLike, Float
 from .._base.parts import concrete, nan_where, number, scalar
 from .matrices import (
     MatrixLike,
-    array_of,
+    as_array,
     fitting,
     fitting_or_sparse,
     is_sparse,
@@ -31,7 +31,7 @@ def rayleigh_damping(M: MatrixLike, K: MatrixLike, alpha: ArrayLike, beta: Array
     K = fitting_or_sparse("K", K, M.shape)
     a, b = (scalar(name, x, at_least=0) for name, x in (("alpha", alpha), ("beta", beta)))
     if is_sparse(M) != is_sparse(K):
-        M, K = (array_of(name, X) for name, X in (("M", M), ("K", K)))
+        M, K = (as_array(name, X) for name, X in (("M", M), ("K", K)))
     return float(a) * M + float(b) * K if is_sparse(M) else a * M + b * K
 
 

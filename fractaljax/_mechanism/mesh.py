@@ -47,7 +47,7 @@ class Mesh:
         self._digest = content.hexdigest()
 
     @classmethod
-    def of_arrays(cls, arrays: Mapping[str, Any], name: str) -> "Mesh":
+    def from_arrays(cls, arrays: Mapping[str, Any], name: str) -> "Mesh":
         """The mesh in the arrays of a file. **Raises:** `ValueError` naming the file `name`."""
         if missing := [key for key in _KEYS if key not in arrays]:
             raise ValueError(f"{name} lacks {', '.join(missing)}: a mesh is {', '.join(_KEYS)}")

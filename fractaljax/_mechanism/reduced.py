@@ -83,7 +83,7 @@ class ReducedStructure(ParametricStructure):
     def _full_n(self, n: int) -> int:
         return len(self.reduction.V)
 
-    def _own_mesh(self) -> None:
+    def _matching_mesh(self) -> None:
         return None
 
     def _touched(self) -> np.ndarray | None:
@@ -125,31 +125,31 @@ class ReducedStructure(ParametricStructure):
         return cls(**{"parameters": {}, **arguments}, reduction=reduction)
 
     def _more_tables(self):
-        of = self.reduction
-        coarse = {} if of.coarse is None else {"coarse_tol": of.coarse.tol}
+        reduction = self.reduction
+        coarse = {} if reduction.coarse is None else {"coarse_tol": reduction.coarse.tol}
         return {
             "reduced": {
                 **coarse,
-                "band": of.band,
-                "tol": of.tol,
-                "error": of.error,
-                "friction_slope": of.friction_slope,
-                "names": of.names,
-                "points": of.points,
-                "over": of.over,
+                "band": reduction.band,
+                "tol": reduction.tol,
+                "error": reduction.error,
+                "friction_slope": reduction.friction_slope,
+                "names": reduction.names,
+                "points": reduction.points,
+                "over": reduction.over,
             }
         }
 
     def _more_arrays(self):
-        of = self.reduction
-        more = {} if of.touched is None else {"touched": of.touched}
-        if of.coarse is not None:
-            more |= {"coarse_V": of.coarse.V, "coarse_W": of.coarse.W}
+        reduction = self.reduction
+        more = {} if reduction.touched is None else {"touched": reduction.touched}
+        if reduction.coarse is not None:
+            more |= {"coarse_V": reduction.coarse.V, "coarse_W": reduction.coarse.W}
         return {
             **more,
-            "V": of.V,
-            "W": of.W,
-            "residuals": np.stack([np.real(of.residuals), np.imag(of.residuals)]),
+            "V": reduction.V,
+            "W": reduction.W,
+            "residuals": np.stack([np.real(reduction.residuals), np.imag(reduction.residuals)]),
         }
 
     def _shown(self):

@@ -123,7 +123,7 @@ class Structure(Mechanism):
     @classmethod
     def from_scene(cls, scene: Scene) -> "Structure":
         """The mass on a belt (Eq. 39) as a structure of two degrees of freedom, x1 and x2."""
-        M, C, K, F = _of_oscillator(scene.oscillator)
+        M, C, K, F = _oscillator_matrices(scene.oscillator)
         return cls(
             M=M,
             C=C,
@@ -255,7 +255,7 @@ class Structure(Mechanism):
         if changes.keys() & {*self.sums, "F"}:
             arguments = {name: changes.get(name, self._terms(name)) for name in self.sums}
             arguments |= {"joints": joints, "F": changes.get("F", self.F), "names": self.names}
-            arguments |= {"mesh": self._own_mesh(), "notes": self.notes}
+            arguments |= {"mesh": self._matching_mesh(), "notes": self.notes}
             if not self.parameters:
                 return Structure(**arguments)
             return ParametricStructure(**arguments, parameters=parameters)
@@ -267,7 +267,7 @@ class Structure(Mechanism):
             _check_coefficients(new)
         return new
 
-    def _own_mesh(self) -> Mesh | None:
+    def _matching_mesh(self) -> Mesh | None:
         """The mesh, if it has the degrees of freedom of the matrices, else None."""
         return self.mesh
 
@@ -373,7 +373,7 @@ class ParametricStructure(Structure):
 
 
 @exported_jit
-def _of_oscillator(oscillator: Oscillator):
+def _oscillator_matrices(oscillator: Oscillator):
     """M, C, K and F of the mass on a belt."""
     m, f = oscillator.m, oscillator.F / jnp.sqrt(2.0)
     omega = jnp.stack([oscillator.omega_1, oscillator.omega_2])
