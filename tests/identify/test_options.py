@@ -1,6 +1,7 @@
 """Options of `identify`: each does what its class says of it, and nonsense is refused."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,9 +35,10 @@ def test_preprocessing():
     assert fj.identify(Z[:100], DX, preprocessing=short).D > 2
     map_ = gaussian_map(np.random.default_rng(0), 2.4, (40, 64))
     assert fj.identify(map_, DX, preprocessing=rare).D > 2
-    for few, options in ((Z[:127], {}), (map_, {}), (Z[:63], short), (map_[:31], rare)):
+    usual = fj.Preprocessing()
+    for few, options in ((Z[:127], usual), (map_, usual), (Z[:63], short), (map_[:31], rare)):
         with pytest.raises(ValueError, match="z is too short"):
-            fj.identify(few, DX, **{"preprocessing": options} if options else {})
+            fj.identify(few, DX, preprocessing=options)
     holes = np.where(np.random.default_rng(1).random((64, 64)) < 0.2, np.nan, 1.0)
     holes *= gaussian_map(np.random.default_rng(0), 2.4, (64, 64))
     with pytest.raises(ValueError, match="too many gaps"):
@@ -125,5 +127,6 @@ test_bad_options_are_refused = refusals(
 
 @pytest.mark.parametrize("name", ["preprocessing", "analysis", "thresholds"])
 def test_options_of_another_kind_are_refused(name):
+    options: dict[str, Any] = {name: 3.0}
     with pytest.raises(TypeError, match=f"^{name} must be a"):
-        fj.identify(Z, DX, **{name: 3.0})
+        fj.identify(Z, DX, **options)
