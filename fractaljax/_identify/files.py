@@ -8,12 +8,12 @@ import numpy as np
 
 from .._base.file_limits import FileLimits
 from .._base.numpy_file import read_npy, read_npz
-from .columns import choose, unclear
+from .columns import choose_columns, suggest_columns
 from .grid import map_on_grid, profile_on_grid
 from .header import height_scale, step
 from .measurement import Measurement, measurement
 from .text import Table, read_table, text_encoding
-from .units import agreed, scale, unit_named
+from .units import reconcile, scale, unit_named
 
 _TEXTS, _ARRAYS = {".csv", ".tsv", ".txt", ".dat", ".xyz", ".asc"}, {".npy", ".npz"}
 _GWYDDION = b"# Value units:"  # in the header of its text export, which has sizes and units
@@ -77,7 +77,7 @@ def read_measurement(
             raise ValueError(f"it has no channels, got channel {channel!r}")
         if encoding is None:
             return _read_arrays(path, content, dx, dy, unit, limits.arrays)
-        table = choose(whole := read_table(content, encoding), columns)
+        table = choose_columns(whole := read_table(content, encoding), columns)
         return _from_table(path, whole, table, dx, dy, unit, position_unit)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
@@ -95,15 +95,15 @@ def _from_table(path, whole: Table, table: Table, dx, dy, unit, position_unit) -
         metre = height_scale(settings, units[-1], unit)
     except ValueError as error:
         is_length = units[-1] is None or unit_named(units[-1]) is not None
-        raise (error if is_length else unclear(whole, error)) from None
+        raise (error if is_length else suggest_columns(whole, error)) from None
     if "factor" in settings:
         source += f", heights times {metre:g} m by its header"
     z = numbers * metre
     if columns not in (2, 3):
-        dx = agreed("dx", step(settings, "dx", dx, position_unit), dx)
+        dx = reconcile("dx", step(settings, "dx", dx, position_unit), dx)
         if columns > 1:
             user_step = dx if dy is None else dy
-            dy = agreed("dy", step(settings, "dy", user_step, position_unit), dy)
+            dy = reconcile("dy", step(settings, "dy", user_step, position_unit), dy)
         return measurement(z[:, 0] if columns == 1 else z.T, dx, dy, source)
     if np.isnan(numbers[:, :-1]).any():
         raise ValueError("positions must not have gaps")
@@ -118,9 +118,9 @@ def _from_table(path, whole: Table, table: Table, dx, dy, unit, position_unit) -
         try:
             z, grid_dx, grid_dy = map_on_grid(place[0], place[1], z[:, 2])
         except ValueError as error:
-            raise unclear(whole, error) from None
-        dy = agreed("dy", grid_dy, dy)
-    return measurement(z, agreed("dx", grid_dx, dx), dy, source)
+            raise suggest_columns(whole, error) from None
+        dy = reconcile("dy", grid_dy, dy)
+    return measurement(z, reconcile("dx", grid_dx, dx), dy, source)
 
 
 def _read_arrays(path, content, dx, dy, unit, most) -> Measurement:
@@ -129,7 +129,7 @@ def _read_arrays(path, content, dx, dy, unit, most) -> Measurement:
         if not {"z", "dx"} <= set(arrays):
             raise ValueError(f"it must hold z and dx in metres, got {', '.join(arrays)}")
         z, stored_unit = arrays["z"], "m"
-        dx, dy = agreed("dx", _step(arrays, "dx"), dx), agreed("dy", _step(arrays, "dy"), dy)
+        dx, dy = reconcile("dx", _step(arrays, "dx"), dx), reconcile("dy", _step(arrays, "dy"), dy)
     else:
         z, stored_unit = read_npy(content, "z"), None
     shape = " x ".join(map(str, z.shape))

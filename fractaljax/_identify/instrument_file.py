@@ -13,7 +13,7 @@ from .._base.parts import one_line
 from .grid import profile_on_grid
 from .measurement import Measurement, measurement
 from .topography import instrument_limits
-from .units import Unit, agreed, scale
+from .units import Unit, reconcile, scale
 
 _ANY_BYTES = {"hgt": ".hgt", "nms": ".nms"}  # formats that accept any bytes: by suffix only
 
@@ -57,12 +57,12 @@ def read_instrument_file(
     metre = scale(topography.unit, unit, "heights", "--unit")
     if x is not None:
         z, step = profile_on_grid(x * metre, z)
-        dx = agreed("dx", step, dx)
+        dx = reconcile("dx", step, dx)
     elif chosen.physical_sizes is not None:
         sizes = np.ravel(topography.physical_sizes)
         steps = [float(L) * metre / n for L, n in zip(sizes, z.shape, strict=True)]
-        dx = agreed("dx", steps[0], dx)
-        dy = agreed("dy", steps[1], dy) if z.ndim == 2 else dy
+        dx = reconcile("dx", steps[0], dx)
+        dy = reconcile("dy", steps[1], dy) if z.ndim == 2 else dy
     instrument = topography.info.get("instrument") or {}
     words = [source, f"channel {chosen.name!r}", instrument.get("vendor"), instrument.get("name")]
     source = f"{path.name}: {', '.join(word for word in words if word)}"

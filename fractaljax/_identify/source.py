@@ -7,7 +7,7 @@ from .files import read_measurement
 from .measurement import Measurement
 from .preparation import Preprocessing, check_heights, spacing
 from .topography import from_topography, is_topography
-from .units import agreed
+from .units import reconcile
 
 
 def read_heights(
@@ -28,7 +28,7 @@ def read_heights(
         z = from_topography(z, dx, dy)
     if isinstance(z, Measurement):
         where = "of the measurement"
-        dx, dy = agreed("dx", z.dx, dx, where), agreed("dy", z.dy, dy, where)
+        dx, dy = reconcile("dx", z.dx, dx, where), reconcile("dy", z.dy, dy, where)
         limits = {"resolution": z.resolution, "stylus_radius": z.stylus_radius}
         z, source = z.z, z.source
     z = check_heights(z, options)

@@ -53,7 +53,7 @@ def profile_spectrum(
     """Spectrum of contiguous segments of one profile, by sine tapers (Riedel, Sidorenko 1995)."""
     parts = [_segment_spectrum(z, dx, tapers) for z in segments]
     f, power, count, spread = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return _merged(f, power, count, count / f, spread, "profile", 0.5 / dx)
+    return _merge_ordinates(f, power, count, count / f, spread, "profile", 0.5 / dx)
 
 
 def _segment_spectrum(z, dx, count):
@@ -70,7 +70,7 @@ def _segment_spectrum(z, dx, count):
     return f, power[1:], np.full(f.size, 1 / inflation), np.full(f.size, width)
 
 
-def _merged(f, power, count, weight, spread, kind, nyquist) -> Spectrum:
+def _merge_ordinates(f, power, count, weight, spread, kind, nyquist) -> Spectrum:
     """Merge ordinates within two percent of each other, between which no law differs."""
     order = np.argsort(f, kind="stable")
     f, power, count, weight, spread = (x[order] for x in (f, power, count, weight, spread))
@@ -131,7 +131,7 @@ def map_spectra(z: np.ndarray, dx: float, dy: float) -> tuple[Spectrum, ...]:
         )
         at, power_at = frequencies / modes, 2 * np.pi * powers / (share * area)
         spread = np.full(bins, width)
-        return _merged(at, power_at, modes / inflation, 1 / at, spread, "map", nyquist)
+        return _merge_ordinates(at, power_at, modes / inflation, 1 / at, spread, "map", nyquist)
 
     near_x = np.abs(fx[:, None]) > fy
     return radial(np.ones_like(near_x), 1.0), radial(near_x, 0.5), radial(~near_x, 0.5)

@@ -31,7 +31,7 @@ class Expression(NamedTuple):
     text: str
 
     def __call__(self, p: Parameters) -> Any:
-        return _value(_parsed(self.text), p)
+        return _value(_parse(self.text), p)
 
 
 def check_coefficient(name: str, coefficient: Any, parameters: Parameters) -> Callable | ArrayLike:
@@ -82,7 +82,7 @@ def evaluated(coefficient: Callable | None, p: Parameters) -> Any:
     return None if coefficient is None else coefficient(p)
 
 
-def _parsed(text: str) -> ast.expr:
+def _parse(text: str) -> ast.expr:
     wrong = ValueError(
         f"a coefficient must be a formula of parameters, numbers, pi, + - * / ** and "
         f"{', '.join(_FUNCTIONS)}, got {brief(text)}"

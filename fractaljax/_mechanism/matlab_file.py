@@ -44,7 +44,7 @@ def read_matlab(content: bytes, limits: FileLimits) -> dict[str, Any]:
     for kind, element in _elements(content[128:], order, padded=False):
         most -= len(element)
         if kind == _COMPRESSED:
-            element = _unpacked(element, most)
+            element = _unpack(element, most)
             most -= len(element)
             kind, element = next(_elements(element, order), (0, b""))
         if kind != _MATRIX:
@@ -61,7 +61,7 @@ def read_matlab(content: bytes, limits: FileLimits) -> dict[str, Any]:
     return variables
 
 
-def _unpacked(element: bytes, most: int) -> bytes:
+def _unpack(element: bytes, most: int) -> bytes:
     inflate = zlib.decompressobj()
     try:
         content = inflate.decompress(element, max(most, 0) + 1)

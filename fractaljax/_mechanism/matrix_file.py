@@ -102,11 +102,11 @@ def read_matrices(path: str | os.PathLike, limits: FileLimits = FileLimits()) ->
         if reader is None:
             raise ValueError(f"of unknown format; known are {', '.join(_READERS)}, .gz and .bz2")
         content = read_bounded(path, limits.matrices)
-        unpacked = _unpacked(content, packed, limits.matrices) if packed else content
+        unpacked = _unpack(content, packed, limits.matrices) if packed else content
         candidates, names, *mirrored = reader(inner.stem, unpacked, limits)
         if not candidates:
             raise ValueError("it holds no matrix")
-        matrices, unread = _sorted(candidates, reader in (_op4, _dmig), limits.dofs)
+        matrices, unread = _check_candidates(candidates, reader in (_op4, _dmig), limits.dofs)
         if not matrices:
             raise ValueError("; ".join(unread.values()))
         by_name = _ByName(matrices, path.name, unread)
@@ -115,7 +115,7 @@ def read_matrices(path: str | os.PathLike, limits: FileLimits = FileLimits()) ->
         raise ValueError(f"{path.name}: {error}") from None
 
 
-def _unpacked(content: bytes, packed: str, most: int) -> bytes:
+def _unpack(content: bytes, packed: str, most: int) -> bytes:
     try:
         with _PACKED[packed](io.BytesIO(content), "rb") as file:
             content = file.read(most + 1)
@@ -126,7 +126,7 @@ def _unpacked(content: bytes, packed: str, most: int) -> bytes:
     return content
 
 
-def _sorted(
+def _check_candidates(
     candidates: dict[str, Any], any_shape: bool, largest: int
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """The valid matrices, and by name the reason why each other candidate is invalid."""
@@ -135,14 +135,14 @@ def _sorted(
         try:
             if isinstance(value, ValueError):
                 raise value
-            matrices[name] = _sound(name, value, any_shape, largest)
+            matrices[name] = _check_matrix(name, value, any_shape, largest)
         except ValueError as error:
             why = str(error)
             unread[name] = why + _DAMPING * bool(_COMPLEX.search(why))
     return matrices, unread
 
 
-def _sound(name: str, value: Any, any_shape: bool, largest: int):
+def _check_matrix(name: str, value: Any, any_shape: bool, largest: int):
     """A checked sparse matrix in float64 from a dense or sparse one."""
     import scipy.sparse
 

@@ -103,9 +103,9 @@ class ReducedStructure(ParametricStructure):
         return (halves @ V.T.astype(halves.dtype)).reshape(*q.shape[:-1], -1)
 
     @classmethod
-    def from_file(cls, given: dict[str, Any]) -> "ReducedStructure":
+    def from_file(cls, arguments: dict[str, Any]) -> "ReducedStructure":
         """The reduced structure of a file, from the arguments that `read_structure` returns."""
-        about: dict[str, Any] = dict(given.pop("reduced"))
+        about: dict[str, Any] = dict(arguments.pop("reduced"))
         keys = ("V", "W", "residuals", "over", "band", "tol", "friction_slope", "error")
         missing = [key for key in keys if about.get(key) is None]
         if missing:
@@ -121,8 +121,8 @@ class ReducedStructure(ParametricStructure):
             reduction = Reduction(**about)
         except TypeError:
             raise ValueError(f"[reduced] has an unknown key among {brief(list(about))}") from None
-        arguments = {key: x for key, x in given.items() if key not in ("names", "notes")}
-        return cls(**{"parameters": {}, **arguments}, reduction=reduction)
+        rest = {key: x for key, x in arguments.items() if key not in ("names", "notes")}
+        return cls(**{"parameters": {}, **rest}, reduction=reduction)
 
     def _more_tables(self):
         reduction = self.reduction

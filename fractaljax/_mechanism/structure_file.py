@@ -136,7 +136,7 @@ def read_structure(document: dict[str, Any], folder: Path) -> dict[str, Any]:
     source = _Source(table, folder)
     matrices: dict[str, Any] = {}
     for name in (*_MATRICES, "F"):
-        if name in table and name in source.held and not _among(table[name], source.held):
+        if name in table and name in source.held and not _is_stored(table[name], source.held):
             raise ValueError(f"[structure] gives {name} twice: in matrices and as {name}")
         if name not in table and (name in source.held or name in source.unread):
             matrices[name] = source.held[name]
@@ -180,7 +180,7 @@ def read_structure(document: dict[str, Any], folder: Path) -> dict[str, Any]:
     return arguments | ({"parameters": parameters} if parameters else {})
 
 
-def _among(value: Any, held: Mapping[str, Any]) -> bool:
+def _is_stored(value: Any, held: Mapping[str, Any]) -> bool:
     """True if the file of matrices contains a matrix, or all of its terms."""
     terms = value if isinstance(value, list) else [{"matrix": value}]
     return all(isinstance(term, dict) and term.get("matrix") in held for term in terms)
