@@ -2,7 +2,8 @@
 
 import dataclasses
 
-from .._base.parts import scalar, whole
+from .._base.options import require_number
+from .._base.parts import whole
 
 
 @dataclasses.dataclass(frozen=True)
@@ -15,8 +16,8 @@ class SpectralAnalysis:
       resolve less. Three have two thirds of the variance of Hann's window.
     - `fewest_periods`: periods of the longest wave of the band in the length, at least 1. From
       longer waves tilt has been taken out, and the window is too wide for them.
-    - `resolutions`: the shortest wavelength of the band in units of the lateral resolution, above
-      0. A Gaussian filter leaves 96 percent of the height of a wave of 4 cut-off wavelengths.
+    - `resolutions`: the shortest wavelength of the band in units of the lateral resolution, at
+      least 1. A Gaussian filter leaves 96 percent of the height of a wave of 4 cut-off wavelengths.
     - `sigmas`: standard errors, at least 0, at which a bend or a noise floor is credible: the
       deviance must fall by their square.
 
@@ -30,6 +31,6 @@ class SpectralAnalysis:
 
     def __post_init__(self):
         whole("tapers", self.tapers, 1)
-        scalar("fewest_periods", self.fewest_periods, at_least=1)
-        scalar("resolutions", self.resolutions, above=0)
-        scalar("sigmas", self.sigmas, at_least=0)
+        require_number("fewest_periods", self.fewest_periods, 1)
+        require_number("resolutions", self.resolutions, 1)
+        require_number("sigmas", self.sigmas, 0)

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._base.parts import scalar, whole
+from .._base.options import require_number
+from .._base.parts import whole
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,7 +23,7 @@ class Preprocessing:
     - `longest_gap`: missing points of a profile in a row that are interpolated; a longer gap
       divides the profile.
     - `most_missing`: share of the points of a map that may be missing, from 0 to 1.
-    - `spike`: robust standard deviations, above 0, by which a spike is off the mean of its
+    - `spike`: robust standard deviations, at least 1, by which a spike is off the mean of its
       neighbours; infinite to keep all heights.
 
     **Raises:** `ValueError` or `TypeError` for an option that is no number or outside its domain.
@@ -38,9 +39,8 @@ class Preprocessing:
         whole("fewest_points", self.fewest_points, 32)
         whole("fewest_per_side", self.fewest_per_side, 16)
         whole("longest_gap", self.longest_gap, 0)
-        scalar("most_missing", self.most_missing, at_least=0, at_most=1)
-        if self.spike != math.inf:
-            scalar("spike", self.spike, above=0)
+        require_number("most_missing", self.most_missing, 0, 1)
+        require_number("spike", self.spike, 1)
 
 
 class Heights(NamedTuple):

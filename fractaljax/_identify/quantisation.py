@@ -16,13 +16,23 @@ import numpy as np
 
 @dataclasses.dataclass(frozen=True)
 class QuantisationTest:
-    """When differences of heights count as equal, and how many equal ones matter."""
+    """When differences of heights count as equal, and how many equal ones matter.
 
-    repeated: float = 0.2  # share of equal second differences at which the error of D matters
-    first: float = 1.5  # factor by which the share of equal first differences is larger
-    interpolated: float = 0.05  # interpolated heights fall below this share at once
-    window: float = 0.01  # of the rms second difference: closer ones are equal
-    fewest: int = 32  # differences
+    **Fields:**
+
+    - `repeated`: share of equal second differences; with less of them, D changes by less than its
+      error.
+    - `first`: factor by which the share of equal first differences is larger.
+    - `interpolated`: share below which that of interpolated heights falls at once.
+    - `window`: largest distance of equal differences, relative to the rms second difference.
+    - `fewest`: number of differences; with fewer, the test tells nothing.
+    """
+
+    repeated: float = 0.2
+    first: float = 1.5
+    interpolated: float = 0.05
+    window: float = 0.01
+    fewest: int = 32
 
 
 def quantisation_limit(

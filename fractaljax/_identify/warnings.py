@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from .._base.parts import scalar
+from .._base.options import require_number
 from .band import Band
 from .fit import PowerLaw, curvature, fit
 from .preparation import Heights
@@ -57,7 +57,7 @@ class WarningThresholds:
 
     def __post_init__(self):
         for name, value in vars(self).items():
-            scalar(name, 0.0 if value == math.inf else value, at_least=0)
+            require_number(name, value, 0)
 
 
 def spectrum_warnings(
