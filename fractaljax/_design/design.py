@@ -155,7 +155,7 @@ class Design(Record):
         - `n`: points along each side, 1024 by default.
         - `L`, `L_s`: longest and shortest wavelength [m], by default those of `wavelengths`, but
           L_s no less than 2 L/n.
-        - `M`: number of ridges, as in `topography`; 10 by default.
+        - `M`: directions of waves, as in `topography`; 10 by default.
         - `key`: JAX random key of the phases, by default that of the design's seed.
 
         **Raises:** as `topography`.
