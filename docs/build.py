@@ -36,7 +36,6 @@ GROUPS = {  # of the API: title, and the modules whose public names it has
     "sweep": ("Sweeps", ("_sweep",)),
     "validate": ("Validation", ("_validate",)),
     "plot": ("Pictures", ("plot",)),
-    "compilation": ("Compilation", ("_base",)),
 }
 
 

@@ -1,7 +1,6 @@
 from . import plot as plot
 from ._base.file_limits import FileLimits as FileLimits
 from ._base.parts import quantity as quantity
-from ._base.programs import quick_compilation as quick_compilation
 from ._contact.asperity import AsperityContact as AsperityContact
 from ._contact.boundary_element import (
     BoundaryElement as BoundaryElement,

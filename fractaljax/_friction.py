@@ -96,17 +96,23 @@ class Friction(Part):
 
     @abc.abstractmethod
     def mu(self, speed: ArrayLike) -> Numbers:
-        """The friction coefficient at sliding speeds >= 0 [m/s]; any shape."""
+        """The friction coefficient [-] at sliding speeds `speed` >= 0 [m/s], of any shape."""
 
     def slope(self, v: ArrayLike) -> Numbers:
-        """dmu/d|v| [s/m] at sliding velocities v [m/s]; any shape."""
+        """dmu/d|v| [s/m] at sliding velocities `v` [m/s], of any shape."""
         speed = jnp.abs(v)
         return jax.jvp(self.mu, (speed,), (jnp.ones_like(speed),))[1]
 
     def branch(self, v: ArrayLike, sign: ArrayLike) -> Numbers:
-        """mu of one sliding direction, `sign` = +1 or -1, continued smoothly through v = 0.
+        """mu of one sliding direction, continued smoothly through v = 0.
 
-        branch(0, +-1) = +-mu_s. A sign between them smooths this jump, and nothing else.
+        branch(0, +-1) = +-mu_s.
+
+        **Arguments:**
+
+        - `v`: sliding velocities [m/s], of any shape.
+        - `sign`: the direction, +1 or -1. A sign between them smooths the jump at v = 0, and
+          nothing else.
         """
         if not self.velocity_dependent:
             return self.mu_s * sign
@@ -114,7 +120,7 @@ class Friction(Part):
         return self.mu_s * sign + side * (self.mu(side * v) - self.mu_s)
 
     def times(self, factor: ArrayLike) -> "Friction":
-        """The law as a whole times a factor; not checked."""
+        """The law as a whole times `factor`, a number above 0; not checked."""
         law, names = (self, self.amplitudes) if self.amplitudes else (Scaled(self), ("factor",))
         scaled = [factor * getattr(law, name) for name in names]
         return eqx.tree_at(lambda law: [getattr(law, name) for name in names], law, scaled)
@@ -148,6 +154,10 @@ def _least(law: Friction) -> Numbers:
 class Coulomb(Friction, law="coulomb"):
     """Constant friction.
 
+    **Arguments:**
+
+    - `mu`: friction coefficient [-].
+
     **Raises:** `ValueError` unless mu > 0.
     """
 
@@ -162,6 +172,7 @@ class Coulomb(Friction, law="coulomb"):
 
     @property
     def mu_m(self):
+        """The friction coefficient, at every speed."""
         return self.mu_s
 
     def mu(self, speed):
@@ -220,6 +231,7 @@ class ExponentialStribeck(Friction, law="exponential"):
 
     @property
     def mu_m(self):
+        """The least friction coefficient over all speeds."""
         rise, drop = self.viscous * self.v_0, self.mu_s - self.mu_d
         falls, ratio = rise < drop, safe_divide(rise, drop, jnp.ones_like(rise * drop))
         ratio = jnp.where(falls & (ratio > 0), ratio, 1)
@@ -251,6 +263,7 @@ class HyperbolicStribeck(Friction, law="hyperbolic"):
 
     @property
     def mu_m(self):
+        """The limit of the friction coefficient at high speed, 0."""
         return jnp.zeros_like(self.mu_s)
 
     def mu(self, speed):

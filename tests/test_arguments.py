@@ -1,5 +1,7 @@
 """Every public function refuses what it cannot mean, by name and in one line."""
 
+import inspect
+import re
 from functools import partial
 from typing import Any
 
@@ -96,3 +98,21 @@ def test_arguments_of_the_margin_structures_and_the_boundary():
 def test_a_scene_is_asked_for_by_name(function, bad):
     with pytest.raises(TypeError, match=r"must be a Scene.*, got"):
         function(bad)
+
+
+REWRITTEN = {"roughness", "topography"}  # with their package, by another change
+FUNCTIONS = [
+    function
+    for module in (fj, fj.plot)
+    for name in module.__all__
+    if inspect.isroutine(function := inspect.unwrap(getattr(module, name)))
+    and (module is fj.plot or name not in REWRITTEN)
+]
+
+
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_each_parameter_is_documented_by_itself(function):
+    """In a list, `- name`: several that mean the same thing may share an item."""
+    heads = re.findall(r"^ *- ((?:`\w+`,?\s*)+)", function.__doc__ or "", re.MULTILINE)
+    listed = set(re.findall(r"\w+", " ".join(heads)))
+    assert set(inspect.signature(function).parameters) <= listed

@@ -26,7 +26,7 @@ from tools import ROOT
 pytestmark = pytest.mark.optimised
 
 # What computes nothing, or only draws, reads and stores.
-NO_NUMBERS = {"quantity", "quick_compilation", "read_measurement", "read_matrices", "load"}
+NO_NUMBERS = {"quantity", "read_measurement", "read_matrices", "load"}
 NO_NUMBERS |= {"brake_scene", "explore", "repeat_design"}
 QUIET: dict[str, Any] = {"progress": False}
 NEAR = {"D": (2.39, 2.41)}

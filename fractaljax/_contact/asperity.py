@@ -67,8 +67,8 @@ class AsperityContact(Contact):
     **Raises:** `ValueError` unless P > 0, L_s > 0 and stiffness_ratio >= 0.
     """
 
-    surface: Surface
-    material: Material
+    surface: Surface  # surface that is machined
+    material: Material  # the pair as one material
     P: Numbers = quantity("N", "normal load", log=True)
     L_s: Numbers = quantity("m", "shortest wavelength of the surface", log=True)
     stiffness_ratio: Numbers | None = quantity("-", "K_t/K_n, if not Mindlin's")

@@ -45,7 +45,7 @@ class BoundaryElement(Record):
     mean_gap: Float[Array, ""]  # mean distance of the two surfaces [m]
     pressure: Float[Array, "nx ny"]  # [Pa]
     gap: Float[Array, "nx ny"]  # distance of the two surfaces [m], 0 in contact
-    result: BoundaryElementResult
+    result: BoundaryElementResult  # a member of BoundaryElementResult
 
 
 class _Solution(NamedTuple):
@@ -64,25 +64,36 @@ def boundary_element(
     rtol: float | None = None,
     throw: bool = True,
 ) -> BoundaryElement:
-    """Press a surface of heights [m] on a grid of spacing dx [m] on a flat one by P [N].
+    """Press a rough surface on a flat one by the load P.
 
-    Both are periodic, of area nx ny dx^2, and frictionless. E of the material is that of the pair
-    (Eq. 2). K_n = -dP/d(mean gap) is the stiffness of the current contact: that of a flat punch of
-    the same outline, from one more linear system. With `plastic` no pressure exceeds H, and K_n
-    is that of a small vibration, in which plastic contacts unload elastically.
-
-    `rtol` bounds the largest gap in contact and overlap outside, over the rms height; by default
-    1e-9, and 1e-5 in float32.
+    Both are periodic, of area nx ny dx^2, and frictionless. K_n = -dP/d(mean gap) is the stiffness
+    of the current contact: that of a flat punch of the same outline, from one more linear system.
+    The equations and their sources are in `boundary_element.py`.
 
     Differentiable in heights, dx, E and P, in both modes, and works under `jit` and `vmap`.
     Pressure, gap and mean gap have their exact derivatives on the grid. The outline of the contact
     moves by whole grid points, so the derivative of K_n is that of the mean gap between the loads
-    0.95 P and 1.05 P, as d(1/K_n)/dh = -d(d mean gap/dh)/dP. The area counts points: its
-    derivative is 0. There are no second derivatives, and none at all with `plastic`.
+    0.95 P and 1.05 P, as d(1/K_n)/dh = -d(d mean gap/dh)/dP. The area counts points: its derivative
+    is 0. There are no second derivatives, and none at all with `plastic`.
 
-    **Raises:** `ValueError` unless heights are (nx, ny) and finite, dx > 0, P > 0 and
-    0 < rtol < 1; `RuntimeError` if `throw` and the solution has not converged. Under a trace
-    (`jit`, `vmap`) everything is NaN instead.
+    **Arguments:**
+
+    - `heights`: (nx, ny), heights of the surface [m].
+    - `dx`: grid spacing [m], the same in x and y.
+    - `material`: E is that of the pair (Eq. 2), H the hardness.
+    - `P`: normal load [N], a scalar.
+    - `plastic`: True lets no pressure exceed H; K_n is then that of a small vibration, in which
+      plastic contacts unload elastically. By default the contact is elastic.
+    - `rtol`: bound on the largest gap in contact and overlap outside, over the rms height; by
+      default 1e-9, and 1e-5 in float32.
+    - `throw`: True, the default, raises unless the solution has converged; otherwise `result` says
+      how it ended.
+
+    **Returns:** a `BoundaryElement`.
+
+    **Raises:** `ValueError` unless heights are (nx, ny) and finite, dx > 0, P > 0 and 0 < rtol < 1;
+    `RuntimeError` if `throw` and the solution has not converged. Under a trace (`jit`, `vmap`)
+    everything is NaN instead.
     """
     heights = number("heights", heights)
     if heights.ndim != 2 or min(heights.shape) < 2:

@@ -65,17 +65,17 @@ class Design(Record):
     """What `design` returns; numbers in SI units, arrays as NumPy. Printed, it is a table."""
 
     scene: Any  # the designed scene or structure; if infeasible, the best one found
-    initial: Any
+    initial: Any  # the given scene or structure
     value: float  # the objective at `scene`: by default d^2, the squared scaled distance
     growth_rate: float  # [1/s], of `scene` itself
     active: tuple[str, ...]  # requirements met with nothing to spare
     violated: tuple[str, ...]  # requirements not met, none unless infeasible
     result: DesignResult  # a member of DesignResult
     history: Mapping[str, np.ndarray]  # one row an evaluation on the way to `scene`, as it is
-    bounds: Mapping[str, tuple[float, float]]
+    bounds: Mapping[str, tuple[float, float]]  # (lower, upper) by name
     target: float  # largest growth rate allowed [1/s]
     K_n_min: float  # least normal stiffness allowed [N/m], of the stiffest joint
-    friction_slope: bool
+    friction_slope: bool  # True if growth rates count the slope of friction
     starts: int  # designs that the solver started from, 0 if unchanged
     failed_starts: int  # how many of them ended without meeting every requirement
     options: Mapping[str, Any]  # the arguments of `design`, for another run
@@ -84,10 +84,10 @@ class Design(Record):
     worst_of: Mapping[str, Mapping[str, float]] | None = None  # of every requirement
     squeal_probability: float | None = None  # as machined
     squeal_probability_error: float | None = None  # its standard error
-    initial_squeal_probability: float | None = None
-    # Share of the draws without a sliding equilibrium, neither quiet nor squealing, after, before.
+    initial_squeal_probability: float | None = None  # as given
+    # Share of the draws without a sliding equilibrium, neither quiet nor squealing.
     undetermined: float | None = None
-    initial_undetermined: float | None = None
+    initial_undetermined: float | None = None  # as given
     # What is asked of the limit cycle, before and after; 0 at rest.
     cycles: Mapping[str, tuple[float, float]] | None = None
     quiet_radius: float | None = None  # the largest kick survived, as `quiet_within` measures it
@@ -138,7 +138,9 @@ class Design(Record):
     ) -> tuple[Roughness, Roughness]:
         """Sq [m], Sa [m] and Sdq of the given and of the designed surface, as `roughness` says.
 
-        Over wavelengths from L to L_s [m], by default those of `wavelengths`.
+        **Arguments:**
+
+        - `L`, `L_s`: longest and shortest wavelength [m], by default those of `wavelengths`.
         """
         longest, shortest = self.wavelengths
         band = longest if L is None else L, shortest if L_s is None else L_s
@@ -148,8 +150,15 @@ class Design(Record):
     def topographies(self, n: int = 1024, *, L=None, L_s=None, M=10, key=None) -> Topographies:
         """Both surfaces on a grid of n x n points with the same phases, to see the difference.
 
-        L and L_s [m] are by default those of `wavelengths`, but L_s no less than 2 L/n, and `key`
-        that of the design's seed; the rest, and errors, as `topography`.
+        **Arguments:**
+
+        - `n`: points along each side, 1024 by default.
+        - `L`, `L_s`: longest and shortest wavelength [m], by default those of `wavelengths`, but
+          L_s no less than 2 L/n.
+        - `M`: directions of waves, as in `topography`; 10 by default.
+        - `key`: JAX random key of the phases, by default that of the design's seed.
+
+        **Raises:** as `topography`.
         """
         longest, shortest = self.wavelengths
         L = longest if L is None else L
@@ -168,7 +177,7 @@ class Design(Record):
         return self.initial.contact.surface, self.scene.contact.surface
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write scenes, options, results and history to a TOML file, for `repeat_design`.
+        """Write scenes, options, results and history to the TOML file `path`, for `repeat_design`.
 
         A structure, given and designed, has files of its own beside it: all are written or none.
 
@@ -518,9 +527,17 @@ def repeat_design(
 ) -> Design:
     """Run again what a file of `Design.save` holds: with the same versions, to the last bit.
 
-    A file of other versions is run under a warning. Functions of the user's own, an objective,
-    constraints or a solver, are in the file by name only: give them as `functions`,
-    {name: function}; an optimiser of optax, which has no name, as {"optimiser": optimiser}.
+    A file of other versions is run under a warning.
+
+    **Arguments:**
+
+    - `path`: the TOML file.
+    - `functions`: {name: function} of the user's own, an objective, constraints or a solver, which
+      are in the file by name only; an optimiser of optax, which has no name, as {"optimiser":
+      optimiser}. By default there are none.
+    - `progress`: shows a bar.
+
+    **Returns:** a `Design`.
 
     **Raises:** `OSError` if the file cannot be read; `ValueError` naming the file for anything
     unknown or missing in it, and for a precision that JAX is not set to.

@@ -66,7 +66,10 @@ class Envelope(Record):
 
     @classmethod
     def of(cls, conditions: "Envelope | Mapping[str, Any]") -> "Envelope":
-        """An envelope, or a mapping of names to (lower, upper) or to three or more samples."""
+        """An envelope from `conditions`: itself, or a mapping as in `design`.
+
+        The mapping has names with (lower, upper), or with three or more samples.
+        """
         if isinstance(conditions, Envelope):
             return conditions
         if not isinstance(conditions, Mapping):
@@ -93,7 +96,10 @@ class Envelope(Record):
         return len(next(iter(self.samples.values()))) if self.samples else 1
 
     def check(self, x: Mechanism, designed: Sequence[str]) -> None:
-        """Refuse names that `x` lacks or that are designed, and values outside a domain."""
+        """Refuse names that `x` lacks and values outside a domain.
+
+        Names among the `designed` are refused, too.
+        """
         quantities = stored_quantities(x)
         available = [
             name
@@ -113,7 +119,7 @@ class Envelope(Record):
             raise ValueError(f"envelope: {error}") from None
 
     def values(self, places: np.ndarray) -> np.ndarray:
-        """The quantities (n, names) at places (n, 1 + ranges)."""
+        """The quantities (n, names) at `places` (n, 1 + ranges)."""
         columns = [
             within(low, high, at)
             for at, (low, high) in zip(places[:, 1:].T, self.ranges.values(), strict=True)
@@ -123,7 +129,7 @@ class Envelope(Record):
         return np.array(columns).reshape(len(self.names), len(places)).T
 
     def condition(self, place: np.ndarray) -> dict[str, float]:
-        """The quantities at one place, by name."""
+        """The quantities at one `place` (1 + ranges,), by name."""
         return dict(zip(self.names, self.values(place[None])[0].tolist(), strict=True))
 
     def grid(self) -> np.ndarray:
@@ -149,7 +155,7 @@ class Envelope(Record):
         return _with_samples(points, samples)[:count]
 
     def drawn(self, count: int, seed: int) -> np.ndarray:
-        """Places (count, 1 + ranges) drawn at random, uniform in every range and over samples."""
+        """Places (`count`, 1 + ranges) drawn by `seed`, uniform in every range and over samples."""
         random = np.random.default_rng([seed, 1])
         which = random.integers(self.sample_count, size=(count, 1))
         return np.hstack([which, random.uniform(size=(count, len(self.ranges)))])
@@ -157,8 +163,9 @@ class Envelope(Record):
     def climb(self, residual: Callable, places: np.ndarray, values: np.ndarray):
         """Places and residuals after a climb from `places` (n, 1 + ranges) with `values` (n,).
 
-        `residual(places, i)` is evaluated at places (m, 1 + ranges), row j for problem i[j]. Every
-        range is tried in both directions; the step is halved where neither helps.
+        `residual` is a function: `residual(places, i)` is evaluated at places (m, 1 + ranges), row
+        j for problem i[j]. Every range is tried in both directions; the step is halved where
+        neither helps.
         """
         k = len(self.ranges)
         if k == 0 or not len(places):

@@ -42,7 +42,7 @@ class DesignMany(Record):
     growth_rate: Float[Array, "..."]  # [1/s]
     residuals: Float[Array, "... k"]  # at most 0 where a requirement is met
     result: Any  # members of `DesignResult`
-    residual_names: tuple[str, ...] = eqx.field(static=True)
+    residual_names: tuple[str, ...] = eqx.field(static=True)  # names of the k requirements
     target: Float[Array, "..."]  # largest growth rate allowed [1/s]
 
     @property
@@ -56,7 +56,7 @@ class DesignMany(Record):
         return _members(self.mechanisms)[0]
 
     def mechanism_quantity(self, name: str) -> np.ndarray:
-        """The values of a quantity of the mechanisms as given, in the shape of the batch."""
+        """Values of the quantity `name` of the mechanisms as given, in the shape of the batch."""
         first, stacked, shape = _members(self.mechanisms)
         return np.asarray(_values(first, stacked, name)).reshape(shape)
 
@@ -138,12 +138,15 @@ def design_many(
       `area_ratio_min`, `slip_ratio_max`, `friction_slope`: as `design`, for every member alike;
       what is by default a member's own (`target`, `K_n_min`) is that of each.
     - `modes`: as `DesignProblem`; by default at most 16 of a structure.
-    - `starts`: designs from which each is solved, 10 by default, chosen from `lattice` designs that
-      are screened, 256 by default, each in at most `steps` steps, 40 by default.
-    - `batch_size`: members side by side, by default 256 a device, 16 of structures; `progress`
-      shows a bar; `out` names a folder in which batches are kept, so that the same call resumes
-      (see `sweep`); `devices` share each batch, by default all of this process. They have no
-      meaning under `jax.jit`, `jax.grad` and `jax.vmap`, where all members are one program.
+    - `starts`: designs from which each is solved, 10 by default.
+    - `lattice`: designs that are screened for them, 256 by default.
+    - `steps`: most steps from each start, 40 by default.
+    - `batch_size`: members side by side, by default 256 a device, 16 of structures. This and what
+      follows have no meaning under `jax.jit`, `jax.grad` and `jax.vmap`, where all members are one
+      program.
+    - `progress`: shows a bar.
+    - `out`: a folder in which batches are kept, so that the same call resumes (see `sweep`).
+    - `devices`: those that share each batch, by default all of this process.
 
     A member without a design does not stop the others: its `result` says so, its quantities are
     those of the best design found, and derivatives by it are NaN. In single precision derivatives

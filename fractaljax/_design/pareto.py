@@ -32,12 +32,12 @@ class Front(Record):
     first: np.ndarray  # (n,), in the units of the objectives
     second: np.ndarray  # (n,)
     quantities: Mapping[str, np.ndarray]  # (n,) each: D and G of a surface, all that is designed
-    names: tuple[str, str]
+    names: tuple[str, str]  # of the two objectives
     ends: tuple[Design, Design]  # the designs for either objective alone
     failed: int  # members of the family without a design that meets every requirement
 
     def scene(self, i: int) -> Any:
-        """The scene or structure of member i."""
+        """The scene or structure of member `i`, from 0."""
         values = {name: column[i] for name, column in self.quantities.items()}
         return replaced(self.ends[0].initial, values)
 
@@ -84,8 +84,18 @@ def pareto(
 ) -> Front:
     """The front of two objectives, both functions of a scene or structure that are minimised.
 
-    `options` are those of `design`, except `objective`, `starts`, `envelope`, `risk` and
-    `quiet_within`: bounds, target, K_n_min, constraints, tolerance and so on hold for every member.
+    **Arguments:**
+
+    - `x`: the scene or structure, as in `design`.
+    - `first`, `second`: functions of a mechanism that `jax` can differentiate.
+    - `points`: members of the front, with its two ends; 16 by default, at least three.
+    - `names`: of the two objectives, for tables and pictures.
+    - `progress`: shows a bar.
+    - `options`: those of `design`, except `objective`, `starts`, `envelope`, `risk` and
+      `quiet_within`: bounds, target, K_n_min, constraints, tolerance and so on hold for every
+      member.
+
+    **Returns:** a `Front`.
 
     **Raises:** `ValueError` for fewer than three points, where no design meets the requirements,
     for objectives without a trade-off, and as `design`.

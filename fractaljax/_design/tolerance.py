@@ -57,8 +57,8 @@ class Tolerance(Record):
     **Raises:** `ValueError` unless the covariance is symmetric, positive semidefinite and not 0.
     """
 
-    names: tuple[str, ...] = eqx.field(static=True)
-    covariance: Float[Array, "k k"]
+    names: tuple[str, ...] = eqx.field(static=True)  # of the quantities, or of their logarithms
+    covariance: Float[Array, "k k"]  # of what is named, in SI units
 
     def __init__(self, names: Sequence[str], covariance: ArrayLike):
         self.names = tuple(names)
@@ -83,7 +83,10 @@ class Tolerance(Record):
 
     @classmethod
     def of(cls, scatter: Any) -> "Tolerance":
-        """A tolerance, a mapping of names to standard deviations, or an identification."""
+        """A tolerance from `scatter`.
+
+        It is a tolerance, a mapping of names to standard deviations, or an identification.
+        """
         if isinstance(scatter, Tolerance):
             return scatter
         if hasattr(scatter, "D_standard_error") and hasattr(scatter, "covariance"):
@@ -143,9 +146,10 @@ class Tolerance(Record):
             raise ValueError(f"tolerance takes at most {_MOST} quantities, got {len(self.names)}")
 
     def shifts(self, deviates: np.ndarray) -> np.ndarray:
-        """Shifts (n, k) of the quantities, or of their logarithms, from standard normal deviates.
+        """Shifts (n, k) of quantities, or of their logarithms, from normal `deviates` (n, k).
 
-        Correlated by the Cholesky factor of the correlation matrix, which may be singular.
+        The deviates have variance 1; they are correlated by the Cholesky factor of the correlation
+        matrix, which may be singular.
         """
         C = np.asarray(self.covariance, float)
         sigma = np.sqrt(np.diagonal(C))
@@ -163,9 +167,9 @@ class Tolerance(Record):
         }
 
     def scattered(self, x: Mechanism, values: Mapping[str, Any], shift: Any) -> dict[str, Any]:
-        """The quantities at `values` by name, moved by shifts (k,), or (k, n) for values (n,).
+        """The quantities at `values` by name, moved by a `shift` (k,), or (k, n) for values (n,).
 
-        `values` holds a plain name, "D", where it is moved for all joints at once.
+        `values` holds a plain name, "D", where it is moved for all joints of `x` at once.
         """
         values_at = {}
         shifts = self._inside(x, values, shift)
@@ -293,10 +297,19 @@ def squeal_probability(
     Draws whose growth rate is NaN, as where a preloaded joint has no closed equilibrium, are
     `undetermined`.
 
-    `tolerance` is an `Identification`, a `Tolerance` or a mapping of standard deviations; with an
-    `envelope` every draw is at a condition drawn evenly from it. A name without a joint, "D", of a
-    structure moves all joints that have one by the same amount. `samples` are 100,000 by default,
-    fewer, down to 1000, of a structure of more than 17 degrees of freedom.
+    **Arguments:**
+
+    - `x`: a scene or structure of scalars.
+    - `tolerance`: an `Identification`, a `Tolerance` or a mapping of standard deviations. A name
+      without a joint, "D", of a structure moves all joints that have one by the same amount.
+    - `envelope`: an `Envelope` or a mapping; every draw is at a condition drawn evenly from it. By
+      default there is none.
+    - `friction_slope`: False leaves the slope of friction out of growth rates.
+    - `samples`: number of draws, 100,000 by default, fewer, down to 1000, of a structure of more
+      than 17 degrees of freedom.
+    - `seed`: of the draws, 0 by default.
+
+    **Returns:** a `SquealProbability`.
 
     **Raises:** `ValueError` for quantities that `x` lacks, or scattered beyond their domain; D is
     truncated to its own instead (see `Tolerance`).

@@ -58,7 +58,7 @@ class Question(NamedTuple):
 class Verdict(Record):
     """What a quiet scene rests on, as `verdict` returns it; printed, it is a table."""
 
-    questions: tuple[Question, ...]
+    questions: tuple[Question, ...]  # assumptions that were changed, with the answers
     incurable: bool  # whether the slope of the friction feeds in more than all damping takes out
     omitted: tuple[str, ...] = ()  # what `verdict` would ask with other arguments, in brackets
 
@@ -110,13 +110,26 @@ def verdict(
     """Ask of a scene or a structure whether it stays quiet where an assumption is another.
 
     Its growth rate [1/s] as it is; with the load P in the friction, or without it where it is
-    there; under every other of the contact `laws`, with its surface, material and load, and by
-    `AsperityContact` and `PerssonContact` if the nominal `area` [m^2] is given, one for all joints
-    or by joint, with wavelengths from its side down to a hundredth of it; and with K_t/K_n between
-    its own, the fractal law's and Mindlin's, the worst of 65 values, or 17 of a structure. With a
-    `tolerance` or an `Identification`, and an `envelope`, the probability of squeal (see
-    `squeal_probability`), quiet below 5 percent; with `quiet_within` (see `design`) the largest
-    kick survived. What no argument asks for is named. The joints of a structure change together.
+    there; under other contact laws; with K_t/K_n between its own, the fractal law's and Mindlin's,
+    the worst of 65 values, or 17 of a structure; the probability of squeal, quiet below 5 percent;
+    and the largest kick survived. What no argument asks for is named. The joints of a structure
+    change together.
+
+    **Arguments:**
+
+    - `x`: a scene or structure of scalars.
+    - `area`: nominal area [m^2], one for all joints or {joint: area}, for `AsperityContact` and
+      `PerssonContact` with wavelengths from its side down to a hundredth of it. By default they are
+      left out.
+    - `laws`: other contact laws, each with the surface, material and load of `x`.
+    - `tolerance`: as in `squeal_probability`, by default none.
+    - `envelope`: as in `squeal_probability`, by default none.
+    - `quiet_within`: the kick that has to be survived, as in `design`; by default none.
+    - `friction_slope`: False leaves the slope of friction out of growth rates.
+    - `seed`: of all that is drawn, 0 by default.
+    - `progress`: shows a bar.
+
+    **Returns:** a `Verdict`.
 
     **Raises:** `ValueError` for what holds arrays, for an area without a surface or of a joint that
     is not there, and as those functions.
@@ -307,9 +320,9 @@ def _scattered(x, tolerance, envelope, friction_slope, seed) -> Question:
 class Suggestion(Record):
     """The least change of each quantity that makes a scene quiet, as `suggest` returns it."""
 
-    scene: Scene
+    scene: Scene  # as given
     values: dict[str, float | None]  # by name; None where none inside its bounds does
-    bounds: dict[str, tuple[float, float]]
+    bounds: dict[str, tuple[float, float]]  # (lower, upper) by name, inside which was sought
 
     def __repr__(self) -> str:
         rows = {}
@@ -330,11 +343,20 @@ def suggest(
 ) -> Suggestion:
     """The least change of one quantity at a time that brings the growth rate to `target`.
 
-    What a surface cannot cure, damping, friction or load may. `bounds` maps quantities to (lower,
-    upper), by default: each damping ratio up to 0.5; the friction as a whole down to a hundredth;
-    the smallest friction up to the static one, which is the slope, where the law has both; the load
-    and the belt velocity from a hundredth to a hundred times. Each is a `design` of its own, with
+    What a surface cannot cure, damping, friction or load may. Each is a `design` of its own, with
     its `target`, but without limits on K_n and on the regime of the joint.
+
+    **Arguments:**
+
+    - `scene`: a scene of scalars.
+    - `bounds`: {name: (lower, upper)} of quantities in SI units, by default: each damping ratio up
+      to 0.5; the friction as a whole down to a hundredth; the smallest friction up to the static
+      one, which is the slope, where the law has both; the load and the belt velocity from a
+      hundredth to a hundred times.
+    - `target`: largest growth rate [1/s], by default that of `design`.
+    - `friction_slope`: False leaves the slope of friction out of growth rates.
+
+    **Returns:** a `Suggestion`.
 
     **Raises:** `ValueError` as `design`.
     """

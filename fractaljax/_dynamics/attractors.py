@@ -25,9 +25,15 @@ def attractors(
 ) -> list[LimitCycle]:
     """Every distinct motion that the starts end in, including those without a cycle.
 
-    Two cycles are the same if their periods and amplitudes agree to 1e-6. `starts` is (k, 2n),
-    [x, v] in m and m/s; by default 32 spread about the equilibrium, up to velocities of 2 V. The
-    list is in the order of the starts. The options are those of `limit_cycle`.
+    Two cycles are the same if their periods and amplitudes agree to 1e-6. The list is in the order
+    of the starts.
+
+    **Arguments:**
+
+    - `mechanism`: as in `limit_cycle`.
+    - `starts`: (k, 2n), [x, v] in m and m/s; by default 32 spread about the equilibrium, up to
+      velocities of 2 V.
+    - `excitation`, `rtol`, `max_returns`: as in `limit_cycle`.
 
     **Raises:** `ValueError` for starts of another shape, and what `limit_cycle` raises.
     """

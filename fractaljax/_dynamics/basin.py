@@ -366,10 +366,14 @@ def basin(
     - `radius`: instead of a box, a ball about the sliding equilibrium. It is the Euclidean norm of
       the state in units of V/omega and V, with omega as in `limit_cycle`; or the semi-axes (2n,) of
       an ellipsoid in m and m/s.
-    - `starts`: the number of Sobol points, scrambled by `seed`; or the starts, (k, 2n), then
-      without box and ball.
+    - `starts`: the number of Sobol points, 4000 by default; or the starts, (k, 2n), then without
+      box and ball.
+    - `seed`: scrambles the Sobol points, 0 by default.
     - `excitation`, `rtol`, `max_returns`: as in `limit_cycle`; no excited motion ends in
       equilibrium.
+    - `progress`: shows a bar.
+
+    **Returns:** a `Basin`.
 
     **Raises:** `ValueError` for corners, semi-axes or starts of another shape, a box that is empty,
     for box, ball or starts given twice or not at all, and what `limit_cycle` raises.

@@ -24,9 +24,9 @@ Range = tuple[str, float, float]
 class BifurcationMap(Record):
     """All boundaries in a window of two quantities, as `bifurcation_map` finds them."""
 
-    mechanism: Scene | Structure
+    mechanism: Scene | Structure  # with all other quantities
     x: Range = eqx.field(static=True)  # name and range
-    y: Range = eqx.field(static=True)
+    y: Range = eqx.field(static=True)  # name and range
     boundary: Boundary  # of stability against small disturbances
     curves: tuple[EventCurve, ...]  # of cycles; their x and y are those of the map
     branches: tuple[Branch, ...]  # in one quantity or the other through `mechanism`
@@ -72,6 +72,7 @@ def bifurcation_map(
     - `radius`, `starts`, `seed`: as in `basin`.
     - `step`, `points`: as in `continue_cycle`.
     - `lines`: as in `hopf_boundary`.
+    - `progress`: shows a bar.
 
     **Returns:** a `BifurcationMap`.
 

@@ -48,7 +48,7 @@ class BranchEvent(Record):
     _rtol: float = eqx.field(static=True, default=0.0, repr=False)
 
     def value_at(self, x: Mechanism) -> Float[jax.Array, ""]:
-        """`value` as a function of the mechanism, whose other quantities are as on the branch.
+        """`value` as a function of the mechanism `x`, whose other quantities are as on the branch.
 
         It serves for derivatives at that mechanism: the event is not followed to another one.
         """
@@ -58,25 +58,25 @@ class BranchEvent(Record):
 class Branch(Record):
     """A branch of periodic orbits with k points, as `continue_cycle` returns it."""
 
-    name: str = eqx.field(static=True)
+    name: str = eqx.field(static=True)  # of the quantity that is followed
     parameter: Float[np.ndarray, " k"]  # the quantity
     period: Float[np.ndarray, " k"]  # [s]
     amplitude: Float[np.ndarray, "k n"]  # peak to peak [m]
     velocity_min: Float[np.ndarray, "k n"]  # [m/s]
     velocity_max: Float[np.ndarray, "k n"]  # [m/s]
     stick_fraction: Float[np.ndarray, "k m"]  # of the period, as in `limit_cycle`
-    open_fraction: Float[np.ndarray, "k m"]
+    open_fraction: Float[np.ndarray, "k m"]  # of the period, as in `limit_cycle`
     stable: Bool[np.ndarray, " k"]  # True where small deviations from the cycle die out
     multipliers: Complex[np.ndarray, "k 2n"]  # the one that is 1 comes last
     state: Float[np.ndarray, "k 2n"]  # [x, v] where t.x of the first joint is largest [m, m/s]
     error: Float[np.ndarray, " k"]  # estimated, of the states, relative
-    itinerary: tuple[str, ...] = eqx.field(static=True)
-    events: tuple[BranchEvent, ...]
-    start: BranchEnd
-    end: BranchEnd
+    itinerary: tuple[str, ...] = eqx.field(static=True)  # phases of the cycle at each point
+    events: tuple[BranchEvent, ...]  # in the order of the branch
+    start: BranchEnd  # what it begins at
+    end: BranchEnd  # what it ends at
 
     def of_kind(self, kind: str) -> list[BranchEvent]:
-        """The events of one kind."""
+        """The events of one `kind`, such as "fold" or "Hopf"."""
         return [event for event in self.events if event.kind == kind]
 
     @property

@@ -193,7 +193,7 @@ class LimitCycle(Record):
     error: Float[Array, ""]  # estimated relative error of period and states
     returns: Int[Array, ""]  # of the Poincare map in one period
     regularisation_error: Float[Array, ""]  # largest relative difference from the exact law
-    result: CycleResult
+    result: CycleResult  # a member of CycleResult
     of_scene: bool = eqx.field(static=True, repr=False)  # fractions are of directions, not joints
     _system: HybridSystem = eqx.field(repr=False)
     _orbit: Any = eqx.field(repr=False)  # Orbit, or regularised.SmoothOrbit
@@ -303,25 +303,29 @@ class LimitCycle(Record):
         return 20 * jnp.log10(self.velocity_rms / VELOCITY_REFERENCE)
 
     def orbit(self, n: int = 512) -> tuple[Float[Array, " n"], Float[Array, "n 2dofs"]]:
-        """Times [s] and states [x, v] in m and m/s, evenly spaced over one period from `state`."""
+        """Times (n,) [s] and states (n, 2 dofs), [x, v] in m and m/s, over one period from `state`.
+
+        They are evenly spaced; `n` is their number, 512 by default.
+        """
         return _sampled(self._orbit, self._system, self.period, n=n)
 
     def spectrum(self, n: int = 512) -> tuple[Float[Array, " n/2"], Float[Array, "n/2 dofs"]]:
         """Harmonics: frequencies [Hz] and peak amplitudes [m] of the degrees of freedom.
 
-        The Fourier coefficients of n samples of the orbit, without the mean.
+        The Fourier coefficients of `n` samples of the orbit, 512 by default, without the mean.
         """
         return self.harmonics(jnp.eye(len(self.state) // 2, dtype=self.state.dtype), n)
 
     def harmonics(self, rows, n: int = 512) -> tuple[Float[Array, " n/2"], Float[Array, "n/2 k"]]:
-        """As `spectrum`, for the displacements rows @ x with rows (k, dofs)."""
+        """As `spectrum` with its `n`, for the displacements rows @ x with `rows` (k, dofs)."""
         return _harmonics(self._orbit, self._system, self.period, rows, n=n)
 
     def contact_states(self, n: int = 512) -> Float[Array, "n f"]:
         """Contact states from the times of `orbit(n)` on: +1, -1 slip, 0 stick, 2 open.
 
         Slip is forward at +1 and backward at -1. As in a `Trajectory`, there is one for each
-        direction of friction, the tangential one of a joint first.
+        direction of friction, the tangential one of a joint first. `n` is the number of times, 512
+        by default.
 
         **Raises:** `ValueError` for the regularised law, which has none.
         """

@@ -35,11 +35,11 @@ class EventCurve(Record):
     y: Float[np.ndarray, " k"]  # the second one
     period: Float[np.ndarray, " k"]  # of the cycle at the event [s]
     amplitude: Float[np.ndarray, "k n"]  # peak to peak [m]
-    itinerary: tuple[str, ...] = eqx.field(static=True)
+    itinerary: tuple[str, ...] = eqx.field(static=True)  # phases of the cycle at each point
     side: int = eqx.field(static=True)  # 1: stable cycles are on its left from first to last point,
     # -1: on its right, 0: on both sides or on none
     start: BranchEnd
-    end: BranchEnd
+    end: BranchEnd  # what it ends at
 
     def swapped(self) -> "EventCurve":
         """The same curve with the quantities in the other order."""

@@ -167,7 +167,8 @@ def limit_cycle(
       difference of period and amplitudes, and the result `depends_on_eps` where it is above
       1e-3. Derivatives differ by far more than values do.
     - `solver`: a diffrax solver for the regularised law, Tsit5 by default; an implicit one, such
-      as Kvaerno5, for a small eps. `max_steps` bounds its steps in one period.
+      as Kvaerno5, for a small eps.
+    - `max_steps`: most steps of that solver in one period, 4096 by default.
     - `rtol`: relative tolerance of period and states, 1e-9 by default and at least 9.1e-13; in
       float32 both are 4.9e-4. It sets the number of segments.
     - `max_returns`: returns of the coarse run after which the search gives up.

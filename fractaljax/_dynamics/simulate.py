@@ -60,7 +60,7 @@ class Trajectory(Record):
     contact_states: Float[
         Array, "n f"
     ]  # from each time on: +1, -1 slip forward, backward, 0 stick, 2 open
-    result: SimulationResult
+    result: SimulationResult  # a member of SimulationResult
     _system: HybridSystem | None = eqx.field(repr=False)  # None with `saveat`
     _solution: Any = eqx.field(repr=False)  # diffrax's, of the regularised law
 

@@ -33,22 +33,30 @@ def read_measurement(
     """Read a profile or a map of heights.
 
     `.csv`, `.tsv`, `.txt`, `.dat`, `.xyz`, `.asc`: text with one column (heights), two (position,
-    height), three (x, y, height on a rectangular grid) or more (a map, each line along x).
-    `.npy`: heights (n,) or (n, m), x along the first axis. `.npz`: z, dx and perhaps dy in metres.
-    Everything else is read by the SurfaceTopography package. At most 256 MiB of text are read,
-    1 GiB of arrays, and 2 GiB in an instrument's format, or what `limits` says.
-
-    `dx`, `dy` [m] are steps, `unit` that of heights and `position_unit` that of positions (default
-    `unit`), for files that do not state them. They must not contradict the file. A unit may be a
-    number of metres, 2.9e-8. `channel` is the name or number of one of several. Missing heights
-    are NaN.
+    height), three (x, y, height on a rectangular grid) or more (a map, each line along x). `.npy`:
+    heights (n,) or (n, m), x along the first axis. `.npz`: z, dx and perhaps dy in metres.
+    Everything else is read by the SurfaceTopography package. At most 256 MiB of text are read, 1
+    GiB of arrays, and 2 GiB in an instrument's format, or what `limits` says.
 
     In text, titles such as X, Z, valid or quality choose the columns, also where there are others;
-    heights whose flag is 0 are missing. `columns` selects by title, or by number from 0, where
-    titles do not: {"x": "X", "z": "Y", "valid": "flag"}, of x, y, z, valid and invalid (whose 1
-    stands for a missing height). A factor for heights and the size of a pixel in the header count:
-    `height conversion factor (-> m)=2.9e-8`, `pixel size=0.35 um`; `unit` is then that of heights
-    after the factor, and a size without a unit is in metres if the factor leads to them.
+    heights whose flag is 0 are missing. A factor for heights and the size of a pixel in the header
+    count: `height conversion factor (-> m)=2.9e-8`, `pixel size=0.35 um`; `unit` is then that of
+    heights after the factor, and a size without a unit is in metres if the factor leads to them.
+    Missing heights are NaN.
+
+    **Arguments**, by default what the file states, which they must not contradict:
+
+    - `path`: the file, whose ending tells its format.
+    - `dx`, `dy`: steps along x and y [m].
+    - `unit`: that of heights, such as "um", or a number of metres, 2.9e-8.
+    - `position_unit`: that of positions, by default `unit`.
+    - `channel`: the name or number of one of several channels.
+    - `columns`: columns of text by title, or by number from 0, where titles do not tell: {"x": "X",
+      "z": "Y", "valid": "flag"}, of x, y, z, valid and invalid (whose 1 stands for a missing
+      height).
+    - `limits`: how much is read, a `FileLimits`.
+
+    **Returns:** a `Measurement`.
 
     **Raises:** `OSError` if the file cannot be read; `ValueError` naming it for an unknown or
     damaged format, a file that is too large, a unit or step that neither the file nor an argument

@@ -39,24 +39,24 @@ class Identification(Record):
     G is that of Eq. 13, which the contact law uses.
     """
 
-    D: float
+    D: float  # fractal dimension
     G: float  # m
-    D_standard_error: float
-    ln_G_standard_error: float
+    D_standard_error: float  # of D
+    ln_G_standard_error: float  # of ln G
     covariance: Float[np.ndarray, "2 2"]  # of (D, ln G)
     G_profile: float  # m: by Majumdar's and Bhushan's formula
-    gamma: float
+    gamma: float  # that of Eq. 13
     band: tuple[float, float]  # 1/m
     limit: float  # 1/m: of the instrument, or the Nyquist frequency
-    aliased: bool
+    aliased: bool  # True if waves finer than two points are sampled, not averaged out
     noise_floor: float  # m^3
-    law: PowerLaw
-    spectrum: Spectrum
-    structure_function: StructureFunction
-    missing: int
-    outliers: int
-    unused: int
-    warnings: tuple[str, ...] = eqx.field(static=True)
+    law: PowerLaw  # the fitted power law
+    spectrum: Spectrum  # what is fitted
+    structure_function: StructureFunction  # an independent estimate
+    missing: int  # number of missing heights
+    outliers: int  # number of heights taken out as spikes
+    unused: int  # number of heights in segments that are too short
+    warnings: tuple[str, ...] = eqx.field(static=True)  # what to doubt, one line each
 
     @property
     def decades(self) -> float:
@@ -106,25 +106,34 @@ def identify(
     analysis: SpectralAnalysis = SpectralAnalysis(),
     thresholds: WarningThresholds = WarningThresholds(),
 ) -> Identification:
-    """D and G of heights z [m], a profile (n,) or a map (n, m), from their power spectrum.
+    """D and G of a measured profile or map, from its power spectrum.
 
-    Points are dx [m] apart along the first axis, dy (default dx) along the second; NaN is missing.
-    z may also be a `Measurement`, the path of a file that `read_measurement` reads without
-    options but dx and dy, or a topography of SurfaceTopography: with `heights()`, a `unit`, and
-    `pixel_size` or `positions()`. These have dx and dy, which the arguments must not contradict,
-    and `resolution` and `stylus_radius`, which the arguments replace.
     The surface is assumed to be that of Eq. 13, a profile a cut through it. Standard errors of a
-    map include its variation from place to place; those of a profile assume that there is none.
-    The effect of filled gaps on the spectrum is estimated on surrogates and removed.
+    map include its variation from place to place; those of a profile assume that there is none. The
+    effect of filled gaps on the spectrum is estimated on surrogates and removed.
 
+    **Arguments:**
+
+    - `z`: heights [m], a profile (n,) or a map (n, m); NaN is missing. Or a `Measurement`, the path
+      of a file that `read_measurement` reads without options but dx and dy, or a topography of
+      SurfaceTopography: with `heights()`, a `unit`, and `pixel_size` or `positions()`. These have
+      dx and dy, which the arguments must not contradict, and `resolution` and `stylus_radius`,
+      which the arguments replace.
+    - `dx`: distance of points along the first axis [m].
+    - `dy`: distance of points along the second axis [m], by default dx.
     - `band`: lowest and highest frequency [1/m] of the fit; chosen by default.
-    - `resolution` [m]: lateral resolution, or the cut-off wavelength of a Gaussian filter.
-    - `stylus_radius` [m] of the tip. It and `resolution` limit a band chosen by default.
-    - `aliased`: whether waves finer than two points are sampled, and so aliased, or averaged out;
-      decided from the spectrum by default.
-    - `gamma` of Eq. 13, also the ratio of the ends of a bin: waves may come in steps of it.
+    - `resolution`: lateral resolution [m], or the cut-off wavelength of a Gaussian filter; by
+      default none.
+    - `stylus_radius`: radius of the tip [m], by default none. It and `resolution` limit a band
+      chosen by default.
+    - `aliased`: True if waves finer than two points are sampled, and so aliased, False if they are
+      averaged out; decided from the spectrum by default.
+    - `gamma`: that of Eq. 13, 1.5 by default, also the ratio of the ends of a bin: waves may come
+      in steps of it.
     - `preprocessing`, `analysis`, `thresholds`: options of the heights before their spectrum, of
       the spectrum and the band, and of the warnings.
+
+    **Returns:** an `Identification`.
 
     **Raises:** `ValueError` for heights that are too few, flat, complex, infinite or not (n,) or
     (n, m); distances that are missing, not above 0 or not those of z; a band that is empty or

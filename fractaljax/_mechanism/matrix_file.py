@@ -55,8 +55,8 @@ class Matrices:
     declaring them symmetric.
     """
 
-    matrices: dict[str, Any]
-    names: tuple[str, ...] | None = None
+    matrices: dict[str, Any]  # by name
+    names: tuple[str, ...] | None = None  # of the degrees of freedom, where the file has them
     unread: dict[str, str] = dataclasses.field(default_factory=dict)
     mirrored: tuple[str, ...] = ()
 
@@ -81,8 +81,8 @@ def read_matrices(path: str | os.PathLike, limits: FileLimits = FileLimits()) ->
     `.npz`: one sparse matrix of `scipy.sparse.save_npz`, or arrays of `numpy.savez`. `.mat`: MATLAB
     version 4 to 7. `.mtx`: Matrix Market, or Abaqus (*MATRIX OUTPUT). `.op4`: OUTPUT4 of Nastran.
     `.pch`, `.bdf`, `.dat`: DMIG cards of Nastran. `.hb`, `.rb`, `.rua`, `.rsa`, `.matrix`:
-    Harwell-Boeing in ASCII, which Ansys writes with HBMAT. Each may be compressed as .gz or .bz2.
-    A single matrix is named after its file. Symmetric matrices are filled. Matrices of Abaqus and
+    Harwell-Boeing in ASCII, which Ansys writes with HBMAT. Each may be compressed as .gz or .bz2. A
+    single matrix is named after its file. Symmetric matrices are filled. Matrices of Abaqus and
     DMIG cards come with sorted names of degrees of freedom, "node.dof". At most 1 GiB and 1000000
     degrees of freedom are read, or what `limits` says.
 
@@ -90,6 +90,12 @@ def read_matrices(path: str | os.PathLike, limits: FileLimits = FileLimits()) ->
     of Nastran), and text or a cell array of MATLAB leave the others readable: `unread` says why.
     Abaqus does not say whether it writes one triangle: `mirrored` names matrices that were filled
     because no entry has a mirror image.
+
+    **Arguments:**
+
+    - `path`: the file, whose ending tells its format.
+
+    **Returns:** `Matrices`, in the units of the file.
 
     **Raises:** `OSError` if the file cannot be read; `ValueError`, one line that begins with the
     file name, for an unknown format, a damaged file, and a file without a matrix as above.

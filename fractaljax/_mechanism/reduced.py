@@ -60,9 +60,16 @@ class ReducedStructure(ParametricStructure):
     It has the parameters, the joints and the mesh of the large structure and can be used like any
     structure. Only eigenvalues in `band` are those of the large structure, and only they count in
     its stability. `replace` of a matrix gives a plain structure.
+
+    **Arguments:**
+
+    - `M`, `C`, `K`, `joints`, `parameters`, `F`: as in `ParametricStructure`, of the r degrees of
+      freedom.
+    - `reduction`: the basis, the band and the accuracy.
+    - `mesh`: that of the large structure, by default none.
     """
 
-    reduction: Reduction = eqx.field(static=True)
+    reduction: Reduction = eqx.field(static=True)  # the basis and the accuracy
 
     def __init__(
         self, M, C, K, joints, parameters, F, reduction: Reduction, mesh: Mesh | None = None
@@ -90,9 +97,12 @@ class ReducedStructure(ParametricStructure):
         return self.reduction.touched
 
     def full(self, q: ArrayLike) -> Numbers:
-        """Displacements or velocities (..., n) of all degrees of freedom from q (..., r).
+        """Displacements or velocities (..., n) of all degrees of freedom from the reduced ones.
 
-        A state (..., 2r) gives a state (..., 2n). Mode shapes may be complex.
+        **Arguments:**
+
+        - `q`: (..., r), real or, as a mode shape, complex; a state (..., 2r) gives a state (...,
+          2n).
 
         **Raises:** `ValueError` for another size.
         """

@@ -63,12 +63,12 @@ class BoundaryEnd(eqx.Enumeration):
 class BoundaryBranch(Record):
     """One connected piece of a stability boundary, with squeal on its right."""
 
-    x: Float[np.ndarray, " k"]
-    y: Float[np.ndarray, " k"]
+    x: Float[np.ndarray, " k"]  # values of the first quantity
+    y: Float[np.ndarray, " k"]  # values of the second one
     frequency: Float[np.ndarray, " k"]  # of the imaginary pair of eigenvalues [Hz]; 0: divergence
     growth_rate: Float[np.ndarray, " k"]  # [1/s], 0 up to rounding
-    start: BoundaryEnd
-    end: BoundaryEnd
+    start: BoundaryEnd  # what it begins at
+    end: BoundaryEnd  # what it ends at
 
     @property
     def closed(self) -> bool:
@@ -84,11 +84,11 @@ class BoundaryBranch(Record):
 class Boundary(Record):
     """Where the growth rate is 0 in a window of two quantities, as `hopf_boundary` returns it."""
 
-    scene: Mechanism
+    scene: Mechanism  # scene or structure with all other quantities
     x: Window  # name and range
-    y: Window
-    branches: tuple[BoundaryBranch, ...]
-    friction_slope: bool
+    y: Window  # name and range
+    branches: tuple[BoundaryBranch, ...]  # each one connected piece
+    friction_slope: bool  # True if growth rates count the slope of friction
     squeals: bool  # at the corner (low, low) of the window
     untraced: int  # crossings of the lattice that could not be followed
 
@@ -118,21 +118,30 @@ def hopf_boundary(
 ) -> Boundary:
     """Trace where the growth rate is 0 in the window of two quantities of a scene or structure.
 
-    `x` and `y` are (name, low, high): any quantity; for a structure also "left.D"; for a scene also
-    "K_t/K_n" at the scene's K_n (the given stiffness ratio of a fractal contact), "omega_1/omega_2"
-    at the scene's omega_2, and "mu", the friction at the belt velocity, which scales the friction
-    law as a whole. A range over a decade or more is logarithmic. Every point lies on the boundary
-    within 1e-12 of the window, or what the rounding of the scene allows. Branches are found where
-    they cross one of `lines` lines each way, or dip between two of them; a loop within a cell can
-    be missed. Where both directions lose all their damping at once, along a whole line, the Hopf
-    test function does not change sign smoothly: such crossings are counted as `untraced`.
+    Every point lies on the boundary within 1e-12 of the window, or what the rounding of the scene
+    allows. Branches are found where they cross a line of a lattice, or dip between two of them; a
+    loop within a cell can be missed. Where both directions lose all their damping at once, along a
+    whole line, the Hopf test function does not change sign smoothly: such crossings are counted as
+    `untraced`.
 
     For a structure, the boundary is flutter or static divergence (`BoundaryBranch.divergence`). A
     branch ends at a corner, where a second mode loses its damping too; the next branch begins
-    there. Points lie on it within 1e-10 of the window, or eps over the damping ratio. Each
-    takes a full eigenvalue solution: choose fewer `lines` for many degrees of freedom.
+    there. Points lie on it within 1e-10 of the window, or eps over the damping ratio.
 
     Not differentiable, and not for use under `jit`; see `critical_friction` for that.
+
+    **Arguments:**
+
+    - `scene`: a scene or structure of scalars.
+    - `x`, `y`: (name, low, high) of any quantity in SI units; for a structure also "left.D"; for a
+      scene also "K_t/K_n" at the scene's K_n (the given stiffness ratio of a fractal contact),
+      "omega_1/omega_2" at the scene's omega_2, and "mu", the friction at the belt velocity, which
+      scales the friction law as a whole. A range over a decade or more is logarithmic.
+    - `friction_slope`: False leaves the slope of friction out of growth rates.
+    - `lines`: lines of the lattice each way, 49 by default. Each point takes a full eigenvalue
+      solution of a structure: choose fewer for many degrees of freedom.
+
+    **Returns:** a `Boundary`.
 
     **Raises:** `ValueError` for a name that is no quantity of the scene, two names that set the
     same one, a range that is empty, inverted or outside the domain, a scene that holds arrays, and

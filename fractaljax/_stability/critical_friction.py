@@ -74,23 +74,29 @@ def critical_friction(
 ) -> Float[Array, ""]:
     """Friction coefficient mu(V) at which the scene or structure starts to squeal [-], a scalar.
 
-    With a `FixedContact` and friction that has no slope, or `friction_slope=False`, the closed
-    form mu_c = m sqrt(g_c/(K_n K_t)), infinite where K_n or K_t is 0. Otherwise the friction law
-    as a whole is multiplied by a factor, so that mu_s, mu_m and its slope grow together, and the
-    contact follows as in `stiffness`: K_t of a fractal joint depends on mu_s, its critical area on
-    mu_m. The first friction that squeals is searched from 1/1000 to 1000 times that of the scene,
-    up to the limit of Eq. 19 (mu_m <= 0.9): 0 if the least squeals already, infinite if none does,
-    NaN where it cannot be computed, and where a preloaded joint opens first. To hold the stiffness,
+    With a `FixedContact` and friction without a slope, the closed form mu_c = m sqrt(g_c/(K_n
+    K_t)), infinite where K_n or K_t is 0. Otherwise the friction law as a whole is multiplied by a
+    factor, so that mu_s, mu_m and its slope grow together, and the contact follows as in
+    `stiffness`: K_t of a fractal joint depends on mu_s, its critical area on mu_m. The first
+    friction that squeals is searched from 1/1000 to 1000 times that of the scene, up to the limit
+    of Eq. 19 (mu_m <= 0.9): 0 if the least squeals already, infinite if none does, NaN where it
+    cannot be computed, and where a preloaded joint opens first. To hold the stiffness,
     `scene.replace(contact=FixedContact(*stiffness(scene)))`, with its P if it is preloaded.
 
     For a structure, one factor scales the friction of all joints, and the equilibrium follows.
-    The result is mu at the sliding velocity of `joint`, which all joints share unless it is named;
-    the other coefficients keep their proportion to it. Squeal begins by flutter or by static
-    divergence (a real eigenvalue). The factor is the root of the Hopf test function of n degrees
-    of freedom (`critical_pair.py`) between two of 512 factors f, evenly spaced in f/(1 + f): an
-    interval of squeal narrower than that can be missed. Each takes a full eigenvalue solution.
+    Squeal begins by flutter or by static divergence (a real eigenvalue). The factor is the root of
+    the Hopf test function of n degrees of freedom (`critical_pair.py`) between two of 512 factors
+    f, evenly spaced in f/(1 + f): an interval of squeal narrower than that can be missed. Each
+    takes a full eigenvalue solution.
 
     The derivative is that of the root, and 0 where it is 0 or infinite.
+
+    **Arguments:**
+
+    - `scene`: a scene or structure of scalars.
+    - `friction_slope`: False leaves the slope of friction out of growth rates.
+    - `joint`: name of the joint of a structure at whose sliding velocity mu is meant; by default
+      all joints share that mu. The other coefficients keep their proportion to it.
 
     **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`; for a structure without
     joints, a `joint` that it does not have, or none where friction differs between them (NaN under

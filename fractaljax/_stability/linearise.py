@@ -114,13 +114,18 @@ def assemble(
 ) -> tuple[Float[Array, "n n"], Float[Array, "n n"], Float[Array, "n n"]]:
     """(M, C, K), each (n, n), with the joints attached, in the units of the structure.
 
-    With t and n the directions of a joint, Eq. 43 in vectors: K_t t t^T + K_n n n^T
-    - mu K_n t n^T + mu K_t n t^T is added to K. The slope of the friction law adds
-    mu' N_0 t t^T - mu' K_t (t.x_0) n n^T to C, where x_0 is the equilibrium and N_0 = K_n n.x_0.
-    With preload N_0 = P + K_n n.x_0, and the equilibrium is that under F and the friction mu P t;
-    for a load curve N_0 = N(n.x_0), and the tangent at N_0 takes the place of P + K_n n.x.
-    C and K are NaN where such a joint is open, N_0 <= 0, and under `jit` where there is no
-    equilibrium. A joint without normal has N_0 = P and no term with n.
+    With t and n the directions of a joint, Eq. 43 in vectors: K_t t t^T + K_n n n^T - mu K_n t n^T
+    + mu K_t n t^T is added to K. The slope of the friction law adds mu' N_0 t t^T - mu' K_t (t.x_0)
+    n n^T to C, where x_0 is the equilibrium and N_0 = K_n n.x_0. With preload N_0 = P + K_n n.x_0,
+    and the equilibrium is that under F and the friction mu P t; for a load curve N_0 = N(n.x_0),
+    and the tangent at N_0 takes the place of P + K_n n.x. C and K are NaN where such a joint is
+    open, N_0 <= 0, and under `jit` where there is no equilibrium. A joint without normal has N_0 =
+    P and no term with n.
+
+    **Arguments:**
+
+    - `structure`: a `Structure`; `jax.vmap` takes many.
+    - `friction_slope`: False leaves the slope of friction out of C.
 
     **Raises:** `ValueError` for a batch, where a slope needs F and there is none, and if there is
     no equilibrium: a rigid-body mode is free.

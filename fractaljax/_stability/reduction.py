@@ -64,21 +64,30 @@ def reduce(
 ) -> ReducedStructure:
     """A small structure with the eigenvalues of a large one in a band of frequencies.
 
-    `over` maps named quantities, parameters or those of joints, to ranges (low, high) in which the
-    reduction holds; without any it holds for the quantities as they are. `band` is (low, high) in
-    rad/s. In it, every eigenvalue s is right to `tol` |s| at all candidates, by an estimate, and
-    at two fresh points, by comparison. Candidates are 33 along one quantity, 32 for each of
-    several, 128 at most, besides the corners. Eigenvectors are taken at `points` points at most.
-    Modes with |Re s| > 0.3 |s|, static divergence among them, are not looked for.
+    In the band, every eigenvalue s is right to `tol` |s| at all candidates, by an estimate, and at
+    two fresh points, by comparison. Candidates are 33 along one quantity, 32 for each of several,
+    128 at most, besides the corners. Modes with |Re s| > 0.3 |s|, static divergence among them, are
+    not looked for.
 
-    The result keeps parameters, joints and their directions, and derivatives; `.full(q)` leads
-    back to all degrees of freedom, `.reduction` has the bases, the points and the largest error,
-    and `reduction_errors` estimates that of each eigenvalue. Without joints, and with a mass
-    matrix that does not depend on parameters, the projection is oblique, left vectors against
-    right ones; otherwise one space holds both, so that a joint pulls where it is pulled, and
-    static displacements under F and along the joints' directions as well.
+    The result keeps parameters, joints and their directions, and derivatives; `.full(q)` leads back
+    to all degrees of freedom, `.reduction` has the bases, the points and the largest error, and
+    `reduction_errors` estimates that of each eigenvalue. Without joints, and with a mass matrix
+    that does not depend on parameters, the projection is oblique, left vectors against right ones;
+    otherwise one space holds both, so that a joint pulls where it is pulled, and static
+    displacements under F and along the joints' directions as well.
 
     Not for use under `jit`; what it returns is.
+
+    **Arguments:**
+
+    - `structure`: a `Structure`, also a large and sparse one.
+    - `over`: {name: (low, high)} of quantities, parameters or those of joints, in SI units: the
+      ranges in which the reduction holds. By default it holds for the quantities as they are.
+    - `band`: (low, high) of |Im s| [rad/s], by default all frequencies.
+    - `tol`: largest relative error of an eigenvalue, 1e-8 by default.
+    - `friction_slope`: False leaves the slope of friction out.
+    - `points`: the most points at which eigenvectors are computed, 40 by default.
+    - `progress`: shows a bar; False by default.
 
     **Raises:** `ValueError` for a band or a range that is empty or outside the domain, an unknown
     quantity, and if `tol` is not met with so many points.
@@ -104,11 +113,15 @@ def reduce(
 
 
 def reduction_errors(reduced: ReducedStructure) -> Float[np.ndarray, " 2*r"]:
-    """The approximate error of each eigenvalue of `stability` due to the reduction [1/s].
+    """The approximate error (2r,) of each eigenvalue of `stability` due to the reduction [1/s].
 
-    In the same order; infinite outside the band. It is the product of the residuals of the
-    right and the left vector (see `reduction.py`): an estimate, right to leading order. Not
-    for use under `jit`.
+    In the same order; infinite outside the band. It is the product of the residuals of the right
+    and the left vector (see `reduction.py`): an estimate, right to leading order. Not for use under
+    `jit`.
+
+    **Arguments:**
+
+    - `reduced`: a structure as `reduce` returns it.
     """
     numbers = joint_numbers(reduced, reduced.reduction.friction_slope)
     s, errors = estimated_errors(reduced, reduced.parameters, np.asarray(numbers))

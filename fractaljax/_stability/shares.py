@@ -68,15 +68,23 @@ def energy_shares(
 ) -> EnergyShares:
     """Energy and contribution to the growth rate of each part, in each mode that oscillates.
 
-    Parts are the terms of M, C and K, "K" or "K 1", "K 2", ... where it is a sum, or as `names` has
-    them ({"K 2": "pad"}; parts of one name are added up), and the joints by their names. A joint
-    acts through its springs, its friction and, unless `friction_slope` is False, the slope of its
-    friction law. `modes` is `stability(x, friction_slope)`, if already computed.
+    Parts are the terms of M, C and K, "K" or "K 1", "K 2", ... where it is a sum, and the joints by
+    their names. A joint acts through its springs, its friction and the slope of its friction law.
 
     The sum of the contributions is the growth rate, as exactly as shapes are known. Where
     gyroscopic modes coalesce, 2 omega m + Im c passes through 0 and they grow without bound. For a
     structure that `reduce` made obliquely (`Reduction.W` is not `V`), shares are of forms in its
     coordinates, not of energies.
+
+    **Arguments:**
+
+    - `x`: a scene or structure of scalars.
+    - `modes`: `stability(x, friction_slope)`, if already computed.
+    - `friction_slope`: False leaves the slope of friction out.
+    - `names`: {part: other name}, such as {"K 2": "pad"}; parts of one name are added up. By
+      default parts keep their names.
+
+    **Returns:** `EnergyShares`.
 
     **Raises:** `TypeError` for what is neither a scene nor a structure; `ValueError` for a name of
     no part, for modes of another size, and as `stability`.

@@ -64,12 +64,13 @@ class ModeTracks(Record):
     for the second of two real eigenvalues where the two are still one conjugate pair.
     """
 
-    name: str = eqx.field(static=True)
-    values: Float[np.ndarray, " p"]
+    name: str = eqx.field(static=True)  # of the quantity
+    values: Float[np.ndarray, " p"]  # of the quantity, in SI units
     eigenvalues: Complex[np.ndarray, "p k"]  # [1/s], in the upper half plane
     shapes: Complex[np.ndarray, "p k n"]  # displacements, the largest of each 1
     mac: Float[np.ndarray, "p-1 k"]  # the least within each step; below 0.8 it is no certain match
     x: Any = eqx.field(repr=False)  # the Scene or Structure
+    # True if the slope of friction counts
     friction_slope: bool = eqx.field(static=True, default=True)
 
     @property
@@ -148,7 +149,7 @@ def track_modes(
     *,
     friction_slope: bool = True,
 ) -> ModeTracks:
-    """Eigenvalues and shapes of all modes over the values (p,) of a quantity, each mode a column.
+    """Eigenvalues and shapes of all modes over the values of a quantity, each mode a column.
 
     Neighbours are paired by the modal assurance criterion of left and right eigenvectors
     (`tracks.py`), MAC = max(0, 1 - |1 - B|), in the best way for all modes together. A step in
@@ -157,12 +158,21 @@ def track_modes(
     crossing. Equal eigenvalues with independent shapes, as in an exact crossing, get the shapes
     that continue those of the value before.
 
-    Where two modes coalesce exactly, no continuation is better than the other: all MACs are at
-    most 1/2. Then the mode with the higher frequency goes on as the one that grows faster, and that
-    one as the higher frequency where they part. With any difference in damping, modes pass the
+    Where two modes coalesce exactly, no continuation is better than the other: all MACs are at most
+    1/2. Then the mode with the higher frequency goes on as the one that grows faster, and that one
+    as the higher frequency where they part. With any difference in damping, modes pass the
     coalescence at some distance, and their own continuation decides. `mac` tells which it was.
 
     Rigid-body modes, with s = 0, are left out.
+
+    **Arguments:**
+
+    - `x`: a scene or structure of scalars.
+    - `name`: a quantity by its name in `x.replace`.
+    - `values`: (p,), values of the quantity in SI units.
+    - `friction_slope`: False leaves the slope of friction out.
+
+    **Returns:** `ModeTracks`.
 
     **Raises:** `ValueError` for an unknown quantity, values outside its domain or not a list, and a
     structure that is large and sparse; `TypeError` for what is neither a scene nor a structure.

@@ -49,31 +49,39 @@ def sweep(
 ) -> Sweep:
     """`measure(x)` at every point of a grid: `sweep(growth_rate, scene, D=Ds, G=Gs)`.
 
-    Each axis is a quantity by its name in `x.replace`, or a ratio as in `**{"K_t/K_n": ratios}`
-    (`quantities.py`), and its values (n,). `measure` gives an array or a pytree of arrays; the
-    result holds it as NumPy arrays (n_1, n_2, ..., *shape of the measure's). `jax.jit` and
-    `jax.grad` act on the measure, not on the sweep. The measure is traced once per sweep, with the
-    values that it captures at that time; equal programs are compiled once.
+    Points are evaluated in batches, which are blocks of the grid. The last digits of a result may
+    depend on the size of a batch, and on nothing else here. `jax.jit` and `jax.grad` act on the
+    measure, not on the sweep.
 
-    Points are evaluated in batches, blocks of the grid of at most `batch_size` points (8192 for
-    every device, fewer for a structure with more than 8 degrees of freedom), split evenly over
-    `devices` (all of this process). The last digits of a result may depend on the size of a batch,
-    and on nothing else here.
+    **Arguments:**
 
-    `out` names a folder for a Zarr store, which `xarray.open_zarr` opens, finished or not: the
-    values of each axis with unit and meaning (K_t/K_n as K_t_over_K_n), each array of the measure,
-    and `computed`, which is 0 where a point is not computed yet. The same sweep called again
-    computes what is missing; batches running when it was killed are lost. Another sweep is
-    refused, and one begun by other versions resumes with a warning. Under `jax.distributed` every
-    process must name the same folder: each computes its share of the batches, and all return the
-    whole. Needs `fractaljax[sweep]`.
+    - `measure`: a function of a scene or structure that gives an array or a pytree of arrays. It is
+      traced once per sweep, with the values that it captures at that time; equal programs are
+      compiled once.
+    - `x`: the scene or structure whose quantities are replaced.
+    - `batch_size`: the most points of a batch, by default 8192 for every device, fewer for a
+      structure with more than 8 degrees of freedom.
+    - `progress`: shows a bar.
+    - `out`: a folder for a Zarr store, by default none, which `xarray.open_zarr` opens, finished or
+      not: the values of each axis with unit and meaning (K_t/K_n as K_t_over_K_n), each array of
+      the measure, and `computed`, which is 0 where a point is not computed yet. The same sweep
+      called again computes what is missing; batches running when it was killed are lost. Another
+      sweep is refused, and one begun by other versions resumes with a warning. Under
+      `jax.distributed` every process must name the same folder: each computes its share of the
+      batches, and all return the whole. Needs `fractaljax[sweep]`.
+    - `executor`: computes the batches: a `ThreadPoolExecutor`, a `ProcessPoolExecutor` that spawns,
+      `client.get_executor()` of Dask, an `MPIPoolExecutor`, or anything like them; by default this
+      thread. It needs several batches for each worker. Unless the workers are threads, measure and
+      x are sent along by cloudpickle (`fractaljax[sweep]`); workers trace and compile them once,
+      with the 64 bits and other settings of the caller, who collects the results and alone writes
+      to `out`. If a batch fails, those that were running are kept in `out` before its error is
+      raised.
+    - `devices`: the devices that share each batch evenly, by default all of this process.
+    - `axes`: each axis is a quantity by its name in `x.replace`, or a ratio as in
+      `**{"K_t/K_n": ratios}` (`quantities.py`), and its values (n,) in SI units.
 
-    `executor` computes the batches: a `ThreadPoolExecutor`, a `ProcessPoolExecutor` that spawns,
-    `client.get_executor()` of Dask, an `MPIPoolExecutor`, or anything like them. It needs several
-    batches for each worker. Measure and x are sent along, a lambda only with `fractaljax[sweep]`;
-    workers trace and compile them once, with the 64 bits and other settings of the caller, who
-    collects the results and alone writes to `out`. If a batch fails, those that were running are
-    kept in `out` before its error is raised.
+    **Returns:** a `Sweep`, which holds each array of the measure as a NumPy array
+    (n_1, n_2, ..., *shape of the measure's).
 
     **Raises:** `ValueError` for no axis, an unknown name, two axes of one quantity, values that are
     not one-dimensional or outside their domain, a batch size that does not divide by the devices, a
@@ -82,7 +90,7 @@ def sweep(
     it, devices beside an executor, or an executor that forks; `TypeError` for what is not numeric,
     no executor, or cannot be sent to a worker; `RuntimeError` if a worker of a pool dies, or traces
     another program; `OSError` if the folder cannot be written; `ImportError` for `out` without
-    Zarr.
+    Zarr, or for workers that are not threads without cloudpickle.
     """
     grid = _checked(x, axes)
     names = tuple(grid)

@@ -15,8 +15,13 @@ _COLOURS = {"equilibrium": "#c6dbef", "diverges": "0.25", "undecided": "#d62728"
 def basin(result: Basin, ax: Axes | None = None) -> Axes:
     """The outcomes of a section as areas: each point has the outcome of the nearest start.
 
-    The starts differ in two coordinates only, as in a box with all others fixed.
     Displacements are in um, or in m if one is above 1 cm; velocities are in m/s.
+
+    **Arguments:**
+
+    - `result`: as `basin` returns it, of starts that differ in two coordinates only, as in a box
+      with all others fixed.
+    - `ax`: axes to draw in, by default those of a new figure.
 
     **Raises:** `ValueError` unless exactly two coordinates differ.
     """

@@ -25,6 +25,11 @@ def bifurcation_map(result: BifurcationMap, ax: Axes | None = None) -> Axes:
 
     The region where small disturbances grow is shaded. Elsewhere the mechanism is quiet if there
     are no stable cycles, and the kick decides if there are.
+
+    **Arguments:**
+
+    - `result`: as `bifurcation_map` returns it.
+    - `ax`: axes to draw in, by default those of a new figure.
     """
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch

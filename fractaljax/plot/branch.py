@@ -23,8 +23,14 @@ def branch(
 ) -> Axes:
     """Peak-to-peak amplitude of one degree of freedom over the quantity of a branch.
 
-    Stable cycles are solid, unstable ones dashed; markers are the branch's events. `direction` is
-    the degree of freedom, from 1; `label` names the abscissa.
+    Stable cycles are solid, unstable ones dashed; markers are the branch's events.
+
+    **Arguments:**
+
+    - `result`: as `continue_cycle` returns it.
+    - `ax`: axes to draw in, by default those of a new figure.
+    - `direction`: the degree of freedom, from 1; 1 by default.
+    - `label`: text at the abscissa, by default the name of the quantity with its unit.
 
     **Raises:** `ValueError` for an unknown degree of freedom.
     """

@@ -16,8 +16,13 @@ def phase_portrait(
 ) -> Axes:
     """The orbit of one displacement [um] against its velocity [m/s], and where it sticks.
 
-    The displacement is that of the degree of freedom `direction`, or t.x of the `joint` of that
-    number; both count from 1.
+    **Arguments:**
+
+    - `cycle`: as `limit_cycle` returns it.
+    - `ax`: axes to draw in, by default those of a new figure.
+    - `direction`: the degree of freedom, from 1; 1 by default.
+    - `joint`: the number of a joint, from 1, whose displacement t.x is shown instead; by default
+      none.
 
     **Raises:** `ValueError` if there is no limit cycle, for a batch, or an unknown direction or
     joint.
@@ -51,7 +56,11 @@ def spectrum(
 ) -> Axes:
     """Peak amplitudes [um] of the harmonics of a displacement over frequency [kHz].
 
-    They begin with the fundamental. The displacement is that of `phase_portrait`.
+    They begin with the fundamental.
+
+    **Arguments:**
+
+    - `cycle`, `ax`, `direction`, `joint`: as in `phase_portrait`.
 
     **Raises:** as `phase_portrait`.
     """
@@ -75,6 +84,10 @@ def cycle(result: LimitCycle) -> Figure:
     """Phase portraits and spectra; returns the figure.
 
     A row for each direction of a scene, and for t.x of each joint of a structure.
+
+    **Arguments:**
+
+    - `result`: as `limit_cycle` returns it.
 
     **Raises:** `ValueError` if there is no limit cycle, or for a batch.
     """

@@ -19,8 +19,12 @@ def cycles(
 ) -> Figure:
     """Phase portrait and spectrum of one displacement, a row for each cycle; returns the figure.
 
-    The keys name the rows, and all rows have the same axes. The displacement is that of
-    `phase_portrait`.
+    All rows have the same axes.
+
+    **Arguments:**
+
+    - `results`: {name of the row: limit cycle}.
+    - `direction`, `joint`: as in `phase_portrait`.
 
     **Raises:** `ValueError` if there are no cycles, and as `phase_portrait`.
     """
@@ -56,9 +60,16 @@ def amplitudes(
 ) -> Axes:
     """Peak-to-peak amplitudes [um] of all directions over a quantity, for a batch of cycles.
 
-    `over` (n,) are the values of the quantity, `label` its name with its unit, and `slopes` (n,)
-    the derivative of the amplitude of direction 1 with respect to it [m per unit], drawn as a few
-    tangents. Gaps are members without a cycle.
+    Gaps are members without a cycle.
+
+    **Arguments:**
+
+    - `results`: a batch (n,) of limit cycles, as `jax.vmap` gives it.
+    - `over`: (n,), values of the quantity.
+    - `ax`: axes to draw in, by default those of a new figure.
+    - `label`: the name of the quantity with its unit.
+    - `slopes`: (n,), the derivative of the amplitude of direction 1 with respect to the quantity [m
+      per unit], drawn as a few tangents; by default none.
 
     **Raises:** `ValueError` for a batch or slopes whose shape is not that of `over` (n,).
     """

@@ -31,10 +31,17 @@ def stability_map(
     K_n_min: float | None = None,
     friction_slope: bool = True,
 ) -> Axes:
-    """Growth rate [1/s] over the first two quantities of `bounds`, by default D and G [m].
+    """Growth rate [1/s] over two quantities, the stability boundary and the regimes of the contact.
 
-    It shows the stability boundary and the regimes of a fractal contact. `target` [1/s] and
-    `K_n_min` [N/m] add the lines of these limits.
+    **Arguments:**
+
+    - `scene`: a scene or structure of scalars.
+    - `bounds`: {name: (lower, upper)} in SI units, of which the first two are the axes; by default
+      D and G.
+    - `ax`: axes to draw in, by default those of a new figure.
+    - `target`: growth rate [1/s] of which a line is drawn, by default none.
+    - `K_n_min`: normal stiffness [N/m] of which a line is drawn, by default none.
+    - `friction_slope`: False leaves the slope of friction out of growth rates.
 
     **Raises:** `ValueError` for a quantity that the scene does not have.
     """
@@ -88,7 +95,13 @@ def stability_map(
 
 
 def design(result: Design, ax: Axes | None = None) -> Axes:
-    """The stability map of a design, and the path from the given scene to the designed one."""
+    """The stability map of a design, and the path from the given scene to the designed one.
+
+    **Arguments:**
+
+    - `result`: as `design` returns it.
+    - `ax`: axes to draw in, by default those of a new figure.
+    """
     limits: Any = {key: getattr(result, key) for key in ("target", "K_n_min", "friction_slope")}
     ax = stability_map(result.initial, result.bounds, ax, **limits)
     names = list(result.bounds)[:2]

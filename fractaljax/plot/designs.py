@@ -21,9 +21,15 @@ def design_map(
 ) -> Axes:
     """A designed quantity over one or two quantities that differ between the members of a family.
 
-    **Arguments:** `designs` as `design_many` returns them; `x` and `y`, names of quantities of the
-    mechanisms; `quantity`, a designed one, by default the first. Over two quantities it is a map of
-    a grid of members, or points; over one a line. Members without a design are crosses.
+    Over two quantities it is a map of a grid of members, or points; over one a line. Members
+    without a design are crosses.
+
+    **Arguments:**
+
+    - `designs`: as `design_many` returns them.
+    - `x`, `y`: names of quantities of the mechanisms; by default there is no `y`.
+    - `ax`: axes to draw in, by default those of a new figure.
+    - `quantity`: a designed one, by default the first.
 
     **Raises:** `ValueError` for an unknown name.
     """

@@ -94,22 +94,28 @@ def explore(
 ) -> None:
     """Write a page with a slider for each of `windows`, in one .html file that needs no network.
 
-    `windows` are quantities by name, as the axes of `sweep`, each (low, high), two or more:
-    `D=(2.35, 2.45)`. By default those of D, G, P and mu that the scene has, or K_n, K_t/K_n and mu.
-    The first two span the map of growth rates.
-
     The page shows what `stability` and `stiffness` give at every position of the sliders, to
     rounding: it runs the same program, translated. It also shows the mode in motion, a surface with
-    its D and G, and limit cycles from a small disturbance. These are computed here, where sliding
-    squeals, on a grid of 13 values of the first quantity, 5 of the second and 3 of the others, or
-    as many as `cycles` says by name, and the value of the scene. Where it squeals in between the
-    page shows the nearest and says so. `cycles=False` leaves them out: seconds, not minutes.
+    its D and G, and limit cycles from a small disturbance. Where the mechanism squeals between
+    those that are computed, the page shows the nearest and says so.
+
+    **Arguments:**
+
+    - `scene`: a scene of scalars.
+    - `path`: the .html file.
+    - `cycles`: True, the default, computes limit cycles where sliding squeals, on a grid of 13
+      values of the first quantity, 5 of the second and 3 of the others, and the value of the scene;
+      {name: number of values} chooses the grid; False leaves them out: seconds, not minutes.
+    - `progress`: shows a bar.
+    - `windows`: (low, high) of two or more quantities by name, as the axes of `sweep`:
+      `D=(2.35, 2.45)`. By default those of D, G, P and mu that the scene has, or K_n, K_t/K_n and
+      mu. The first two span the map of growth rates.
 
     **Raises:** `TypeError` for what is not a `Scene`; `ValueError` for a scene that holds arrays,
     one whose program has loops (as of `AsperityContact`, or on a load curve), an unknown quantity,
-    two that are not independent, less than two, a window outside its domain, that is no
-    (low, high) or that leaves out the value of the scene, and a path that does not end in .html;
-    `OSError` if the file cannot be written.
+    two that are not independent, less than two, a window outside its domain, that is no (low, high)
+    or that leaves out the value of the scene, and a path that does not end in .html; `OSError` if
+    the file cannot be written.
     """
     if not os.fspath(path).endswith(".html"):
         raise ValueError(f"path must end in .html, got {os.fspath(path)!r}")

@@ -42,12 +42,17 @@ def cycle_motion(
 ) -> Figure:
     """A limit cycle at one time: the deformed mesh, and what each joint does over the period.
 
-    `structure` is the one of the cycle; for a reduced one, the mesh of the full one is drawn.
-    `points`, `dofs` and `cells` are as in `complex_mode`, by default from the structure's mesh.
-    `at` is the time as a share of the period, from `state` on. Displacements are from the mean over
-    the period, times `scale`, which by default draws the largest as 3 % of the size of the mesh;
-    the colour is the largest displacement of each node over the period. A mark on the mesh is at
+    The colour is the largest displacement of each node over the period. A mark on the mesh is at
     the mean place of the nodes that a joint's directions touch, in the colour of its contact state.
+
+    **Arguments:**
+
+    - `cycle`: as `limit_cycle` returns it.
+    - `structure`: the one of the cycle; for a reduced one, the mesh of the full one is drawn.
+    - `points`, `dofs`, `cells`: as in `complex_mode`, by default from the structure's mesh.
+    - `at`: the time as a share of the period, from `state` on; 0 by default.
+    - `scale`: factor of the displacements from their mean over the period, which by default draws
+      the largest as 3 % of the size of the mesh.
 
     **Raises:** `ValueError` if there is no limit cycle, for a batch, a regularised cycle, the cycle
     of another structure and a mesh that does not fit.
@@ -72,11 +77,18 @@ def animate_cycle(
 ) -> "FuncAnimation":
     """One period of a limit cycle in motion on its mesh, as matplotlib's animation.
 
-    Frame j is the picture of `cycle_motion` at j/frames of the period. `path` ends in .gif for a
-    picture, or in .html for one page with its frames and buttons inside, which needs no network.
-    Other arguments and errors are as for `cycle_motion`.
+    Frame j is the picture of `cycle_motion` at j/frames of the period.
 
-    **Raises:** `ValueError` for another ending; `OSError` if the file cannot be written.
+    **Arguments:**
+
+    - `cycle`, `structure`, `points`, `dofs`, `cells`, `scale`: as in `cycle_motion`.
+    - `frames`: number of pictures in the period, 24 by default.
+    - `fps`: frames per second, 12 by default.
+    - `path`: a file, by default none: it ends in .gif for a picture, or in .html for one page with
+      its frames and buttons inside, which needs no network.
+
+    **Raises:** as `cycle_motion`; `ValueError` for another ending; `OSError` if the file cannot be
+    written.
     """
     frames, fps, path = whole("frames", frames, 2), whole("fps", fps, 1), animation_path(path)
     motion = _motion(cycle, structure, points, dofs, cells, frames)

@@ -33,16 +33,23 @@ def complex_mode(
 ) -> Axes:
     """The displacement Re(shape exp(i phase)) of a mode: a deformed mesh coloured by amplitude.
 
-    `mode` is a shape (n,), or a `Stability` whose shape `index` is taken; for a reduced structure,
-    `reduced.full(modes.shapes[index])`. `points` (nodes, 2) or (nodes, 3) [m] are the places of the
-    nodes, `dofs`, of the same shape, the degree of freedom of each displacement, -1 where it is
-    held, and `cells` (cells, 3) or (cells, 4) the nodes of triangles or quadrilaterals, the outer
-    ones of a solid. For a solid, `ax` has to be 3D. `scale` is the factor of the displacements; by
-    default the largest amplitude is drawn as 3 % of the size of the mesh. The colour is the
-    greatest displacement of each node over a period, divided by the largest of all.
+    The colour is the greatest displacement of each node over a period, divided by the largest of
+    all. Without `points` there is a bar for each degree of freedom, coloured by its phase, within a
+    pale one that shows its amplitude.
 
-    Without `points` there is a bar for each degree of freedom, coloured by its phase, within a pale
-    one that shows its amplitude.
+    **Arguments:**
+
+    - `mode`: a shape (n,), or a `Stability`; for a reduced structure,
+      `reduced.full(modes.shapes[index])`.
+    - `index`: which shape of a `Stability` is drawn, from 0, the default.
+    - `ax`: axes to draw in, by default those of a new figure; for a solid they have to be 3D.
+    - `points`: (nodes, 2) or (nodes, 3), places of the nodes [m]; by default there is no mesh.
+    - `dofs`: of the same shape, the degree of freedom of each displacement, -1 where it is held.
+    - `cells`: (cells, 3) or (cells, 4), the nodes of triangles or quadrilaterals, the outer ones of
+      a solid.
+    - `phase`: [rad], 0 by default.
+    - `scale`: factor of the displacements; by default the largest amplitude is drawn as 3 % of the
+      size of the mesh.
 
     **Raises:** `ValueError` for a batch, an unknown index, and a mesh that does not fit.
     """
@@ -65,11 +72,15 @@ def animate_mode(
 ) -> "FuncAnimation":
     """One period of a mode in motion, Re(shape exp(i omega t)), as matplotlib's animation.
 
-    Frame j has the phase omega t = 2 pi j/frames; growth is left out. Other arguments and errors
-    are as for `complex_mode`. `path` ends in .gif for a picture, or in .html for one page with its
-    frames and buttons inside, which needs no network.
+    Frame j has the phase omega t = 2 pi j/frames; growth is left out.
 
-    **Raises:** `ValueError` for another ending; `OSError` if the file cannot be written.
+    **Arguments:**
+
+    - `mode`, `index`, `points`, `dofs`, `cells`, `scale`: as in `complex_mode`.
+    - `frames`, `fps`, `path`: as in `animate_cycle`.
+
+    **Raises:** as `complex_mode`; `ValueError` for another ending; `OSError` if the file cannot be
+    written.
     """
     frames, fps, path = whole("frames", frames, 2), whole("fps", fps, 1), animation_path(path)
     ax, draw = _picture(mode, index, None, points, dofs, cells, scale)

@@ -13,9 +13,14 @@ from .axes import Axes, Figure, ensure_axes, new_figure
 def topography(
     z: Float[ArrayLike, "n m"], dx: float, ax: Axes | None = None, *, dy: float | None = None
 ) -> Axes:
-    """Heights [um] of a map z (n, m) [m] about their mean; x [um] along its first axis.
+    """Heights [um] of a map about their mean; x [um] along its first axis.
 
-    Points are dx [m] apart, and dy (dx, if not given) along the second axis; NaN is left white.
+    **Arguments:**
+
+    - `z`: heights (n, m) [m]; NaN is left white.
+    - `dx`: distance of points along the first axis [m].
+    - `ax`: axes to draw in, by default those of a new figure.
+    - `dy`: distance of points along the second axis [m], by default dx.
 
     **Raises:** `ValueError` for a z that is no map or holds no height, and unless dx, dy > 0.
     """
@@ -34,7 +39,10 @@ def topography(
 def topographies(design: Design, **options: Any) -> Figure:
     """The given and the designed surface side by side, at one colour scale; returns the figure.
 
-    `options` are those of `Design.topographies`.
+    **Arguments:**
+
+    - `design`: as `design` returns it.
+    - `options`: those of `Design.topographies`.
     """
     return drawn_topographies(design, design.topographies(**options))
 

@@ -14,6 +14,10 @@ def mode_tracks(tracks: ModeTracks) -> Figure:
 
     A mode is drawn thick where it is unstable. If there are more than nine, only modes that are
     unstable somewhere have a colour, and the axes show their range; the others are grey.
+
+    **Arguments:**
+
+    - `tracks`: as `track_modes` returns them.
     """
     x, growth = tracks.values, tracks.growth_rates
     unstable = growth > _ROUNDING * np.abs(tracks.eigenvalues)

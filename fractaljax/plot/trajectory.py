@@ -13,8 +13,13 @@ def trajectory(
 ) -> Axes:
     """A displacement [um] over time [ms], and where it sticks.
 
-    The displacement is that of the degree of freedom `direction`, or t.x of joint number `joint`;
-    both count from 1.
+    **Arguments:**
+
+    - `result`: as `simulate` returns it, without `saveat`.
+    - `ax`: axes to draw in, by default those of a new figure.
+    - `direction`: the degree of freedom, from 1; 1 by default.
+    - `joint`: the number of a joint, from 1, whose displacement t.x is shown instead; by default
+      none.
 
     **Raises:** `ValueError` for an unknown direction or joint, a batch, or a simulation with
     `saveat`.

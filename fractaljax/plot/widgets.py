@@ -30,9 +30,13 @@ _POINTS = 128  # of a side of the surface
 def explore(scene: Scene, **windows: tuple[float, float]) -> Any:
     """Sliders over the quantities of a scene, for a notebook: a widget to end a cell with.
 
-    `windows` are as for `plot.explore`, which writes a page for those without Python. Beside the
-    sliders are the numbers of `stability` and `stiffness`, the map of the first two quantities with
-    the point on it, the surface and the mode. A button finds the limit cycle.
+    Beside the sliders are the numbers of `stability` and `stiffness`, the map of the first two
+    quantities with the point on it, the surface and the mode. A button finds the limit cycle.
+
+    **Arguments:**
+
+    - `scene`: a scene of scalars.
+    - `windows`: as for `plot.explore`, which writes a page for those without Python.
 
     **Raises:** `ImportError` unless ipywidgets is installed; else as `plot.explore`, except that
     any contact law is accepted.

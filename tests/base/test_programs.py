@@ -260,23 +260,3 @@ def test_commands_in_new_processes(tmp_path):
         for file in [x for x in cache.rglob("*") if x.is_file()]:
             file.write_bytes(flipped(file.read_bytes(), 0.5))
         assert output(command) == first
-
-
-def test_each_option_is_tried_by_itself(monkeypatch):
-    """XLA refuses those that it does not know, of which one more or less changes no other."""
-    options = programs.quick_compilation()
-    assert jax.jit(lambda x: x**2, compiler_options=options)(3.0) == 9
-    if jax.default_backend() != "cpu":
-        assert options == {}
-        return
-    assert options.pop("xla_backend_optimization_level") == 1
-    every = programs.quick_compilation.__wrapped__
-    jitted = jax.jit
-
-    def refusing(function, compiler_options):
-        if "xla_backend_optimization_level" in compiler_options:
-            compiler_options = {"xla_no_such_option": True}
-        return jitted(function, compiler_options=compiler_options)
-
-    monkeypatch.setattr(jax, "jit", refusing)
-    assert every() == options
