@@ -6,6 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from .._base.parts import whole
 from .._base.ranges import within
 from .._contact.contact import Regime
 from .._design.design import Design
@@ -17,10 +18,6 @@ from .._sweep.sweep import sweep
 from .axes import Axes, ensure_axes, legend_above, set_quantity_axis
 from .maps import regime_of, shade_regimes, shade_unsteady
 
-_POINTS = 240  # per axis
-_WINDOW = {"D": (2.1, 2.9), "G": (1e-12, 1e-8)}
-_DECADES = 4  # of growth rates, from the largest down
-
 
 def stability_map(
     scene: Scene | Structure,
@@ -30,21 +27,23 @@ def stability_map(
     target: float | None = None,
     K_n_min: float | None = None,
     friction_slope: bool = True,
+    points: int = 240,
 ) -> Axes:
     """Growth rate [1/s] over the first two quantities of `bounds`, by default D and G [m].
 
     It shows the stability boundary and the regimes of a fractal contact. `target` [1/s] and
-    `K_n_min` [N/m] add the lines of these limits.
+    `K_n_min` [N/m] add the lines of these limits. There are `points` values of each quantity.
 
-    **Raises:** `ValueError` for a quantity that the scene does not have.
+    **Raises:** `ValueError` for a quantity that the scene does not have, and unless points >= 2.
     """
     from matplotlib.colors import LogNorm
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     ax, window = ensure_axes(ax), dict(bounds or {})
-    window = window if len(window) > 1 else _WINDOW | window
-    places = np.linspace(0, 1, _POINTS)
+    if len(window) < 2:
+        window = {"D": (2.1, 2.9), "G": (1e-12, 1e-8)} | window  # of most machined surfaces
+    places = np.linspace(0, 1, whole("points", points, 2))
     axes: Any = {name: within(*ends, places) for name, ends in list(window.items())[:2]}
     single = isinstance(scene, Scene)
     fractal = single and scene.contact.fractal
@@ -63,7 +62,7 @@ def stability_map(
     valid = np.ma.masked_where(inelastic | none, growth)
     if valid.count() and valid.max() > 0:
         top = 10 ** np.ceil(np.log10(valid.max()))
-        norm = LogNorm(top / 10**_DECADES, top)
+        norm = LogNorm(top / 1e4, top)  # four decades; less is as pale as stable
         shown = np.ma.masked_where(inelastic | ~(growth > 0), np.clip(growth, norm.vmin, None))
         mesh = ax.pcolormesh(x, y, shown.T, norm=norm, cmap="YlOrBr", shading="nearest")
         mesh.set_rasterized(True)

@@ -20,8 +20,6 @@ from .mesh import draw_mesh, mesh_height, projection, scale_of
 if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
 
-_SAMPLES = 256  # of a period, at least
-_NAMED = 24  # joints with a name at their lane
 _STATES = {  # value in `contact_states`: colour, and words
     1: ("tab:blue", "slips, t.dx/dt < V"),
     -1: ("tab:cyan", "slips, t.dx/dt > V"),
@@ -126,8 +124,8 @@ def _motion(
     elif (mesh := structure.mesh) is None:
         raise ValueError("structure has no mesh: give points, dofs and cells")
     mesh.require(n if reduced is None else len(reduced.V))
-    # The mean and the largest displacements need more times than are shown.
-    count = frames * -(-_SAMPLES // frames)
+    # The mean and the largest displacements need more times than are shown: 256 or a few more.
+    count = frames * -(-256 // frames)
     x = np.asarray(cycle.orbit(count)[1])[:, :n]
     x = x - x.mean(axis=0)
     x = x if reduced is None else x @ reduced.V.T
@@ -220,7 +218,7 @@ def _lanes(ax: Axes, motion: _Motion) -> Any:
         Patch(color=colour, label=words) for s, (colour, words) in _STATES.items() if s in passed
     ]
     legend_above(ax, shown)
-    few = len(motion.names) <= _NAMED
+    few = len(motion.names) <= 24  # more names would overlap
     ax.set_yticks(range(len(motion.names)) if few else [], motion.names if few else [])
     ax.set(xlim=(0, 1), ylim=(len(motion.names) - 0.5, -0.5))
     ax.set_xlabel("share of the period [-]")

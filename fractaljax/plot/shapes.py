@@ -17,8 +17,6 @@ from .mesh import draw_mesh, scale_of
 if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
 
-_NAMED = 24  # degrees of freedom named below their bars
-
 
 def complex_mode(
     mode: Stability | ArrayLike,
@@ -147,7 +145,7 @@ def _bars(shape: Any, names: Any, ax: Axes) -> tuple[Axes, Callable[[complex], A
     bars = ax.bar(x, unit.real, 0.5, color=colours.to_rgba(np.angle(unit, deg=True)))
     ax.axhline(0, color="k", lw=0.8)
     ax.set(ylim=(-1.1, 1.1), xlabel="degree of freedom", ylabel="displacement, of the largest [-]")
-    if len(x) <= _NAMED:
+    if len(x) <= 24:  # more names would overlap
         ax.set_xticks(x, names or [str(i) for i in x], rotation=0 if names is None else 90)
     bar = ax.figure.colorbar(colours, ax=ax, pad=0.02, ticks=range(-180, 181, 90))
     bar.set_label("phase of the shape [°]")

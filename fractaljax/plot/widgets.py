@@ -24,8 +24,6 @@ from .maps import regime_of
 from .shapes import complex_mode
 from .topography import topography as draw_topography
 
-_POINTS = 128  # of a side of the surface
-
 
 def explore(scene: Scene, **windows: tuple[float, float]) -> Any:
     """Sliders over the quantities of a scene, for a notebook: a widget to end a cell with.
@@ -128,9 +126,9 @@ class _Map:
 
 
 def _surface(scene: Scene) -> bytes:
-    L = WAVELENGTHS[0]
-    z = topography(scene.contact.surface, L, _POINTS, key=jax.random.key(0))
-    return _png(draw_topography(z, L / _POINTS, new_figure(5.6, 4.8).add_subplot()).figure)
+    L, n = WAVELENGTHS[0], 128  # points on a side: a surface is drawn in a moment
+    z = topography(scene.contact.surface, L, n, key=jax.random.key(0))
+    return _png(draw_topography(z, L / n, new_figure(5.6, 4.8).add_subplot()).figure)
 
 
 def _mode(scene: Scene) -> bytes:
