@@ -36,7 +36,7 @@ _MATERIAL = fj.Material(_E, _NU, _SIGMA_Y, _H)
 # --- stiffness ----------------------------------------------------------------------------
 
 
-def _as_printed(D, G, P=_P):
+def _printed_stiffness(D, G, P=_P):
     """(K_n, K_t, Q_e) by Eqs. 21, 26, 30, 33 and 36 as they are printed, with SciPy's a_l."""
     log_gamma, k_mu = np.log(_GAMMA), 1 - 0.228 * _MU_M
     a_e = 2 ** ((3 * D - 11) / (2 - D)) * (33 * k_mu * _SIGMA_Y / _E / 40) ** (2 / (2 - D))
@@ -66,7 +66,7 @@ def _as_printed(D, G, P=_P):
     return K_n, K_t * np.cbrt(max(0.0, 1 - Q_e / (_MU_S * P))), Q_e
 
 
-def _ours(D, G):
+def _computed_stiffness(D, G):
     """(K_n, K_t) at surfaces (n,)."""
 
     def one(D, G):
@@ -79,10 +79,10 @@ def _ours(D, G):
 
 def _stiffness() -> CaseResult:
     at = np.array([_D, 2.5, 2.6])
-    K_n, K_t, Q_e = _ours(at, _G)
-    theirs = [_as_printed(D, _G) for D in (_D, 2.5 - 1e-7, 2.6)]
+    K_n, K_t, Q_e = _computed_stiffness(at, _G)
+    theirs = [_printed_stiffness(D, _G) for D in (_D, 2.5 - 1e-7, 2.6)]
     # Eq. 33 has a removable pole at D = 2.5: the mean of both sides is Eq. 34.
-    limit = (theirs[1][2] + _as_printed(2.5 + 1e-7, _G)[2]) / 2
+    limit = (theirs[1][2] + _printed_stiffness(2.5 + 1e-7, _G)[2]) / 2
     lost = "not run: Table 1 (yield strength, friction) is lost. The printed G = 5.1372e-5 m makes "
     lost += "the joint fully plastic whatever it held; G near 5e-10 or 5e-11 m is meant"
     checks = [
@@ -109,8 +109,8 @@ def _stiffness() -> CaseResult:
         ("fractal dimension D [-]", D, (D, _G), {"yscale": "log"}),
         ("fractal roughness G [m]", G, (_D, G), {"yscale": "log", "xscale": "log"}),
     ):
-        printed = np.array([_as_printed(d, g)[:2] for d, g in np.broadcast(*surfaces)])
-        ours = _ours(*surfaces)
+        printed = np.array([_printed_stiffness(d, g)[:2] for d, g in np.broadcast(*surfaces)])
+        ours = _computed_stiffness(*surfaces)
         curves = []
         for k, name in enumerate(("K_n", "K_t")):
             shown = np.where(printed[::4, k] > 0, printed[::4, k], np.nan)
@@ -271,7 +271,7 @@ def _cycles() -> CaseResult:
         curves = []
         for K_n, cycle, other in zip(stiffnesses, cycles, theirs, strict=True):
             orbit, states = other[-1], np.asarray(cycle.orbit(512)[1])
-            thinned = _even(orbit[[i, i + 2]], 36)
+            thinned = _thin(orbit[[i, i + 2]], 36)
             label = f"K_n = {K_n:g} N/m"
             curves.append(Curve(thinned[0] * 1e6, thinned[1], f"Eq. 44 by SciPy, {label}", False))
             curves.append(Curve(states[:, i] * 1e6, states[:, i + 2], f"fractaljax, {label}", True))
@@ -279,7 +279,7 @@ def _cycles() -> CaseResult:
     return CaseResult(checks, panels)
 
 
-def _even(orbit, count):
+def _thin(orbit, count):
     """`count` points of a closed curve (2, n), evenly along it."""
     scaled = orbit / np.ptp(orbit, axis=1, keepdims=True)
     along = np.append(0, np.cumsum(np.hypot(*np.diff(scaled))))

@@ -16,7 +16,7 @@ from .._mechanism.structure import Structure
 from .._stability.stability import growth_rate
 from .._sweep.sweep import sweep
 from .axes import Axes, ensure_axes, legend_above, set_quantity_axis
-from .maps import regime_of, shade_regimes, shade_unsteady
+from .maps import contact_regime, shade_regimes, shade_unsteady
 
 
 def stability_map(
@@ -50,7 +50,7 @@ def stability_map(
 
     def measure(scene):
         K_n = stiffness(scene)[0] if single else jnp.nan
-        return growth_rate(scene, friction_slope), K_n, regime_of(scene) if fractal else None
+        return growth_rate(scene, friction_slope), K_n, contact_regime(scene) if fractal else None
 
     growth, K_n, regime = sweep(measure, scene, progress=False, **axes).values
     x, y = axes.values()

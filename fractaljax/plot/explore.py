@@ -48,7 +48,7 @@ from .._surface.surface import frequency_count
 from .._surface.topography import random_phases
 from .._version import __version__
 from .javascript import javascript
-from .maps import regime_of
+from .maps import contact_regime
 
 WAVELENGTHS = 1e-3, 1e-6  # [m], of Sq; the surface is drawn over the longest
 _SHADES = ["growth_rate", "plastic", "slip"]  # what the map shows, in the order of the leaves
@@ -115,7 +115,7 @@ def page(
     progress: bool = True,
 ) -> str:
     """The text of the page that `explore` writes."""
-    axes, scene = explored(scene, windows, cycles)
+    axes, scene = slider_axes(scene, windows, cycles)
     names = [axis.name for axis in axes]
 
     def numbers(*q):
@@ -158,7 +158,7 @@ def page(
     return re.sub(r"@(\w+)@", lambda placeholder: text[placeholder[1]], template)
 
 
-def explored(
+def slider_axes(
     scene: Scene, windows: Mapping[str, Any], cycles: bool | Mapping[str, int] = False
 ) -> tuple[list[Axis], Any]:
     """The axes of `windows`, and the scene with a number for each quantity among them.
@@ -204,7 +204,7 @@ def point(scene: Scene) -> dict[str, Any]:
         "slip": False,
     }
     if scene.contact.fractal:
-        regime = regime_of(scene)
+        regime = contact_regime(scene)
         numbers["plastic"] = regime == Regime.fully_plastic
         numbers["slip"] = regime == Regime.gross_slip
     if scene.contact.has_surface:

@@ -10,7 +10,7 @@ from .._mechanism.mesh import Mesh
 from .axes import new_figure
 
 
-def scale_of(mesh: Mesh, largest: float) -> float:
+def mesh_scale(mesh: Mesh, largest: float) -> float:
     """The factor that draws the largest displacement as 3 % of the size of the mesh."""
     return 0.03 * float(np.linalg.norm(np.ptp(mesh.points, axis=0))) / largest
 

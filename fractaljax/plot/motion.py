@@ -15,7 +15,7 @@ from .._mechanism.reduced import ReducedStructure
 from .._mechanism.structure import Structure
 from .animation import animated, animation_path
 from .axes import Axes, Figure, frequency_unit, legend_above, new_figure
-from .mesh import draw_mesh, mesh_height, projection, scale_of
+from .mesh import draw_mesh, mesh_height, mesh_scale, projection
 
 if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
@@ -173,7 +173,7 @@ def _picture(motion: _Motion, scale: float | None) -> tuple[Figure, Callable[[fl
     mesh, count = motion.mesh, len(motion.names)
     amplitudes = np.linalg.norm(motion.displacements, axis=2).max(axis=0)
     largest = float(amplitudes.max()) or 1.0
-    factor = scale_of(mesh, largest) if scale is None else float(scalar("scale", scale, above=0))
+    factor = mesh_scale(mesh, largest) if scale is None else float(scalar("scale", scale, above=0))
     heights = mesh_height(mesh), 1.1 + min(0.26 * count, 4.0)
     figure = new_figure(8.4, sum(heights))
     grid = figure.add_gridspec(2, 1, height_ratios=heights)

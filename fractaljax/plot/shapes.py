@@ -12,7 +12,7 @@ from .._mechanism.mesh import Mesh
 from .._stability.stability import Stability
 from .animation import animated, animation_path
 from .axes import Axes, ensure_axes, frequency_unit
-from .mesh import draw_mesh, scale_of
+from .mesh import draw_mesh, mesh_scale
 
 if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
@@ -87,7 +87,7 @@ def _picture(
     mode: Any, index: int, ax: Any, points: Any, dofs: Any, cells: Any, scale: float | None
 ) -> tuple[Any, Callable[[float], Any]]:
     """The axes, and a function that draws a phase on them."""
-    shape, words, names = _shape_of(mode, index)
+    shape, words, names = _read_shape(mode, index)
     if points is None:
         ax, move = _bars(shape, names, ensure_axes(ax))
     else:
@@ -104,7 +104,7 @@ def _picture(
     return ax, draw
 
 
-def _shape_of(mode: Any, index: int) -> tuple[np.ndarray, list[str], Any]:
+def _read_shape(mode: Any, index: int) -> tuple[np.ndarray, list[str], Any]:
     """A shape (n,), the numbers of its mode, and the names of its degrees of freedom."""
     if not isinstance(mode, Stability):
         shape = np.asarray(mode)
@@ -127,7 +127,7 @@ def _deformed(
     motion = mesh.displacements(shape)
     amplitudes = _amplitudes(motion)
     largest = float(amplitudes.max()) or 1.0
-    factor = scale_of(mesh, largest) if scale is None else scale
+    factor = mesh_scale(mesh, largest) if scale is None else scale
     ax, drawn, move = draw_mesh(mesh, ax, factor * largest, amplitudes / largest, 1.0)
     bar = ax.figure.colorbar(drawn, ax=ax, location="bottom", shrink=0.6, aspect=40)
     bar.set_label("amplitude, of the largest [-]")

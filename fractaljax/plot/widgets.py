@@ -19,8 +19,8 @@ from .._surface.topography import topography
 from .axes import new_figure
 from .cycle import cycle as draw_cycle
 from .design import stability_map
-from .explore import WAVELENGTHS, Axis, explored
-from .maps import regime_of
+from .explore import WAVELENGTHS, Axis, slider_axes
+from .maps import contact_regime
 from .shapes import complex_mode
 from .topography import topography as draw_topography
 
@@ -39,7 +39,7 @@ def explore(scene: Scene, **windows: tuple[float, float]) -> Any:
         import ipywidgets
     except ImportError:
         raise ImportError("explore needs ipywidgets: python -m pip install ipywidgets") from None
-    axes, scene = explored(scene, windows)
+    axes, scene = slider_axes(scene, windows)
     sliders = {axis.name: _slider(ipywidgets, axis) for axis in axes}
     numbers, words = ipywidgets.HTML(), ipywidgets.HTML()
     pictures = {name: ipywidgets.Image(format="png") for name in ("map", "surface", "mode")}
@@ -100,7 +100,7 @@ def _table(scene: Scene) -> str:
     if scene.contact.has_surface:
         rows["Sq"] = f"{roughness(scene.contact.surface, *WAVELENGTHS).Sq:.5g} m"
     if scene.contact.fractal:
-        rows["regime"] = Regime[regime_of(scene)]
+        rows["regime"] = Regime[contact_regime(scene)]
     cells = (f"<tr><td>{name}</td><td>{html.escape(text)}</td></tr>" for name, text in rows.items())
     return f"<table>{''.join(cells)}</table>"
 

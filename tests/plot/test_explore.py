@@ -14,7 +14,7 @@ from scipy.special import erf
 import fractaljax as fj
 from browser import chromium, complaints
 from fractaljax._mechanism.quantities import replaced, substituted, with_optional
-from fractaljax.plot.explore import explored, page, point, points_at, surface_waves
+from fractaljax.plot.explore import page, point, points_at, slider_axes, surface_waves
 from fractaljax.plot.javascript import javascript
 from tools import refused_command, run_command as run
 
@@ -158,7 +158,7 @@ def test_command_refuses_in_one_line(over, said, capsys, tmp_path):
 
 def test_stops_hold_the_nodes_and_the_scene():
     """Every `refine`-th stop is a node; the value of the scene is one, to the last bit."""
-    axes, _ = explored(SCENE, dict(D=(2.31, 2.42), G=(1e-10, 1e-9)), dict(G=4))
+    axes, _ = slider_axes(SCENE, dict(D=(2.31, 2.42), G=(1e-10, 1e-9)), dict(G=4))
     for axis, nominal in zip(axes, (2.4, 1.342e-10), strict=True):
         stops = axis.stops
         assert (np.diff(stops) > 0).all() and len(stops) > 100
