@@ -158,7 +158,7 @@ def compare_laws(
                     pressed = boundary_element(heights, L / n, material, P)
                     samples.append((pressed.K_n * cells, pressed.area * cells))
                     bar.update()
-        curves[BOUNDARY_ELEMENTS] = _over_seeds(np.reshape(samples, (seeds, -1, 2)), loads)
+        curves[BOUNDARY_ELEMENTS] = _average_seeds(np.reshape(samples, (seeds, -1, 2)), loads)
     return LawComparison(surface, material, loads, area, L, L_s, curves)
 
 
@@ -182,7 +182,7 @@ def _curve(law: Contact, loads, mu_s, mu_m) -> LawCurve:
     return jax.vmap(one)(loads)
 
 
-def _over_seeds(samples, loads) -> LawCurve:
+def _average_seeds(samples, loads) -> LawCurve:
     """The curve of boundary elements from K_n and real area (seeds, k, 2)."""
     stiff = np.isfinite(samples[..., 0]).all(0)  # not in full contact
     log_K_n = np.log(np.where(stiff, samples[..., 0], np.nan))

@@ -80,7 +80,7 @@ class Contact(Part):
             return True
         both = jnp.ones(2)
         try:  # raises if the result follows a batch of friction
-            alone = jax.vmap(lambda *friction: _of_each(self, *friction), out_axes=None)
+            alone = jax.vmap(lambda *friction: _map_stiffness(self, *friction), out_axes=None)
             jax.eval_shape(alone, both, both)
         except (ValueError, TypeError):
             return True
@@ -152,7 +152,7 @@ def refused_stiffness(law: Contact, mu_s: ArrayLike, mu_m: ArrayLike) -> Array |
 
     **Raises:** `TypeError` and `ValueError` as `Contact`.
     """
-    pair = _of_each(law, mu_s, mu_m)
+    pair = _map_stiffness(law, mu_s, mu_m)
     if not (isinstance(pair, (tuple, list)) and len(pair) == 2):
         raise TypeError(
             f"stiffness of {type(law).__name__} must give (K_n, K_t), got {brief(pair)}"
@@ -163,8 +163,8 @@ def refused_stiffness(law: Contact, mu_s: ArrayLike, mu_m: ArrayLike) -> Array |
     return bad if concrete(bad) is None else None
 
 
-def _of_each(law: Contact, mu_s: ArrayLike, mu_m: ArrayLike) -> Any:
-    """The `stiffness` of every member of a batch, one by one."""
+def _map_stiffness(law: Contact, mu_s: ArrayLike, mu_m: ArrayLike) -> Any:
+    """The `stiffness` of every member of a batch."""
     arrays, rest = eqx.partition(law, eqx.is_array)
     leaves, tree = jax.tree.flatten(arrays)
 

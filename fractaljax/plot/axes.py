@@ -58,7 +58,7 @@ def lines(ax: Axes, x: np.ndarray, rows: Iterable[np.ndarray], names: Sequence[s
     return handles
 
 
-def value_of(x: Any, name: str, value: float) -> str:
+def format_value(x: Any, name: str, value: float) -> str:
     """A quantity with its value, as a legend shows it: G = 1e-10 m."""
     return f"{name} = {value:.3g} {unit(x, name)}".removesuffix(" -")
 

@@ -15,7 +15,6 @@ _MARKERS = {
     "Neimark-Sacker": "v",
     "order of switches": "x",
 }
-_UNITS = (1e6, "µm"), (1e3, "mm"), (1.0, "m")  # the first in which all values are below 1000
 
 
 def branch(
@@ -39,7 +38,8 @@ def branch(
         raise ValueError(f"direction must be from 1 to {n}, got {direction}")
     ax = ensure_axes(ax)
     x, y = result.parameter, result.amplitude[:, direction - 1]
-    factor, unit = next(row for row in _UNITS if y.max() * row[0] < 1e3 or row[1] == "m")
+    units = (1e6, "µm"), (1e3, "mm"), (1.0, "m")
+    factor, unit = next(row for row in units if y.max() * row[0] < 1e3 or row[1] == "m")
     y = y * factor
     handles: list[Any] = []
     # A point where stability changes belongs to both parts.

@@ -10,11 +10,11 @@ from .axes import (
     Axes,
     Figure,
     ensure_axes,
+    format_value,
     legend_above,
     lines,
     new_figure,
     set_quantity_axis,
-    value_of,
 )
 
 _STIFFNESS = {"K_n": "normal stiffness K_n", "K_t": "tangential stiffness K_t"}
@@ -102,7 +102,7 @@ def stiffness(result: Sweep) -> Figure:
 def _draw(result, values, ax):
     """Draw values (n,) or (n, m) over the first quantity; the lines."""
     x, *others = result.points
-    names = [value_of(result.scene, result.names[1], y) for y in others[0]] if others else [""]
+    names = [format_value(result.scene, result.names[1], y) for y in others[0]] if others else [""]
     set_quantity_axis(ax, "x", result.scene, result.names[0], x)
     return lines(ax, x, values.reshape(x.size, -1).T, names)
 

@@ -8,8 +8,6 @@ from .._design.many import DesignMany
 from .._mechanism.quantities import label, require_quantity, stored_quantities
 from .axes import Axes, ensure_axes, legend_above
 
-_DIMENSIONS = 2  # of a grid that is drawn as a map
-
 
 def design_map(
     designs: DesignMany,
@@ -54,7 +52,7 @@ def design_map(
         how: dict[str, Any] = {"cmap": "viridis"}
         if scale:
             how["norm"] = "log"
-        if values.ndim == _DIMENSIONS and min(values.shape) > 1:
+        if values.ndim == 2 and min(values.shape) > 1:
             drawn = ax.pcolormesh(*axes, values, shading="nearest", **how)
             drawn.set_rasterized(True)
         else:

@@ -154,7 +154,7 @@ def _shade(ax, x, y, inside, words: str, grey: str, hatch: str) -> list[Artist]:
     return [Patch(facecolor=grey, hatch=hatch, edgecolor="0.3", label=words)]
 
 
-def regime_of(scene: Scene) -> Regime:
+def contact_regime(scene: Scene) -> Regime:
     """The regime of a fractal contact."""
     return scene.contact.state(scene.friction.mu_s, scene.friction.mu_m).regime
 
@@ -174,7 +174,7 @@ def _start(result, ax):
     if not (isinstance(result.scene, Scene) and result.scene.contact.fractal):
         return ax, growth, shade_unsteady(ax, x, y, none)
     axes: Any = result.axes
-    regime = sweep(regime_of, result.scene, progress=False, **axes).values
+    regime = sweep(contact_regime, result.scene, progress=False, **axes).values
     inelastic = np.asarray(regime != Regime.elastic_plastic)
     if not inelastic.all():
         growth = np.ma.masked_where(inelastic, growth)

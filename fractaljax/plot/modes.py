@@ -11,11 +11,11 @@ from .axes import (
     Axes,
     Figure,
     ensure_axes,
+    format_value,
     legend_above,
     lines,
     new_figure,
     set_quantity_axis,
-    value_of,
 )
 from .maps import frequency_map, growth_map, vibration_modes
 
@@ -49,7 +49,7 @@ def mode_lines(
     rows = [int(np.abs(x - value).argmin()) for value in at]
     if quantity == "real":
         ax.axhline(0, color="k", lw=0.8)
-    names = [value_of(result.scene, result.names[0], x[i]) for i in rows]
+    names = [format_value(result.scene, result.names[0], x[i]) for i in rows]
     handles = lines(ax, y, layers[rows], names)
     set_quantity_axis(ax, "x", result.scene, result.names[1], y)
     ax.set_ylabel(f"{_LABELS[quantity]} of all modes")

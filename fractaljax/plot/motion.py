@@ -15,13 +15,11 @@ from .._mechanism.reduced import ReducedStructure
 from .._mechanism.structure import Structure
 from .animation import animated, animation_path
 from .axes import Axes, Figure, frequency_unit, legend_above, new_figure
-from .mesh import draw_mesh, mesh_height, projection, scale_of
+from .mesh import draw_mesh, mesh_height, mesh_scale, projection
 
 if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
 
-_SAMPLES = 256  # of a period, at least
-_NAMED = 24  # joints with a name at their lane
 _STATES = {  # value in `contact_states`: colour, and words
     1: ("tab:blue", "slips, t.dx/dt < V"),
     -1: ("tab:cyan", "slips, t.dx/dt > V"),
@@ -138,8 +136,8 @@ def _motion(
     elif (mesh := structure.mesh) is None:
         raise ValueError("structure has no mesh: give points, dofs and cells")
     mesh.require(n if reduced is None else len(reduced.V))
-    # The mean and the largest displacements need more times than are shown.
-    count = frames * -(-_SAMPLES // frames)
+    # The mean and the largest displacements need more times than are shown: 256 or a few more.
+    count = frames * -(-256 // frames)
     x = np.asarray(cycle.orbit(count)[1])[:, :n]
     x = x - x.mean(axis=0)
     x = x if reduced is None else x @ reduced.V.T
@@ -187,7 +185,7 @@ def _picture(motion: _Motion, scale: float | None) -> tuple[Figure, Callable[[fl
     mesh, count = motion.mesh, len(motion.names)
     amplitudes = np.linalg.norm(motion.displacements, axis=2).max(axis=0)
     largest = float(amplitudes.max()) or 1.0
-    factor = scale_of(mesh, largest) if scale is None else float(scalar("scale", scale, above=0))
+    factor = mesh_scale(mesh, largest) if scale is None else float(scalar("scale", scale, above=0))
     heights = mesh_height(mesh), 1.1 + min(0.26 * count, 4.0)
     figure = new_figure(8.4, sum(heights))
     grid = figure.add_gridspec(2, 1, height_ratios=heights)
@@ -232,7 +230,7 @@ def _lanes(ax: Axes, motion: _Motion) -> Any:
         Patch(color=colour, label=words) for s, (colour, words) in _STATES.items() if s in passed
     ]
     legend_above(ax, shown)
-    few = len(motion.names) <= _NAMED
+    few = len(motion.names) <= 24  # more names would overlap
     ax.set_yticks(range(len(motion.names)) if few else [], motion.names if few else [])
     ax.set(xlim=(0, 1), ylim=(len(motion.names) - 0.5, -0.5))
     ax.set_xlabel("share of the period [-]")

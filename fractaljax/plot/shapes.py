@@ -12,12 +12,10 @@ from .._mechanism.mesh import Mesh
 from .._stability.stability import Stability
 from .animation import animated, animation_path
 from .axes import Axes, ensure_axes, frequency_unit
-from .mesh import draw_mesh, scale_of
+from .mesh import draw_mesh, mesh_scale
 
 if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
-
-_NAMED = 24  # degrees of freedom named below their bars
 
 
 def complex_mode(
@@ -100,7 +98,7 @@ def _picture(
     mode: Any, index: int, ax: Any, points: Any, dofs: Any, cells: Any, scale: float | None
 ) -> tuple[Any, Callable[[float], Any]]:
     """The axes, and a function that draws a phase on them."""
-    shape, words, names = _shape_of(mode, index)
+    shape, words, names = _read_shape(mode, index)
     if points is None:
         ax, move = _bars(shape, names, ensure_axes(ax))
     else:
@@ -117,7 +115,7 @@ def _picture(
     return ax, draw
 
 
-def _shape_of(mode: Any, index: int) -> tuple[np.ndarray, list[str], Any]:
+def _read_shape(mode: Any, index: int) -> tuple[np.ndarray, list[str], Any]:
     """A shape (n,), the numbers of its mode, and the names of its degrees of freedom."""
     if not isinstance(mode, Stability):
         shape = np.asarray(mode)
@@ -140,7 +138,7 @@ def _deformed(
     motion = mesh.displacements(shape)
     amplitudes = _amplitudes(motion)
     largest = float(amplitudes.max()) or 1.0
-    factor = scale_of(mesh, largest) if scale is None else scale
+    factor = mesh_scale(mesh, largest) if scale is None else scale
     ax, drawn, move = draw_mesh(mesh, ax, factor * largest, amplitudes / largest, 1.0)
     bar = ax.figure.colorbar(drawn, ax=ax, location="bottom", shrink=0.6, aspect=40)
     bar.set_label("amplitude, of the largest [-]")
@@ -158,7 +156,7 @@ def _bars(shape: Any, names: Any, ax: Axes) -> tuple[Axes, Callable[[complex], A
     bars = ax.bar(x, unit.real, 0.5, color=colours.to_rgba(np.angle(unit, deg=True)))
     ax.axhline(0, color="k", lw=0.8)
     ax.set(ylim=(-1.1, 1.1), xlabel="degree of freedom", ylabel="displacement, of the largest [-]")
-    if len(x) <= _NAMED:
+    if len(x) <= 24:  # more names would overlap
         ax.set_xticks(x, names or [str(i) for i in x], rotation=0 if names is None else 90)
     bar = ax.figure.colorbar(colours, ax=ax, pad=0.02, ticks=range(-180, 181, 90))
     bar.set_label("phase of the shape [°]")

@@ -30,7 +30,7 @@ def topography(
     steps = dx, dx if dy is None else dy
     if not all(np.isfinite(step) and step > 0 for step in steps):
         raise ValueError(f"dx and dy must be above 0, got {steps[0]!r} and {steps[1]!r}")
-    ax, heights = ensure_axes(ax), _about_mean(z)
+    ax, heights = ensure_axes(ax), _subtract_mean(z)
     image = _draw(ax, heights, steps, np.nanmin(heights), np.nanmax(heights))
     ax.figure.colorbar(image, ax=ax, pad=0.02).set_label("height about the mean [µm]")
     return ax
@@ -49,7 +49,7 @@ def topographies(design: Design, **options: Any) -> Figure:
 
 def drawn_topographies(design: Design, surfaces: Topographies) -> Figure:
     """As `topographies`, of surfaces that are computed already."""
-    heights = [_about_mean(z) for z in (surfaces.before, surfaces.after)]
+    heights = [_subtract_mean(z) for z in (surfaces.before, surfaces.after)]
     low, high = min(z.min() for z in heights), max(z.max() for z in heights)
     figure = new_figure(11.2, 5.4)
     figure.set_layout_engine("constrained", wspace=0.06)
@@ -65,7 +65,7 @@ def drawn_topographies(design: Design, surfaces: Topographies) -> Figure:
     return figure
 
 
-def _about_mean(z):
+def _subtract_mean(z):
     return (z - np.nanmean(z)) * 1e6
 
 

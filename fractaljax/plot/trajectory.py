@@ -2,14 +2,18 @@
 
 import numpy as np
 
+from .._base.parts import whole
 from .._dynamics.simulate import Trajectory
 from .axes import Axes, coordinate, ensure_axes, legend_above
 
-_SAMPLES = 6000
-
 
 def trajectory(
-    result: Trajectory, ax: Axes | None = None, *, direction: int = 1, joint: int | None = None
+    result: Trajectory,
+    ax: Axes | None = None,
+    *,
+    direction: int = 1,
+    joint: int | None = None,
+    samples: int = 6000,
 ) -> Axes:
     """A displacement [um] over time [ms], and where it sticks.
 
@@ -20,13 +24,16 @@ def trajectory(
     - `direction`: the degree of freedom, from 1; 1 by default.
     - `joint`: the number of a joint, from 1, whose displacement t.x is shown instead; by default
       none.
+    - `samples`: evenly spaced times at which it is drawn beside the steps of the simulation, 6000
+      by default.
 
     **Raises:** `ValueError` for an unknown direction or joint, a batch, or a simulation with
-    `saveat`.
+    `saveat`, and unless samples >= 2.
     """
     shown = coordinate(result._continuous(), direction, joint, result.times, batch=1)
     ax, times = ensure_axes(ax), np.asarray(result.times)
-    t = np.sort(np.concatenate([np.linspace(times[0], times[-1], _SAMPLES), times]))
+    even = np.linspace(times[0], times[-1], whole("samples", samples, 2))
+    t = np.sort(np.concatenate([even, times]))
     x = np.asarray(result.at(t))[:, : len(shown.row)] @ shown.row * 1e6
     step = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 1)
     sticks = np.zeros(len(t), bool)
