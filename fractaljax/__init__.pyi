@@ -47,6 +47,7 @@ from ._design.verdict import (
 )
 from ._dynamics.attractors import attractors as attractors
 from ._dynamics.basin import Basin as Basin, basin as basin
+from ._dynamics.basin_search import BasinSearch as BasinSearch
 from ._dynamics.bifurcation import (
     BifurcationMap as BifurcationMap,
     bifurcation_map as bifurcation_map,
