@@ -191,7 +191,7 @@ def _advance(search: BasinSearch, system: HybridSystem, modes: _Modes, lanes: _L
 
     def some(_, carry):
         carry, energy = carry
-        carry = jax.lax.fori_loop(0, search.steps // search.samples, one, carry)
+        carry = jax.lax.fori_loop(0, search.sample_steps, one, carry)
         return carry, energy + jnp.abs(modes.amplitudes(carry[0])) ** 2
 
     names = "y", "s", "guard", "section_state", "returns"
@@ -219,7 +219,7 @@ def _decay(search: BasinSearch, modes: _Modes, lanes: _Lanes):
     way, share = jnp.max(jnp.sum(ways, axis=1), axis=0), jnp.max(ways, axis=0)
     small = share < 0.02 * way[None]
     step = _step_length(search, lanes.rounds - 1, lanes.y.dtype)
-    window = search.window * search.steps * step
+    window = samples * search.sample_steps * step
     linear = modes.values.real[:, None] * window[None]
     steady = jnp.abs(rate - before) < 0.2 * jnp.abs(rate)
     # No switch is reached any more, and every mode decays about as fast as in small motions.

@@ -12,18 +12,18 @@ class BasinSearch:
 
     **Fields:**
 
-    - `lanes`: starts that run side by side in one program; an eighth of it where few are left.
-    - `chunks`: programs that run at a time, which the cores share. The result depends on it, but
-      not on the number of cores.
-    - `step`, `fine_rounds`: step of the coarse run, and the rounds in which it is half of that, for
-      a start may be near the boundary of two basins.
-    - `steps`, `samples`: steps in a round, and samples of the energy among them.
-    - `rounds`: rounds after which the starts that are labelled make room for others, at the latest.
+    - `lanes`: starts that run side by side in one program; an eighth as many once few are left.
+    - `chunks`: programs that run at a time, shared by the cores. A fixed number, so that no result
+      depends on the number of cores.
+    - `step`, `fine_rounds`: step of the coarse run, and the number of first rounds in which it is
+      halved, for a start may be near the boundary of two basins.
+    - `samples`, `sample_steps`: samples of the energy in a round, and steps for each of them.
+    - `rounds`: rounds after which, at the latest, labelled starts make room for others.
     - `window`: rounds over which the energy of a motion without switches is averaged.
-    - `near_distance`, `near_rounds`: distance from a cycle within which a start is labelled after
-      so many rounds of approach.
-    - `approach_distance`, `approach_rounds`: the same for a larger distance; also the number of
-      rounds within `near_distance` that label a start without an approach.
+    - `near_distance`, `near_rounds`: a start this near a cycle gets its label after so many rounds
+      of approach.
+    - `approach_distance`, `approach_rounds`: the same at a larger distance. As many rounds within
+      `near_distance` are enough without approach.
     - `patience`: rounds without a label after which a start is searched in full.
     - `failures`: full searches without an orbit, after which the coarse run alone decides.
     """
@@ -32,8 +32,8 @@ class BasinSearch:
     chunks: int = 4
     step: float = 0.2
     fine_rounds: int = 64
-    steps: int = 128
     samples: int = 32
+    sample_steps: int = 4
     rounds: int = 16
     window: int = 4
     near_distance: float = 0.02
