@@ -93,9 +93,8 @@ def bifurcation_map(
     for name, window in windows.items():
         followed: list[Branch] = []
         for start in (*basins.cycles, "hopf"):
-            if start != "hopf" and any(
-                _passes_cycle(mechanism, branch, start) for branch in followed
-            ):
+            on_branch = (_passes_cycle(mechanism, branch, start) for branch in followed)
+            if start != "hopf" and any(on_branch):
                 continue
             try:
                 branch = continue_cycle(mechanism, name, window, start, **options)
@@ -108,9 +107,8 @@ def bifurcation_map(
         other = y if name == x[0] else x
         for event in tqdm(events, desc=f"events in {name}", disable=not progress):
             at = {name: float(event.value), other[0]: float(value_of(mechanism, other[0]))}
-            if any(
-                _passes_point(curve, at, (x, y)) for curve in curves if curve.kind == event.kind
-            ):
+            alike = [curve for curve in curves if curve.kind == event.kind]
+            if any(_passes_point(curve, at, (x, y)) for curve in alike):
                 continue
             try:
                 curve = continue_event(mechanism, event, other[0], other[1:], **options)

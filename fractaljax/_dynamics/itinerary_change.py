@@ -34,9 +34,8 @@ class ItineraryChange:
     def onward(self):
         """Where the branch goes on from here; None if nowhere."""
         p = self.vanishing
-        candidates = itertools.chain(
-            () if p is None else self._pass_vanishing_phase(p), self._pass_touching_guard()
-        )
+        vanishing = () if p is None else self._pass_vanishing_phase(p)
+        candidates = itertools.chain(vanishing, self._pass_touching_guard())
         return next((candidate for candidate in candidates if candidate is not None), None)
 
     def note_grazing(self) -> None:
