@@ -47,6 +47,7 @@ from ._design.verdict import (
 )
 from ._dynamics.attractors import attractors as attractors
 from ._dynamics.basin import Basin as Basin, basin as basin
+from ._dynamics.basin_search import BasinSearch as BasinSearch
 from ._dynamics.bifurcation import (
     BifurcationMap as BifurcationMap,
     bifurcation_map as bifurcation_map,
@@ -101,6 +102,7 @@ from ._stability.critical_friction import critical_friction as critical_friction
 from ._stability.linearise import assemble as assemble
 from ._stability.margin import margin as margin
 from ._stability.reduction import reduce as reduce, reduction_errors as reduction_errors
+from ._stability.reduction_search import ReductionSearch as ReductionSearch
 from ._stability.shares import EnergyShares as EnergyShares, energy_shares as energy_shares
 from ._stability.stability import (
     Stability as Stability,

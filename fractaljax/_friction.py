@@ -16,9 +16,8 @@ from ._base.singular import safe_divide
 
 LAWS: dict[str, type["Friction"]] = {}  # by their names in files
 
-_FASTEST = 100.0  # m/s: the least value of a law is sought up to this speed
-SPEEDS = np.concatenate([[0.0], np.geomspace(1e-6, _FASTEST, 161)])  # [m/s]
-_BISECTIONS = 60
+# Speeds [m/s] among which the least value of a law is sought.
+SPEEDS = np.concatenate([[0.0], np.geomspace(1e-6, 100.0, 161)])
 
 
 class _FromLaw:
@@ -66,7 +65,7 @@ class Friction(Part):
     amplitudes: ClassVar[tuple[str, ...]] = ()
 
     mu_s = _FromLaw(lambda law: law.mu(jnp.zeros((), _dtype(law))))
-    mu_m = _FromLaw(lambda law: _least(law))
+    mu_m = _FromLaw(lambda law: _least_coefficient(law))
 
     def __init_subclass__(cls, law: str | None = None, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -130,7 +129,7 @@ def _dtype(law: Friction) -> Any:
     return jnp.result_type(float, *jax.tree.leaves(law))
 
 
-def _least(law: Friction) -> Numbers:
+def _least_coefficient(law: Friction) -> Numbers:
     """The least value of mu up to 100 m/s, at least 0; differentiable with its place."""
     fixed = jax.tree.map(jax.lax.stop_gradient, law)
     speeds = jnp.asarray(SPEEDS, _dtype(law))
@@ -143,7 +142,7 @@ def _least(law: Friction) -> Numbers:
         falls = fixed.slope(middle) < 0
         return jnp.where(falls, middle, low), jnp.where(falls, high, middle)
 
-    _, at = jax.lax.fori_loop(0, _BISECTIONS, bisect, ends)
+    _, at = jax.lax.fori_loop(0, 60, bisect, ends)  # more halvings than a double has bits
     # The place of a minimum moves with the law: a Newton step of 0 length has that derivative.
     slope, bend = jax.jvp(law.slope, (at,), (jnp.ones_like(at),))
     step = safe_divide(slope, bend, jnp.zeros_like(bend))

@@ -103,8 +103,8 @@ def boundary_element(
     **Returns:** a `BoundaryElement`.
 
     **Raises:** `ValueError` unless heights are (nx, ny) and finite, dx > 0, P > 0, 0 < rtol < 1 and
-    max_steps >= 1; `RuntimeError` if `throw` and the solution has not converged. Under a trace (`jit`, `vmap`)
-    everything is NaN instead.
+    max_steps >= 1; `RuntimeError` if `throw` and the solution has not converged. Under a trace
+    (`jit`, `vmap`) everything is NaN instead.
     """
     heights = number("heights", heights)
     if heights.ndim != 2 or min(heights.shape) < 2:

@@ -33,10 +33,6 @@ from .critical_pair import critical_pair, least_test
 from .linearise import assembled, linearised
 from .quadratic import solve
 
-_FACTORS = 512  # of the friction law, among which the first root is bracketed
-_AT_ONCE = 8  # factors evaluated together, and points that divide the bracket further
-_REFINED = 12  # times, to 9^-12 of it
-
 
 def critical_coupling(lin: Linearised) -> Float[Array, ""]:
     """g_c [1/s^4], the coupling at which a pair of eigenvalues is imaginary.
@@ -110,7 +106,7 @@ def critical_friction(
         return jnp.where(factor == jnp.inf, jnp.inf, coefficient * _finite(factor))
     if joint is not None:
         raise ValueError(f"joint names one of a structure, got {brief(joint)} for a scene")
-    return _of_scene(scene, sloping)
+    return _critical_friction_of_scene(scene, sloping)
 
 
 def _finite(factor):
@@ -148,7 +144,7 @@ def _factor_of_structure(structure, friction_slope):
 
 
 @functools.partial(exported_jit, static_argnames="friction_slope")
-def _of_scene(scene: Scene, friction_slope: bool) -> Float[Array, ""]:
+def _critical_friction_of_scene(scene: Scene, friction_slope: bool) -> Float[Array, ""]:
     sloping = friction_slope and scene.friction.velocity_dependent
     if scene.contact.depends_on_friction or sloping or scene.follows_load_curve:
         factor, _ = _first_factor(scene, friction_slope)
@@ -209,9 +205,9 @@ def _signs(x, factors, friction_slope, rigid):
 
 
 def _lattice(x):
-    """The factors (_FACTORS,) among which the first root is bracketed."""
+    """The factors (512,) among which the first root is bracketed."""
     dtype = jax.tree.leaves(x)[0].dtype
-    share = (jnp.arange(_FACTORS, dtype=dtype) + 0.5) / _FACTORS
+    share = (jnp.arange(512, dtype=dtype) + 0.5) / 512
     factors = share / (1 - share)
     for part in joints_of(x).values():
         if part.contact.yields:
@@ -227,12 +223,14 @@ def _first_factor(x: Any, friction_slope: bool):
 
     Also the number of rigid-body eigenvalues of a structure.
     """
-    groups = _lattice(x).reshape(-1, _AT_ONCE)
-    inner = (jnp.arange(_AT_ONCE, dtype=groups.dtype) + 1) / (_AT_ONCE + 1)
+    # Eight factors are evaluated together; once there is a bracket, eight divide it into nine.
+    groups = _lattice(x).reshape(-1, 8)
+    inner = (jnp.arange(8, dtype=groups.dtype) + 1) / 9
 
     def onward(at):
         bracketed = at.high < jnp.inf
-        return jnp.where(bracketed, at.refined < _REFINED, at.rounds < len(groups))
+        # Twelve divisions leave 9^-12 of the bracket.
+        return jnp.where(bracketed, at.refined < 12, at.rounds < len(groups))
 
     def search(at):
         bracketed = at.high < jnp.inf

@@ -10,13 +10,13 @@ from jaxtyping import Array, Float
 from .._base.lapack import solve
 from .._base.parts import concrete, flag
 from .._base.programs import exported_jit
+from .._base.rounding import rounding_error
 from .._contact.load_curve import LoadCurve, loaded_equilibrium
 from .._mechanism.oscillator import Linearised, linearise, static_normal_force
 from .._mechanism.quantities import sliding_friction
 from .._mechanism.scene import Scene, stiffness
 from .._mechanism.structure import Structure, require_single
 
-_ROUNDING = 16.0  # of a sum of n products, in units of eps
 NO_EQUILIBRIUM = (
     "F has no static equilibrium to rounding: a rigid-body mode is left free; hold the structure, "
     "or leave the slope of the friction law out"
@@ -339,7 +339,7 @@ def _equilibrium(F, K, directions) -> tuple[jax.Array, jax.Array, jax.Array]:
     K, x_0, F, size = jax.lax.stop_gradient((K, jnp.abs(x_0), F, jnp.abs(along)))
     eps = jnp.finfo(K.dtype).eps
     through = jnp.abs(solve(K.T, directions.T))
-    errors = _ROUNDING * eps * (jnp.abs(K) @ x_0) @ through
+    errors = rounding_error(K.dtype) * (jnp.abs(K) @ x_0) @ through
     supported = eps * jnp.abs(K).max() * x_0.max() <= 0.01 * jnp.abs(F).max()
     supported |= errors.max() <= 0.01 * size.max()
     return along, errors, supported

@@ -26,15 +26,12 @@ from .._mechanism.structure import Structure
 from .snapshots import joint_numbers
 from .stability import Stability, stability
 
-_ROWS = 8  # of the table, at most, beside the unstable modes
-_ROUNDING = 1e-9  # of |s|: a smaller contribution is none
-
 
 class EnergyShares(Record):
     """Shares of `parts` in k modes, as `energy_shares` returns them; its repr is a table.
 
-    The table shows the unstable modes and some of the least damped ones: which part adds most to
-    the growth rate of each, and which takes most off it.
+    The table shows the unstable modes and the eight least damped of the others: which part adds
+    most to the growth rate of each, and which takes most off it.
     """
 
     parts: tuple[str, ...] = eqx.field(static=True)
@@ -48,10 +45,11 @@ class EnergyShares(Record):
         s: Any = self.eigenvalues
         unstable = np.flatnonzero(s.real > 0)
         others = [i for i in np.argsort(-s.real / np.abs(s)) if i not in unstable]
-        for i in [*unstable, *others[:_ROWS]]:
+        for i in [*unstable, *others[:8]]:
             row, most = self.growth[i], int(self.strain[i].argmax())
+            rounding = 1e-9 * abs(s[i])  # a smaller contribution counts as none
             fed, damped = (
-                f"{self.parts[k]} {row[k]:+.3g}" if sign * row[k] > _ROUNDING * abs(s[i]) else "-"
+                f"{self.parts[k]} {row[k]:+.3g}" if sign * row[k] > rounding else "-"
                 for k, sign in ((int(row.argmax()), 1), (int(row.argmin()), -1))
             )
             share = f"{self.parts[most]} {self.strain[i, most]:.0%}"

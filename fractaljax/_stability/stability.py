@@ -185,7 +185,7 @@ def stability(scene: Mechanism, friction_slope: bool = True) -> Stability:
     return result
 
 
-def _of_scene(scene, friction_slope):
+def _solve_scene(scene, friction_slope):
     joint = pressed(scene)
     lin, forces = linearised_at(scene, joint, friction_slope), normal_force(scene, joint)
     s, mobility = quartic.roots(lin), sliding_friction(scene) / scene.oscillator.m
@@ -203,7 +203,7 @@ def _stability(scene, friction_slope):
         counted = in_band(s, scene.band)
         margin, names = least_damping_ratio(among(s, scene.band)), scene.names
     else:
-        s, x, error, margin, forces = _of_scene(scene, friction_slope)
+        s, x, error, margin, forces = _solve_scene(scene, friction_slope)
         counted, names = jnp.ones(s.shape, bool), ("x1", "x2")
     largest = jnp.abs(jax.lax.stop_gradient(x)).argmax(axis=1)
     return Stability(

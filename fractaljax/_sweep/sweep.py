@@ -32,9 +32,6 @@ from .result import Sweep
 from .store import Store, describe, description, leaf_names, zarr
 from .workers import Computed, Job, gathered, require_executor
 
-_POINTS_EACH = 8192  # points in a batch, on every device; fewer for structures:
-_ENTRIES_EACH = 2**21  # entries of one matrix of the eigenvalue problem, at all points together
-
 
 def sweep(
     measure: Callable[[Any], PyTree[ArrayLike]],
@@ -92,11 +89,13 @@ def sweep(
     another program; `OSError` if the folder cannot be written; `ImportError` for `out` without
     Zarr, or for workers that are not threads without cloudpickle.
     """
-    grid = _checked(x, axes)
+    grid = _check_axes(x, axes)
     names = tuple(grid)
     whole: Any = with_optional(x, names)  # pyright: ignore[reportArgumentType]
     program = Program(measure, names, whole, list(grid.values()))
-    how: dict[str, Any] = dict(each=_each(x), batch_size=batch_size, progress=progress, out=out)
+    how: dict[str, Any] = dict(
+        each=_points_each(x), batch_size=batch_size, progress=progress, out=out
+    )
     values = run(program, whole, grid, x, measure, **how, devices=devices, executor=executor)
     return Sweep(values, tuple(grid.values()), names, x)
 
@@ -153,13 +152,15 @@ def run(
     kept = store.there() if store else set()
     missing = [k for k in share if k not in kept]
     if executor is None:
-        computed = _in_turn(Batches(program, whole, list(grid.values()), parts, mesh), missing)
+        computed = _compute_in_turn(
+            Batches(program, whole, list(grid.values()), parts, mesh), missing
+        )
     else:
         job = Job(measure, names, whole, list(grid.values()), parts, program)
         hint = f"out {out} keeps what is done" if store else "out would keep what is done"
         computed = gathered(executor, job, missing, f"{hint}, for the next call to resume")
     shown = progress and jax.process_index() == 0
-    with contextlib.closing(computed), _bar(sum(map(parts.size, share)), shown) as bar:
+    with contextlib.closing(computed), _progress_bar(sum(map(parts.size, share)), shown) as bar:
         bar.update(sum(parts.size(k) for k in share if k in kept))
         for k, batch in computed:
             if store:
@@ -176,7 +177,7 @@ def run(
     return jax.tree.unflatten(tree, arrays)
 
 
-def _in_turn(batches: Batches, numbers: Sequence[int]) -> Computed:
+def _compute_in_turn(batches: Batches, numbers: Sequence[int]) -> Computed:
     """Each batch by its number with its leaves, computed while the previous one is stored."""
     begun = None
     for k in numbers:
@@ -187,7 +188,7 @@ def _in_turn(batches: Batches, numbers: Sequence[int]) -> Computed:
         yield begun[0], batches.end(*begun)
 
 
-def _checked(x: Any, axes: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def _check_axes(x: Any, axes: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """The values of every axis, inside their domains jointly with those of the other axes."""
     if isinstance(x, Scene):
         require_scalar(x)
@@ -199,11 +200,14 @@ def _checked(x: Any, axes: Mapping[str, Any]) -> dict[str, np.ndarray]:
     return grid
 
 
-def _each(x: Any) -> int:
+def _points_each(x: Any) -> int:
     """The default number of points of a batch on a device."""
-    if isinstance(x, Structure):  # the memory of its modes grows as the square of their number
-        return max(1, min(_POINTS_EACH, _ENTRIES_EACH // (2 * x.n) ** 2))
-    return _POINTS_EACH
+    points = 8192
+    if not isinstance(x, Structure):
+        return points
+    # The memory of its modes grows as the square of their number: at all points together, a matrix
+    # of the eigenvalue problem has at most 2^21 entries.
+    return max(1, min(points, 2**21 // (2 * x.n) ** 2))
 
 
 def _batch_size(batch_size: int | None, points: int, devices: int, each: int) -> int:
@@ -218,7 +222,7 @@ def _batch_size(batch_size: int | None, points: int, devices: int, each: int) ->
     return batch_size
 
 
-def _bar(points: int, shown: bool):
+def _progress_bar(points: int, shown: bool):
     from tqdm import tqdm
 
     return tqdm(total=points, desc="sweep", unit="point", unit_scale=True, disable=not shown)
