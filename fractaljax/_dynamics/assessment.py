@@ -170,13 +170,13 @@ def count_rounds(problem: Problem, rounds, returns):
 
 
 def near_equilibrium(problem: Problem, returns: Returns) -> NearEquilibrium:
-    """Which motions have ended without an orbit, and where a slow one continues.
+    """Decide which motions have ended without an orbit, and where a slow one continues.
 
-    A motion dies out only where the equilibrium attracts: one that starts at rest at a repelling
-    equilibrium is small, but grows. There it has to be at rest, or to decay without a switch,
-    either close to the equilibrium, or steadily at no less than 0.7 of the linear rate, which a
-    slow approach to an orbit does not reach. With a joint open there is another equilibrium, at
-    which nothing changes. A motion diverges beyond the bound of the problem.
+    A motion dies out only where the equilibrium attracts: near one that repels, a motion that
+    starts at rest is small, but grows. It dies out once it is at rest, or decays without a switch
+    close to the equilibrium, or decays further out at a steady rate of at least 0.7 of the linear
+    one, which a slow approach to an orbit does not reach. With a joint open there is another
+    equilibrium, at which nothing changes. A motion diverges beyond the bound of the problem.
 
     A slow, steady change without switches would take many returns. It is extrapolated along the
     line through the equilibrium, but by at most half of the change that is left if it slows down
@@ -217,7 +217,7 @@ def near_equilibrium(problem: Problem, returns: Returns) -> NearEquilibrium:
 def near_orbit(
     problem: Problem, returns: Returns, previous: Progress, orbit: Segments, rest: NearEquilibrium
 ) -> NearOrbit:
-    """Which returns nearly repeat, and where an orbit through them is to be solved for.
+    """Find which returns nearly repeat, and decide where their orbit is to be solved for.
 
     A candidate has one return, or, in every other round, as many as the motion seems to repeat
     after. It is ready where its ends are near each other, unless the motion already approaches an
@@ -293,15 +293,14 @@ def _without_linear_motion(problem: Problem, returns: Returns, first, period_ret
 
 
 def patience(problem: Problem, returns: Returns, previous: Progress, near: NearOrbit) -> Patience:
-    """Where the search gives up, and with which outcome.
+    """Decide where the search gives up, and with which outcome.
 
     It ends after `max_returns`, or after many rounds without a return. The motion is then
     `exhausted` if it was still settling: its widest gaps were small, and smaller in the last
     quarter of the returns than in the third, or it decays to the equilibrium without a switch.
-    Otherwise it is `not_periodic`, and `too_long` if it repeats although the orbit was never
-    accepted, as more segments than there are would be needed. The search ends at once, as
-    `too_long`, where a motion that no longer grows has less than two returns in a full record: its
-    period would never be seen to repeat.
+    Otherwise it is `not_periodic`. It is `too_long` if it repeats, but takes more segments than an
+    orbit may have. The search ends at once, as `too_long`, where a motion that no longer grows has
+    less than two returns in a full record: its period would never be seen to repeat.
     """
     search, record = problem.search, returns.record
     count, idle, max_returns = returns.count, returns.idle, problem.max_returns
