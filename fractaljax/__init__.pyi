@@ -59,6 +59,7 @@ from ._dynamics.branch import (
     continue_cycle as continue_cycle,
 )
 from ._dynamics.cycle import CycleResult as CycleResult, LimitCycle as LimitCycle
+from ._dynamics.cycle_search import CycleSearch as CycleSearch
 from ._dynamics.event_curve import EventCurve as EventCurve, continue_event as continue_event
 from ._dynamics.excitation import Excitation as Excitation
 from ._dynamics.limit_cycle import limit_cycle as limit_cycle

@@ -20,7 +20,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
 from jax.core import Tracer
 
@@ -131,7 +130,7 @@ def _described(x: Any, leaves: list) -> Any:
     """
     if isinstance(x, type):
         return {"type": _place(x)}
-    if isinstance(x, eqx.Module):
+    if dataclasses.is_dataclass(x):  # such as a module of Equinox
         fields = {f.name: _described(getattr(x, f.name), leaves) for f in dataclasses.fields(x)}
         return {"class": _place(type(x)), "fields": fields}
     if isinstance(x, tuple) and (names := getattr(x, "_fields", None)):  # a named tuple

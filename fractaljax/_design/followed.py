@@ -13,8 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._base.programs import exported_jit
-from .._dynamics.acceptance import HARDLY, admissible, growth_of
+from .._dynamics.acceptance import admissible, growth_of
 from .._dynamics.cycle import CycleResult
+from .._dynamics.cycle_search import CycleSearch
 from .._dynamics.extremes import extreme_values
 from .._dynamics.limit_cycle import limit_cycle
 from .._dynamics.orbit import orbit, solve_periodic_orbits
@@ -175,7 +176,8 @@ def _followed(problem, u, segments: Segments):
         velocity = jnp.sqrt(mean_square(system, closed)[n:])
         measures = jnp.stack([(high - low) * units[:n], velocity * units[n:]])
         near = jnp.max(jnp.abs(y - segments.y)) < _NEAR * (1 + jnp.max(jnp.abs(y)))
-        ok = solution.converged & (solution.error <= rtol) & (growth_of(frozen, solution) < HARDLY)
+        ok = solution.converged & (solution.error <= rtol)
+        ok = ok & (growth_of(frozen, solution) < CycleSearch().repelling)
         ok = jnp.all(ok & admissible(frozen, solution.segments, solution.middle))
         ok = ok & near & jnp.all(jnp.isfinite(measures))
         return measures, (measures, (closed, y[:, 0] * units, ok))

@@ -18,8 +18,6 @@ from .lanes import log_spectral_radius, product
 from .maps import exact_maps
 from .segments import Segments, flow, mean_square, next_start
 
-SQUARINGS = 40  # of a monodromy matrix
-_SAMPLES = 1024  # of a smooth orbit, for a mean
 VELOCITY_REFERENCE = 1e-9  # [m/s], of levels
 STATE_NAMES = {1: "+", -1: "-", 0: "stick", OPEN: "open"}  # of contact states, in a `Switch`
 
@@ -40,7 +38,10 @@ class CycleResult(eqx.Enumeration):
         "the motion is not a number, as some number of the mechanism or of the start is not"
     )
     too_long = "a period takes more steps than are kept: ask for more segments"
-    not_periodic = "the motion does not repeat within 16 returns (a longer period, or none)"
+    not_periodic = (
+        "the motion does not repeat within the longest period that was looked for, 16 returns by "
+        "default (a longer period, or none)"
+    )
     too_stiff = (
         "the regularised law takes more than max_steps steps: allow more, choose a solver such as "
         "diffrax.Kvaerno5, or leave the regularisation out"
@@ -63,7 +64,7 @@ def repels(
     missed = jnp.max(jnp.abs(jnp.sum(monodromy * along[None], axis=1) - along))
     across = jnp.eye(len(along), dtype=along.dtype) - along[:, None] * along[None]
 
-    log = log_spectral_radius(across @ monodromy @ across, SQUARINGS)
+    log = log_spectral_radius(across @ monodromy @ across, squarings=40)  # exact to rounding
     tolerance = 10 * (missed + error) + 1e3 * jnp.finfo(along.dtype).eps
     return log > tolerance
 
@@ -291,7 +292,8 @@ class LimitCycle(Record):
             )
             square = jnp.where(jnp.isfinite(self.period), square, jnp.nan)
         else:
-            square = jnp.mean(self.orbit(_SAMPLES)[1] ** 2, axis=0)
+            # The mean of a smooth periodic function converges fast with the number of samples.
+            square = jnp.mean(self.orbit(1024)[1] ** 2, axis=0)
         return jnp.sqrt(square[len(square) // 2 :])
 
     @property

@@ -12,7 +12,6 @@ from .hybrid import NONE, SECTION, UNUSED, HybridSystem
 from .lanes import together
 from .segments import Segments, cumulative, flow
 
-_PHASES = 256  # most phases in an orbit
 # The last rows of a record: the guard that ended a step, and sums over the steps up to its end,
 # less the sums of the whole run: time, weight, switches with returns, and returns.
 _ROWS = GUARD, TIME, WEIGHT, ENDED, RETURNED = range(-5, 0)
@@ -208,14 +207,16 @@ class Phases(eqx.Module):
         return cls(exists, starts + 1, ends, jnp.where(exists, weight, 0))
 
 
-def cut(system: HybridSystem, steps: Stretch, first, last, h, length: int) -> Segments:
+def cut(
+    system: HybridSystem, steps: Stretch, first, last, h, length: int, most_phases: int = 256
+) -> Segments:
     """The steps after `first` (g,) up to `last` (g,) in at most `length` segments.
 
     Segments of a phase have equal weight, at most h (g,) where so few suffice. Unused segments have
-    no duration.
+    no duration. Phases beyond `most_phases` are left out, so that no orbit closes.
     """
     n = 2 * system.n
-    phases = Phases.between(steps, first, last, min(length, _PHASES))
+    phases = Phases.between(steps, first, last, min(length, most_phases))
     # The number of segments of each phase.
     free = jnp.maximum(length - jnp.sum(phases.exists, axis=-1), 1)
     h = jnp.maximum(h, jnp.sum(phases.weight, axis=-1) / free)[:, None]

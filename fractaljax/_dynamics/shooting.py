@@ -182,8 +182,9 @@ class Place(NamedTuple):
     after: Int[Array, ""]  # and at its end
 
 
-_NODES = 5
-_TINY = 1e-12  # scaled time from a switch that counts as zero
+def _at_switch(time) -> Array:
+    """True for scaled times from a switch that are zero to rounding."""
+    return time <= 1e-12
 
 
 def reduced_guard(system: HybridSystem, chain: Chain, y, h, at: Place, theta) -> Array:
@@ -201,7 +202,7 @@ def reduced_guard(system: HybridSystem, chain: Chain, y, h, at: Place, theta) ->
     value, rate = values[at.guard], rates[at.guard]
     time, rest = since + theta * h[k], left + (1 - theta) * h[k]
     # At its own zero the guard's rate takes the place of the quotient.
-    at_start, at_end = (at.before > 0) & (time <= _TINY), (at.after > 0) & (rest <= _TINY)
+    at_start, at_end = (at.before > 0) & _at_switch(time), (at.after > 0) & _at_switch(rest)
     plain = value / jnp.where(at_start | (at.before == 0), 1, time**at.before)
     plain = plain / jnp.where(at_end | (at.after == 0), 1, rest)
     at_start_value = rate / jnp.where(at.after > 0, rest, 1)
@@ -219,7 +220,7 @@ def lowest(x: Mechanism, window: Window, chain: Chain, lifted: Lifted, u, before
     system = window.system(x, u[-1])
     y, n = lifted.at(u), system.n
     h = durations(chain, u, n)
-    theta = jnp.arange(_NODES, dtype=y.dtype) / (_NODES - 1)
+    theta = jnp.arange(5, dtype=y.dtype) / 4  # the ends of a segment, and three places inside
 
     def samples(share):
         states = flow(system, y, share * h, chain.s)
@@ -231,8 +232,8 @@ def lowest(x: Mechanism, window: Window, chain: Chain, lifted: Lifted, u, before
     time = ((chain.begin[None] + theta[:, None] * chain.share[None]) * phase[None])[None]
     rest = phase[None, None] - time
     p, q = before[:, chain.phase][:, None], after[:, chain.phase][:, None]
-    at_start, at_end = (p > 0) & (time <= _TINY), (q > 0) & (rest <= _TINY)
-    time, rest = jnp.where(time <= _TINY, 1, time), jnp.where(rest <= _TINY, 1, rest)
+    at_start, at_end = (p > 0) & _at_switch(time), (q > 0) & _at_switch(rest)
+    time, rest = jnp.where(_at_switch(time), 1, time), jnp.where(_at_switch(rest), 1, rest)
     over = jnp.where(at_start, 1, time**p) * jnp.where(at_end, 1, rest**q)
     reduced = jnp.where(at_start, rate, jnp.where(at_end, -rate, value)) / over
     # After a stick ends, a slip begins with a zero of second order, whose sign the stick's decides.

@@ -9,7 +9,6 @@ from .._stability.stability import stability
 from .._stability.summary import friction_remark, stiffness_remarks, verdict
 from .cycle import CycleResult, LimitCycle
 
-_MOST = 12  # degrees of freedom of a structure, and multipliers, that are listed
 _CONTACT_STATES = {
     "+": "slips, dx/dt < V",
     "-": "slips, dx/dt > V",
@@ -18,8 +17,11 @@ _CONTACT_STATES = {
 }
 
 
-def cycle_table(mechanism: Scene | Structure, cycle: LimitCycle) -> str:
-    """The result of the search for one limit cycle, its numbers and its switches."""
+def cycle_table(mechanism: Scene | Structure, cycle: LimitCycle, most: int = 12) -> str:
+    """The result of the search for one limit cycle, its numbers and its switches.
+
+    At most that many multipliers and degrees of freedom of a structure are listed.
+    """
     lacking = stiffness_remarks(mechanism)
     outcome = {"result": str(CycleResult[cycle.result])}
     outcome |= verdict(stability(mechanism), without_joint=bool(lacking))
@@ -39,7 +41,7 @@ def cycle_table(mechanism: Scene | Structure, cycle: LimitCycle) -> str:
     multipliers = (np.round(np.asarray(cycle.multipliers), 6) + 0).tolist()
     whole |= {
         f"Floquet multiplier {i}": f"{s.real:+.6f} {s.imag:+.6f}i  (modulus {abs(s):.6f})"
-        for i, s in enumerate(multipliers[:_MOST], start=1)
+        for i, s in enumerate(multipliers[:most], start=1)
     }
     directions = [
         {
@@ -51,11 +53,11 @@ def cycle_table(mechanism: Scene | Structure, cycle: LimitCycle) -> str:
     ]
     if isinstance(mechanism, Structure):
         names = mechanism.names or [f"x{i}" for i in range(1, mechanism.n + 1)]
-        most = sorted(range(mechanism.n), key=lambda i: -cycle.amplitude[i])[:_MOST]
+        largest = sorted(range(mechanism.n), key=lambda i: -cycle.amplitude[i])[:most]
         tables = ["\n".join(lacking)] * bool(lacking) + [
             table([""], [whole]),
             table(list(mechanism.joint_names), _joint_columns(cycle)),
-            table([names[i] for i in most], [directions[i] for i in most]),
+            table([names[i] for i in largest], [directions[i] for i in largest]),
         ]
         return "\n\n".join(tables)
     scene = mechanism

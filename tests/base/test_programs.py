@@ -1,5 +1,6 @@
 """Programs that a command keeps on disk: the same numbers without a trace, and no wrong program."""
 
+import dataclasses
 import os
 import stat
 import subprocess
@@ -64,6 +65,19 @@ def everything(x, power: int = 2):
 program = programs.exported_jit(everything, "power")
 
 
+@dataclasses.dataclass(frozen=True)
+class Options:
+    power: int = 2
+
+
+def with_options(x, options: Options):
+    traces.append(options)
+    return x**options.power
+
+
+chosen_program = programs.exported_jit(with_options, "options")
+
+
 def forget(monkeypatch):
     """As in a new process."""
     monkeypatch.setattr(programs, "_programs", {})
@@ -82,6 +96,16 @@ def test_a_program_is_loaded_without_a_trace(folder, monkeypatch):
         assert jax.tree.structure(found) == jax.tree.structure(expected)
         jax.tree.map(np.testing.assert_array_equal, found, expected)
     assert (again["module"].label, again["list"][:2]) == ("twice", [True, 0.5])
+
+
+def test_a_program_with_a_class_of_options_is_loaded_without_a_trace(folder, monkeypatch):
+    x = jnp.arange(3.0)
+    chosen_program(x, Options())
+    forget(monkeypatch)
+    np.testing.assert_array_equal(chosen_program(x, Options()), x**2)
+    assert not traces
+    np.testing.assert_array_equal(chosen_program(x, Options(3)), x**3)
+    assert traces and len([*folder.iterdir()]) == 2
 
 
 @pytest.mark.parametrize(
