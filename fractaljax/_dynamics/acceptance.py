@@ -8,10 +8,12 @@ from jaxtyping import Array, Bool, Float
 
 from .cycle import SQUARINGS
 from .events import Cubic
-from .hybrid import SECTION, HybridSystem
+from .guard import SECTION
+from .hybrid import HybridSystem
 from .lanes import log_spectral_radius
 from .orbit import PeriodicOrbit
 from .segments import Segments, cumulative, next_start
+from .transition import switch
 
 HARDLY = 1e-3  # growth per period up to which a repelling orbit is kept
 
@@ -50,7 +52,7 @@ def admissible(system: HybridSystem, segments: Segments, middle) -> Bool[Array, 
     g = jnp.concatenate([g, guards(lowest)])
     # The quintic has this accuracy on a segment of the default length.
     holds = jnp.all(g > -1e-8 * scale[None], axis=(0, 1)) & (h > -1e-10)
-    _, after = system.switch(ends, s, segments.guard)
+    _, after = switch(system, ends, s, segments.guard)
     return jnp.all(holds & jnp.all(after == next_start(s), axis=0), axis=0)
 
 

@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .hybrid import OPEN, HybridSystem
+from .contact_state import OPEN
+from .hybrid import HybridSystem
 from .record import ENDED, RETURNED, TIME, WEIGHT, Record
 from .segments import Segments
 

@@ -22,14 +22,17 @@ from .._base.parts import Record, concrete, flag, whole
 from .._base.programs import exported_jit
 from .._base.table import table
 from .._mechanism.mechanism import Mechanism
+from .contact_state import FORWARD
 from .cycle import CycleResult, LimitCycle
 from .events import step
 from .excitation import Excitation, compiled_system
-from .hybrid import NONE, SECTION, HybridSystem
+from .guard import NONE, SECTION
+from .hybrid import HybridSystem
 from .limit_cycle import limit_cycle
 from .scaled import check_rtol, degrees_of_freedom
 from .segments import next_start
 from .starts import starts_of
+from .transition import first_contact_state
 
 _LANES, _FEW_LANES = 256, 32  # run side by side, for many starts and for few
 _CHUNKS = 4  # of lanes, shared by the cores; fixed, so that no result depends on their number
@@ -167,7 +170,7 @@ def _first(system: HybridSystem, y) -> _Lanes:
     none, zero = jnp.zeros(y.shape[1], int), jnp.zeros(y.shape[1], y.dtype)
     return _Lanes(
         y=y,
-        s=system.contact_state(y),
+        s=first_contact_state(system, y),
         guard=none + NONE,
         seen=y,
         returns=none,
@@ -220,7 +223,7 @@ def _decay(modes: _Modes, lanes: _Lanes):
     rounds, in which ripples average out.
     """
     switched = lanes.smooth == 0
-    slips = jnp.all(lanes.s == 1, axis=0) & modes.free
+    slips = jnp.all(lanes.s == FORWARD, axis=0) & modes.free
     full = ~switched & slips & (lanes.smooth % _WINDOW == 0)
     samples = _WINDOW * _STEPS // _SAMPLED
     log = jnp.log(lanes.energy / samples + jnp.finfo(lanes.y.dtype).tiny) / 2

@@ -20,8 +20,6 @@ from .itinerary import Family
 from .pinned import Event, Pinned
 from .shooting import Window
 
-_STRAIGHT = 0.95  # cosine of the angle by which a curve may turn at a change of itinerary
-
 
 class EventCurve(Record):
     """Curve in two quantities along which cycles fold, graze, or change stability.
@@ -76,7 +74,8 @@ class _CurveFollower(Follower):
         new, begin, ahead = onward
         gap, came = begin[new.quantity :] - z[shooting.quantity :], reached - z
         before, after = came[shooting.quantity :], ahead[new.quantity :]
-        straight = before @ after > _STRAIGHT * np.linalg.norm(before) * np.linalg.norm(after)
+        # It may turn by 18 degrees at a change of itinerary.
+        straight = before @ after > 0.95 * np.linalg.norm(before) * np.linalg.norm(after)
         if straight and np.linalg.norm(gap) < 2 * np.linalg.norm(came):
             return onward
         del self.points[count:]

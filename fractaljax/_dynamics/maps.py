@@ -9,14 +9,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .hybrid import UNUSED, HybridSystem
+from .guard import UNUSED
+from .hybrid import HybridSystem
 from .lanes import product
 from .runge_kutta import runge_kutta, stability_polynomial
 from .segments import Segments, chosen_guard, next_start, tableau
-
-_POWERS = 4  # of a matrix, to evaluate a polynomial of it
-_FEW = 512  # segments, over all lanes, up to which all are taken at once
-_TOGETHER, _LEAST = 128, 8  # if more, segments at a time: over all lanes, least of each
 
 
 class Maps(eqx.Module):
@@ -47,9 +44,12 @@ def coarse_maps(system: HybridSystem, segments: Segments) -> Maps:
 
 
 def segments_together(segments: Segments) -> int:
-    """How many segments of each lane Newton's method takes at a time: all if they are few."""
+    """How many segments of each lane Newton's method takes at a time.
+
+    They are all of at most 512 over all lanes; of more, 128 over all lanes, but at least 8 of each.
+    """
     length, lanes = len(segments.duration), segments.duration[0].size
-    return length if length * lanes <= _FEW else max(_TOGETHER // lanes, _LEAST)
+    return length if length * lanes <= 512 else max(128 // lanes, 8)
 
 
 def unmoved(segments: Segments, *_) -> tuple[Array, Array, Array]:
@@ -111,12 +111,13 @@ def _polynomial_maps(system: HybridSystem, segments: Segments, ends):
     mean = _of_each(slope, _identity(y)) * h[None, None]
     eye, mean = (jnp.moveaxis(x, 2, 0) for x in (_identity(y), mean))
     powers, times = [eye, mean], jax.vmap(functools.partial(product, written_out=True))
-    for _ in range(_POWERS - 1):
+    count = 4  # powers that are evaluated, of the last of which the rest is a polynomial
+    for _ in range(count - 1):
         powers.append(times(powers[-1], mean))
     coefficients = stability_polynomial(tableau()).tolist()
     A = None
-    for first in reversed(range(0, len(coefficients), _POWERS)):
-        block = coefficients[first : first + _POWERS]
+    for first in reversed(range(0, len(coefficients), count)):
+        block = coefficients[first : first + count]
         terms = sum(c * power for c, power in zip(block, powers, strict=False))
         A = terms if A is None else times(A, powers[-1]) + terms
     return ends, A, b

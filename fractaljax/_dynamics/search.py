@@ -17,7 +17,8 @@ from jaxtyping import Array, Float, Int
 
 from .acceptance import HARDLY, admissible, growth_of, has_shorter_period
 from .assessment import RUNNING, Candidates, Progress, SearchOptions, assess, concluded, passed
-from .hybrid import UNUSED, HybridSystem
+from .guard import UNUSED
+from .hybrid import HybridSystem
 from .lanes import chosen
 from .orbit import PeriodicOrbit, solve_periodic_orbits
 from .record import Record, Steps, Stretch, cut

@@ -16,7 +16,7 @@ from fractaljax._base.parts import substitute
 from fractaljax._dynamics import search
 from fractaljax._dynamics.acceptance import growth_of
 from fractaljax._dynamics.cycle import repels
-from fractaljax._dynamics.hybrid import NONE
+from fractaljax._dynamics.guard import NONE
 from fractaljax._dynamics.orbit import solve_periodic_orbits
 from fractaljax._dynamics.segments import flow
 from mechanisms import PLAIN, source_form

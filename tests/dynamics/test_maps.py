@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
-from fractaljax._dynamics.hybrid import NONE, UNUSED
+from fractaljax._dynamics.guard import NONE, UNUSED
 from fractaljax._dynamics.lanes import together
 from fractaljax._dynamics.maps import _maps, coarse_maps, exact_maps, in_blocks, unmoved
 from fractaljax._dynamics.scaled import hybrid_system
