@@ -126,14 +126,14 @@ def continue_event(
     held = Event.of(condition, detail, solution)
     solution = solution._replace(x=frozen, r=starting_position(frozen, second))
 
-    def begun():
+    def start_curve():
         pinned = Pinned(family, second, held, solution, solution.phases, solution.times)
         corrected = pinned.curves.corrected(pinned.begin, pinned.quantity + 1)
         if corrected is None or np.linalg.norm(corrected[0] - pinned.begin) > 0.1:
             raise ValueError("event must be one of a branch of x itself")
         return pinned, corrected[0], pinned.curves.tangent(corrected[1])
 
-    start, end = follower.follow_both_directions(begun)
+    start, end = follower.follow_both_directions(start_curve)
     places = np.array([point.place for point in follower.points])
     rows: dict[str, Any] = {
         key: np.array([point.row[key] for point in follower.points])

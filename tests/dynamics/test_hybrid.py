@@ -159,7 +159,7 @@ def test_steps_are_bounded_by_the_slope_of_friction():
             slopes.append((ends[0] - ends[1]) / 2e-6 / (omega * x["V"]))
         system, s, longest = scaled(scene_of(x)), np.array([[1.0], [-1.0]]), np.full(200, 1e-3)
         s = np.broadcast_to(s, (2, 200))
-        # Of so short a step nothing but the slope here counts.
+        # In so short a step only the slope here counts.
         step = step_length(system, y, s, field(system, y, s), longest, 1e-6 * longest)
         assert (step < longest).all()
         found = np.maximum(5e-10 / np.asarray(step) - 5e-7, 0)
