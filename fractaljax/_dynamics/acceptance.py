@@ -7,10 +7,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .events import Cubic
-from .hybrid import SECTION, HybridSystem
+from .guard import SECTION
+from .hybrid import HybridSystem
 from .lanes import log_spectral_radius
 from .orbit import PeriodicOrbit
 from .segments import Segments, cumulative, next_start
+from .transition import switch
 
 
 def _quintic(y, d, x):
@@ -47,7 +49,7 @@ def admissible(system: HybridSystem, segments: Segments, middle) -> Bool[Array, 
     g = jnp.concatenate([g, guards(lowest)])
     # The quintic has this accuracy on a segment of the default length.
     holds = jnp.all(g > -1e-8 * scale[None], axis=(0, 1)) & (h > -1e-10)
-    _, after = system.switch(ends, s, segments.guard)
+    _, after = switch(system, ends, s, segments.guard)
     return jnp.all(holds & jnp.all(after == next_start(s), axis=0), axis=0)
 
 

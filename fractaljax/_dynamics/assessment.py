@@ -11,8 +11,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .contact_state import OPEN
 from .cycle_search import CycleSearch
-from .hybrid import OPEN, HybridSystem
+from .hybrid import HybridSystem
 from .record import ENDED, RETURNED, TIME, WEIGHT, Record
 from .segments import Segments
 from .status import Status

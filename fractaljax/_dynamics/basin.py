@@ -23,14 +23,17 @@ from .._base.programs import exported_jit
 from .._base.table import table
 from .._mechanism.mechanism import Mechanism
 from .basin_search import BasinSearch
+from .contact_state import FORWARD
 from .cycle import CycleResult, LimitCycle
 from .events import step
 from .excitation import Excitation, compiled_system
-from .hybrid import NONE, SECTION, HybridSystem
+from .guard import NONE, SECTION
+from .hybrid import HybridSystem
 from .limit_cycle import limit_cycle
 from .scaled import check_rtol, degrees_of_freedom
 from .segments import next_start
 from .starts import starts_of
+from .transition import first_contact_state
 
 # A cycle is labelled by its index.
 _RUNNING, _EQUILIBRIUM, _DIVERGES, _UNDECIDED, _LOST = -1, -2, -3, -4, -5
@@ -156,7 +159,7 @@ def _start_lanes(system: HybridSystem, y) -> _Lanes:
     none, zero = jnp.zeros(y.shape[1], int), jnp.zeros(y.shape[1], y.dtype)
     return _Lanes(
         y=y,
-        s=system.contact_state(y),
+        s=first_contact_state(system, y),
         guard=none + NONE,
         section_state=y,
         returns=none,
@@ -210,7 +213,7 @@ def _decay(search: BasinSearch, modes: _Modes, lanes: _Lanes):
     rounds, in which ripples average out.
     """
     switched = lanes.smooth == 0
-    slips = jnp.all(lanes.s == 1, axis=0) & modes.free
+    slips = jnp.all(lanes.s == FORWARD, axis=0) & modes.free
     full = ~switched & slips & (lanes.smooth % search.window == 0)
     samples = search.window * search.samples
     log = jnp.log(lanes.energy / samples + jnp.finfo(lanes.y.dtype).tiny) / 2

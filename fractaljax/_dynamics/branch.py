@@ -18,9 +18,10 @@ from .._mechanism.quantities import (
     with_optional,
 )
 from .._mechanism.scene import Scene
+from .contact_state import FORWARD
 from .cycle import LimitCycle, Orbit
 from .follow import BranchEnd, Follower
-from .hybrid import NONE, SECTION
+from .guard import NONE, SECTION
 from .itinerary import Family, Phase, Shooting, Solution, build_solution
 from .limit_cycle import limit_cycle
 from .scaled import check_rtol, degrees_of_freedom
@@ -280,7 +281,7 @@ def _harmonic_orbit(follower, y, vector, frequency, q) -> Solution:
     N, size = 64, 1.5 * follower.family.tracing.small
     angle = 2 * np.pi * np.arange(N) / N
     states = y[:, None] + size * (vector[:, None] * np.exp(1j * angle)).real
-    slips = (1,) * len(follower.family.template.P)
+    slips = (FORWARD,) * len(follower.family.template.P)
     u = np.concatenate([states[:, 0], [2 * np.pi / frequency], np.zeros(7), [q]])
     chain = Chain(
         s=jnp.ones((len(slips), N)),

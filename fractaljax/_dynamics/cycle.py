@@ -12,14 +12,15 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._base.parts import Record, concrete, nan_where, refused
 from .._base.programs import exported_jit
+from .contact_state import OPEN, STICK, find_state
 from .extremes import extreme_values, time_below_zero
-from .hybrid import NONE, OPEN, UNUSED, HybridSystem
+from .guard import NONE, UNUSED
+from .hybrid import HybridSystem
 from .lanes import log_spectral_radius, product
 from .maps import exact_maps
 from .segments import Segments, flow, mean_square, next_start
 
 VELOCITY_REFERENCE = 1e-9  # [m/s], of levels
-STATE_NAMES = {1: "+", -1: "-", 0: "stick", OPEN: "open"}  # of contact states, in a `Switch`
 
 
 class CycleResult(eqx.Enumeration):
@@ -143,7 +144,7 @@ class Orbit(eqx.Module):
                 rows, offset, system.faces, system.opens, strict=True
             )
         ]
-        return Fractions(share(0), share(OPEN)[_tangential(system)], jnp.stack(pulls))
+        return Fractions(share(STICK), share(OPEN)[_tangential(system)], jnp.stack(pulls))
 
     def monodromy(self, system: HybridSystem) -> Float[Array, "2n 2n"]:
         """The product of the maps of all segments, with the saltation at every switch."""
@@ -347,7 +348,7 @@ class LimitCycle(Record):
             raise ValueError("switches() needs one cycle, outside of jit: index the batch first")
         if not isinstance(self._orbit, Orbit):
             raise ValueError("a regularised cycle has no switches")
-        segments, names = self._orbit.segments, STATE_NAMES
+        segments = self._orbit.segments
         used = np.asarray(segments.guard) != UNUSED
         states = np.asarray(segments.s)[:, used].astype(int)
         times = np.cumsum(np.asarray(segments.duration)[used]) / float(self._system.omega)
@@ -355,7 +356,8 @@ class LimitCycle(Record):
         for k, time in enumerate(times):
             before, after = states[:, k], np.roll(states, -1, axis=1)[:, k]
             for i in np.flatnonzero(before != after):
-                switches.append(Switch(float(time), int(i) + 1, names[before[i]], names[after[i]]))
+                names = (find_state(states[i]).name for states in (before, after))
+                switches.append(Switch(float(time), int(i) + 1, *names))
         return switches
 
 

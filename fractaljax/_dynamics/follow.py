@@ -14,7 +14,9 @@ import numpy as np
 from .._base.programs import exported_jit
 from .._continuation import cubic
 from .._mechanism.mechanism import Mechanism
-from .hybrid import OPEN, SECTION, HybridSystem
+from .contact_state import OPEN, STICK
+from .guard import SECTION
+from .hybrid import HybridSystem
 from .itinerary import Family, Shooting, Solution
 from .itinerary_change import ItineraryChange
 from .shooting import largest_friction, linearised, measured, rate_at
@@ -70,7 +72,7 @@ class Follower:
             "amplitude": (high - low)[:n],
             "velocity_min": low[n:],
             "velocity_max": high[n:],
-            "stick_fraction": h @ (states == 0) / h.sum(),
+            "stick_fraction": h @ (states == STICK) / h.sum(),
             "open_fraction": h @ (states == OPEN) / h.sum(),
             "stable": bool(np.abs(values[:-1]).max() < 1),
             "multipliers": values,

@@ -9,9 +9,11 @@ import numpy as np
 from .._base.programs import exported_jit
 from .._continuation import Continuation
 from .._mechanism.mechanism import Mechanism
+from .contact_state import BACKWARD, FORWARD, STICK, find_state
 from .cycle import LimitCycle
 from .excitation import compiled_system
-from .hybrid import NONE, OPEN, SECTION, UNUSED, HybridSystem
+from .guard import NONE, SECTION, UNUSED
+from .hybrid import HybridSystem
 from .shooting import (
     Chain,
     Lifted,
@@ -24,8 +26,6 @@ from .shooting import (
     return_jacobian,
 )
 from .tracing import BranchTracing
-
-_SYMBOLS = {1: "+", -1: "-", 0: "0", OPEN: "o"}
 
 
 class Phase(NamedTuple):
@@ -210,18 +210,20 @@ class Shooting:
     def _orders(self):
         """Orders of the guards' zeros (k, M) at the start and at the end of each phase."""
         system = self.family.template
-        faces = len(self.phases[0].s)
-        count = 1 + 2 * faces + sum(system.opens)
+        numbers = system.guard_numbers
+        count = numbers.count
         before, after = np.zeros((count, self.padded), int), np.zeros((count, self.padded), int)
         for p, phase in enumerate(self.phases):
             last = self.phases[p - 1]
             for i, (was, now) in enumerate(zip(last.s, phase.s, strict=True)):
-                if abs(now) == 1 and was == 0:
+                if now not in (FORWARD, BACKWARD):
+                    continue
+                if was == STICK:
                     # Released by its own limit w starts with its second derivative.
-                    before[1 + 2 * i, p] = 2 if (last.guard - 1) // 2 == i else 1
-                elif abs(now) == 1 and was == -now:
-                    before[1 + 2 * i, p] = 1
-            if last.guard > 2 * faces and last.s != phase.s:
+                    before[numbers.lower(i), p] = 2 if numbers.face(last.guard) == i else 1
+                elif was == -now:
+                    before[numbers.lower(i), p] = 1
+            if numbers.opens_joint(last.guard) and last.s != phase.s:
                 before[last.guard, p] = 1
             if phase.guard > 0:
                 after[phase.guard, p] = 1
@@ -370,7 +372,7 @@ class Shooting:
         return shortest if shortest <= 0 else min(shortest, self.lowest(z)[0])
 
     def itinerary(self) -> str:
-        return " ".join("".join(_SYMBOLS[i] for i in phase.s) for phase in self.phases)
+        return " ".join("".join(find_state(i).symbol for i in phase.s) for phase in self.phases)
 
 
 def bucket(count: int, least: int) -> int:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .hybrid import SECTION
+from .contact_state import STATES, find_state
+from .guard import SECTION, GuardNumbers
 from .itinerary import Phase, Shooting
 from .shooting import after_switch, guards_at
 
@@ -120,10 +121,10 @@ class ItineraryChange:
             return
         solution, times = shooting.solution(at), shooting.times(at)
         condition = ("vanish", p)
-        faces = len(new.s)
-        if _face(old.guard, faces) != _face(phases[p].guard, faces):
-            changed = [i for i in range(faces) if phases[p].s[i] != new.s[i]]
-            s = tuple(new.s[i] if i in changed else old.s[i] for i in range(faces))
+        numbers = shooting.family.template.guard_numbers
+        if _part(old.guard, numbers) != _part(phases[p].guard, numbers):
+            changed = [i for i in range(len(new.s)) if phases[p].s[i] != new.s[i]]
+            s = tuple(new.s[i] if i in changed else old.s[i] for i in range(len(new.s)))
             swapped = list(phases)
             swapped[p - 1] = Phase(old.s, phases[p].guard)
             swapped[p] = Phase(s, old.guard)
@@ -149,7 +150,8 @@ class ItineraryChange:
         y = np.asarray(self.family.sampled(solution, np.array([moment]), 1)[0])[:, 0]
         q, guard = solution.u[-1], int(place.guard)
         s = np.array(phase.s, float)
-        face = (guard - 1) // 2
+        numbers = shooting.family.template.guard_numbers
+        face = numbers.face(guard)
         tried = []
         if since <= 0 or since >= h:
             tried = self._states_before(phase, face, guard) if since <= 0 else []
@@ -159,7 +161,9 @@ class ItineraryChange:
             ).astype(int)
             tried = [tuple(int(i) for i in engine)]
             if face < len(s):
-                for other in (0, 1, -1):
+                # Those of a closed joint, first the one that holds the face.
+                closed = [state for state in STATES if state.closed]
+                for other in (row.code for row in sorted(closed, key=lambda row: bool(row.force))):
                     tried.append(tuple(other if i == face else j for i, j in enumerate(phase.s)))
         condition = ("touch", place)
         for state in dict.fromkeys(tried):
@@ -185,8 +189,11 @@ class ItineraryChange:
         """Contact states that may come before a phase whose guard is zero at its very start."""
         if face >= len(phase.s):
             return []
-        slip = 1 if guard == 1 + 2 * face else -1
-        state = slip if phase.s[face] == 0 else 0
+        row, numbers = find_state(phase.s[face]), self.shooting.family.template.guard_numbers
+        change = row.lower if guard == numbers.lower(face) else row.upper
+        if change is None:
+            return []
+        state = change.to[0]
         return [tuple(state if i == face else j for i, j in enumerate(phase.s))]
 
     def _merge(self, new: Shooting):
@@ -281,6 +288,6 @@ def _first_time_after(time, begin, times) -> float:
     return time if time > begin else time + times[-1]
 
 
-def _face(guard: int, faces: int) -> int:
-    """The face of a guard or, for guards beyond the faces, its joint."""
-    return (guard - 1) // 2 if guard <= 2 * faces else guard - faces
+def _part(guard: int, numbers: GuardNumbers) -> int:
+    """The face of a guard; for the guard of an opening its own number."""
+    return guard if numbers.opens_joint(guard) else numbers.face(guard)

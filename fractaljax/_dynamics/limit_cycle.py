@@ -19,7 +19,13 @@ from .cycle_search import CycleSearch
 from .excitation import Excitation, excited_system
 from .hybrid import HybridSystem
 from .orbit import orbit
-from .scaled import FEW, check_rtol, degrees_of_freedom, scaled_start, start_state
+from .scaled import (
+    check_rtol,
+    degrees_of_freedom,
+    scaled_start,
+    start_state,
+    steps_follow_motion,
+)
 from .search import find_attractor
 from .segments import Segments
 from .status import Status
@@ -121,7 +127,7 @@ def check_arguments(mechanism, start, excitation, rtol, max_returns, search, seg
     count = 64 if segments is None else whole("segments", segments, 16)
     if segments is None and any(x.follows_load_curve for x in joints.values()):
         count *= 8  # towards an opening segments are short: less than a second compilation
-    elif segments is None and (n > FEW or len(joints) > 1):
+    elif segments is None and (steps_follow_motion(n) or len(joints) > 1):
         count *= 4  # a period may be long beside that of the highest frequency, or of many phases
     of_scene = isinstance(mechanism, Scene)
     return returns, count, {"of_scene": of_scene, "rtol": rtol, "search": search}

@@ -16,7 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from .hybrid import NONE, HybridSystem
+from .guard import NONE
+from .hybrid import HybridSystem
 from .lanes import chosen, product, solve
 from .maps import Maps, axis_of, coarse_maps, exact_maps, in_blocks, segments_together
 from .segments import Segments, chosen_guard, flow, next_start

@@ -15,7 +15,7 @@ import numpy as np
 
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import substituted
-from .hybrid import SECTION
+from .guard import SECTION
 from .itinerary import Family, Phase, Shooting, Solution
 from .shooting import (
     Place,

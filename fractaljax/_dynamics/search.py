@@ -19,7 +19,8 @@ from jaxtyping import Array, Float, Int
 from .acceptance import admissible, growth_of, has_shorter_period
 from .assessment import Candidates, Problem, Progress, assess, conclude_round, count_rounds
 from .cycle_search import CycleSearch
-from .hybrid import UNUSED, HybridSystem
+from .guard import UNUSED
+from .hybrid import HybridSystem
 from .lanes import chosen
 from .orbit import PeriodicOrbit, solve_periodic_orbits
 from .record import Record, Steps, Stretch, cut

@@ -20,10 +20,13 @@ from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import substituted
 from .events import Cubic
 from .extremes import extreme_values
-from .hybrid import NONE, UNUSED, HybridSystem
+from .guard import NONE, UNUSED
+from .hybrid import HybridSystem
 from .runge_kutta import runge_kutta
 from .scaled import hybrid_system
 from .segments import Segments, chosen_guard, flow, next_start, tableau
+from .step_length import density
+from .transition import switch
 
 
 class Window(eqx.Module):
@@ -294,7 +297,7 @@ def resampled(x, window: Window, chain: Chain, lifted: Lifted, u, times, longest
     k = jnp.minimum(jnp.searchsorted(ends, times, side="right"), last)
     s = chain.s[:, k]
     y = flow(system, lifted.at(u)[:, k], times - (ends - h)[k], s)
-    return y, system.density(y, s, jnp.broadcast_to(longest, k.shape))
+    return y, density(system, y, s, jnp.broadcast_to(longest, k.shape))
 
 
 @exported_jit
@@ -347,7 +350,7 @@ def largest_friction(x, window: Window, q, y):
 @jax.jit
 def after_switch(x, window: Window, q, y, s, guard):
     """The contact state after a guard of contact state s has reached zero at y."""
-    return window.system(x, q).switch(y, s, guard)[1]
+    return switch(window.system(x, q), y, s, guard)[1]
 
 
 @jax.jit

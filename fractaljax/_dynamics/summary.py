@@ -7,14 +7,8 @@ from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
 from .._stability.stability import stability
 from .._stability.summary import friction_remark, stiffness_remarks, verdict
+from .contact_state import STATES
 from .cycle import CycleResult, LimitCycle
-
-_CONTACT_STATES = {
-    "+": "slips, dx/dt < V",
-    "-": "slips, dx/dt > V",
-    "stick": "sticks",
-    "open": "open",
-}
 
 
 def cycle_table(mechanism: Scene | Structure, cycle: LimitCycle, most: int = 12) -> str:
@@ -92,12 +86,13 @@ def _joint_columns(cycle: LimitCycle) -> list[dict[str, str]]:
 
 
 def _switching(switches, period) -> str:
+    words = {state.name: state.description.format(velocity="dx/dt") for state in STATES}
     columns = {
         "time [ms]": [f"{at.time * 1e3:.6f}" for at in switches],
         "of the period": [f"{at.time / period:.2%}" for at in switches],
         "direction": [f"x{at.direction}" for at in switches],
-        "before": [_CONTACT_STATES[at.before] for at in switches],
-        "after": [_CONTACT_STATES[at.after] for at in switches],
+        "before": [words[at.before] for at in switches],
+        "after": [words[at.after] for at in switches],
     }
     names = [f"switch {i}" for i in range(1, len(switches) + 1)]
     rows = [dict(zip(names, cells, strict=True)) for cells in columns.values()]

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from .._base.parts import require_kind, scalar, whole
-from .._dynamics.cycle import STATE_NAMES, CycleResult, LimitCycle
-from .._dynamics.hybrid import OPEN
+from .._dynamics.contact_state import STATES, find_state
+from .._dynamics.cycle import CycleResult, LimitCycle
 from .._mechanism.mesh import Mesh
 from .._mechanism.reduced import ReducedStructure
 from .._mechanism.structure import Structure
@@ -19,13 +19,6 @@ from .mesh import draw_mesh, mesh_height, mesh_scale, projection
 
 if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
-
-_STATES = {  # value in `contact_states`: colour, and words
-    1: ("tab:blue", "slips, t.dx/dt < V"),
-    -1: ("tab:cyan", "slips, t.dx/dt > V"),
-    0: ("tab:orange", "sticks"),
-    OPEN: ("tab:red", "open"),
-}
 
 
 def cycle_motion(
@@ -168,7 +161,7 @@ def _places(mesh: Mesh, touched: np.ndarray) -> np.ndarray:
 
 def _spans(cycle: LimitCycle, face: int, start: float) -> Iterator[tuple[float, float, int]]:
     """Yield begin [s], duration [s] and contact state, one after the other over a period."""
-    values = {name: value for value, name in STATE_NAMES.items()}
+    values = {state.name: state.code for state in STATES}
     begin, state = 0.0, int(start)
     for switch in cycle.switches():
         if switch.direction == face + 1:
@@ -211,7 +204,7 @@ def _picture(motion: _Motion, scale: float | None) -> tuple[Figure, Callable[[fl
                 marks._offsets3d = tuple(at.T)
             else:
                 marks.set_offsets(at)
-            marks.set_facecolor([_STATES[int(state)][0] for state in motion.states[k]])
+            marks.set_facecolor([find_state(state).colour for state in motion.states[k]])
         return [cells, marks, cursor]
 
     return figure, draw
@@ -223,11 +216,13 @@ def _lanes(ax: Axes, motion: _Motion) -> Any:
 
     for i, spans in enumerate(motion.spans):
         bars = [(begin / motion.period, duration / motion.period) for begin, duration, _ in spans]
-        colours = [_STATES[state][0] for _, _, state in spans]
+        colours = [find_state(state).colour for _, _, state in spans]
         ax.broken_barh(bars, (i - 0.4, 0.8), facecolors=colours)
     passed = {state for spans in motion.spans for _, _, state in spans}
     shown = [
-        Patch(color=colour, label=words) for s, (colour, words) in _STATES.items() if s in passed
+        Patch(color=state.colour, label=state.description.format(velocity="t.dx/dt"))
+        for state in STATES
+        if state.code in passed
     ]
     legend_above(ax, shown)
     few = len(motion.names) <= 24  # more names would overlap

@@ -3,6 +3,7 @@
 import numpy as np
 
 from .._base.parts import whole
+from .._dynamics.contact_state import STICK
 from .._dynamics.simulate import Trajectory
 from .axes import Axes, coordinate, ensure_axes, legend_above
 
@@ -38,7 +39,7 @@ def trajectory(
     step = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 1)
     sticks = np.zeros(len(t), bool)
     if shown.face is not None:
-        sticks = np.asarray(result.contact_states)[step, shown.face] == 0
+        sticks = np.asarray(result.contact_states)[step, shown.face] == STICK
     handles = ax.plot(t * 1e3, x, color="tab:blue", lw=0.9, label="motion")
     if sticks.any():
         stuck = np.where(sticks, x, np.nan)

@@ -22,7 +22,9 @@ from fractaljax._dynamics.assessment import (
     near_orbit,
     patience,
 )
-from fractaljax._dynamics.hybrid import NONE, OPEN, SECTION, UNUSED, HybridSystem
+from fractaljax._dynamics.contact_state import OPEN
+from fractaljax._dynamics.guard import NONE, SECTION, UNUSED
+from fractaljax._dynamics.hybrid import HybridSystem
 from fractaljax._dynamics.record import Record
 from fractaljax._dynamics.scaled import hybrid_system
 from fractaljax._dynamics.search import _kept_steps

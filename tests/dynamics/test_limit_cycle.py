@@ -15,7 +15,7 @@ import hybrid_truth
 from fractaljax._base.parts import substitute
 from fractaljax._dynamics.acceptance import growth_of
 from fractaljax._dynamics.cycle import repels
-from fractaljax._dynamics.hybrid import NONE
+from fractaljax._dynamics.guard import NONE
 from fractaljax._dynamics.orbit import solve_periodic_orbits
 from fractaljax._dynamics.search import find_attractor
 from fractaljax._dynamics.segments import flow
