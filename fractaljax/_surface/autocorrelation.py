@@ -17,7 +17,8 @@ def autocorrelation_lengths(
     """(Sal [m], Str): the lag of the fastest decay to `level`, and its ratio to the slowest.
 
     Along each of 720 directions the lag is that of the first crossing, or half the map if there is
-    none. The two that count are refined on the sum of waves, and have first derivatives.
+    none. Near the shortest and the longest of them it is refined on the sum of waves that the
+    autocorrelation is. Both results have first derivatives.
     """
     power = jnp.abs(jnp.fft.fft2(z)) ** 2
     power = power / jnp.sum(power)
@@ -26,13 +27,19 @@ def autocorrelation_lengths(
     values = jnp.fft.fft2(jax.lax.stop_gradient(power)).real
     lags, crosses = _first_crossings(values, directions, steps, level)
 
-    def refine(k):
-        refined = _refine_crossing(power, directions[k], lags[k], steps, level)
-        return jnp.where(crosses[k], refined, lags[k])
+    def refine(best, no_crossing):
+        coarse = jnp.where(crosses, lags, no_crossing)
+        near = (best(coarse) + np.arange(-16, 17)) % angles.size
+        roots = jax.vmap(lambda k: _crossing_near(power, directions[k], lags[k], steps, level))(
+            near
+        )
+        k = best(jnp.where(crosses[near], roots, coarse[near]))
+        refined = _with_derivatives(power, directions[near[k]], roots[k], steps, level)
+        return jnp.where(crosses[near[k]], refined, lags[near[k]])
 
-    fastest = refine(jnp.argmin(jnp.where(crosses, lags, jnp.inf)))
+    fastest = refine(jnp.argmin, jnp.inf)
     fastest = jnp.where(jnp.any(crosses), fastest, jnp.nan)  # flat, or not a number
-    return fastest, fastest / refine(jnp.argmax(lags))
+    return fastest, fastest / refine(jnp.argmax, lags)
 
 
 def _first_crossings(values, directions, steps, level):
@@ -66,32 +73,36 @@ def _first_crossings(values, directions, steps, level):
     return spacing * jnp.where(crosses, crossing, most), crosses
 
 
-def _refine_crossing(power, direction, lag, steps, level):
-    """The lag near `lag` at which the sum of waves is `level`, by Newton's method."""
-    n, m = power.shape
-    waves = [2 * np.pi * np.fft.fftfreq(count) for count in (n, m)]
+def _correlation(power, direction, lag, steps):
+    """The autocorrelation at a lag along a direction: the sum of all waves."""
+    (n, m), shift = power.shape, lag * direction / steps
+    x = jnp.asarray(2 * np.pi * np.fft.fftfreq(n), power.dtype) * shift[0]
+    y = jnp.asarray(2 * np.pi * np.fft.fftfreq(m), power.dtype) * shift[1]
+    along_y = jnp.matmul(power, jnp.stack([jnp.cos(y), jnp.sin(y)], 1), precision="highest")
+    return jnp.sum(jnp.cos(x) * along_y[:, 0] - jnp.sin(x) * along_y[:, 1])
 
-    def correlation(power, lag, steps):
-        x, y = (
-            jnp.asarray(wave, power.dtype) * part
-            for wave, part in zip(waves, lag * direction / steps, strict=True)
-        )
-        product = jnp.matmul(power, jnp.stack([jnp.cos(y), jnp.sin(y)], 1), precision="highest")
-        return jnp.sum(jnp.cos(x) * product[:, 0] - jnp.sin(x) * product[:, 1])
 
-    fixed_power, start, fixed_steps = jax.lax.stop_gradient((power, lag, steps))
-    reach = jnp.max(fixed_steps)
+def _value_and_fall(power, direction, lag, steps):
+    """The autocorrelation and its slope, which is minus infinite where it does not fall."""
+    value, slope = jax.jvp(
+        lambda lag: _correlation(power, direction, lag, steps), (lag,), (jnp.ones_like(lag),)
+    )
+    return value, jnp.where(slope < 0, slope, -jnp.inf)
 
-    def at(lag):
-        value, fall = jax.jvp(
-            lambda lag: correlation(fixed_power, lag, fixed_steps), (lag,), (jnp.ones_like(lag),)
-        )
-        return value, jnp.where(fall < 0, fall, -jnp.inf)  # no step where it does not fall
+
+def _crossing_near(power, direction, lag, steps, level):
+    """The lag at which the autocorrelation is `level`, by Newton's method; without derivatives."""
+    power, start, steps = jax.lax.stop_gradient((power, lag, steps))
+    reach = jnp.max(steps)
 
     def newton(_, lag):
-        value, fall = at(lag)
-        return jnp.clip(lag - (value - level) / fall, start - reach, start + reach)
+        value, slope = _value_and_fall(power, direction, lag, steps)
+        return jnp.clip(lag - (value - level) / slope, start - reach, start + reach)
 
-    root = jax.lax.fori_loop(0, 5, newton, start)
-    # One more step, which carries the derivatives.
-    return root - (correlation(power, root, steps) - level) / at(root)[1]
+    return jax.lax.fori_loop(0, 5, newton, start)
+
+
+def _with_derivatives(power, direction, root, steps, level):
+    """The same lag with its derivatives, which one more step of Newton's method carries."""
+    slope = _value_and_fall(*jax.lax.stop_gradient((power, direction, root, steps)))[1]
+    return root - (_correlation(power, direction, root, steps) - level) / slope

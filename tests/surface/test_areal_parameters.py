@@ -60,7 +60,7 @@ def test_lay_in_any_direction(waves):
     f = np.array(waves) / [1.0, 2.0]
     z = np.cos(2 * np.pi * (f[0] * X[:, ::2] + f[1] * 2 * Y[:, ::2]))
     p = fj.areal_parameters(z, 1 / N, dy=4 / N)
-    assert float(p.Sal) == pytest.approx(math.acos(0.2) / (2 * math.pi * np.hypot(*f)), rel=1e-4)
+    assert float(p.Sal) == pytest.approx(math.acos(0.2) / (2 * math.pi * np.hypot(*f)), rel=5e-6)
 
 
 def test_gaussian_heights():
@@ -162,8 +162,10 @@ def test_autocorrelation_lengths(stretch):
     z, steps = np.fft.ifft2(waves).real, (1e-6, 0.8e-6)
     lags = np.array([crossing(z, steps, angle) for angle in np.pi * np.arange(180) / 180])
     Sal, Str = autocorrelation_lengths(jnp.asarray(z - z.mean()), jnp.array(steps))
-    assert float(Sal) == pytest.approx(lags.min(), rel=1e-4)
-    assert float(Sal / Str) == pytest.approx(lags.max(), rel=1e-2)
+    assert float(Sal) == pytest.approx(lags.min(), rel=1e-4) and Sal <= lags.min() * (1 + 1e-9)
+    assert float(Sal / Str) == pytest.approx(lags.max(), rel=1e-3) and Sal / Str >= lags.max() * (
+        1 - 1e-9
+    )
 
 
 # --- derivatives, batches, refusals --------------------------------------------------------

@@ -1,6 +1,7 @@
 """Profile parameters beside closed forms, and beside ISO's definitions in plain NumPy."""
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -139,8 +140,9 @@ def test_sections():
     """Rz, Rp and Rv are means over sections in the middle; Rt is of all of them together."""
     z, dx = noise(), 1e-6
     p = fj.profile_parameters(z, dx, cutoff=5e-4)
-    roughness = np.asarray(remove_form(z) - low_pass(remove_form(z), 5e-4, (dx,)))
-    middle = roughness[750:3250].reshape(5, 500)
+    level = remove_form(jnp.asarray(z))
+    roughness = level - low_pass(level, 5e-4, (dx,))
+    middle = np.asarray(roughness)[750:3250].reshape(5, 500)
     peak, pit = middle.max(axis=1), -middle.min(axis=1)
     expected = dict(Rp=peak.mean(), Rv=pit.mean(), Rz=(peak + pit).mean(), Rt=np.ptp(middle))
     expected |= dict(Ra=abs(middle).mean(), Rq=math.sqrt((middle**2).mean()))
@@ -172,7 +174,7 @@ def test_slope_has_its_order():
     errors = []
     for n in (64, 128):
         x = np.linspace(0, 3, n)
-        errors.append(np.abs(slope(np.sin(x), x[1]) - np.cos(x)))
+        errors.append(np.abs(slope(jnp.asarray(np.sin(x)), x[1]) - np.cos(x)))
     for i, order in ((0, 2), (1, 2), (2, 4), (32, 6)):
         for k in (i, -1 - i):
             ratio = errors[0][k] / errors[1][k if i < 32 else 2 * k]
@@ -294,13 +296,12 @@ def test_derivative_by_the_grid_step():
 
 def test_batches_and_float32():
     z, dx = np.stack([noise(1300, seed) for seed in (0, 1)]), 1e-6
-    filters = {"cutoff": 2e-4, "shortest": 4e-6}
+    filters: dict[str, Any] = {"cutoff": 2e-4, "shortest": 4e-6}
     batch = jax.jit(jax.vmap(lambda z: fj.profile_parameters(z, dx, **filters)))(z)
     for k in (0, 1):
         one = fj.profile_parameters(z[k], dx, **filters)
-        single = fj.profile_parameters(
-            *map(jnp.float32, (z[k], dx)), **{name: jnp.float32(x) for name, x in filters.items()}
-        )
+        lengths: dict[str, Any] = {name: jnp.float32(x) for name, x in filters.items()}
+        single = fj.profile_parameters(jnp.float32(z[k]), jnp.float32(dx), **lengths)
         for name in NAMES:
             np.testing.assert_allclose(getattr(batch, name)[k], getattr(one, name), rtol=1e-12)
             assert getattr(single, name).dtype == jnp.float32

@@ -65,7 +65,9 @@ def test_batches_and_derivatives():
     for name, value in vars(batch).items():
         assert value.shape == (2,), name
     np.testing.assert_allclose(batch.Rz[1] / batch.Rz[0], 2, rtol=1e-12)
-    slopes = both_gradients(lambda x: gaussian_profile_parameters(*x, CUTOFF).Rz, (1e-12, 0.01))
+    slopes = both_gradients(
+        lambda x: gaussian_profile_parameters(x[0], x[1], CUTOFF).Rz, (1e-12, 0.01)
+    )
     for forward, reverse in zip(*slopes, strict=True):
         assert float(forward) == pytest.approx(float(reverse), rel=1e-12)
     Rz = jax.jit(lambda m2: gaussian_profile_parameters(1e-12, m2, CUTOFF).Rz)
