@@ -17,7 +17,7 @@ def section_bounds(
     **Raises:** `ValueError` if the profile is too short; `TypeError` for traced lengths.
     """
     if sections is not None:
-        sections = whole("sections", sections, 1)
+        sections = whole("sections", sections, 1, n)
     if cutoff is None:
         start, end = _inner_points(n, "z", "shortest", shortest, dx)
         count = sections or 1
