@@ -115,6 +115,14 @@ from ._stability.tracks import (
     ModeTracks as ModeTracks,
     track_modes as track_modes,
 )
+from ._surface.areal_parameters import (
+    ArealParameters as ArealParameters,
+    areal_parameters as areal_parameters,
+)
+from ._surface.profile_parameters import (
+    ProfileParameters as ProfileParameters,
+    profile_parameters as profile_parameters,
+)
 from ._surface.roughness import Roughness as Roughness, roughness as roughness
 from ._surface.surface import Surface as Surface
 from ._surface.topography import topography as topography

@@ -39,6 +39,14 @@ CALLS = {
         partial(fj.boundary_element, material=MATERIAL),
         dict(heights=np.eye(3), dx=1e-6, P=1.0, rtol=1e-6),
     ),
+    "profile": (
+        partial(fj.profile_parameters, np.sin(np.arange(100.0))),
+        dict(dx=1e-6, cutoff=1e-5, shortest=2e-6, sections=5),
+    ),
+    "areal": (
+        partial(fj.areal_parameters, np.outer(np.sin(np.arange(40.0)), np.arange(40.0))),
+        dict(dx=1e-6, dy=1e-6, cutoff=1e-5, shortest=2e-6),
+    ),
     "dimensionless": (fj.dimensionless_normal_stiffness, dict(D=2.4, A_r=1e-3, a_e=1e-5)),
     "slip": (partial(fj.dimensionless_tangential_stiffness, 2.4, 0.3, 1e-3, 1e-5), SLIP),
     "equilibrium": (partial(fj.equilibrium, SCENE.oscillator), dict(K_n=1e8, K_t=1e8, mu=0.3)),
