@@ -279,6 +279,6 @@ def _update_curvature(
     change = change + multipliers @ (there.unmet_slopes - here.unmet_slopes)[unmet]
     error = change - hessian @ step
     if abs(step @ error) <= 1e-8 * np.linalg.norm(step) * np.linalg.norm(error):
-        return hessian  # the usual safeguard: a correction would be too large
+        return hessian  # the correction would be too large
     values, vectors = np.linalg.eigh(hessian + np.outer(error, error) / (step @ error))
     return vectors * np.clip(values, curvature, options.largest_curvature) @ vectors.T
