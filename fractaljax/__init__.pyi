@@ -32,6 +32,7 @@ from ._design.design import (
     design as design,
     repeat_design as repeat_design,
 )
+from ._design.design_search import DesignSearch as DesignSearch
 from ._design.envelope import Envelope as Envelope
 from ._design.many import DesignMany as DesignMany, design_many as design_many
 from ._design.pareto import Front as Front, pareto as pareto

@@ -19,14 +19,12 @@ from .._mechanism.structure import Structure
 from .._sweep.program import Program
 from .._sweep.sweep import run
 from .constraints import CycleConstraint
-from .growing_modes import MODES_MOST
+from .growing_modes import largest_mode_count
 from .optimum import Optimum, optimum
 from .problem import DesignProblem
 from .result import DesignResult, is_met
 from .statement import DEFAULT_BOUNDS
 
-_BATCH = 256  # mechanisms side by side on a device; of structures
-_BATCH_OF_STRUCTURES = 16
 _MEMBER = "member"  # the axis of a batch in a store
 
 
@@ -177,7 +175,7 @@ def design_many(
     first, stacked, shape = _members(xs)
     if not is_traced(stacked):
         # What is wrong with the arguments is said of a member that is there.
-        most = min(MODES_MOST, first.n) if isinstance(first, Structure) else None
+        most = largest_mode_count(first) if isinstance(first, Structure) else None
         lowest: Any = 0.0 if K_n_min is None else K_n_min  # its own would take a program
         checked = DesignProblem(
             first, bounds, modes=modes or most, **{**request, "K_n_min": lowest}
@@ -202,7 +200,7 @@ def design_many(
             return _at(first, [leaf[values[_MEMBER]] for leaf in leaves])
 
         program = Program(designed, (_MEMBER,), stacked, [*grid.values()], place)
-        each = _BATCH_OF_STRUCTURES if isinstance(first, Structure) else _BATCH
+        each = 16 if isinstance(first, Structure) else 256
         if checked.scatter is not None:  # each design is as many as its quadrature has nodes
             each = max(1, each // len(checked.scatter.weights))
         how: dict[str, Any] = dict(each=each, batch_size=batch_size, progress=progress)
@@ -229,7 +227,7 @@ def _members(xs: Any) -> tuple[Any, list[Array], tuple[int, ...]]:
             raise ValueError("xs must hold at least one mechanism, got none")
         for i, x in enumerate(xs):
             require_one(f"xs[{i}]", x)
-            if not _alike(x, xs[0]):
+            if not _same_kind(x, xs[0]):
                 raise ValueError(f"xs must be mechanisms of one kind: xs[{i}] differs from xs[0]")
         leaves = zip(*(jax.tree.leaves(x) for x in xs), strict=True)
         return xs[0], [jnp.stack(each) for each in leaves], (len(xs),)
@@ -251,7 +249,8 @@ def _members(xs: Any) -> tuple[Any, list[Array], tuple[int, ...]]:
     return first, [a.reshape(-1, *a.shape[len(shape) :]) for a in leaves], shape
 
 
-def _alike(x: Mechanism, other: Mechanism) -> bool:
+def _same_kind(x: Mechanism, other: Mechanism) -> bool:
+    """True if two mechanisms differ in numbers alone."""
     kinds = [jax.tree.map(lambda a: (a.shape, a.dtype), each) for each in (x, other)]
     return kinds[0] == kinds[1] if jax.tree.structure(x) == jax.tree.structure(other) else False
 

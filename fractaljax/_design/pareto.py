@@ -15,15 +15,11 @@ from .._base.parts import Record, brief, flag, scalar, whole
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import replaced
 from .constraints import Constraint
-from .design import Design, design, screened, solver_of, stated
+from .design import Design, default_solver, design, designs_to_screen, state_problem
 from .evaluator import Evaluator
 from .problem import DesignProblem
 from .rows import describe
 from .search import Search
-
-_STARTS = 6  # for each member of the front
-_RESOLVED = 1e-6  # relative difference of the ends of a front
-_POINTS_MAX = 1000
 
 
 class Front(Record):
@@ -102,7 +98,7 @@ def pareto(
     """
     from tqdm import tqdm
 
-    points = whole("points", points, 3, _POINTS_MAX)
+    points = whole("points", points, 3, 1000)
     if not (isinstance(names, (tuple, list)) and len(names) == 2):
         raise TypeError(f"names must be those of both objectives, got {brief(names)}")
     for name, objective in zip(("first", "second"), (first, second), strict=True):
@@ -124,7 +120,7 @@ def pareto(
 
     def problem_at(limit: float, scale: float) -> DesignProblem:
         constraints: Any = (*made["constraints"], _Second(second, limit, scale))
-        return stated(x, made | {"constraints": constraints})
+        return state_problem(x, made | {"constraints": constraints})
 
     problem = problem_at(0.0, 1.0)
     places = np.stack([problem.scaled(end.scene) for end in ends])
@@ -133,9 +129,9 @@ def pareto(
     # Ends are found to the solver's tolerance; at either of equal ends both objectives are least.
     if not high > low or _equal(high, low) or _equal(*rows[:, 0].tolist()):
         raise ValueError(f"the least {names[0]} and the least {names[1]} are one design")
-    _, designs = screened(problem, None, made["lattice"])
+    _, designs = designs_to_screen(problem, None, made["lattice"])
     screening = Evaluator(problem).evaluate(designs)
-    solver = made["solver"] or solver_of(problem)
+    solver = made["solver"] or default_solver(problem)
     members = []
     for share in tqdm(np.linspace(1, 0, points), desc="pareto", disable=not progress):
         limit = low + share * (high - low)
@@ -145,9 +141,10 @@ def pareto(
         merit = screening.values / scale + 10 * np.maximum(residuals, 0).sum(axis=1)
         promising = designs[np.argsort(np.nan_to_num(merit, nan=np.inf), kind="stable")]
         between = share * places[0] + (1 - share) * places[1]
-        starts = np.concatenate([places, between[None], promising[: _STARTS - 3]])
+        starts = np.concatenate([places, between[None], promising[:3]])
         evaluator = Evaluator(problem_at(limit, high - low))
-        path, *_ = Search(evaluator, solver, scale).best(starts, progress=False)
+        search = Search(evaluator, solver, scale, options=made["search"])
+        path, *_ = search.best(starts, progress=False)
         # The last limit leaves no room for the slack: there is the second end alone.
         us = np.stack([path[-1], *places])
         ends_here = evaluator.evaluate(us)
@@ -174,7 +171,7 @@ def pareto(
 
 def _equal(one: float, other: float) -> bool:
     """True if two values of an objective differ by no more than its error."""
-    return abs(one - other) <= _RESOLVED * max(abs(one), abs(other))
+    return abs(one - other) <= 1e-6 * max(abs(one), abs(other))
 
 
 def _beats(other, member) -> bool:

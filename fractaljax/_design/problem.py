@@ -25,17 +25,17 @@ from .._mechanism.structure import Structure
 from .._stability.linearise import assembled
 from .._stability.quadratic import leading
 from .._stability.stability import growth_rate
-from .coalescence import neighbour_residuals, of_scene
+from .coalescence import neighbour_residuals, scene_residuals
 from .constraints import Constraint, CycleConstraint
 from .cuts import Cuts
 from .envelope import Envelope
 from .followed import FollowedCycles
-from .growing_modes import MODES_MOST, modes_to_keep
+from .growing_modes import largest_mode_count, modes_to_keep
 from .joints import (
     is_fractal,
     joint_prefix,
+    joint_states,
     slips,
-    states_of,
     with_contact_law,
     with_stiffness,
 )
@@ -142,7 +142,7 @@ class DesignProblem(eqx.Module):
             setattr(self, name, value)
         self.modes, self.smooth, self.cuts = 0, False, None
         if isinstance(x, Structure):
-            most = min(MODES_MOST, x.n)
+            most = largest_mode_count(x)
             if modes is not None:
                 self.modes = whole("modes", modes, 1, most)
             else:
@@ -150,7 +150,7 @@ class DesignProblem(eqx.Module):
         # A quantile of smooth residuals is not that of the growth rates.
         self.smooth = self.least_growth or self.scatter is None
         if K_n_min is None and self.contacts:
-            self.K_n_min = _own_stiffness(self)
+            self.K_n_min = _initial_stiffness(self)
 
     def with_fields(self, **changes: Any) -> "DesignProblem":
         """The same problem with some of its fields set to `changes`, unchecked."""
@@ -239,7 +239,7 @@ class DesignProblem(eqx.Module):
                     smooth += list(jnp.arcsinh(leading_modes.s.real / self.growth_scale))
             else:
                 rates.append(growth_rate(each, self.friction_slope))
-                smooth += of_scene(
+                smooth += scene_residuals(
                     each, self.friction_slope, rates[-1], self.target, self.growth_scale
                 )
         growth = rates[0]
@@ -277,7 +277,7 @@ class DesignProblem(eqx.Module):
             for name, part in parts.items()
             if part.contact.fractal or name in self.contacts
         }
-        states = states_of(designed_parts)
+        states = joint_states(designed_parts)
         # The load curve of a joint is that of its own law.
         constant_states = {
             name: state for name, state in states.items() if not parts[name].follows_load_curve
@@ -315,6 +315,11 @@ class DesignProblem(eqx.Module):
     def robust(self) -> bool:
         """True with an envelope or a tolerance."""
         return bool(self.conditions) or self.scatter is not None
+
+    @property
+    def has_many_joints(self) -> bool:
+        """True if nearly no design of an even spread is inside the limits of all joints."""
+        return len(self.contacts) > 2
 
     @property
     def least_growth(self) -> bool:
@@ -406,7 +411,7 @@ class DesignProblem(eqx.Module):
 
 
 @exported_jit
-def _own_stiffness(problem: DesignProblem) -> tuple[Array, ...]:
+def _initial_stiffness(problem: DesignProblem) -> tuple[Array, ...]:
     """K_n [N/m] of each contact that a design moves, as it is given."""
     states = problem.stiffened(problem.mechanism(problem.start))[0]
     return tuple(states[name].K_n for name in problem.contacts)
