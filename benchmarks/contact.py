@@ -5,6 +5,8 @@ own surface, material, load and friction, and 40 digits. The package solves the 
 fixed number of Halley steps; the peer is a loop over SciPy's brentq at several tolerances.
 """
 
+import functools
+import inspect
 import json
 import math
 import statistics
@@ -17,7 +19,8 @@ import numpy as np
 from tqdm import tqdm
 
 import fractaljax as fj
-from fractaljax._contact import load_balance
+from fractaljax._contact import fractal
+from fractaljax._contact.load_balance import log_area_ratio
 
 from .loops import scalar_joint
 from .page import draw, png, subplots, table
@@ -32,7 +35,7 @@ INPUTS = ("D", "G", "gamma", "E", "nu", "sigma_y", "H", "P", "mu_s", "mu_m")
 OUTPUTS = ("a_l", "K_n", "K_t")
 STEPS = range(1, 9)
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)  # of ln a_l
-DEFAULT = load_balance._HALLEY_STEPS
+DEFAULT = inspect.signature(log_area_ratio).parameters["steps"].default
 
 
 def joint(inputs: jax.Array) -> jax.Array:
@@ -46,11 +49,11 @@ def joint(inputs: jax.Array) -> jax.Array:
 
 def package(steps: int, rows: jax.Array) -> tuple[Any, float]:
     """A call for all rows at once by this many Halley steps, and the seconds to compile it."""
-    load_balance._HALLEY_STEPS = steps
+    fractal.log_area_ratio = functools.partial(log_area_ratio, steps=steps)
     try:
         program, compile_s = compiled(jax.vmap(joint), rows)
     finally:
-        load_balance._HALLEY_STEPS = DEFAULT
+        fractal.log_area_ratio = log_area_ratio
         jax.clear_caches()
     jax.block_until_ready(program(rows))
     return lambda: program(rows), compile_s

@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import fractaljax as fj
-from fractaljax._dynamics import search
 from fractaljax._dynamics.scaled import hybrid_system, scaled_start
+from fractaljax._dynamics.search import find_attractor
 
 from .page import draw, png, spread, subplots, table, verdict
 from .timing import compiled, devices, ended, ratio, seconds, started, taking_turns, versions
@@ -88,9 +88,8 @@ def lanes(K_n: jax.Array) -> Row:
         growth = fj.growth_rate(scene) / system.omega
         start, tolerances = scaled_start(system, None), (jnp.asarray(0.25), jnp.asarray(1e-9))
         most = jnp.asarray(5000.0)
-        return search.find(
-            system, start, system.equilibrium(), growth, most, *tolerances, 64
-        ).returns
+        limits = most, *tolerances, 64, fj.CycleSearch()
+        return find_attractor(system, start, system.equilibrium(), growth, *limits).returns
 
     returns = np.asarray(jax.jit(jax.vmap(one))(K_n))
     groups = dict.fromkeys((TOGETHER, len(returns)))

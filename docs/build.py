@@ -36,7 +36,6 @@ GROUPS = {  # of the API: title, and the modules whose public names it has
     "sweep": ("Sweeps", ("_sweep",)),
     "validate": ("Validation", ("_validate",)),
     "plot": ("Pictures", ("plot",)),
-    "compilation": ("Compilation", ("_base",)),
 }
 
 
@@ -180,7 +179,7 @@ def public_names() -> dict[str, list[str]]:
             local = prefix != "constraints." or home == module.__name__
             if name.startswith("_") or not home.startswith("fractaljax.") or not local:
                 continue
-            if prefix + name in ("quantity", "plot"):
+            if prefix + name in ("quantity", "plot", "FileLimits"):
                 home = "fractaljax._mechanism"
             (group,) = [g for g, (_, of) in GROUPS.items() if home.split(".")[1] in of]
             found[group].append(prefix + name)

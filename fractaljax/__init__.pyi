@@ -1,6 +1,6 @@
 from . import plot as plot
+from ._base.file_limits import FileLimits as FileLimits
 from ._base.parts import quantity as quantity
-from ._base.programs import quick_compilation as quick_compilation
 from ._contact.asperity import AsperityContact as AsperityContact
 from ._contact.boundary_element import (
     BoundaryElement as BoundaryElement,
@@ -32,6 +32,7 @@ from ._design.design import (
     design as design,
     repeat_design as repeat_design,
 )
+from ._design.design_search import DesignSearch as DesignSearch
 from ._design.envelope import Envelope as Envelope
 from ._design.many import DesignMany as DesignMany, design_many as design_many
 from ._design.pareto import Front as Front, pareto as pareto
@@ -47,6 +48,7 @@ from ._design.verdict import (
 )
 from ._dynamics.attractors import attractors as attractors
 from ._dynamics.basin import Basin as Basin, basin as basin
+from ._dynamics.basin_search import BasinSearch as BasinSearch
 from ._dynamics.bifurcation import (
     BifurcationMap as BifurcationMap,
     bifurcation_map as bifurcation_map,
@@ -58,6 +60,7 @@ from ._dynamics.branch import (
     continue_cycle as continue_cycle,
 )
 from ._dynamics.cycle import CycleResult as CycleResult, LimitCycle as LimitCycle
+from ._dynamics.cycle_search import CycleSearch as CycleSearch
 from ._dynamics.event_curve import EventCurve as EventCurve, continue_event as continue_event
 from ._dynamics.excitation import Excitation as Excitation
 from ._dynamics.limit_cycle import limit_cycle as limit_cycle
@@ -73,10 +76,13 @@ from ._friction import (
     HyperbolicStribeck as HyperbolicStribeck,
     Stribeck as Stribeck,
 )
+from ._identify.analysis import SpectralAnalysis as SpectralAnalysis
 from ._identify.files import read_measurement as read_measurement
 from ._identify.identify import Identification as Identification, identify as identify
 from ._identify.measurement import Measurement as Measurement
+from ._identify.preparation import Preprocessing as Preprocessing
 from ._identify.spectrum_of import spectrum_of as spectrum_of
+from ._identify.warnings import WarningThresholds as WarningThresholds
 from ._mechanism.damping import modal_damping as modal_damping, rayleigh_damping as rayleigh_damping
 from ._mechanism.matrix_file import Matrices as Matrices, read_matrices as read_matrices
 from ._mechanism.mesh import Mesh as Mesh
@@ -99,6 +105,7 @@ from ._stability.critical_friction import critical_friction as critical_friction
 from ._stability.linearise import assemble as assemble
 from ._stability.margin import margin as margin
 from ._stability.reduction import reduce as reduce, reduction_errors as reduction_errors
+from ._stability.reduction_search import ReductionSearch as ReductionSearch
 from ._stability.shares import EnergyShares as EnergyShares, energy_shares as energy_shares
 from ._stability.stability import (
     Stability as Stability,
@@ -110,7 +117,15 @@ from ._stability.tracks import (
     ModeTracks as ModeTracks,
     track_modes as track_modes,
 )
+from ._surface.areal_parameters import (
+    ArealParameters as ArealParameters,
+    areal_parameters as areal_parameters,
+)
 from ._surface.measured_spectrum import MeasuredSpectrum as MeasuredSpectrum
+from ._surface.profile_parameters import (
+    ProfileParameters as ProfileParameters,
+    profile_parameters as profile_parameters,
+)
 from ._surface.roughness import (
     Roughness as Roughness,
     SpectralMoments as SpectralMoments,

@@ -12,10 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-_NEWTON_STEPS = 12
-_STRAIGHT, _BENT = 0.03, 0.15  # angles between tangents [rad] that lengthen and halve the step
-_BISECTIONS = 30  # towards a zero on an edge of the lattice
-
 
 class CurveEnd(enum.Enum):
     """Why a curve ends."""
@@ -55,6 +51,9 @@ class Continuation:
     settled: float = 0.0  # Newton step at which the iteration stops at once
     small: float = np.inf  # largest residual there, which may be large even close to the zero
     most: int = 5000  # number of points each way
+    newton_steps: int = 12  # of one correction, at most
+    straight: float = 0.03  # angle between tangents [rad] below which the step becomes longer
+    bent: float = 0.15  # angle above which it is halved
 
     def tangent(self, jacobian: np.ndarray) -> np.ndarray:
         """The unit vector t (n,) with Jacobian t = 0 and det [t; Jacobian] > 0."""
@@ -68,7 +67,7 @@ class Continuation:
         """
         free = np.arange(len(u)) != (-1 if fixed is None else fixed)
         best, least, zero = np.inf, np.inf, None
-        for _ in range(_NEWTON_STEPS):
+        for _ in range(self.newton_steps):
             residual, jacobian = self.equations(u)
             if not (np.isfinite(residual).all() and np.isfinite(jacobian).all()):
                 return None
@@ -126,7 +125,7 @@ class Continuation:
             before = u, ahead
             u, ahead, angle, leaves = step
             yield u, ahead, leaves
-            if angle < _STRAIGHT:
+            if angle < self.straight:
                 length = min(1.5 * length, self.longest)
 
     def _step(self, u, ahead, length, sign, before):
@@ -140,7 +139,7 @@ class Continuation:
             target = cubic(before[0], before[1], u, ahead, 1 + length / size)
         leaves = not self._inside(target)
         if leaves:
-            share, fixed, side = self._way_out(u, target)
+            share, fixed, side = self._find_exit(u, target)
             target = u + share * length * ahead
             target[fixed] = side
         zero = self.corrected(target, fixed)
@@ -151,13 +150,13 @@ class Continuation:
             turned = -turned
         angle = np.arccos(np.clip(turned @ ahead, -1, 1))
         along = (reached - u) @ ahead
-        fits = self._inside(reached) and 0 <= along <= 2 * length and angle <= _BENT
+        fits = self._inside(reached) and 0 <= along <= 2 * length and angle <= self.bent
         return (reached, turned, angle, leaves) if fits else None
 
     def _inside(self, u) -> bool:
         return bool(((u >= self.low) & (u <= self.high)).all())
 
-    def _way_out(self, u, target):
+    def _find_exit(self, u, target):
         """Share of the way to an outside target at which it leaves the box, coordinate and side."""
         return min(
             ((side - u[i]) / (target[i] - u[i]), i, side)
@@ -206,17 +205,24 @@ def trace(curves: Continuation, values: Values, lines: int) -> tuple[list[Curve]
             continue
         # In the same direction: the other side of a narrow tongue is another curve.
         along = curves.tangent(start[1])
-        if any((passing(curve, seed, curves.shortest) @ along > 0).any() for curve in branches):
+        steps = [passing_steps(curve, seed, curves.shortest) for curve in branches]
+        if any((each @ along > 0).any() for each in steps):
             continue
         curve = curves.curve(*start)
         if len(curve.points) > 1:
             branches.append(curve)
-    missed = [p for p in failed if not any(len(passing(c, p, curves.shortest)) for c in branches)]
-    return branches, negative, len(missed)
+    missed = sum(
+        not any(len(passing_steps(curve, seed, curves.shortest)) for curve in branches)
+        for seed in failed
+    )
+    return branches, negative, missed
 
 
-def _crossings(values, lines):
-    """Zeros (k, 2) on the lines of a lattice, those on the edge of the square first."""
+def _crossings(values, lines, bisections=30):
+    """Zeros (k, 2) on the lines of a lattice, those on the edge of the square first.
+
+    Also True if the value at (0, 0) is negative. Each zero is located by so many `bisections`.
+    """
     side = np.linspace(0, 1, lines)
     grid = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1)
     value, slope = values(grid.reshape(-1, 2))
@@ -234,14 +240,14 @@ def _crossings(values, lines):
         sign = np.where(low, -1.0, 1.0)
         dips = ~differ & (sign * s[:-1].ravel() < 0) & (sign * s[1:].ravel() > 0)
         first, last, sign = ends[0][dips], ends[1][dips], sign[dips]
-        inside = _beyond(values, first, last, axis, sign)
+        inside = _find_other_sign(values, first, last, axis, sign, bisections)
         through = ~np.isnan(inside[:, 0])
         swapped = (sign < 0)[through, None]
         for end in (first, last):
             positive.append(np.where(swapped, inside[through], end[through]))
             negative.append(np.where(swapped, end[through], inside[through]))
     positive, negative = np.concatenate(positive), np.concatenate(negative)
-    for _ in range(_BISECTIONS):
+    for _ in range(bisections):
         middle = (positive + negative) / 2
         below = (values(middle)[0] < 0)[:, None]
         positive, negative = np.where(below, positive, middle), np.where(below, middle, negative)
@@ -250,10 +256,10 @@ def _crossings(values, lines):
     return middle[np.argsort(within, kind="stable")], bool(value[0, 0] < 0)
 
 
-def _beyond(values, first, last, axis, sign):
+def _find_other_sign(values, first, last, axis, sign, bisections):
     """Points (k, 2) between `first` and `last` where the value has the other sign; else NaN."""
     points = np.full_like(first, np.nan)
-    for _ in range(_BISECTIONS):
+    for _ in range(bisections):
         middle = (first + last) / 2
         value, slope = values(middle)
         other = (value < 0) != (sign < 0)
@@ -263,7 +269,7 @@ def _beyond(values, first, last, axis, sign):
     return points
 
 
-def passing(curve, p, shortest):
+def passing_steps(curve, p, shortest):
     """The steps of a curve that pass p, within the error of its polyline."""
     begin, step = curve.points[:-1], np.diff(curve.points, axis=0)
     length = np.maximum(np.linalg.norm(step, axis=1), shortest**2)

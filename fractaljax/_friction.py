@@ -16,9 +16,8 @@ from ._base.singular import safe_divide
 
 LAWS: dict[str, type["Friction"]] = {}  # by their names in files
 
-_FASTEST = 100.0  # m/s: the least value of a law is sought up to this speed
-SPEEDS = np.concatenate([[0.0], np.geomspace(1e-6, _FASTEST, 161)])  # [m/s]
-_BISECTIONS = 60
+# Speeds [m/s] among which the least value of a law is sought.
+SPEEDS = np.concatenate([[0.0], np.geomspace(1e-6, 100.0, 161)])
 
 
 class _FromLaw:
@@ -66,7 +65,7 @@ class Friction(Part):
     amplitudes: ClassVar[tuple[str, ...]] = ()
 
     mu_s = _FromLaw(lambda law: law.mu(jnp.zeros((), _dtype(law))))
-    mu_m = _FromLaw(lambda law: _least(law))
+    mu_m = _FromLaw(lambda law: _least_coefficient(law))
 
     def __init_subclass__(cls, law: str | None = None, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -96,17 +95,23 @@ class Friction(Part):
 
     @abc.abstractmethod
     def mu(self, speed: ArrayLike) -> Numbers:
-        """The friction coefficient at sliding speeds >= 0 [m/s]; any shape."""
+        """The friction coefficient [-] at sliding speeds `speed` >= 0 [m/s], of any shape."""
 
     def slope(self, v: ArrayLike) -> Numbers:
-        """dmu/d|v| [s/m] at sliding velocities v [m/s]; any shape."""
+        """dmu/d|v| [s/m] at sliding velocities `v` [m/s], of any shape."""
         speed = jnp.abs(v)
         return jax.jvp(self.mu, (speed,), (jnp.ones_like(speed),))[1]
 
     def branch(self, v: ArrayLike, sign: ArrayLike) -> Numbers:
-        """mu of one sliding direction, `sign` = +1 or -1, continued smoothly through v = 0.
+        """mu of one sliding direction, continued smoothly through v = 0.
 
-        branch(0, +-1) = +-mu_s. A sign between them smooths this jump, and nothing else.
+        branch(0, +-1) = +-mu_s.
+
+        **Arguments:**
+
+        - `v`: sliding velocities [m/s], of any shape.
+        - `sign`: the direction, +1 or -1. A sign between them smooths the jump at v = 0, and
+          nothing else.
         """
         if not self.velocity_dependent:
             return self.mu_s * sign
@@ -114,7 +119,7 @@ class Friction(Part):
         return self.mu_s * sign + side * (self.mu(side * v) - self.mu_s)
 
     def times(self, factor: ArrayLike) -> "Friction":
-        """The law as a whole times a factor; not checked."""
+        """The law as a whole times `factor`, a number above 0; not checked."""
         law, names = (self, self.amplitudes) if self.amplitudes else (Scaled(self), ("factor",))
         scaled = [factor * getattr(law, name) for name in names]
         return eqx.tree_at(lambda law: [getattr(law, name) for name in names], law, scaled)
@@ -124,7 +129,7 @@ def _dtype(law: Friction) -> Any:
     return jnp.result_type(float, *jax.tree.leaves(law))
 
 
-def _least(law: Friction) -> Numbers:
+def _least_coefficient(law: Friction) -> Numbers:
     """The least value of mu up to 100 m/s, at least 0; differentiable with its place."""
     fixed = jax.tree.map(jax.lax.stop_gradient, law)
     speeds = jnp.asarray(SPEEDS, _dtype(law))
@@ -137,7 +142,7 @@ def _least(law: Friction) -> Numbers:
         falls = fixed.slope(middle) < 0
         return jnp.where(falls, middle, low), jnp.where(falls, high, middle)
 
-    _, at = jax.lax.fori_loop(0, _BISECTIONS, bisect, ends)
+    _, at = jax.lax.fori_loop(0, 60, bisect, ends)  # more halvings than a double has bits
     # The place of a minimum moves with the law: a Newton step of 0 length has that derivative.
     slope, bend = jax.jvp(law.slope, (at,), (jnp.ones_like(at),))
     step = safe_divide(slope, bend, jnp.zeros_like(bend))
@@ -147,6 +152,10 @@ def _least(law: Friction) -> Numbers:
 @final
 class Coulomb(Friction, law="coulomb"):
     """Constant friction.
+
+    **Arguments:**
+
+    - `mu`: friction coefficient [-].
 
     **Raises:** `ValueError` unless mu > 0.
     """
@@ -162,6 +171,7 @@ class Coulomb(Friction, law="coulomb"):
 
     @property
     def mu_m(self):
+        """The friction coefficient, at every speed."""
         return self.mu_s
 
     def mu(self, speed):
@@ -220,6 +230,7 @@ class ExponentialStribeck(Friction, law="exponential"):
 
     @property
     def mu_m(self):
+        """The least friction coefficient over all speeds."""
         rise, drop = self.viscous * self.v_0, self.mu_s - self.mu_d
         falls, ratio = rise < drop, safe_divide(rise, drop, jnp.ones_like(rise * drop))
         ratio = jnp.where(falls & (ratio > 0), ratio, 1)
@@ -251,6 +262,7 @@ class HyperbolicStribeck(Friction, law="hyperbolic"):
 
     @property
     def mu_m(self):
+        """The limit of the friction coefficient at high speed, 0."""
         return jnp.zeros_like(self.mu_s)
 
     def mu(self, speed):

@@ -26,7 +26,7 @@ from tools import ROOT
 pytestmark = pytest.mark.optimised
 
 # What computes nothing, or only draws, reads and stores.
-NO_NUMBERS = {"quantity", "quick_compilation", "read_measurement", "read_matrices", "load"}
+NO_NUMBERS = {"quantity", "read_measurement", "read_matrices", "load"}
 NO_NUMBERS |= {"brake_scene", "explore", "repeat_design"}
 QUIET: dict[str, Any] = {"progress": False}
 NEAR = {"D": (2.39, 2.41)}
@@ -64,6 +64,9 @@ def trend(D) -> Any:
 
 
 CALLS: dict[str, Callable[[], Any]] = {
+    "areal_parameters": lambda: fj.areal_parameters(
+        rough((48, 40)), 1e-6, cutoff=2e-5, shortest=4e-6
+    ),
     "assemble": lambda: fj.assemble(STRUCTURE),
     "attractors": lambda: [cycle.period for cycle in fj.attractors(BRAKE)],
     "basin": lambda: [*fj.basin(BRAKE, radius=1.0, starts=2, **QUIET).shares.values()],
@@ -111,6 +114,9 @@ CALLS: dict[str, Callable[[], Any]] = {
             points=3,
             **QUIET,
         ).first
+    ),
+    "profile_parameters": lambda: fj.profile_parameters(
+        rough((600, 2))[:, 0], 1e-6, cutoff=1e-4, shortest=4e-6
     ),
     "rayleigh_damping": lambda: fj.rayleigh_damping(M, K, 0.1, 0.2),
     "reduce": lambda: fj.growth_rate(reduced()),

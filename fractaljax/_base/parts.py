@@ -197,8 +197,13 @@ def one_line(error: Exception) -> str:
 def quantity(unit: str, meaning: str, *, log: bool = False, name: str | None = None) -> Any:
     """A numeric field of a part, with its unit and its meaning for files and tables.
 
-    `log` marks a scale, which is designed and swept on a logarithmic axis. `name` is the name of
-    the quantity and of the argument of `__init__`, if the attribute has another.
+    **Arguments:**
+
+    - `unit`: the SI unit as text, "-" where there is none.
+    - `meaning`: what the number is, in a few words.
+    - `log`: True for a scale, which is designed and swept on a logarithmic axis; False by default.
+    - `name`: name of the quantity and of the argument of `__init__`, by default that of the
+      attribute.
     """
     named = {} if name is None else {"name": name}
     return eqx.field(metadata={"unit": unit, "meaning": meaning, "log": log, **named})

@@ -1,4 +1,4 @@
-"""Programs that a command keeps on disk, and options with which JAX compiles others faster.
+"""Programs that a command keeps on disk.
 
 JAX's persistent cache saves the compilation of a program, which is still traced to look it up.
 `jax.export` saves the trace, too: a second run of a command starts computing at once.
@@ -20,9 +20,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 from jax.core import Tracer
 
 from .files import read_bounded, write_whole
@@ -42,28 +40,6 @@ _CHECKSUMS = "checksums.json"
 
 _folder: Path | None = None
 _programs: dict[Any, Callable] = {}
-
-
-@functools.cache
-def quick_compilation() -> dict[str, Any]:
-    """Compiler options with which a program may compile faster on a CPU.
-
-    `jax.jit(function, compiler_options=fj.quick_compilation())`, for the outermost program. Each is
-    an option of XLA, which guarantees none of them: one that the installed XLA lacks is left out,
-    so that the dictionary may be empty. The program may run up to two thirds longer.
-    """
-    options = {
-        "xla_backend_optimization_level": 1,
-        "xla_cpu_use_fusion_emitters": False,
-        "xla_disable_hlo_passes": "while-loop-invariant-code-motion,simplify-while-loops",
-    }
-    supported = {}
-    if jax.default_backend() == "cpu":
-        for name, value in options.items():
-            with contextlib.suppress(jax.errors.JaxRuntimeError):
-                jax.jit(jnp.negative, compiler_options={name: value})(0.0)
-                supported[name] = value
-    return supported
 
 
 def exported_jit(function: Callable, static_argnames: str | tuple[str, ...] = ()) -> Callable:
@@ -138,7 +114,7 @@ def _read(file: Path) -> Callable:
     skeleton, _, serialized = content.partition(b"\n")
     described = json.loads(skeleton)
     call = jax.export.deserialize(bytearray(serialized)).call
-    program = jax.jit(call, compiler_options=quick_compilation())
+    program = jax.jit(call)
     os.utime(file)
     return lambda *leaves: _rebuilt(described, program(*leaves))
 
@@ -154,7 +130,7 @@ def _described(x: Any, leaves: list) -> Any:
     """
     if isinstance(x, type):
         return {"type": _place(x)}
-    if isinstance(x, eqx.Module):
+    if dataclasses.is_dataclass(x):  # such as a module of Equinox
         fields = {f.name: _described(getattr(x, f.name), leaves) for f in dataclasses.fields(x)}
         return {"class": _place(type(x)), "fields": fields}
     if isinstance(x, tuple) and (names := getattr(x, "_fields", None)):  # a named tuple

@@ -12,9 +12,7 @@ import jax.numpy as jnp
 
 from .parts import Numbers
 
-# Taylor coefficients of exprel and of its derivative, highest power first: below the radius the
-# rest of the series is under 1e-17.
-_SERIES_RADIUS = 0.25
+# Taylor coefficients of exprel and of its derivative, highest power first
 _EXPREL = [1 / math.factorial(k + 1) for k in range(12, -1, -1)]
 _EXPREL_SLOPE = [(k + 1) / math.factorial(k + 2) for k in range(12, -1, -1)]
 
@@ -27,20 +25,24 @@ def polynomial(coefficients: Sequence[float], x: Numbers) -> Numbers:
     return value
 
 
+def _split(x):
+    """True near 0, where a series serves, and x for the closed form and for the series."""
+    near = jnp.abs(x) < 0.25  # the rest of either series is under 1e-17 there
+    return near, jnp.where(near, 1, x), jnp.where(near, x, 0)
+
+
 @jax.custom_jvp
 @jax.jit
 def exprel(x: Numbers) -> Numbers:
     """(exp(x) - 1) / x, with its limit 1 at x = 0."""
-    near = jnp.abs(x) < _SERIES_RADIUS
-    far, x = jnp.where(near, 1, x), jnp.where(near, x, 0)
+    near, far, x = _split(x)
     return jnp.where(near, polynomial(_EXPREL, x), (jnp.exp(far) - 1) / far)
 
 
 @jax.jit
 def _exprel_slope(x):
     # Both branches are smooth, so every further derivative is right too.
-    near = jnp.abs(x) < _SERIES_RADIUS
-    far, x = jnp.where(near, 1, x), jnp.where(near, x, 0)
+    near, far, x = _split(x)
     exp = jnp.exp(far)
     return jnp.where(near, polynomial(_EXPREL_SLOPE, x), (exp - (exp - 1) / far) / far)
 

@@ -1,11 +1,9 @@
 """Aligned text."""
 
-_ABREAST = 5  # columns that fit on a line
 
-
-def table(titles: list[str], columns: list[dict[str, str]]) -> str:
-    """Columns with common row names as aligned text; more than five columns become rows."""
-    if len(titles) > _ABREAST:
+def table(titles: list[str], columns: list[dict[str, str]], most_columns: int = 5) -> str:
+    """Columns with common row names as aligned text; more than `most_columns` become rows."""
+    if len(titles) > most_columns:
         cells = (
             [title, *(c[name] for name in columns[0])]
             for title, c in zip(titles, columns, strict=True)

@@ -6,8 +6,7 @@ from typing import Any
 from .output import csv_text, import_pictures, output, picture
 from .parsing import add_constant_friction, add_out, add_scene_file, load_mechanism
 
-_SAMPLES = 512  # of one period
-_MODES, _MODES_MOST = "fractaljax-stability", 8  # folder of the pictures of modes, and how many
+_FOLDER = "fractaljax-stability"  # of the pictures of modes
 
 
 def add_stability(commands) -> None:
@@ -21,7 +20,7 @@ def add_stability(commands) -> None:
         "--out",
         type=Path,
         metavar="FOLDER",
-        help=f"folder for pictures of the modes of a structure with a mesh; default {_MODES}",
+        help=f"folder for pictures of the modes of a structure with a mesh; default {_FOLDER}",
     )
     parser.set_defaults(run=_stability)
 
@@ -46,21 +45,24 @@ def _stability(arguments) -> int:
             raise ValueError("--out needs a structure whose file names a mesh, to draw its modes")
         print(table(subject, slope))
         return 0
-    with output(arguments.out or Path(_MODES)) as write:
+    with output(arguments.out or Path(_FOLDER)) as write:
         written = write(_mode_pictures(subject, slope))
     print(table(subject, slope))
     print(written)
     return 0
 
 
-def _mode_pictures(structure, friction_slope: bool) -> dict[str, bytes]:
-    """Pictures of the unstable modes, the fastest first, or of the first of all, by file name."""
+def _mode_pictures(structure, friction_slope: bool, most: int = 8) -> dict[str, bytes]:
+    """Pictures of the unstable modes, the fastest first, or of the first of all, by file name.
+
+    At most `most` are drawn.
+    """
     from .. import plot
     from .._mechanism.reduced import ReducedStructure
     from .._stability.stability import stability
 
     modes, mesh = stability(structure, friction_slope), structure.mesh.arrays()
-    drawn = (modes.unstable() or modes._modes()[:1])[:_MODES_MOST]
+    drawn = (modes.unstable() or modes._modes()[:1])[:most]
     files = {}
     for i, mode in enumerate(drawn, start=1):
         shape = mode.shape
@@ -134,8 +136,8 @@ def _cycle(arguments) -> int:
     return 0 if has_cycle else 1
 
 
-def _orbit_text(cycle) -> str:
-    t, states = cycle.orbit(_SAMPLES)
+def _orbit_text(cycle, samples: int = 512) -> str:
+    t, states = cycle.orbit(samples)
     dofs = range(1, 1 + len(cycle.amplitude))
     titles = ["time [s]", *(f"x{i} [m]" for i in dofs), *(f"v{i} [m/s]" for i in dofs)]
     rows = zip(t.tolist(), states.tolist(), strict=True)

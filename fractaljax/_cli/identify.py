@@ -6,7 +6,6 @@ from pathlib import Path
 from .output import output, picture
 from .parsing import add_out, load_mechanism, parse_envelope, parse_pairs
 
-_MANY = 5  # warnings at which no scene is written
 _OPTIONS = {
     "--dx": {"type": float, "help": "step between heights [m], if not in the file"},
     "--dy": {"type": float, "help": "step across a map [m], if not in the file; default dx"},
@@ -114,14 +113,17 @@ def _run(arguments) -> int:
     return 0
 
 
-def _scene_text(base, read, fit, force) -> str:
-    """The scene with this surface, and its origin. **Raises:** `ValueError` if there is none."""
+def _scene_text(base, read, fit, force, most: int = 5) -> str:
+    """The scene with this surface, and its origin.
+
+    **Raises:** `ValueError` if D and G have no meaning, or for `most` warnings, without `force`.
+    """
     from .._identify.warnings import DISQUALIFYING
 
     for warning in fit.warnings:
         if warning.startswith(DISQUALIFYING) and not force:
             raise ValueError(f"{warning} (--force writes one all the same)")
-    if len(fit.warnings) >= _MANY and not force:
+    if len(fit.warnings) >= most and not force:
         raise ValueError(f"{len(fit.warnings)} warnings (--force writes one all the same)")
     scene = base.replace(surface=fit.surface)
     comments = [

@@ -6,7 +6,6 @@ from .output import csv_text, output, picture
 from .parsing import add_out, add_scene_file, kick_size, load_mechanism, parse_windows
 
 _FORM = "NAME=LOW:HIGH"
-_AROUND = {"D": (-0.05, 0.05), "G": (0.5, 2.0)}  # of the default window: added, and a factor
 
 
 def add_map(commands) -> None:
@@ -64,10 +63,10 @@ def _window(x, which: str, text: str | None) -> tuple[str, float, float]:
         name = {"x": "D", "y": "G"}[which]
         if name not in quantity_names(x):
             raise ValueError(f"--{which} must be {_FORM}: the scene has no {name}")
-        value, (low, high) = float(value_of(x, name)), _AROUND[name]
+        value = float(value_of(x, name))
         if name == "G":
-            return name, value * low, value * high
-        return name, max(2.001, value + low), min(2.999, value + high)
+            return name, value / 2, value * 2
+        return name, max(2.001, value - 0.05), min(2.999, value + 0.05)
     ((name, window),) = parse_windows(f"--{which}", [text], _FORM).items()
     return name, *window
 

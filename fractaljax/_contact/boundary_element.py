@@ -12,6 +12,7 @@ doi:10.1016/S0043-1648(99)00113-1), preconditioned by |q| (Vollebergt, Appl. Mat
 2014, doi:10.1016/j.apm.2013.12.004).
 """
 
+import dataclasses
 import functools
 import math
 from typing import Any, NamedTuple
@@ -22,18 +23,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, ScalarLike
 
-from .._base.parts import Record, flag, number, raise_unless, require_kind, scalar
+from .._base.parts import Record, flag, number, raise_unless, require_kind, scalar, whole
 from .material import Material
-
-_ITERATIONS = 2000
-_LOAD_STEP = 0.05  # relative load step, to either side, of the derivative of K_n
 
 
 class BoundaryElementResult(eqx.Enumeration):
     """How a boundary-element solution ended."""
 
     converged = "converged"
-    not_converged = "boundary elements did not converge: rtol may be too small"
+    not_converged = "boundary elements did not converge: rtol may be too small, or max_steps"
     too_soft = "the load exceeds what the surface carries at the hardness H everywhere"
 
 
@@ -45,7 +43,18 @@ class BoundaryElement(Record):
     mean_gap: Float[Array, ""]  # mean distance of the two surfaces [m]
     pressure: Float[Array, "nx ny"]  # [Pa]
     gap: Float[Array, "nx ny"]  # distance of the two surfaces [m], 0 in contact
-    result: BoundaryElementResult
+    result: BoundaryElementResult  # a member of BoundaryElementResult
+
+
+@dataclasses.dataclass(frozen=True)
+class _Convergence:
+    """When an iteration ends."""
+
+    rtol: float
+    max_steps: int
+
+    def continues(self, residual, count) -> Array:
+        return (residual > self.rtol) & (count < self.max_steps)
 
 
 class _Solution(NamedTuple):
@@ -62,26 +71,39 @@ def boundary_element(
     *,
     plastic: bool = False,
     rtol: float | None = None,
+    max_steps: int = 2000,
     throw: bool = True,
 ) -> BoundaryElement:
-    """Press a surface of heights [m] on a grid of spacing dx [m] on a flat one by P [N].
+    """Press a rough surface on a flat one by the load P.
 
-    Both are periodic, of area nx ny dx^2, and frictionless. E of the material is that of the pair
-    (Eq. 2). K_n = -dP/d(mean gap) is the stiffness of the current contact: that of a flat punch of
-    the same outline, from one more linear system. With `plastic` no pressure exceeds H, and K_n
-    is that of a small vibration, in which plastic contacts unload elastically.
-
-    `rtol` bounds the largest gap in contact and overlap outside, over the rms height; by default
-    1e-9, and 1e-5 in float32.
+    Both are periodic, of area nx ny dx^2, and frictionless. K_n = -dP/d(mean gap) is the stiffness
+    of the current contact: that of a flat punch of the same outline, from one more linear system.
+    The equations and their sources are in `boundary_element.py`.
 
     Differentiable in heights, dx, E and P, in both modes, and works under `jit` and `vmap`.
     Pressure, gap and mean gap have their exact derivatives on the grid. The outline of the contact
     moves by whole grid points, so the derivative of K_n is that of the mean gap between the loads
-    0.95 P and 1.05 P, as d(1/K_n)/dh = -d(d mean gap/dh)/dP. The area counts points: its
-    derivative is 0. There are no second derivatives, and none at all with `plastic`.
+    0.95 P and 1.05 P, as d(1/K_n)/dh = -d(d mean gap/dh)/dP. The area counts points: its derivative
+    is 0. There are no second derivatives, and none at all with `plastic`.
 
-    **Raises:** `ValueError` unless heights are (nx, ny) and finite, dx > 0, P > 0 and
-    0 < rtol < 1; `RuntimeError` if `throw` and the solution has not converged. Under a trace
+    **Arguments:**
+
+    - `heights`: (nx, ny), heights of the surface [m].
+    - `dx`: grid spacing [m], the same in x and y.
+    - `material`: E is that of the pair (Eq. 2), H the hardness.
+    - `P`: normal load [N], a scalar.
+    - `plastic`: True lets no pressure exceed H; K_n is then that of a small vibration, in which
+      plastic contacts unload elastically. By default the contact is elastic.
+    - `rtol`: bound on the largest gap in contact and overlap outside, over the rms height; by
+      default 1e-9, and 1e-5 in float32.
+    - `max_steps`: most steps of each iteration, 2000 by default.
+    - `throw`: True, the default, raises unless the solution has converged; otherwise `result` says
+      how it ended.
+
+    **Returns:** a `BoundaryElement`.
+
+    **Raises:** `ValueError` unless heights are (nx, ny) and finite, dx > 0, P > 0, 0 < rtol < 1 and
+    max_steps >= 1; `RuntimeError` if `throw` and the solution has not converged. Under a trace
     (`jit`, `vmap`) everything is NaN instead.
     """
     heights = number("heights", heights)
@@ -94,25 +116,28 @@ def boundary_element(
         rtol = 1e-9 if heights.dtype == jnp.float64 else 1e-5
     rtol = float(scalar("rtol", rtol, above=0, below=1))
     plastic, throw = flag("plastic", plastic), flag("throw", throw)
-    solution = _boundary_element(heights, dx, material, P, plastic, rtol)
+    convergence = _Convergence(rtol, whole("max_steps", max_steps, 1))
+    solution = _boundary_element(heights, dx, material, P, plastic, convergence)
     return raise_unless(BoundaryElementResult.converged, solution) if throw else solution
 
 
 @functools.partial(jax.jit, static_argnums=(4, 5))
-def _boundary_element(heights, dx, material, P, plastic, rtol):
+def _boundary_element(heights, dx, material, P, plastic, convergence):
     flat = jnp.max(heights) == jnp.min(heights)  # their mean may be rounded
     h = jnp.where(flat, 0, heights - jnp.mean(heights)) / dx
     mean = jnp.asarray(P / (material.E * dx**2 * h.size), h.dtype)
     limit = material.H / material.E if plastic else None
     pressure, mean_gap, compliance, residual = (
-        _plastic(h, mean, limit, rtol) if plastic else _contact(h, mean, rtol)
+        _plastic(h, mean, limit, convergence) if plastic else _contact(h, mean, convergence)
     )
     gap = jnp.maximum(_displacement(pressure) + mean_gap - h, 0)
     touches = jax.lax.stop_gradient(pressure) > 0
     gap = jnp.where(touches, 0, gap)
     full = jnp.all(touches)
     result = BoundaryElementResult.where(
-        residual <= rtol, BoundaryElementResult.converged, BoundaryElementResult.not_converged
+        residual <= convergence.rtol,
+        BoundaryElementResult.converged,
+        BoundaryElementResult.not_converged,
     )
     if plastic:
         soft = mean >= material.H / material.E
@@ -163,7 +188,7 @@ def _rms(h):
 # --- solvers -------------------------------------------------------------------------------
 
 
-def _solve(h, mean, rtol, start=None) -> _Solution:
+def _solve(h, mean, convergence, start=None) -> _Solution:
     """Constrained conjugate gradients."""
 
     def conditions(pressure, displacement):
@@ -181,7 +206,7 @@ def _solve(h, mean, rtol, start=None) -> _Solution:
 
     def go_on(state):
         *_, residual, count = state
-        return (residual > rtol) & (count < _ITERATIONS)
+        return convergence.continues(residual, count)
 
     def iterate(state):
         pressure, u, direction, old, product, before, count = state
@@ -219,7 +244,7 @@ def _solve(h, mean, rtol, start=None) -> _Solution:
     return _Solution(pressure, conditions(pressure, u)[3], residual)
 
 
-def _solve_plastic(h, mean, limit, rtol) -> _Solution:
+def _solve_plastic(h, mean, limit, convergence) -> _Solution:
     """Projected gradients with Nesterov's momentum, from the elastic solution.
 
     Conjugate gradients fail once no point in contact is below the limit.
@@ -229,7 +254,7 @@ def _solve_plastic(h, mean, limit, rtol) -> _Solution:
     root = math.sqrt(stiffest / softest)
     momentum = (1 - root) / (1 + root)
 
-    def within(field):
+    def project(field):
         """(p, shift): the nearest pressure from 0 to the limit with the given load."""
 
         def halve(_, bracket):
@@ -253,32 +278,32 @@ def _solve_plastic(h, mean, limit, rtol) -> _Solution:
 
     def go_on(state):
         *_, residual, count = state
-        return (residual > rtol) & (count < _ITERATIONS)
+        return convergence.continues(residual, count)
 
     def iterate(state):
         pressure, u, ahead, u_ahead, *_, count = state
-        following, shift = within(ahead - (u_ahead - h) / softest)
+        following, shift = project(ahead - (u_ahead - h) / softest)
         u_following = _displacement(following)
         ahead = following + momentum * (following - pressure)
         u_ahead = u_following + momentum * (u_following - u)
         mean_gap, residual = conditions(following, u_following, -shift * softest)
         return following, u_following, ahead, u_ahead, mean_gap, residual, count + 1
 
-    elastic = _solve(h, mean, rtol)
+    elastic = _solve(h, mean, convergence)
     yields = jnp.any(elastic.pressure > limit)
-    start = jnp.where(yields, within(elastic.pressure)[0], elastic.pressure)
+    start = jnp.where(yields, project(elastic.pressure)[0], elastic.pressure)
     u = _displacement(start)
     state = start, u, start, u, *conditions(start, u, elastic.mean_gap), 0
     pressure, *_, mean_gap, residual, _ = jax.lax.while_loop(go_on, iterate, state)
     return _Solution(pressure, mean_gap, residual)
 
 
-def _conjugate_gradients(right, load, contact, rtol):
+def _conjugate_gradients(right, load, contact, convergence):
     """p with S p + g = right in contact for some g, p = 0 outside, and the sum `load`."""
 
     def go_on(state):
         *_, product, count = state
-        return (product > enough) & (count < _ITERATIONS)
+        return (product > enough) & (count < convergence.max_steps)
 
     def iterate(state):
         p, residual, direction, product, count = state
@@ -301,13 +326,13 @@ def _conjugate_gradients(right, load, contact, rtol):
     residual = _projected(whole)
     step = _projected(_precondition(residual))
     # Not relative to the first residual, which may be pure rounding error.
-    tolerance = max(rtol, 4 * float(jnp.finfo(p.dtype).eps))
+    tolerance = max(convergence.rtol, 4 * float(jnp.finfo(p.dtype).eps))
     enough = tolerance**2 * (jnp.sum(whole * _precondition(whole)) + jnp.sum(p**2))
     state = p, residual, step, jnp.sum(residual * step), 0
     return jax.lax.while_loop(go_on, iterate, state)[0]
 
 
-def _on_contact(right, load, contact, rtol) -> Any:
+def _solve_contact(right, load, contact, convergence) -> Any:
     """(p, g) with S p + g = right in contact, p = right outside, and the sum `load` inside."""
 
     def operator(solution):
@@ -317,17 +342,17 @@ def _on_contact(right, load, contact, rtol) -> Any:
 
     def solve(_, sides):
         right, load = sides
-        p = _conjugate_gradients(right, load, contact, rtol)
+        p = _conjugate_gradients(right, load, contact, convergence)
         g = _mean(right - _displacement(p), contact)
         return jnp.where(contact, p, right), g
 
     return jax.lax.custom_linear_solve(operator, (right, load), solve, symmetric=True)
 
 
-def _flat_punch(contact, rtol, dtype):
+def _flat_punch(contact, convergence, dtype):
     """(w, c): pressure w, of mean 1, and indentation c of a flat punch of the contact's outline."""
     load = jnp.asarray(contact.size, dtype)
-    w = _conjugate_gradients(jnp.zeros(contact.shape, dtype), load, contact, rtol)
+    w = _conjugate_gradients(jnp.zeros(contact.shape, dtype), load, contact, convergence)
     # The minimum of this energy, so its error is the square of the error of w.
     return w, jnp.sum(w * _displacement(w)) / w.size
 
@@ -343,27 +368,28 @@ def _first_only_jvp(primals, tangents):
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
-def _contact(h, mean, rtol):
+def _contact(h, mean, convergence):
     """(p, g, c, residual): pressure, mean gap and compliance c = -dg/d(mean pressure)."""
-    pressure, mean_gap, residual = _solve(h, mean, rtol)
-    return pressure, mean_gap, _flat_punch(pressure > 0, rtol, h.dtype)[1], residual
+    pressure, mean_gap, residual = _solve(h, mean, convergence)
+    return pressure, mean_gap, _flat_punch(pressure > 0, convergence, h.dtype)[1], residual
 
 
 @_contact.defjvp
-def _contact_jvp(rtol, primals, tangents):
+def _contact_jvp(convergence, primals, tangents):
     (h, mean), (dh, dmean) = _first_only(primals), tangents
-    pressure, mean_gap, residual = _solve(h, mean, rtol)
+    pressure, mean_gap, residual = _solve(h, mean, convergence)
     contact = pressure > 0
-    w, compliance = _flat_punch(contact, rtol, h.dtype)
-    dpressure, _ = _on_contact(jnp.where(contact, dh, 0), dmean * h.size, contact, rtol)
+    w, compliance = _flat_punch(contact, convergence, h.dtype)
+    dpressure, _ = _solve_contact(jnp.where(contact, dh, 0), dmean * h.size, contact, convergence)
     dmean_gap = jnp.mean(w * dh) - compliance * dmean
 
-    def beside(step):
-        solution = _solve(h, mean * (1 + step), rtol, start=pressure)
-        return _flat_punch(solution.pressure > 0, rtol, h.dtype)
+    def punch_at(load):
+        solution = _solve(h, load, convergence, start=pressure)
+        return _flat_punch(solution.pressure > 0, convergence, h.dtype)
 
-    (w_more, c_more), (w_less, c_less) = beside(_LOAD_STEP), beside(-_LOAD_STEP)
-    width = 2 * _LOAD_STEP * mean
+    step = 0.05  # of the load: not less, since the outline moves by whole grid points
+    (w_more, c_more), (w_less, c_less) = (punch_at(mean * (1 + x)) for x in (step, -step))
+    width = 2 * step * mean
     # c = -dg/dmean and dg/dh = w/n, so dc/dh = -d(w/n)/dmean.
     dcompliance = (jnp.mean((w_less - w_more) * dh) + (c_more - c_less) * dmean) / width
     primals = pressure, mean_gap, compliance, residual
@@ -371,12 +397,12 @@ def _contact_jvp(rtol, primals, tangents):
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
-def _plastic(h, mean, limit, rtol):
+def _plastic(h, mean, limit, convergence):
     """As `_contact`, for a surface that yields at the pressure `limit`."""
-    pressure, mean_gap, residual = _solve_plastic(h, mean, limit, rtol)
-    return pressure, mean_gap, _flat_punch(pressure > 0, rtol, h.dtype)[1], residual
+    pressure, mean_gap, residual = _solve_plastic(h, mean, limit, convergence)
+    return pressure, mean_gap, _flat_punch(pressure > 0, convergence, h.dtype)[1], residual
 
 
 @_plastic.defjvp
-def _plastic_jvp(rtol, primals, tangents):
+def _plastic_jvp(convergence, primals, tangents):
     raise TypeError("boundary_element with plastic=True cannot be differentiated")

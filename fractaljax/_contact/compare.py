@@ -46,8 +46,8 @@ class LawCurve(Record):
 class LawComparison(Record):
     """Contact laws at the same loads, as `compare_laws` returns them; printed as a table."""
 
-    surface: Surface
-    material: Material
+    surface: Surface  # surface of all laws
+    material: Material  # material of all laws
     loads: Float[Array, " k"]  # [N]
     area: Float[Array, ""]  # nominal [m^2]
     L: Float[Array, ""]  # longest and
@@ -93,19 +93,31 @@ def compare_laws(
 ) -> LawComparison:
     """Stiffness and real area of a joint by every contact law, and by boundary elements.
 
-    The laws are the source's `FractalContact`, `AsperityContact`, `PerssonContact`, and other
-    `laws` by name, each with P replaced by the loads (k,) [N], on the nominal area [m^2].
-    Boundary elements press `seeds` periodic surfaces of the same D and G, of n x n
-    points, drawn from `key`: K_n is the geometric mean over the seeds, the real area their mean,
-    and alpha the slope of that K_n from load to load. They are elastic and frictionless.
+    The laws are the source's `FractalContact`, `AsperityContact`, `PerssonContact`, and others by
+    name, each with P replaced by the loads. Boundary elements press periodic surfaces of the same D
+    and G: K_n is the geometric mean over the seeds, the real area their mean, and alpha the slope
+    of that K_n from load to load. They are elastic and frictionless. On an area larger than L^2
+    surfaces lie side by side.
 
-    Wavelengths run from L, by default the side of the area, down to L_s [m], by default 4 L/n; no
-    wave is longer than the side. On a larger area than L^2 surfaces lie side by side. `mu_s` and
-    `mu_m` are the friction coefficients for laws with yield, by default the reference brake's.
-    With `seeds` = 0 there are no boundary elements.
+    **Arguments:**
 
-    **Raises:** `ValueError` unless loads increase and are above 0, area > 0, 2 L/n <= L_s <= L,
-    n >= 8, seeds >= 0, mu_s > 0 and 0 <= mu_m <= 0.9; `RuntimeError` if boundary elements do not
+    - `surface`, `material`: those of the joint, as in `FractalContact`.
+    - `loads`: (k,), rising normal loads [N].
+    - `area`: nominal area [m^2].
+    - `L`: longest wavelength [m], by default the side of the area; no wave is longer than the side.
+    - `L_s`: shortest wavelength [m], by default 4 L/n.
+    - `mu_s`, `mu_m`: static and smallest friction coefficient for laws with yield, by default 0.4
+      and 0.25, the reference brake's.
+    - `laws`: {name: contact law}, more laws to compare; by default none.
+    - `n`: points of a surface along each side, 128 by default.
+    - `seeds`: number of surfaces, 4 by default; 0 leaves boundary elements out.
+    - `key`: JAX random key from which the surfaces are drawn, `jax.random.key(0)` by default.
+    - `progress`: shows a bar.
+
+    **Returns:** a `LawComparison`.
+
+    **Raises:** `ValueError` unless loads increase and are above 0, area > 0, 2 L/n <= L_s <= L, n
+    >= 8, seeds >= 0, mu_s > 0 and 0 <= mu_m <= 0.9; `RuntimeError` if boundary elements do not
     converge.
     """
     require_kind("surface", surface, Surface)
@@ -146,7 +158,7 @@ def compare_laws(
                     pressed = boundary_element(heights, L / n, material, P)
                     samples.append((pressed.K_n * cells, pressed.area * cells))
                     bar.update()
-        curves[BOUNDARY_ELEMENTS] = _over_seeds(np.reshape(samples, (seeds, -1, 2)), loads)
+        curves[BOUNDARY_ELEMENTS] = _average_seeds(np.reshape(samples, (seeds, -1, 2)), loads)
     return LawComparison(surface, material, loads, area, L, L_s, curves)
 
 
@@ -170,7 +182,7 @@ def _curve(law: Contact, loads, mu_s, mu_m) -> LawCurve:
     return jax.vmap(one)(loads)
 
 
-def _over_seeds(samples, loads) -> LawCurve:
+def _average_seeds(samples, loads) -> LawCurve:
     """The curve of boundary elements from K_n and real area (seeds, k, 2)."""
     stiff = np.isfinite(samples[..., 0]).all(0)  # not in full contact
     log_K_n = np.log(np.where(stiff, samples[..., 0], np.nan))

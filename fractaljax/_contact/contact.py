@@ -80,7 +80,7 @@ class Contact(Part):
             return True
         both = jnp.ones(2)
         try:  # raises if the result follows a batch of friction
-            alone = jax.vmap(lambda *friction: _of_each(self, *friction), out_axes=None)
+            alone = jax.vmap(lambda *friction: _map_stiffness(self, *friction), out_axes=None)
             jax.eval_shape(alone, both, both)
         except (ValueError, TypeError):
             return True
@@ -90,7 +90,12 @@ class Contact(Part):
     def stiffness(
         self, mu_s: ScalarLike, mu_m: ScalarLike
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """(K_n, K_t) [N/m] at the given static and smallest friction coefficient."""
+        """Normal and tangential stiffness (K_n, K_t) [N/m].
+
+        **Arguments:**
+
+        - `mu_s`, `mu_m`: static and smallest friction coefficient, scalars.
+        """
 
     @property
     def opening_exponent(self) -> Numbers | float | None:
@@ -106,16 +111,24 @@ class Contact(Part):
         return None
 
     def load_curve(self, mu_s: ScalarLike, mu_m: ScalarLike) -> LoadCurve | None:
-        """N/P as a function of K_n(P) u/P; None for a law without a load curve."""
+        """N/P as a function of K_n(P) u/P; None for a law without a load curve.
+
+        `mu_s` and `mu_m` are as in `stiffness`.
+        """
         return None if self.opening_exponent is None else _load_curve(self, mu_s, mu_m)
 
     def load(
         self, u: ArrayLike | Sequence[float], mu_s: ScalarLike = 0.0, mu_m: ScalarLike = 0.0
     ) -> Numbers:
-        """Normal force N [N] at the approach u [m] from rest under the load P; any shape.
+        """Normal force N [N] at an approach u from rest under the load P.
 
-        dN/du = K_n(N) with N(0) = P, and 0 where the joint is open. The friction coefficients
-        matter where the stiffness depends on them.
+        dN/du = K_n(N) with N(0) = P, and 0 where the joint is open.
+
+        **Arguments:**
+
+        - `u`: approach of the two bodies [m], of any shape, which is that of the result.
+        - `mu_s`, `mu_m`: friction coefficients, 0 by default; they matter where the stiffness
+          depends on them.
 
         **Raises:** `ValueError` for a law without a load curve.
         """
@@ -127,7 +140,10 @@ class Contact(Part):
         return law.P * curve(e)
 
     def real_area(self, mu_m: ScalarLike) -> Float[Array, ""] | None:
-        """Real contact area [m^2]; None where the law has none."""
+        """Real contact area [m^2]; None where the law has none.
+
+        `mu_m` is the smallest friction coefficient, as in `stiffness`.
+        """
         return None
 
 
@@ -136,7 +152,7 @@ def refused_stiffness(law: Contact, mu_s: ArrayLike, mu_m: ArrayLike) -> Array |
 
     **Raises:** `TypeError` and `ValueError` as `Contact`.
     """
-    pair = _of_each(law, mu_s, mu_m)
+    pair = _map_stiffness(law, mu_s, mu_m)
     if not (isinstance(pair, (tuple, list)) and len(pair) == 2):
         raise TypeError(
             f"stiffness of {type(law).__name__} must give (K_n, K_t), got {brief(pair)}"
@@ -147,8 +163,8 @@ def refused_stiffness(law: Contact, mu_s: ArrayLike, mu_m: ArrayLike) -> Array |
     return bad if concrete(bad) is None else None
 
 
-def _of_each(law: Contact, mu_s: ArrayLike, mu_m: ArrayLike) -> Any:
-    """The `stiffness` of every member of a batch, one by one."""
+def _map_stiffness(law: Contact, mu_s: ArrayLike, mu_m: ArrayLike) -> Any:
+    """The `stiffness` of every member of a batch."""
     arrays, rest = eqx.partition(law, eqx.is_array)
     leaves, tree = jax.tree.flatten(arrays)
 

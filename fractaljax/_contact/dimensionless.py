@@ -13,7 +13,13 @@ from .fractal import area_moment, normal_stiffness, tangential_stiffness
 def dimensionless_normal_stiffness(D: ArrayLike, A_r: ArrayLike, a_e: ArrayLike) -> Numbers:
     """Eq. 31: K_n* = K_n/(E sqrt(A_a)) from A_r* and a_e*.
 
-    **Raises:** `ValueError` unless 2 < D < 3, A_r > 0 and a_e > 0, which may be infinite.
+    **Arguments**, of any shapes that broadcast:
+
+    - `D`: fractal dimension [-].
+    - `A_r`: real contact area over the nominal one, A_r* [-].
+    - `a_e`: critical area over the nominal one, a_e* [-]; it may be infinite.
+
+    **Raises:** `ValueError` unless 2 < D < 3, A_r > 0 and a_e > 0.
     """
     D, J_half = _root_area_moment(D, A_r, a_e)
     return normal_stiffness(D, 1.0, J_half)
@@ -22,9 +28,17 @@ def dimensionless_normal_stiffness(D: ArrayLike, A_r: ArrayLike, a_e: ArrayLike)
 def dimensionless_tangential_stiffness(
     D: ArrayLike, nu: ArrayLike, A_r: ArrayLike, a_e: ArrayLike, slip_ratio: ArrayLike
 ) -> Numbers:
-    """Eq. 37: K_t* = K_t/(E sqrt(A_a)) from A_r*, a_e* and `slip_ratio` = Q_e*/(mu P*).
+    """Eq. 37: K_t* = K_t/(E sqrt(A_a)) from A_r*, a_e* and the slip ratio.
 
     The source's text normalises by the shear modulus; its equation, followed here, by E.
+
+    **Arguments**, of any shapes that broadcast:
+
+    - `D`: fractal dimension [-].
+    - `nu`: Poisson's ratio [-].
+    - `A_r`: real contact area over the nominal one, A_r* [-].
+    - `a_e`: critical area over the nominal one, a_e* [-]; it may be infinite.
+    - `slip_ratio`: Q_e*/(mu P*) [-], at least 1 in gross slip, where K_t* is 0.
 
     **Raises:** `ValueError` unless 2 < D < 3, 0 <= nu <= 0.5, A_r > 0, a_e > 0 and `slip_ratio` is
     finite.

@@ -98,8 +98,8 @@ class FractalContact(Contact):
     **Raises:** `ValueError` unless P > 0 and stiffness_ratio >= 0.
     """
 
-    surface: Surface
-    material: Material
+    surface: Surface  # surface that is machined
+    material: Material  # the pair as one material
     P: Numbers = quantity("N", "normal load", log=True)
     stiffness_ratio: Numbers | None = quantity("-", "K_t/K_n, if not by the tangential law")
 
@@ -128,13 +128,18 @@ class FractalContact(Contact):
         return balance.K_n, balance.K_t
 
     def real_area(self, mu_m):
-        """Eq. 28."""
+        """Real contact area A_r [m^2] of Eq. 28 at the smallest friction coefficient `mu_m`."""
         # The static friction bounds the tangential load only.
         return self.state(jnp.ones_like(self.P), mu_m).A_r
 
     @jax.jit
     def state(self, mu_s: ScalarLike, mu_m: ScalarLike) -> ContactState:
-        """Everything about the joint; Q_e and slip_ratio are None if `stiffness_ratio` is given."""
+        """The whole state of the joint; Q_e and slip_ratio are None if `stiffness_ratio` is given.
+
+        **Arguments:**
+
+        - `mu_s`, `mu_m`: static and smallest friction coefficient, scalars.
+        """
         balance, D = self._solve(mu_s, mu_m), self.surface.D
         a_l, slip_ratio = jnp.exp(balance.log_a_l), balance.slip_ratio
         regime = Regime.elastic_plastic
@@ -181,9 +186,16 @@ class FractalContact(Contact):
 def contact_state(
     surface: Surface, material: Material, P: ScalarLike, *, mu_s: ScalarLike, mu_m: ScalarLike
 ) -> ContactState:
-    """The joint of `surface` and `material` under the normal load P [N].
+    """The joint of `surface` and `material` under a normal load: Eqs. 21, 26, 28, 30, 33 and 36.
 
-    `mu_m` lowers the pressure at yield (Eq. 19), `mu_s` bounds the tangential load (Eq. 35).
+    **Arguments:**
+
+    - `surface`, `material`: those of the joint; scalars, `jax.vmap` takes many.
+    - `P`: normal load [N].
+    - `mu_s`: static friction coefficient, which bounds the tangential load (Eq. 35).
+    - `mu_m`: smallest friction coefficient, which lowers the pressure at yield (Eq. 19).
+
+    **Returns:** a `ContactState`.
 
     **Raises:** `ValueError` unless P > 0, mu_s > 0, 0 <= mu_m <= 0.9 and mu_m <= mu_s, and for
     arrays: use `jax.vmap`.
@@ -198,9 +210,15 @@ def contact_state(
 def contact_load(
     surface: Surface, material: Material, A_r: ArrayLike, *, mu_m: ArrayLike
 ) -> Float[Array, "..."]:
-    """Eqs. 26 to 28: the normal load P [N] at the real contact area A_r [m^2]; any shape.
+    """Eqs. 26 to 28: the normal load P [N] at a real contact area.
 
     The inverse of `contact_state`, whose A_r under this load is the given one.
+
+    **Arguments**, of any shapes that broadcast:
+
+    - `surface`, `material`: those of the joint.
+    - `A_r`: real contact area [m^2].
+    - `mu_m`: smallest friction coefficient, which lowers the pressure at yield (Eq. 19).
 
     **Raises:** `ValueError` unless A_r > 0 and 0 <= mu_m <= 0.9.
     """

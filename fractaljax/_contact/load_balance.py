@@ -9,6 +9,7 @@ Its root t(s) takes a fixed number of Halley steps, and has the implicit derivat
 takes any shape.
 """
 
+import functools
 import math
 
 import jax
@@ -16,9 +17,6 @@ import jax.numpy as jnp
 
 from .._base.parts import Numbers
 from .._base.singular import boxcox
-
-# From the tangent at t = 0, three steps reach the last digit over the whole domain (tested).
-_HALLEY_STEPS = 3
 
 
 def _bounded(t, D):
@@ -56,25 +54,29 @@ def _halley_step(t, s, D, beta):
     return t - error * slope / (slope**2 - error * w * ((5 - 2 * D) / 2 - w) / 2)
 
 
-@jax.custom_jvp
-def _elastic_log_area_ratio(s, D, beta):
-    t = s / ((D - 1) / 2 + beta * (3 - D) / 2)
-    for _ in range(_HALLEY_STEPS):
+@functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
+def _elastic_log_area_ratio(s, D, beta, steps):
+    t = s / ((D - 1) / 2 + beta * (3 - D) / 2)  # the tangent at t = 0
+    for _ in range(steps):
         t = _halley_step(t, s, D, beta)
     return t
 
 
 @_elastic_log_area_ratio.defjvp
-def _elastic_log_area_ratio_jvp(primals, tangents):
+def _elastic_log_area_ratio_jvp(steps, primals, tangents):
     # Made of differentiable pieces, so that every order of derivative is right.
     s, D, beta = primals
     ds, dD, dbeta = tangents
-    t = _elastic_log_area_ratio(s, D, beta)
+    t = _elastic_log_area_ratio(s, D, beta, steps)
     _, dload = jax.jvp(lambda D, beta: log_load(t, D, beta), (D, beta), (dD, dbeta))
     return t, (ds - dload) / ((D - 1) / 2 + _excess_slope(t, D, beta))
 
 
-def log_area_ratio(s: Numbers, D: Numbers, beta: Numbers) -> Numbers:
-    """t(s) = ln(a_l/a_e); t = s where the joint is fully plastic, s <= 0."""
+def log_area_ratio(s: Numbers, D: Numbers, beta: Numbers, steps: int = 3) -> Numbers:
+    """t(s) = ln(a_l/a_e); t = s where the joint is fully plastic, s <= 0.
+
+    Three Halley steps reach the last digit over the whole domain (tested).
+    """
     elastic = s > 0
-    return jnp.where(elastic, _elastic_log_area_ratio(jnp.where(elastic, s, 1), D, beta), s)
+    root = _elastic_log_area_ratio(jnp.where(elastic, s, 1), D, beta, steps)
+    return jnp.where(elastic, root, s)

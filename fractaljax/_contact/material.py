@@ -38,6 +38,12 @@ class Material(Part):
 
         nu is the mean of nu1 and nu2: the source has one nu for both bodies.
 
+        **Arguments:**
+
+        - `E1`, `E2`: elastic modulus of each body [Pa].
+        - `nu1`, `nu2`: Poisson's ratio of each body [-].
+        - `sigma_y`, `H`: yield strength and hardness of the softer body [Pa].
+
         **Raises:** `ValueError` as the constructor, for each body's own E and nu.
         """
         E1, E2 = number("E1", E1, above=0), number("E2", E2, above=0)

@@ -58,6 +58,7 @@ class MeasuredContact(Contact):
 
     @property
     def load_borders(self):
+        """The loads of the table [N], between which K_n(P) is smooth."""
         return self.loads
 
     def _curve(self):

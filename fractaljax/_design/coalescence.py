@@ -15,8 +15,6 @@ from .._stability.critical_pair import hopf_test
 from .._stability.linearise import linearised
 from .._stability.quadratic import Leading
 
-_SEPARATION = 0.01  # ((s_1 - s_2)/s)^2 of two modes whose residuals are of order one
-
 
 def neighbour_residuals(
     modes: Leading, target: Float[Array, ""], scale: Float[Array, ""]
@@ -29,13 +27,13 @@ def neighbour_residuals(
     spread = ((modes.s - modes.neighbour) / 2) ** 2
     decay = mean.real < 0
     test = hopf_test(mean, spread, ~decay)
-    unit = _SEPARATION * jnp.abs(jax.lax.stop_gradient(modes.s)) ** 2
+    unit = _unit(jnp.abs(jax.lax.stop_gradient(modes.s)) ** 2)
     unit = jnp.where(unit > 0, unit, 1)
     faster = jnp.where(decay, -test / unit, (modes.s.real - target) / scale)
     return jnp.arcsinh(jnp.where(modes.first, faster, mean.real / scale))
 
 
-def of_scene(
+def scene_residuals(
     scene: Scene,
     friction_slope: bool,
     growth: Float[Array, ""],
@@ -51,5 +49,10 @@ def of_scene(
     decide = (q_3 > 0) & (q_2 > 0) & (q_1 > 0) & (q_0 > 0)  # necessary
     ratio, squared = q_1 / jnp.where(decide, q_3, 1), jnp.where(decide, q_2, 1)
     test = ratio * (1 - ratio / squared) - q_0 / squared
-    faster = jnp.where(decide, -test / (_SEPARATION * squared), (growth - target) / scale)
+    faster = jnp.where(decide, -test / _unit(squared), (growth - target) / scale)
     return [jnp.arcsinh(faster), jnp.arcsinh(-q_3 / (4 * scale))]
+
+
+def _unit(squared_frequency: Array) -> Array:
+    """(s_1 - s_2)^2 [1/s^2] of two modes whose residuals are of order one."""
+    return 0.01 * squared_frequency

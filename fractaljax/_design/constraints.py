@@ -34,8 +34,8 @@ class Constraint(Record):
     **Raises:** `ValueError` without a limit, for one outside its domain, or in the wrong order.
     """
 
-    at_least: Limit
-    at_most: Limit
+    at_least: Limit  # the least value allowed, in the unit of the quantity, or None
+    at_most: Limit  # the largest value allowed, in the unit of the quantity, or None
 
     symbol: ClassVar[str]
     unit: ClassVar[str] = ""
@@ -58,14 +58,14 @@ class Constraint(Record):
 
     @abc.abstractmethod
     def measure(self, scene: Scene) -> Array:
-        """The quantity itself, in SI units."""
+        """The quantity itself of a `scene`, in SI units."""
 
     def below(self, value: Array) -> Array:
-        """The residual of `at_least` at a value."""
+        """The residual of `at_least` at a `value` of the quantity."""
         return 1 - value / self.at_least
 
     def above(self, value: Array) -> Array:
-        """The residual of `at_most` at a value."""
+        """The residual of `at_most` at a `value` of the quantity."""
         return value / self.at_most - 1
 
     def __call__(self, scene: Scene) -> Float[Array, ""]:
@@ -97,7 +97,7 @@ class Constraint(Record):
 class Plain(Constraint):
     """A user's function that is itself a residual."""
 
-    function: Callable[[Any], Any] = eqx.field(static=True)
+    function: Callable[[Any], Any] = eqx.field(static=True)  # gives the residual of a scene
 
     def __init__(self, function: Callable[[Any], Any]):
         self.at_least, self.at_most, self.function = None, None, function
@@ -110,6 +110,7 @@ class Plain(Constraint):
 
     @property
     def name(self):
+        """The name of the function."""
         return getattr(self.function, "__name__", repr(self.function))
 
 
@@ -188,8 +189,8 @@ class Roughness(_LogConstraint):
     See `root_mean_square`.
     """
 
-    L: Float[Array, ""]
-    L_s: Float[Array, ""]
+    L: Float[Array, ""]  # longest wavelength [m]
+    L_s: Float[Array, ""]  # shortest wavelength [m]
 
     symbol: ClassVar[str] = "Sq"
     unit: ClassVar[str] = "m"
@@ -218,7 +219,7 @@ class DampingRatio(Constraint):
     For a structure, rigid-body modes do not count.
     """
 
-    friction_slope: bool = eqx.field(static=True)
+    friction_slope: bool = eqx.field(static=True)  # True if the slope of friction counts
 
     symbol: ClassVar[str] = "damping ratio"
     domain: ClassVar[dict[str, float]] = {"above": -1, "below": 1}
@@ -242,7 +243,7 @@ class Frequency(Constraint):
     All modes count, since the critical one jumps where modes cross.
     """
 
-    friction_slope: bool = eqx.field(static=True)
+    friction_slope: bool = eqx.field(static=True)  # True if the slope of friction counts
 
     symbol: ClassVar[str] = "frequencies"
     unit: ClassVar[str] = "Hz"
@@ -258,7 +259,7 @@ class Frequency(Constraint):
         self.friction_slope = flag("friction_slope", friction_slope)
 
     def measure(self, scene):
-        """The lowest and the highest frequency (2,) [Hz]; 0 for an overdamped mode."""
+        """The lowest and highest frequency (2,) [Hz] of a `scene`; 0 for an overdamped mode."""
         modes = stability(scene, self.friction_slope)
         frequencies = jnp.abs(modes.eigenvalues.imag) / (2 * math.pi)
         lowest = jnp.where(modes.counted, frequencies, jnp.inf).min()
@@ -289,7 +290,7 @@ class CycleConstraint(Constraint):
 
     @abc.abstractmethod
     def of(self, amplitude: Array, velocity: Array) -> Array:
-        """The measure of an amplitude peak to peak [m] and a velocity, root mean square [m/s]."""
+        """The measure of an `amplitude` peak to peak [m] and a `velocity`, rms [m/s]."""
 
     def __call__(self, scene):
         return self.measure(scene) if self.at_most is None else super().__call__(scene)

@@ -13,15 +13,15 @@ class Cuts(eqx.Module):
 
     centres: Float[Array, "k v"]
     normals: Float[Array, "k 2 v"]
-    gaps: Float[Array, "k 2"]  # distances of the planes from the centre
+    gaps: Float[Array, "k 2"]  # distances of the planes from the centre, infinite without one
     reach: Float[Array, " k"]
 
     @classmethod
     def none(cls, count: int, u: Array) -> "Cuts":
         """Room for `count` cuts of designs like u (v,), none of which excludes anything."""
         zeros = jnp.zeros((count, len(u)), u.dtype)
-        gaps = jnp.full((count, 2), 1e3, u.dtype)
-        return cls(zeros - 10, jnp.stack([zeros, zeros], axis=1), gaps, gaps[:, 0] * 0)
+        gaps = jnp.full((count, 2), jnp.inf, u.dtype)
+        return cls(zeros - 10, jnp.stack([zeros, zeros], axis=1), gaps, jnp.zeros(count, u.dtype))
 
     def added(self, k: int, centre, normals, gaps, reach: float) -> "Cuts":
         """A copy with cut k set."""

@@ -1,8 +1,8 @@
 """Descent from many starts side by side, by any optimiser of optax, on an exact penalty.
 
 The merit of a design is its objective and `penalty` times the sum of what is unmet, at the
-conditions it is solved for. Steps end at the bounds. What is left unmet the landing corrects: a
-descent only has to end in the right basin.
+conditions that count. Steps end at the bounds. A solver corrects what is left unmet: a descent only
+has to end in the right basin.
 """
 
 from typing import Any
@@ -15,10 +15,6 @@ from .evaluator import Evaluator
 from .functions import compressed, finite
 from .rows import linearise, paired
 
-STEPS = 100
-_PENALTY = 1.0  # of scaled objectives and residuals of order one
-_APART = 0.02  # least distance of two ends that are solved from, in scaled variables
-
 
 def descend(
     evaluator: Evaluator,
@@ -26,24 +22,25 @@ def descend(
     optimiser: Any,
     limited: np.ndarray,
     scale: float,
-    penalty: float = _PENALTY,
+    steps: int,
+    penalty: float = 1.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The best designs on the way of an optimiser from starts (n, v), and their merit (n,).
+    """The best designs on the paths of an optimiser from starts (n, v), and their merit (n,).
 
     `optimiser` is an `optax.GradientTransformation`, `limited` (1 + k,) marks the columns of a row
-    that are requirements, and `scale` is that of the objective.
+    that are requirements, and `scale` is that of the objective. `penalty` is that of residuals.
     """
     dtype, conditions = evaluator.problem.low.dtype, evaluator.working
     update = jax.jit(optimiser.update)
     us, n = np.asarray(starts, float), len(starts)
     state = optimiser.init(jnp.asarray(us, dtype))
     best, lowest = us, np.full(n, np.inf)
-    for step in range(STEPS + 1):
+    for step in range(steps + 1):
         rows, slopes, _ = linearise(evaluator.problem, *paired(us, conditions))
         merit, gradient = _merit(evaluator, rows, slopes, n, limited, scale, penalty)
         better = merit < lowest
         best, lowest = np.where(better[:, None], us, best), np.where(better, merit, lowest)
-        if step < STEPS:
+        if step < steps:
             changes, state = update(jnp.asarray(gradient, dtype), state, jnp.asarray(us, dtype))
             us = np.clip(us + np.asarray(changes, float), 0, 1)
     return best, lowest
@@ -62,10 +59,12 @@ def _merit(evaluator, rows, slopes, n, limited, scale, penalty):
     return np.array(merits), np.array(gradients)
 
 
-def distinct(us: np.ndarray, merit: np.ndarray, count: int) -> np.ndarray:
-    """At most `count` of us (n, v), the best first, each away from those before it."""
+def select_distinct(
+    us: np.ndarray, merit: np.ndarray, count: int, distance: float = 0.02
+) -> np.ndarray:
+    """At most `count` of us (n, v), the best first, farther from one another than `distance`."""
     chosen: list[np.ndarray] = []
     for i in np.argsort(merit, kind="stable"):
-        if all(np.abs(us[i] - u).max() > _APART for u in chosen) and len(chosen) < count:
+        if all(np.abs(us[i] - u).max() > distance for u in chosen) and len(chosen) < count:
             chosen.append(us[i])
     return np.array(chosen)

@@ -1,8 +1,9 @@
 """The best scene or structure inside bounds that is stable against small disturbances.
 
-Many designs are screened by one compiled program. From the best of distinct basins a solver lands
-on the constraints, and the best of all that meet every requirement, evaluated afresh, is the
-answer (`search.py`). What is asked is stated in `statement.py` and required in `problem.py`.
+Many designs are screened by one compiled program. From the best of distinct basins a solver
+minimises the objective under the constraints, and the best of all ends that meet every requirement,
+evaluated afresh, is the answer (`search.py`). `statement.py` checks what a user requires, and
+`problem.py` evaluates it.
 """
 
 import functools
@@ -16,7 +17,7 @@ import numpy as np
 from jaxtyping import ScalarLike
 
 from .._base.files import write_together
-from .._base.parts import Record, brief, flag, whole
+from .._base.parts import Record, brief, flag, require_kind, whole
 from .._base.table import table
 from .._contact.contact import Contact
 from .._contact.persson import PerssonContact
@@ -28,54 +29,41 @@ from .._stability.summary import stiffness_remarks
 from .._surface.roughness import Roughness, roughness
 from .._surface.topography import Topographies, topography
 from . import constraints as limits
-from .descent import descend, distinct
+from .descent import descend, select_distinct
 from .design_file import STATED, design_files, read_design
+from .design_search import DesignSearch
 from .envelope import Envelope, condition_text
 from .evaluator import Evaluation, make_evaluator
-from .few_modes import in_few_modes
+from .few_modes import project_on_modes
 from .limit import LeastGrowth, least_growth
 from .problem import DesignProblem
-from .quiet import VERIFIED, Kicks, quiet
+from .quiet import Kicks, quiet
 from .result import DesignResult
 from .rows import describe
-from .search import Found, Search
+from .search import Search, SearchResult
 from .sensitivity import Sensitivity, design_sensitivity
 from .solvers import Solver, slsqp
-from .starts import choose_starts, designs_around, screened_designs
+from .starts import choose_starts, draw_designs, spread_designs
 from .statement import DEFAULT_BOUNDS
 from .summary import NO_EQUILIBRIUM, comparison_table, growth_text
 from .tolerance import Tolerance, squeal_probability
-
-_STARTS, _FOLLOWED = 12, 1  # the latter where cycles are followed
-# Designs a side that are screened, in one variable and in more, and what memory holds of them.
-_LATTICE = {False: (1024, 48), True: (256, 24)}  # whether a design takes long
-_LATTICE_MAX = 1_000_000, 1000
-_STARTS_OF_STRUCTURES, _STARTS_OF_MANY_JOINTS = 8, 32
-# Shares of the bounds, about the given design, in which they lie: near, where the nearest is best.
-_SHARES = {True: (0.1, 0.2, 0.6), False: (0.2, 0.6, 1.0)}
-_STARTS_MAX = 10_000
-_DESCENDED = 4  # ends of descents that a solver lands from
-_FEW_JOINTS = 2  # of more, nearly no design of an even spread is inside all limits
-_SEED_MAX = 2**63 - 1  # of a JAX key
-_ACTIVE = 1e-4  # a requirement met by less than this is called active
-_WAVELENGTHS = (1e-3, 1e-6)  # [m], of the roughness that is reported
 
 
 class Design(Record):
     """What `design` returns; numbers in SI units, arrays as NumPy. Printed, it is a table."""
 
     scene: Any  # the designed scene or structure; if infeasible, the best one found
-    initial: Any
+    initial: Any  # the given scene or structure
     value: float  # the objective at `scene`: by default d^2, the squared scaled distance
     growth_rate: float  # [1/s], of `scene` itself
     active: tuple[str, ...]  # requirements met with nothing to spare
     violated: tuple[str, ...]  # requirements not met, none unless infeasible
     result: DesignResult  # a member of DesignResult
-    history: Mapping[str, np.ndarray]  # one row an evaluation on the way to `scene`, as it is
-    bounds: Mapping[str, tuple[float, float]]
+    history: Mapping[str, np.ndarray]  # one row an evaluation on the path to `scene`, as it is
+    bounds: Mapping[str, tuple[float, float]]  # (lower, upper) by name
     target: float  # largest growth rate allowed [1/s]
     K_n_min: float  # least normal stiffness allowed [N/m], of the stiffest joint
-    friction_slope: bool
+    friction_slope: bool  # True if growth rates count the slope of friction
     starts: int  # designs that the solver started from, 0 if unchanged
     failed_starts: int  # how many of them ended without meeting every requirement
     options: Mapping[str, Any]  # the arguments of `design`, for another run
@@ -84,10 +72,10 @@ class Design(Record):
     worst_of: Mapping[str, Mapping[str, float]] | None = None  # of every requirement
     squeal_probability: float | None = None  # as machined
     squeal_probability_error: float | None = None  # its standard error
-    initial_squeal_probability: float | None = None
-    # Share of the draws without a sliding equilibrium, neither quiet nor squealing, after, before.
+    initial_squeal_probability: float | None = None  # as given
+    # Share of the draws without a sliding equilibrium, neither quiet nor squealing.
     undetermined: float | None = None
-    initial_undetermined: float | None = None
+    initial_undetermined: float | None = None  # as given
     # What is asked of the limit cycle, before and after; 0 at rest.
     cycles: Mapping[str, tuple[float, float]] | None = None
     quiet_radius: float | None = None  # the largest kick survived, as `quiet_within` measures it
@@ -110,8 +98,9 @@ class Design(Record):
         is_plain = self.options["quiet_within"] is None and self.result != DesignResult.infeasible
         if not is_plain or any(isinstance(each, limits.CycleConstraint) for each in cycles):
             return None
-        problem = stated(self.initial, self.options)
-        state = functools.partial(stated, options=self.options, modes=problem.modes or None)
+        problem = state_problem(self.initial, self.options)
+        modes = problem.modes or None
+        state = functools.partial(state_problem, options=self.options, modes=modes)
         evaluator = make_evaluator(problem, self.options["envelope"], self.options["risk"])
         return design_sensitivity(self.initial, self.scene, state, evaluator)
 
@@ -133,14 +122,16 @@ class Design(Record):
         if isinstance(contact, PerssonContact) and contact.L is not None:
             band: Any = contact.L, contact.L_s
             return float(band[0]), float(band[1])
-        return _WAVELENGTHS
+        return 1e-3, 1e-6
 
     def roughness(
         self, L: ScalarLike | None = None, L_s: ScalarLike | None = None
     ) -> tuple[Roughness, Roughness]:
         """Sq [m], Sa [m] and Sdq of the given and of the designed surface, as `roughness` says.
 
-        Over wavelengths from L to L_s [m], by default those of `wavelengths`.
+        **Arguments:**
+
+        - `L`, `L_s`: longest and shortest wavelength [m], by default those of `wavelengths`.
         """
         longest, shortest = self.wavelengths
         band = longest if L is None else L, shortest if L_s is None else L_s
@@ -150,8 +141,15 @@ class Design(Record):
     def topographies(self, n: int = 1024, *, L=None, L_s=None, M=10, key=None) -> Topographies:
         """Both surfaces on a grid of n x n points with the same phases, to see the difference.
 
-        L and L_s [m] are by default those of `wavelengths`, but L_s no less than 2 L/n, and `key`
-        that of the design's seed; the rest, and errors, as `topography`.
+        **Arguments:**
+
+        - `n`: points along each side, 1024 by default.
+        - `L`, `L_s`: longest and shortest wavelength [m], by default those of `wavelengths`, but
+          L_s no less than 2 L/n.
+        - `M`: directions of waves, as in `topography`; 10 by default.
+        - `key`: JAX random key of the phases, by default that of the design's seed.
+
+        **Raises:** as `topography`.
         """
         longest, shortest = self.wavelengths
         L = longest if L is None else L
@@ -170,7 +168,7 @@ class Design(Record):
         return self.initial.contact.surface, self.scene.contact.surface
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write scenes, options, results and history to a TOML file, for `repeat_design`.
+        """Write scenes, options, results and history to the TOML file `path`, for `repeat_design`.
 
         A structure, given and designed, has files of its own beside it: all are written or none.
 
@@ -191,7 +189,7 @@ class Design(Record):
             lines.append(f"Sq and Sdq: wavelengths from {L:g} to {L_s:g} m")
         for name, (before, after) in (self.cycles or {}).items():
             lines.append(f"{name}: {before:.6g}, then {after:.6g}")
-        lines += self._under_conditions() + self._under_kicks()
+        lines += self._condition_lines() + self._kick_lines()
         changed = isinstance(self.scene, Scene) and self.result == DesignResult.found
         if changed and self.sensitivity is not None:
             lines += ["", "What this design hangs on:", repr(self.sensitivity), ""]
@@ -207,21 +205,22 @@ class Design(Record):
             promise = "no promise: see above" if after else promise
         return "\n".join([*lines, self.outcome, promise])
 
-    def _under_kicks(self) -> list[str]:
-        """What is known of kicks, and how well."""
+    def _kick_lines(self) -> list[str]:
+        """The largest kick survived, and the confidence in it."""
         if not self.quiet_radius:
             return [] if self.quiet_radius is None else ["largest kick survived: none"]
         ellipsoid = isinstance(self.options["quiet_within"], list)
         unit = "of the ellipsoid" if ellipsoid else "in units of V/omega and V"
-        share = f"share below {3 / VERIFIED:.2g} with 95 % confidence"
+        count = self.options["search"].kick_starts[-1]
+        share = f"share below {3 / count:.2g} with 95 % confidence"
         where = " " if self.options["envelope"] is None else ", shared by the worst conditions, "
         return [
             f"largest kick survived: {self.quiet_radius:.6g} {unit}",
-            f"none of {VERIFIED} starts within it{where}ends anywhere but at rest ({share})",
+            f"none of {count} starts within it{where}ends anywhere but at rest ({share})",
         ]
 
-    def _under_conditions(self) -> list[str]:
-        """What the envelope and the tolerance make of it, before and after, and the worst."""
+    def _condition_lines(self) -> list[str]:
+        """The results over the envelope and the tolerance, before and after, and the worst."""
         if self.growth_rates is None:
             return []
         envelope, tolerance = self.options["envelope"], self.options["tolerance"]
@@ -269,6 +268,7 @@ def design(
     lattice: int | None = None,
     seed: int = 0,
     quiet_within: Any = None,
+    search: DesignSearch = DesignSearch(),
     progress: bool = True,
 ) -> Design:
     """Find by gradients the scene or structure inside `bounds` that is best and meets all that is
@@ -320,30 +320,32 @@ def design(
     - `friction_slope`: False leaves the slope of friction out of growth rates.
     - `quiet_within`: the `radius` of `basin`, in units of V/omega and V, or the semi-axes (2n,) of
       an ellipsoid in m and m/s. No start within it of the sliding equilibrium ends anywhere else,
-      as 4000 starts drawn by `seed` confirm; `Design.quiet_radius` is the largest radius, or share
-      of the semi-axes, so confirmed. Motions follow the whole friction law whatever
-      `friction_slope`. It needs a V of every joint and takes no tolerance: whether a start comes to
-      rest has no quantile. Under an envelope the starts are shared by its middle, up to four
-      corners and the worst conditions of the requirements, each in its own V/omega and V.
+      as 4000 starts drawn by `seed` confirm (`search.kick_starts`); `Design.quiet_radius` is the
+      largest radius, or share of the semi-axes, so confirmed. Motions follow the whole friction law
+      whatever `friction_slope`. It needs a V of every joint and takes no tolerance: whether a start
+      comes to rest has no quantile. Under an envelope the starts are shared by its middle, up to
+      four corners and the worst conditions of the requirements, each in its own V/omega and V.
 
     **How it is solved:**
 
-    - `starts`: how many designs the solver lands from; by default 12, 8 for a structure, 32 for one
-      of more than two joints. They are the given design, the most promising of those screened, and
-      an even spread; for more than two joints they are drawn around the given design.
+    - `starts`: how many designs the solver starts from; by default 12, 8 for a structure, 32 for
+      one of more than two joints. They are the given design, the most promising of those screened,
+      and an even spread; for more than two joints they are drawn around the given design.
     - `lattice`: how many designs a side are screened, 48, or 24 for a structure, with an envelope
       or a tolerance; 1024 or 256 in one variable; lattice^2 designs of a low-discrepancy set in
       more than two variables.
     - `optimiser`: any `optax.GradientTransformation`, such as
       `optax.adam(optax.cosine_decay_schedule(0.03, 100))`. All starts first descend by it side by
-      side for 100 steps, on scaled variables and an exact penalty of what is unmet; the solver
-      lands from the distinct best of their ends. By default there is no descent.
+      side for 100 steps (`search.descent_steps`), on scaled variables and an exact penalty of what
+      is unmet; the solver starts from the distinct best of their ends. By default there is no
+      descent.
     - `solver`: a function `solver(objective, constraints, start, bounds)`; by default SciPy's SLSQP
       (see `slsqp`). For more than two joints steps in a trust region keep to the limits of every
       joint instead, the eight best of their ends go on, and rounds of more starts near the best
       follow until they cease to gain. With 60 degrees of freedom or more all that is in the space
       of the modes that grow most, and the best end in all degrees of freedom.
     - `seed`: of all that is drawn. The same arguments give the same design.
+    - `search`: a `DesignSearch`, which says how thorough all this is.
     - `progress`: shows a bar.
 
     A request that cannot be met is a result, not an error: see `Design.result`. Then
@@ -365,8 +367,9 @@ def design(
         )
     if solver is not None and not callable(solver):
         raise TypeError(f"solver must be a function, got {brief(solver)}")
-    whole("seed", seed, 0, _SEED_MAX)
-    problem = stated(x, options)
+    whole("seed", seed, 0, 2**63 - 1)  # those of a JAX key
+    require_kind("search", search, DesignSearch)
+    problem = state_problem(x, options)
     options["bounds"] = dict(options["bounds"])
     kicks = None
     if quiet_within is not None:
@@ -375,10 +378,10 @@ def design(
                 "quiet_within takes no tolerance: a start comes to rest or not, which has no "
                 "quantile; give what scatters as an envelope"
             )
-        kicks = Kicks.of(x, quiet_within, seed, progress)
+        kicks = Kicks.of(x, quiet_within, seed, progress, search.kick_starts)
         options["quiet_within"] = kicks.within
     evaluator = make_evaluator(problem, envelope, risk)
-    count, designs = screened(problem, starts, lattice)
+    count, designs = designs_to_screen(problem, starts, lattice)
     start = np.asarray(problem.start, float)
     before = evaluator.evaluate(start[None])
     if not np.isfinite(before.rows).all() and isinstance(x, Scene):
@@ -389,28 +392,32 @@ def design(
         us, scale = choose_starts(start, designs, evaluator.screen(designs), count)
         if problem.cycles is not None:
             scale = abs(float(before.values[0])) or 1.0
-        landing = solver or solver_of(problem)
-        rough = None if landing else in_few_modes(problem, us)
-        search = Search(evaluator, landing, 1.0 if objective is None else scale, rough)
+        landing = solver or default_solver(problem)
+        rough = None if landing else project_on_modes(problem, us)
+        scale = 1.0 if objective is None else scale
+        searching = Search(evaluator, landing, scale, rough, search)
         if optimiser is not None:
-            ends, merit = descend(evaluator, us, optimiser, problem.limited, search.scale)
-            us = distinct(ends, merit, _DESCENDED)
-        path, after, failed, lowest = search.best(us, progress)
-        limit = None if lowest is None else least_growth(search, *lowest)
-        return Found(path, after, len(us), failed, limit)
+            limited, steps = problem.limited, search.descent_steps
+            ends, merit = descend(evaluator, us, optimiser, limited, scale, steps)
+            us = select_distinct(ends, merit, search.descent_ends)
+        path, after, failed, lowest = searching.best(us, progress)
+        limit = None if lowest is None else least_growth(searching, *lowest)
+        return SearchResult(path, after, len(us), failed, limit)
 
     if objective is None and before.worst[0] <= 0:
-        best = Found(start[None], before, 0, 0)
+        best = SearchResult(start[None], before, 0, 0)
     else:
         best = solve(problem)
     if kicks is None:
         return _conclude(x, problem, options, before, best)
-    best, survived = quiet(problem, best, solve, kicks, envelope)
+    best, survived = quiet(problem, best, solve, kicks, envelope, search)
     best = best._replace(evaluation=evaluator.evaluate(best.path[-1:]))  # without cuts
     return _conclude(x, problem, options, before, best, survived)
 
 
-def stated(x: Mechanism, options: Mapping[str, Any], modes: int | None = None) -> DesignProblem:
+def state_problem(
+    x: Mechanism, options: Mapping[str, Any], modes: int | None = None
+) -> DesignProblem:
     """The problem that options of `design` state; of a structure perhaps of so many modes."""
     problem = DesignProblem(x, **{name: options[name] for name in STATED}, modes=modes)
     # An average of smooth residuals over conditions is not that of the growth rates.
@@ -418,32 +425,42 @@ def stated(x: Mechanism, options: Mapping[str, Any], modes: int | None = None) -
     return problem.with_fields(smooth=smooth)
 
 
-def screened(problem: DesignProblem, starts: int | None, lattice: int | None):
+def designs_to_screen(
+    problem: DesignProblem, starts: int | None, lattice: int | None
+) -> tuple[int, np.ndarray]:
     """How many designs to start from, and those (n, v) to choose them from."""
-    variables, many_joints = len(problem.names), len(problem.contacts) > _FEW_JOINTS
-    default = _STARTS_OF_STRUCTURES if problem.modes else _STARTS
-    default = _STARTS_OF_MANY_JOINTS if many_joints else default
-    default = default if problem.cycles is None else _FOLLOWED
-    sized = lattice is not None
+    variables = len(problem.names)
+    sides, sized = min(variables, 2), lattice is not None
     if lattice is None:
-        many = problem.robust or problem.modes > 0  # each design takes long
-        lattice = _LATTICE[many][min(variables, 2) - 1]
-    lattice = whole("lattice", lattice, 1, _LATTICE_MAX[min(variables, 2) - 1])
-    count = lattice ** min(variables, 2)
-    starts = whole("starts", min(default, count) if starts is None else starts, 1, _STARTS_MAX)
+        takes_long = problem.robust or problem.modes > 0
+        lattice = (256 if takes_long else 1024) if sides == 1 else (24 if takes_long else 48)
+    lattice = whole("lattice", lattice, 1, 10 ** (6 // sides))  # memory holds a million
+    count = lattice**sides
+    if starts is None:
+        starts = min(_default_starts(problem), count)
+    starts = whole("starts", starts, 1, 10_000)
     if starts > count:
         raise ValueError(f"starts must be at most the {count} of the lattice, got {starts}")
-    if not many_joints:
-        return starts, screened_designs(lattice, variables)
-    # Near the given design more is met, and an objective is often that of few changes.
+    if not problem.has_many_joints:
+        return starts, spread_designs(lattice, variables)
     drawn = count if sized else max(1, starts - 1)
-    shares = _SHARES[problem.objective is None]
-    return starts, designs_around(problem, np.asarray(problem.start, float), drawn, shares, 0)
+    # Near the given design more is met, and an objective is often that of few changes.
+    shares = (0.1, 0.2, 0.6) if problem.objective is None else (0.2, 0.6, 1.0)
+    return starts, draw_designs(problem, np.asarray(problem.start, float), drawn, shares, 0)
 
 
-def solver_of(problem: DesignProblem) -> Solver | None:
-    """The solver that lands where none is given; None: steps in a trust region."""
-    return None if len(problem.contacts) > _FEW_JOINTS else slsqp
+def _default_starts(problem: DesignProblem) -> int:
+    """The number of starts unless it is given."""
+    if problem.cycles is not None:
+        return 1  # the cycle is that of the given design
+    if problem.has_many_joints:
+        return 32  # of which few are continued
+    return 8 if problem.modes else 12
+
+
+def default_solver(problem: DesignProblem) -> Solver | None:
+    """The solver unless one is given; None stands for steps in a trust region."""
+    return None if problem.has_many_joints else slsqp
 
 
 def _conclude(
@@ -451,7 +468,7 @@ def _conclude(
     problem: DesignProblem,
     options: Mapping[str, Any],
     before: Evaluation,
-    end: Found,
+    end: SearchResult,
     quiet_radius: float | None = None,
 ) -> Design:
     """How every requirement stands at the end of the path; unchanged without a start."""
@@ -469,7 +486,7 @@ def _conclude(
     least = 1 if isinstance(kick_size, list) else kick_size
     if quiet_radius is not None and quiet_radius < least:
         violated += (f"quiet within {kick_size}",)
-    active = max(_ACTIVE, 100 * problem.rounding)
+    active = max(1e-4, 100 * problem.rounding)
     more: dict[str, Any] = {}
     if envelope is not None or tolerance is not None:
         i = names.index("growth_rate <= target")
@@ -520,9 +537,17 @@ def repeat_design(
 ) -> Design:
     """Run again what a file of `Design.save` holds: with the same versions, to the last bit.
 
-    A file of other versions is run under a warning. Functions of the user's own, an objective,
-    constraints or a solver, are in the file by name only: give them as `functions`,
-    {name: function}; an optimiser of optax, which has no name, as {"optimiser": optimiser}.
+    A file of other versions is run under a warning.
+
+    **Arguments:**
+
+    - `path`: the TOML file.
+    - `functions`: {name: function} of the user's own, an objective, constraints or a solver, which
+      are in the file by name only; an optimiser of optax, which has no name, as {"optimiser":
+      optimiser}. By default there are none.
+    - `progress`: shows a bar.
+
+    **Returns:** a `Design`.
 
     **Raises:** `OSError` if the file cannot be read; `ValueError` naming the file for anything
     unknown or missing in it, and for a precision that JAX is not set to.

@@ -1,5 +1,6 @@
 """A design as a TOML file: the initial design, every option, the result and the history."""
 
+import dataclasses
 import importlib
 import inspect
 import os
@@ -30,14 +31,15 @@ from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
 from . import constraints as known_constraints
 from .constraints import Constraint
+from .design_search import DesignSearch
 from .envelope import Envelope
 from .tolerance import Tolerance
 
-_PACKAGE = __name__.split(".")[0]
 # The arguments of `design` that state its problem, and all that a file holds.
 STATED = ("bounds", "objective", "target", "K_n_min", "constraints", "envelope", "tolerance")
 STATED += ("quantile", "area_ratio_min", "slip_ratio_max", "friction_slope", "laws")
-OPTIONS = (*STATED, "risk", "optimiser", "solver", "starts", "lattice", "seed", "quiet_within")
+OPTIONS = (*STATED, "risk", "optimiser", "solver", "starts", "lattice", "seed")
+OPTIONS += ("quiet_within", "search")
 # Fields of a `Design` that are not in the table of results.
 _NOT_RESULTS = {"scene", "initial", "result", "history", "options", "least_growth", "sensitivity"}
 
@@ -56,7 +58,7 @@ def design_files(best: Any, path: Path) -> dict[Path, bytes]:
         if isinstance(x, Scene):
             heads[name] = x.to_toml()
         else:
-            beside = _beside(path, name)
+            beside = _structure_file(path, name)
             heads[name] = beside.name
             files |= x._files(beside)
     options = dict(best.options)
@@ -71,6 +73,7 @@ def design_files(best: Any, path: Path) -> dict[Path, bytes]:
     }
     if (envelope := options["envelope"]) is not None:
         options["envelope"] = {"ranges": envelope.ranges, "samples": envelope.samples}
+    options["search"] = dataclasses.asdict(options["search"])
     if (tolerance := options["tolerance"]) is not None:
         options["tolerance"] = _tolerance_table(tolerance)
     tables = {
@@ -98,7 +101,7 @@ def read_design(
         refuse_unknown("the file", tables, ("options", "result", "history"))
         options = table_at(document, "options")
         try:
-            inputs = _given(document, Path(path)), _options(options, dict(functions or {}))
+            inputs = _read_mechanism(document, Path(path)), _options(options, dict(functions or {}))
         except KeyError as error:
             raise ValueError(f"not a design file, it lacks {error}") from None
     if others := versions_differ(document):
@@ -132,13 +135,14 @@ def _with_arguments(kind: type, table: Mapping[str, Any], where: str) -> Any:
     return kind(**table)
 
 
-def _beside(path: Path, name: str) -> Path:
+def _structure_file(path: Path, name: str) -> Path:
+    """The file of a structure beside that of a design."""
     return path.with_name(f"{path.stem}.{name}.toml")
 
 
-def _given(document, path: Path) -> Mechanism:
+def _read_mechanism(document, path: Path) -> Mechanism:
     text = _text("given", document["given"])
-    beside = _beside(path, "given")
+    beside = _structure_file(path, "given")
     x = Structure.load(beside) if text == beside.name else Scene.from_toml(text)
     precision = document["precision"]
     if precision not in ("float32", "float64"):
@@ -167,7 +171,8 @@ def _options(table, functions) -> dict[str, Any]:
                 options[name] = _constraint(value, functions)
             else:
                 options[name] = _function(value, functions)
-    for name, kind in (("envelope", Envelope), ("tolerance", Tolerance)):
+    kinds = ("envelope", Envelope), ("tolerance", Tolerance), ("search", DesignSearch)
+    for name, kind in kinds:
         if name in options:
             arguments = table_at(options, name, "options.")
             options[name] = _with_arguments(kind, arguments, f"[options.{name}]")
@@ -190,7 +195,11 @@ def _options(table, functions) -> dict[str, Any]:
 def _function_name(function) -> str:
     module = getattr(function, "__module__", None) or ""
     name = getattr(function, "__name__", repr(function))
-    return f"{module}:{name}" if module.split(".")[0] == _PACKAGE else name
+    return f"{module}:{name}" if _belongs_to_package(module) else name
+
+
+def _belongs_to_package(module: str) -> bool:
+    return module.partition(".")[0] == __name__.partition(".")[0]
 
 
 def _function(name: str, functions):
@@ -198,7 +207,7 @@ def _function(name: str, functions):
     if _text("a function's name", name) in functions:
         return functions[name]
     module, _, member = name.partition(":")
-    if module.split(".")[0] != _PACKAGE or not member:
+    if not (_belongs_to_package(module) and member):
         raise ValueError(f"the function {name!r} is not in the file: give it in `functions`")
     try:
         return getattr(importlib.import_module(module), member)

@@ -5,6 +5,7 @@ decade or more is logarithmic. The worst condition is sought on a grid of all co
 inside, then by halving steps along every range.
 """
 
+import dataclasses
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -17,10 +18,29 @@ from .._base.ranges import within
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import quantity_names, replaced, stored_quantities
 
-_SIDES = {1: 33, 2: 11, 3: 6, 4: 4, 5: 3, 6: 3}  # points along each range, by their number
-_INNER_SIDES = {1: 16, 2: 6, 3: 4, 4: 3, 5: 2, 6: 2}  # the same for an average over conditions
-_CORNERS = 4  # in a first guess at the worst
-_HALVINGS = 10
+
+@dataclasses.dataclass(frozen=True)
+class WorstCaseSearch:
+    """How the worst conditions of an envelope are sought.
+
+    **Fields:**
+
+    - `points`: points of the grid along each range, by the number of ranges, from one to six.
+    - `average_points`: the same for an average over conditions, which takes all points each time.
+    - `likely`: conditions in a first guess.
+    - `corners`: how many of these are corners of the ranges, for each sample.
+    - `climbs`: steps of the climb from the worst point of the grid; one that fails is halved.
+    - `margin`: a requirement met by more than this at all points is met between them.
+    - `excess`: by how much a condition must be worse than the working ones to join them.
+    """
+
+    points: tuple[int, ...] = (33, 11, 6, 4, 3, 3)
+    average_points: tuple[int, ...] = (16, 6, 4, 3, 2, 2)
+    likely: int = 8
+    corners: int = 4
+    climbs: int = 10
+    margin: float = 0.05
+    excess: float = 1e-7
 
 
 class Envelope(Record):
@@ -59,14 +79,15 @@ class Envelope(Record):
             raise ValueError(f"samples of an envelope must be equally many, got {counts}")
         if 0 in lengths.values() or not (ranges or samples):
             raise ValueError("envelope must name at least one range or sample, got none")
-        if len(ranges) > len(_SIDES):
-            raise ValueError(
-                f"envelope takes at most {len(_SIDES)} ranges, got {len(ranges)}; use samples"
-            )
+        if len(ranges) > 6:  # 729 points at least
+            raise ValueError(f"envelope takes at most 6 ranges, got {len(ranges)}; use samples")
 
     @classmethod
     def of(cls, conditions: "Envelope | Mapping[str, Any]") -> "Envelope":
-        """An envelope, or a mapping of names to (lower, upper) or to three or more samples."""
+        """An envelope from `conditions`: itself, or a mapping as in `design`.
+
+        The mapping has names with (lower, upper), or with three or more samples.
+        """
         if isinstance(conditions, Envelope):
             return conditions
         if not isinstance(conditions, Mapping):
@@ -93,7 +114,10 @@ class Envelope(Record):
         return len(next(iter(self.samples.values()))) if self.samples else 1
 
     def check(self, x: Mechanism, designed: Sequence[str]) -> None:
-        """Refuse names that `x` lacks or that are designed, and values outside a domain."""
+        """Refuse names that `x` lacks and values outside a domain.
+
+        Names among the `designed` are refused, too.
+        """
         quantities = stored_quantities(x)
         available = [
             name
@@ -113,7 +137,7 @@ class Envelope(Record):
             raise ValueError(f"envelope: {error}") from None
 
     def values(self, places: np.ndarray) -> np.ndarray:
-        """The quantities (n, names) at places (n, 1 + ranges)."""
+        """The quantities (n, names) at `places` (n, 1 + ranges)."""
         columns = [
             within(low, high, at)
             for at, (low, high) in zip(places[:, 1:].T, self.ranges.values(), strict=True)
@@ -123,25 +147,25 @@ class Envelope(Record):
         return np.array(columns).reshape(len(self.names), len(places)).T
 
     def condition(self, place: np.ndarray) -> dict[str, float]:
-        """The quantities at one place, by name."""
+        """The quantities at one `place` (1 + ranges,), by name."""
         return dict(zip(self.names, self.values(place[None])[0].tolist(), strict=True))
 
-    def grid(self) -> np.ndarray:
+    def grid(self, points: Sequence[int] = WorstCaseSearch.points) -> np.ndarray:
         """Places (n, 1 + ranges) among which the worst is sought: all corners, points inside."""
-        return self._grid(lambda n: np.linspace(0, 1, n), _SIDES)
+        return self._grid(lambda n: np.linspace(0, 1, n), points)
 
-    def coarse_grid(self) -> np.ndarray:
+    def coarse_grid(self, points: Sequence[int] = WorstCaseSearch.average_points) -> np.ndarray:
         """Fewer places (n, 1 + ranges) than `grid`: all corners, points inside."""
-        return self._grid(lambda n: np.linspace(0, 1, n), _INNER_SIDES)
+        return self.grid(points)
 
-    def cells(self) -> np.ndarray:
+    def cells(self, points: Sequence[int] = WorstCaseSearch.average_points) -> np.ndarray:
         """Equally likely places (n, 1 + ranges): the midpoints of equal cells of every range."""
-        return self._grid(lambda n: (np.arange(n) + 0.5) / n, _INNER_SIDES)
+        return self._grid(lambda n: (np.arange(n) + 0.5) / n, points)
 
-    def likely(self, count: int) -> np.ndarray:
+    def likely(self, count: int, corner_count: int = WorstCaseSearch.corners) -> np.ndarray:
         """A first guess (at most `count`, 1 + ranges) at the worst places: middle and corners."""
         corners = self._corners()
-        chosen = np.linspace(0, len(corners) - 1, min(_CORNERS, len(corners))).astype(int)
+        chosen = np.linspace(0, len(corners) - 1, min(corner_count, len(corners))).astype(int)
         middle = np.full((1, len(self.ranges)), 0.5)
         points = np.unique(np.vstack([middle, corners[chosen]]), axis=0)
         each = max(1, count // len(points))
@@ -149,24 +173,31 @@ class Envelope(Record):
         return _with_samples(points, samples)[:count]
 
     def drawn(self, count: int, seed: int) -> np.ndarray:
-        """Places (count, 1 + ranges) drawn at random, uniform in every range and over samples."""
+        """Places (`count`, 1 + ranges) drawn by `seed`, uniform in every range and over samples."""
         random = np.random.default_rng([seed, 1])
         which = random.integers(self.sample_count, size=(count, 1))
         return np.hstack([which, random.uniform(size=(count, len(self.ranges)))])
 
-    def climb(self, residual: Callable, places: np.ndarray, values: np.ndarray):
+    def climb(
+        self,
+        residual: Callable,
+        places: np.ndarray,
+        values: np.ndarray,
+        options: WorstCaseSearch = WorstCaseSearch(),
+    ):
         """Places and residuals after a climb from `places` (n, 1 + ranges) with `values` (n,).
 
-        `residual(places, i)` is evaluated at places (m, 1 + ranges), row j for problem i[j]. Every
-        range is tried in both directions; the step is halved where neither helps.
+        `residual` is a function: `residual(places, i)` is evaluated at places (m, 1 + ranges), row
+        j for problem i[j]. Every range is tried in both directions; the step is halved where
+        neither helps.
         """
         k = len(self.ranges)
         if k == 0 or not len(places):
             return places, values
         every = np.arange(len(places))
-        step = np.full(len(places), 1 / (_SIDES[k] - 1))
+        step = np.full(len(places), 1 / (options.points[k - 1] - 1))
         directions = np.hstack([np.zeros((2 * k, 1)), np.vstack([np.eye(k), -np.eye(k)])])
-        for _ in range(_HALVINGS):
+        for _ in range(options.climbs):
             tried = places[:, None] + step[:, None, None] / 2 * directions[None]
             tried[..., 1:] = np.clip(tried[..., 1:], 0, 1)
             residuals = residual(tried.reshape(-1, 1 + k), np.repeat(every, 2 * k)).reshape(
@@ -182,10 +213,10 @@ class Envelope(Record):
     def _corners(self) -> np.ndarray:
         return np.array(list(itertools.product((0.0, 1.0), repeat=len(self.ranges))))
 
-    def _grid(self, side, sides) -> np.ndarray:
+    def _grid(self, side, points) -> np.ndarray:
         k = len(self.ranges)
-        points = np.array(list(itertools.product(side(sides[k]) if k else (), repeat=k)))
-        return _with_samples(points, range(self.sample_count))
+        places = np.array(list(itertools.product(side(points[k - 1]) if k else (), repeat=k)))
+        return _with_samples(places, range(self.sample_count))
 
     def __str__(self) -> str:
         shown = [f"{name} {low:g} to {high:g}" for name, (low, high) in self.ranges.items()]
@@ -194,12 +225,12 @@ class Envelope(Record):
         return ", ".join(shown)
 
 
-class _Alone(Envelope):
+class _SingleCondition(Envelope):
     def __init__(self):
         self.ranges, self.samples = {}, {}
 
 
-ALONE = _Alone()  # a scene as it is: one condition, without quantities
+SINGLE_CONDITION = _SingleCondition()  # a scene as it is: one condition, without quantities
 
 
 def _numbers(name, values) -> tuple[float, ...]:

@@ -7,15 +7,9 @@ from typing import Any
 import numpy as np
 
 from .._base.parts import brief, scalar
-from .envelope import ALONE, Envelope
+from .envelope import SINGLE_CONDITION, Envelope, WorstCaseSearch
 from .problem import DesignProblem
 from .rows import evaluate, linearise, paired
-
-_LIKELY = 8  # conditions in a first guess at the worst
-_NEW = 1e-7  # by which a condition must be worse than the working ones
-_NEAR = 0.05  # a requirement met by more than this on the grid is met between its points
-_TEMPERATURE = 0.02  # temperature of the smooth maximum over an envelope
-
 
 Rows = Callable[[DesignProblem, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -42,7 +36,7 @@ class Evaluation:
         """The largest residual (n,); infinite where it or the objective is undefined."""
         return np.where(np.isfinite(self.values), self.residuals.max(axis=1), np.inf)
 
-    def of(self, i: int) -> "Evaluation":
+    def select(self, i: int) -> "Evaluation":
         """The evaluation of one design, still with a leading axis."""
         return Evaluation(self.rows[i : i + 1], self.places[i : i + 1])
 
@@ -52,12 +46,13 @@ class Evaluator:
     """Evaluates requirements and objective of designs at the worst conditions of an envelope."""
 
     problem: DesignProblem
-    envelope: Envelope = ALONE
+    envelope: Envelope = SINGLE_CONDITION
+    options: WorstCaseSearch = WorstCaseSearch()
 
     @property
     def likely(self) -> np.ndarray:
         """Conditions (m, c) that are a first guess at the worst."""
-        return self.envelope.values(self.envelope.likely(_LIKELY))
+        return self.envelope.values(self.envelope.likely(self.options.likely, self.options.corners))
 
     @property
     def working(self) -> np.ndarray:
@@ -67,7 +62,7 @@ class Evaluator:
     @property
     def minimax(self) -> bool:
         """True if the objective is the largest of its values at many conditions."""
-        return self.problem.objective is not None and self.envelope is not ALONE
+        return self.problem.objective is not None and self.envelope is not SINGLE_CONDITION
 
     def screen(self, us: np.ndarray) -> np.ndarray:
         """Approximate objective and residuals (n, 1 + k) of us (n, v), for the choice of starts."""
@@ -77,11 +72,11 @@ class Evaluator:
 
     def evaluate(self, us: np.ndarray) -> Evaluation:
         """Evaluate designs us (n, v) over all conditions."""
-        grid = self.envelope.grid()
+        grid = self.envelope.grid(self.options.points)
         each = self._at_all(us, self.envelope.values(grid))
         each = each[:, :, self.problem.named_columns]
         places, rows = grid[each.argmax(axis=1)], each.max(axis=1)
-        near = rows > -_NEAR
+        near = rows > -self.options.margin
         near[:, 0] = self.problem.objective is not None
         which, column = np.nonzero(near)
 
@@ -90,7 +85,9 @@ class Evaluator:
                 np.arange(len(i)), column[i]
             ]
 
-        places[near], rows[near] = self.envelope.climb(residual, places[near], rows[near])
+        places[near], rows[near] = self.envelope.climb(
+            residual, places[near], rows[near], self.options
+        )
         return Evaluation(rows, places)
 
     def average(self, rows: np.ndarray, jacobians: np.ndarray):
@@ -105,7 +102,9 @@ class Evaluator:
         places = self.envelope.values(self.evaluate(u[None]).places[0])
         conditions, which = np.unique(places, axis=0, return_inverse=True)
         which = which.ravel()
-        if self.envelope is ALONE:  # one condition of all columns, also of those without a name
+        if (
+            self.envelope is SINGLE_CONDITION
+        ):  # one condition of all columns, also of those without a name
             which = np.zeros(len(self.problem.named_columns), int)
         columns = np.arange(len(which))
 
@@ -123,7 +122,7 @@ class Evaluator:
         working_rows = working_rows[:, self.problem.named_columns]
         pieces = np.split(working_rows, np.cumsum(counts)[:-1])
         for rows, places, piece in zip(evaluation.rows, evaluation.places, pieces, strict=True):
-            worse = rows > piece.max(axis=0) + _NEW
+            worse = rows > piece.max(axis=0) + self.options.excess
             worse[1:] &= rows[1:] > 0
             new.append(self.envelope.values(np.unique(places[worse], axis=0)))
         return new
@@ -190,9 +189,9 @@ def make_evaluator(problem: DesignProblem, envelope: Envelope | None, risk: Any)
     """The evaluator of designs over the conditions of an envelope, with `risk` as in `design`."""
     match risk:
         case "worst":
-            return Evaluator(problem, envelope or ALONE)
+            return Evaluator(problem, envelope or SINGLE_CONDITION)
         case "smooth":
-            kind, number = "smooth", _TEMPERATURE
+            kind, number = "smooth", 0.02
         case ("smooth" as kind, temperature):
             number = float(scalar("temperature of risk", temperature, above=0))
         case ("cvar" as kind, alpha):

@@ -20,38 +20,37 @@ from .._stability.reduced_space import decomposed
 from .._stability.snapshots import projected
 from .problem import DesignProblem
 
-_LARGE = 60  # degrees of freedom, below which little is saved
-_SHARE = 0.7  # of them, above which the space saves too little
-_MODES = 3  # in the space, as a multiple of those that may grow
-_CUT = 1e-5  # relative to the largest singular value
 
-
-def in_few_modes(problem: DesignProblem, us: np.ndarray) -> DesignProblem | None:
+def project_on_modes(problem: DesignProblem, us: np.ndarray) -> DesignProblem | None:
     """The problem in the space of the modes that grow most in us (n, v); None if it saves little.
 
     It is also None with functions of the user's, which may need all degrees of freedom.
     """
     x = problem.x
     needs_all = (problem.objective is not None and not problem.least_growth) or problem.constraints
-    if not problem.modes or x.n < _LARGE or x.band is not None or needs_all or problem.cycles:
+    if not problem.modes or x.band is not None or needs_all or problem.cycles:
         return None
-    vectors, size = in_batches(functools.partial(_growing, problem), 1, us)
-    V = decomposed(list(vectors[np.isfinite(vectors).all(axis=(1, 2))]), np.sqrt(size[0]), _CUT)
-    if V.shape[1] > _SHARE * x.n:
+    if x.n < 60:  # eigenvalues take little time
+        return None
+    vectors, size = in_batches(functools.partial(_growing_modes, problem), 1, us)
+    vectors = vectors[np.isfinite(vectors).all(axis=(1, 2))]
+    # Directions with less than this share of the largest one are left out.
+    V = decomposed(list(vectors), np.sqrt(size[0]), 1e-5)
+    if V.shape[1] > 0.7 * x.n:  # eigenvalues take a third of the time at least
         return None
     return problem.with_fields(x=ParametricStructure(**projected(x, V, V)))
 
 
 @exported_jit
-def _growing(problem: DesignProblem, us):
+def _growing_modes(problem: DesignProblem, us):
     """Right and left vectors (n, dofs, k) of the modes that grow most, and the diagonals of M."""
 
     def one(u):
         _, x = problem.stiffened(problem.mechanism_at(u, problem.nominal_condition))
         attached = assembled(x, problem.friction_slope, refuse=False)
         modes = solve(*attached[:3])
-        sought = jnp.argsort(jnp.where(modes.s.imag >= 0, -modes.s.real, jnp.inf))
-        chosen = sought[: _MODES * problem.modes]
+        order = jnp.argsort(jnp.where(modes.s.imag >= 0, -modes.s.real, jnp.inf))
+        chosen = order[: 3 * problem.modes]  # other modes come up at other designs
         vectors = jnp.concatenate([modes.x[chosen], modes.y[chosen]]).T
         return vectors, jnp.diagonal(attached.M)
 

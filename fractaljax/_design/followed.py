@@ -13,8 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._base.programs import exported_jit
-from .._dynamics.acceptance import HARDLY, admissible, growth_of
+from .._dynamics.acceptance import admissible, growth_of
 from .._dynamics.cycle import CycleResult
+from .._dynamics.cycle_search import CycleSearch
 from .._dynamics.extremes import extreme_values
 from .._dynamics.limit_cycle import limit_cycle
 from .._dynamics.orbit import orbit, solve_periodic_orbits
@@ -22,9 +23,6 @@ from .._dynamics.scaled import check_rtol, hybrid_system
 from .._dynamics.segments import Segments, mean_square
 from .._stability.stability import growth_rate
 from .constraints import CycleConstraint
-
-_REACH = 0.05, 0.01  # longest step between designs, in scaled variables, and the shortest
-_NEAR = 0.2  # relative distance of states beyond which an orbit is another one
 
 
 class _StoredCycle(NamedTuple):
@@ -47,7 +45,7 @@ class FollowedCycles:
     def fill(self, problem, us: np.ndarray, rows: np.ndarray, jacobians: np.ndarray) -> None:
         """Write the columns of cycles into rows (n, 1 + k) and Jacobians (n, 1 + k, v)."""
         columns = [
-            (column, constraint, (lambda c, value: c.above(value)) if column else _itself)
+            (column, constraint, (lambda c, value: c.above(value)) if column else _measure)
             for column, constraint in self.columns(problem)
         ]
         for i, u in enumerate(np.asarray(us, float)):
@@ -88,41 +86,41 @@ class FollowedCycles:
             return self.stored[u.tobytes()]
         if not self.stored:
             first = np.asarray(problem.start, float)
-            self._searched(problem, first, None)
+            self._search(problem, first, None)
             return self.at(problem, u)
         cycles = [other for other in self.stored.values() if other.segments is not None]
         if not cycles:
-            return self._searched(problem, u, None)
+            return self._search(problem, u, None)
         last = min(cycles, key=lambda other: np.abs(u - other.u).max())
-        reach, shortest = _REACH
+        reach, shortest = 0.05, 0.01  # longest and shortest step, in scaled variables
         while True:
             distance = float(np.abs(u - last.u).max())
             arrives = distance <= reach
             next_u = u if arrives else last.u + reach / distance * (u - last.u)
-            cycle = self._newton(problem, next_u, last.segments)
+            cycle = self._correct(problem, next_u, last.segments)
             if cycle is None and reach > shortest:
                 reach = min(distance, reach) / 2
                 continue
             if cycle is None:
-                cycle = self._searched(problem, next_u, last.start)
+                cycle = self._search(problem, next_u, last.start)
                 if cycle.segments is None and not arrives:
-                    cycle = self._beyond(problem, u, cycle, last.start)
+                    cycle = self._continue_beyond(problem, u, cycle, last.start)
             self.stored[cycle.u.tobytes()] = cycle
             if np.array_equal(cycle.u, u):
                 return cycle
             last = cycle
 
-    def _beyond(self, problem, u, ended: _StoredCycle, start) -> _StoredCycle:
+    def _continue_beyond(self, problem, u, ended: _StoredCycle, start) -> _StoredCycle:
         """The cycle at u if its branch has ended on the way there, with the one in `ended`."""
         x = _mechanism(problem, u)
         at_rest = not ended.measures.any()
         if at_rest and float(growth_rate(x)) < 0:
             return ended._replace(u=u)
-        return self._searched(problem, u, None if at_rest else start)
+        return self._search(problem, u, None if at_rest else start)
 
-    def _newton(self, problem, u, segments) -> _StoredCycle | None:
+    def _correct(self, problem, u, segments) -> _StoredCycle | None:
         """The orbit near another design's segments; None unless it is an attracting cycle."""
-        (segments, start, ok), measures, slopes = _followed(
+        (segments, start, ok), measures, slopes = _follow_orbit(
             problem.with_fields(cycles=None, cuts=None, constraints=(), grid=None),
             jnp.asarray(u, problem.low.dtype),
             segments,
@@ -131,14 +129,14 @@ class FollowedCycles:
             return None
         return _StoredCycle(u, segments, *(np.asarray(x, float) for x in (start, measures, slopes)))
 
-    def _searched(self, problem, u, start) -> _StoredCycle:
+    def _search(self, problem, u, start) -> _StoredCycle:
         """The cycle, if any, to which the motion from a start settles."""
         x = _mechanism(problem, u)
         cycle = limit_cycle(x, start, throw=False)
         n = len(cycle.amplitude)
         stored = None
         if bool(jnp.isfinite(cycle.period)):  # or one that hardly repels
-            stored = self._newton(problem, u, cycle._orbit.segments)
+            stored = self._correct(problem, u, cycle._orbit.segments)
         if stored is None:
             at_rest = bool(cycle.result == CycleResult.equilibrium)
             measures = np.full((2, n), 0.0 if at_rest else np.nan)
@@ -148,7 +146,7 @@ class FollowedCycles:
         return stored
 
 
-def _itself(constraint: CycleConstraint, value: jax.Array) -> jax.Array:
+def _measure(constraint: CycleConstraint, value: jax.Array) -> jax.Array:
     return value
 
 
@@ -157,7 +155,7 @@ def _mechanism(problem, u):
 
 
 @exported_jit
-def _followed(problem, u, segments: Segments):
+def _follow_orbit(problem, u, segments: Segments):
     """The orbit of the design u near these segments, its measures, and their slopes by u."""
     rtol = check_rtol(None, u.dtype)
 
@@ -174,8 +172,10 @@ def _followed(problem, u, segments: Segments):
         n, units = len(rows), system.units
         velocity = jnp.sqrt(mean_square(system, closed)[n:])
         measures = jnp.stack([(high - low) * units[:n], velocity * units[n:]])
-        near = jnp.max(jnp.abs(y - segments.y)) < _NEAR * (1 + jnp.max(jnp.abs(y)))
-        ok = solution.converged & (solution.error <= rtol) & (growth_of(frozen, solution) < HARDLY)
+        # A farther orbit is another one.
+        near = jnp.max(jnp.abs(y - segments.y)) < 0.2 * (1 + jnp.max(jnp.abs(y)))
+        ok = solution.converged & (solution.error <= rtol)
+        ok = ok & (growth_of(frozen, solution) < CycleSearch().repelling)
         ok = jnp.all(ok & admissible(frozen, solution.segments, solution.middle))
         ok = ok & near & jnp.all(jnp.isfinite(measures))
         return measures, (measures, (closed, y[:, 0] * units, ok))

@@ -27,17 +27,17 @@ class Functions:
     evaluated: list[np.ndarray] = dataclasses.field(
         default_factory=list
     )  # where rows were evaluated
-    _known: dict[bytes, Any] = dataclasses.field(default_factory=dict)
+    _cache: dict[bytes, Any] = dataclasses.field(default_factory=dict)
 
     def at(self, z):
         """Rows and their Jacobians at z, which is u (v,) or, with the extra variable, (u, t)."""
         u = np.clip(z[:-1] if self.extra else z, 0, 1)
-        if u.tobytes() not in self._known:
+        if u.tobytes() not in self._cache:
             rows, jacobians = finite(*self.rows_at(u))
             scale = np.where(np.arange(rows.shape[1]) == 0, self.scale, 1)
-            self._known[u.tobytes()] = rows / scale, jacobians / scale[:, None]
+            self._cache[u.tobytes()] = rows / scale, jacobians / scale[:, None]
             self.evaluated.append(u.copy())
-        return self._known[u.tobytes()]
+        return self._cache[u.tobytes()]
 
     def objective(self, z):
         """Value and gradient."""

@@ -8,6 +8,7 @@ import numpy as np
 
 from .._base.programs import exported_jit
 from .._base.ranges import low_discrepancy
+from .._mechanism.structure import Structure
 from .._stability.linearise import assembled
 from .._stability.quadratic import leading
 from .joints import with_contact_law
@@ -16,19 +17,20 @@ from .rows import paired, rows_in_batches
 if TYPE_CHECKING:
     from .problem import DesignProblem
 
-_LOOKED_AT = 15  # designs, besides the initial one, in which growing modes are counted
-MODES_MOST = 16  # that requirements can include
+
+def largest_mode_count(x: Structure) -> int:
+    """The largest number of modes of a structure that requirements can include."""
+    return min(16, x.n)
 
 
 def modes_to_keep(problem: "DesignProblem") -> int:
     """The number of modes that may grow: two more than grow in any of a few designs."""
-    designs = np.concatenate(
-        [np.asarray(problem.start)[None], low_discrepancy(_LOOKED_AT, len(problem.names))]
-    )
-    modes = max(2, min(MODES_MOST, problem.x.n))
-    looking = problem.with_fields(modes=modes)
+    spread = low_discrepancy(15, len(problem.names))  # few, for each takes long
+    designs = np.concatenate([np.asarray(problem.start)[None], spread])
+    modes = max(2, largest_mode_count(problem.x))
+    counting = problem.with_fields(modes=modes)
     pairs = paired(designs, np.asarray(problem.nominal_condition)[None])
-    growing = rows_in_batches(_rates, looking, *pairs) > float(problem.target)
+    growing = rows_in_batches(_rates, counting, *pairs) > float(problem.target)
     return min(int(growing.sum(axis=2).max()) + 2, modes)
 
 

@@ -10,13 +10,10 @@ import numpy as np
 from .._base.batches import in_batches
 from .._base.programs import exported_jit
 from .._mechanism.quantities import joints_of
-from .joints import states_of
+from .joints import joint_states
 from .problem import UNKNOWN, DesignProblem
 from .rows import paired
 from .tolerance import quantile
-
-_BATCH = 8  # designs: a step in a trust region evaluates few at once
-_INSIDE, _INSIDE_STEPS = 0.01, 40  # margin within the limits, and most steps to reach it
 
 Limits = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -32,15 +29,22 @@ def make_joint_limits(problem: DesignProblem) -> Limits:
     dtype = problem.low.dtype
 
     def limits(us, conditions):
-        return in_batches(program, _BATCH, np.asarray(us, dtype), np.asarray(conditions, dtype))
+        # Batches are small, for a step in a trust region evaluates few designs at once.
+        return in_batches(program, 8, np.asarray(us, dtype), np.asarray(conditions, dtype))
 
     return limits
 
 
 def restore_joint_limits(
-    problem: DesignProblem, us: np.ndarray, conditions: np.ndarray
+    problem: DesignProblem,
+    us: np.ndarray,
+    conditions: np.ndarray,
+    margin: float = 0.01,
+    steps: int = 40,
 ) -> np.ndarray:
-    """Designs us (n, v) moved until every joint is inside its limits, as far as possible.
+    """Designs near us (n, v) with every joint inside its limits, as far as possible.
+
+    They go as far inside as `margin`, a residual, in at most `steps`.
 
     The limits apply at all conditions (m, c). With many joints a random design nearly always has
     one outside, where growth rates are meaningless. The limits take no eigenvalues. The method is
@@ -48,23 +52,23 @@ def restore_joint_limits(
     """
     limits, (n, v) = make_joint_limits(problem), us.shape
 
-    def lacking(us):
+    def violation(us):
         residuals, slopes = limits(*paired(us, conditions))
         residuals, slopes = residuals.reshape(n, -1), slopes.reshape(n, -1, v)
-        r = np.clip(np.nan_to_num(residuals, nan=UNKNOWN) + _INSIDE, 0, UNKNOWN)
+        r = np.clip(np.nan_to_num(residuals, nan=UNKNOWN) + margin, 0, UNKNOWN)
         return r, np.nan_to_num(slopes) * (r > 0)[:, :, None]
 
-    (r, slopes), damping = lacking(us), np.ones(len(us))
-    for _ in range(_INSIDE_STEPS):
+    (r, slopes), damping = violation(us), np.ones(len(us))
+    for _ in range(steps):
         if not r.any():
             break
         normal = np.einsum("nkv,nkw->nvw", slopes, slopes)
         normal += damping[:, None, None] * np.eye(us.shape[1])
         step = np.linalg.solve(normal, np.einsum("nkv,nk->nv", slopes, r)[:, :, None])[:, :, 0]
-        tried = np.clip(us - step, 0, 1)
-        other, other_slopes = lacking(tried)
+        trial = np.clip(us - step, 0, 1)
+        other, other_slopes = violation(trial)
         better = (other**2).sum(axis=1) < (r**2).sum(axis=1)
-        us = np.where(better[:, None], tried, us)
+        us = np.where(better[:, None], trial, us)
         r = np.where(better[:, None], other, r)
         slopes = np.where(better[:, None, None], other_slopes, slopes)
         damping = np.clip(np.where(better, damping / 5, damping * 3), 1e-6, 1e6)
@@ -78,7 +82,7 @@ def _limits_of_joints(leaves, us, conditions, structure):
     def required(u, condition, shift=None):
         joints = joints_of(problem.mechanism_at(u, condition, shift))
         model, stiff = problem.joint_residuals(
-            states_of({name: joints[name] for name in problem.contacts})
+            joint_states({name: joints[name] for name in problem.contacts})
         )
         return jnp.stack([*model, *stiff])
 

@@ -19,8 +19,6 @@ from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
 from .._stability.band import in_band
 
-_FEW = 2  # joints, up to which each has a separate program
-
 
 def joint_prefix(name: str) -> str:
     """The prefix of the quantities of a joint; empty for a scene."""
@@ -37,13 +35,13 @@ class _Stiffness(NamedTuple):
 
 
 class _Part(NamedTuple):
-    """The fields of a scene or a joint that `state_of` needs."""
+    """The fields of a scene or a joint that `joint_state` needs."""
 
     contact: Any
     friction: Any
 
 
-def state_of(part) -> Any:
+def joint_state(part) -> Any:
     """The `ContactState` of a scene or a joint, or the stiffness by other laws."""
     law, friction = part.contact, part.friction
     if law.fractal:
@@ -51,21 +49,21 @@ def state_of(part) -> Any:
     return _Stiffness(*law.stiffness(friction.mu_s, friction.mu_m))
 
 
-def states_of(parts: Mapping[str, Any]) -> dict[str, Any]:
-    """`state_of` for many parts, by name; a law that more than two share is compiled once."""
-    alike: dict[Any, list[str]] = {}
+def joint_states(parts: Mapping[str, Any]) -> dict[str, Any]:
+    """`joint_state` for many parts, by name; a law that more than two share is compiled once."""
+    same_kind: dict[Any, list[str]] = {}
     pairs = {name: (part.contact, part.friction) for name, part in parts.items()}
     for name, pair in pairs.items():
         leaves, structure = jax.tree.flatten(pair)
         kind = structure, tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
-        alike.setdefault(kind, []).append(name)
+        same_kind.setdefault(kind, []).append(name)
     states = {}
-    for names in alike.values():
-        if len(names) <= _FEW:
-            states |= {name: state_of(parts[name]) for name in names}
+    for names in same_kind.values():
+        if len(names) <= 2:
+            states |= {name: joint_state(parts[name]) for name in names}
             continue
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(pairs[name] for name in names))
-        batch = jax.vmap(lambda contact, friction: state_of(_Part(contact, friction)))(*stacked)
+        batch = jax.vmap(lambda contact, friction: joint_state(_Part(contact, friction)))(*stacked)
         for i, name in enumerate(names):
             states[name] = jax.tree.map(lambda leaf, i=i: leaf[i], batch)
     return {name: states[name] for name in parts}

@@ -17,10 +17,6 @@ from .envelope import condition_text
 from .evaluator import Evaluation
 from .search import Search
 
-_ACTIVE = 1e-4  # a residual, or a scaled variable, is at its limit within this
-_AGREE = 0.01  # of a growth rate
-_LEVEL = 1e-3  # of the steepest slope, below which a slope counts as zero
-
 
 class LeastGrowth(Record):
     """The least growth rate that was found with every other requirement met.
@@ -59,7 +55,7 @@ class LeastGrowth(Record):
     @property
     def stationary(self) -> bool:
         """True if no small change lowers it, to first order."""
-        return self.slope <= _LEVEL * self.steepest
+        return self.slope <= 1e-3 * self.steepest
 
     def __repr__(self) -> str:
         held = ", ".join(f"{name} ({by:.3g})" for name, by in self.held_by.items())
@@ -100,11 +96,11 @@ def least_growth(
     if not np.isfinite(rates[best] if possible[best] else unmet[best]):
         return None
     if possible[best]:
-        near = _AGREE * max(abs(rates[best]), abs(rates[best] - target), scale)
+        near = 0.01 * max(abs(rates[best]), abs(rates[best] - target), scale)
         agreed = possible & (np.abs(rates - rates[best]) <= near)
         held, slope, steepest = _held_by(search, u, growing, others)
     else:
-        agreed = unmet <= (1 + _AGREE) * unmet[best]
+        agreed = unmet <= 1.01 * unmet[best]
         held, slope, steepest = _held_by(search, u, others, np.zeros_like(others))
     lacking = {
         name: float(residual)
@@ -124,11 +120,14 @@ def least_growth(
     )
 
 
-def _held_by(search: Search, u: np.ndarray, aim: np.ndarray, limited: np.ndarray) -> Any:
+def _held_by(
+    search: Search, u: np.ndarray, aim: np.ndarray, limited: np.ndarray, near: float = 1e-4
+) -> Any:
     """Multipliers by name, what they leave of the slopes, and the steepest slope.
 
     They belong to the largest columns in `aim` (1 + k,), to the active ones in `limited`, and to
-    active bounds; slopes of growth rates are in 1/s.
+    active bounds; slopes of growth rates are in 1/s. A residual or a scaled variable within `near`
+    of its limit is active.
     """
     from scipy.optimize import nnls
 
@@ -140,10 +139,10 @@ def _held_by(search: Search, u: np.ndarray, aim: np.ndarray, limited: np.ndarray
     with np.errstate(over="ignore"):  # far from any target
         scale = np.where(growing, float(problem.growth_scale) * np.cosh(row), 1.0)
     slopes = slopes * scale[:, None]
-    largest = aim & (row >= row[aim].max() - _ACTIVE)
-    others = limited & (np.abs(row) <= _ACTIVE)
+    largest = aim & (row >= row[aim].max() - near)
+    others = limited & (np.abs(row) <= near)
     v = len(u)
-    low, high = u <= _ACTIVE, u >= 1 - _ACTIVE
+    low, high = u <= near, u >= 1 - near
     columns = [*slopes[largest], *slopes[others], *-np.eye(v)[low], *np.eye(v)[high]]
     labels = [name for name, here in zip(names, largest, strict=True) if here]
     labels += [name for name, here in zip(names, others, strict=True) if here]

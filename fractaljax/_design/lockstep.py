@@ -5,7 +5,7 @@ import queue
 from collections.abc import Callable, Sequence
 
 
-def in_lockstep(tasks: Sequence[Callable], answer: Callable[[dict], dict]) -> list:
+def run_in_lockstep(tasks: Sequence[Callable], answer: Callable[[dict], dict]) -> list:
     """The results of tasks, each a function of `ask`, run side by side.
 
     Their next questions are answered together, in this thread: one call of a compiled program costs

@@ -19,14 +19,12 @@ from .._mechanism.structure import Structure
 from .._sweep.program import Program
 from .._sweep.sweep import run
 from .constraints import CycleConstraint
-from .growing_modes import MODES_MOST
+from .growing_modes import largest_mode_count
 from .optimum import Optimum, optimum
 from .problem import DesignProblem
 from .result import DesignResult, is_met
 from .statement import DEFAULT_BOUNDS
 
-_BATCH = 256  # mechanisms side by side on a device; of structures
-_BATCH_OF_STRUCTURES = 16
 _MEMBER = "member"  # the axis of a batch in a store
 
 
@@ -42,7 +40,7 @@ class DesignMany(Record):
     growth_rate: Float[Array, "..."]  # [1/s]
     residuals: Float[Array, "... k"]  # at most 0 where a requirement is met
     result: Any  # members of `DesignResult`
-    residual_names: tuple[str, ...] = eqx.field(static=True)
+    residual_names: tuple[str, ...] = eqx.field(static=True)  # names of the k requirements
     target: Float[Array, "..."]  # largest growth rate allowed [1/s]
 
     @property
@@ -56,7 +54,7 @@ class DesignMany(Record):
         return _members(self.mechanisms)[0]
 
     def mechanism_quantity(self, name: str) -> np.ndarray:
-        """The values of a quantity of the mechanisms as given, in the shape of the batch."""
+        """Values of the quantity `name` of the mechanisms as given, in the shape of the batch."""
         first, stacked, shape = _members(self.mechanisms)
         return np.asarray(_values(first, stacked, name)).reshape(shape)
 
@@ -138,12 +136,15 @@ def design_many(
       `area_ratio_min`, `slip_ratio_max`, `friction_slope`: as `design`, for every member alike;
       what is by default a member's own (`target`, `K_n_min`) is that of each.
     - `modes`: as `DesignProblem`; by default at most 16 of a structure.
-    - `starts`: designs from which each is solved, 10 by default, chosen from `lattice` designs that
-      are screened, 256 by default, each in at most `steps` steps, 40 by default.
-    - `batch_size`: members side by side, by default 256 a device, 16 of structures; `progress`
-      shows a bar; `out` names a folder in which batches are kept, so that the same call resumes
-      (see `sweep`); `devices` share each batch, by default all of this process. They have no
-      meaning under `jax.jit`, `jax.grad` and `jax.vmap`, where all members are one program.
+    - `starts`: designs from which each is solved, 10 by default.
+    - `lattice`: designs that are screened for them, 256 by default.
+    - `steps`: most steps from each start, 40 by default.
+    - `batch_size`: members side by side, by default 256 a device, 16 of structures. This and what
+      follows have no meaning under `jax.jit`, `jax.grad` and `jax.vmap`, where all members are one
+      program.
+    - `progress`: shows a bar.
+    - `out`: a folder in which batches are kept, so that the same call resumes (see `sweep`).
+    - `devices`: those that share each batch, by default all of this process.
 
     A member without a design does not stop the others: its `result` says so, its quantities are
     those of the best design found, and derivatives by it are NaN. In single precision derivatives
@@ -174,7 +175,7 @@ def design_many(
     first, stacked, shape = _members(xs)
     if not is_traced(stacked):
         # What is wrong with the arguments is said of a member that is there.
-        most = min(MODES_MOST, first.n) if isinstance(first, Structure) else None
+        most = largest_mode_count(first) if isinstance(first, Structure) else None
         lowest: Any = 0.0 if K_n_min is None else K_n_min  # its own would take a program
         checked = DesignProblem(
             first, bounds, modes=modes or most, **{**request, "K_n_min": lowest}
@@ -199,7 +200,7 @@ def design_many(
             return _at(first, [leaf[values[_MEMBER]] for leaf in leaves])
 
         program = Program(designed, (_MEMBER,), stacked, [*grid.values()], place)
-        each = _BATCH_OF_STRUCTURES if isinstance(first, Structure) else _BATCH
+        each = 16 if isinstance(first, Structure) else 256
         if checked.scatter is not None:  # each design is as many as its quadrature has nodes
             each = max(1, each // len(checked.scatter.weights))
         how: dict[str, Any] = dict(each=each, batch_size=batch_size, progress=progress)
@@ -226,7 +227,7 @@ def _members(xs: Any) -> tuple[Any, list[Array], tuple[int, ...]]:
             raise ValueError("xs must hold at least one mechanism, got none")
         for i, x in enumerate(xs):
             require_one(f"xs[{i}]", x)
-            if not _alike(x, xs[0]):
+            if not _same_kind(x, xs[0]):
                 raise ValueError(f"xs must be mechanisms of one kind: xs[{i}] differs from xs[0]")
         leaves = zip(*(jax.tree.leaves(x) for x in xs), strict=True)
         return xs[0], [jnp.stack(each) for each in leaves], (len(xs),)
@@ -248,7 +249,8 @@ def _members(xs: Any) -> tuple[Any, list[Array], tuple[int, ...]]:
     return first, [a.reshape(-1, *a.shape[len(shape) :]) for a in leaves], shape
 
 
-def _alike(x: Mechanism, other: Mechanism) -> bool:
+def _same_kind(x: Mechanism, other: Mechanism) -> bool:
+    """True if two mechanisms differ in numbers alone."""
     kinds = [jax.tree.map(lambda a: (a.shape, a.dtype), each) for each in (x, other)]
     return kinds[0] == kinds[1] if jax.tree.structure(x) == jax.tree.structure(other) else False
 

@@ -22,15 +22,6 @@ from .problem import DesignProblem
 from .result import DesignResult, is_met
 from .sequential import Row, sequential
 
-_APART = 0.15  # least distance of two starts, in scaled variables
-_PENALTY = 10.0  # of unmet requirements, by which starts are ranked
-# A variable closer to a bound, with a slope outwards, is held by it, and a residual closer to 0 is
-# active if it has a multiplier.
-_AT_BOUND = 1e-6
-_NEGLIGIBLE = 1e-7  # share of the largest multiplier that is none
-_REGULAR = 1e-12
-_STEP = 0.2  # power of eps: the step of differences, in scaled variables
-
 
 class Optimum(Record):
     """The best design of one problem, or of a batch of them."""
@@ -85,9 +76,9 @@ def _search(problem: DesignProblem, starts: int, lattice: int, steps: int):
         values = jnp.where(screened, rows[:, 0], jnp.nan)
         scale = jnp.nanquantile(values, 0.9) - jnp.nanquantile(values, 0.1)
         scale = jnp.where(scale > 0, scale, 1)
-    merit = rows[:, 0] / scale + _PENALTY * jnp.sum(jnp.maximum(rows[:, 1:], 0), axis=1)
+    merit = rows[:, 0] / scale + 10 * jnp.sum(jnp.maximum(rows[:, 1:], 0), axis=1)
     merit = jnp.where(screened, merit, jnp.inf)
-    first = us[_distinct(us, merit, starts)]
+    first = us[_select_distinct(us, merit, starts)]
 
     def linearised(u) -> Row:
         def values(u):
@@ -125,13 +116,13 @@ def _search(problem: DesignProblem, starts: int, lattice: int, steps: int):
     return u, multipliers, DesignResult.where(none, DesignResult.undetermined, result)
 
 
-def _distinct(us, merit, count: int) -> Array:
-    """The numbers (count,) of designs: the given one, and the best ones away from one another."""
+def _select_distinct(us, merit, count: int, distance: float = 0.15) -> Array:
+    """The numbers (count,) of designs: the given one, and the best ones by `distance` or more."""
     chosen = [jnp.zeros((), int)]
     for _ in range(count - 1):
         best = jnp.argmin(merit)
         chosen.append(best)
-        near = jnp.max(jnp.abs(us - us[best][None]), axis=1) < _APART
+        near = jnp.max(jnp.abs(us - us[best][None]), axis=1) < distance
         merit = jnp.where(near, jnp.inf, merit)
     return jnp.stack(chosen)
 
@@ -159,26 +150,27 @@ def _implicit_jvp(primals, tangents):
 
     f_slope, A = by_design(u)
     shifts = by_problem(u)[1]
-    active = multipliers > _NEGLIGIBLE * jnp.max(multipliers)
-    # Rounding leaves others a multiplier, too.
-    near = max(_AT_BOUND, 10 * problem.rounding)
+    near_bound = 1e-6
+    # Rounding leaves requirements a multiplier that are not active.
+    active = multipliers > 1e-7 * jnp.max(multipliers)
+    near = max(near_bound, 10 * problem.rounding)
     active = active & (values(problem, u)[1] >= -near)
     slope = f_slope + jnp.where(active, multipliers, 0) @ A
     # A variable that a bound holds does not move, and a requirement that is not active holds none.
-    held = ((u <= _AT_BOUND) & (slope > 0)) | ((u >= 1 - _AT_BOUND) & (slope < 0))
+    held = ((u <= near_bound) & (slope > 0)) | ((u >= 1 - near_bound) & (slope < 0))
     A = jnp.where(active[:, None] & ~held[None], A, 0)
     # Where more is active than there are variables, a part so small picks one of the multipliers.
-    lower = jnp.diag(jnp.where(active, -_REGULAR, 1.0)).astype(u.dtype)
+    lower = jnp.diag(jnp.where(active, -1e-12, 1.0)).astype(u.dtype)
     # Multipliers of the search are only as exact as its last step.
     right = A @ jnp.where(held, 0, f_slope)
     weights = -jnp.linalg.solve(A @ A.T - lower, right[:, None])[:, 0]
 
-    def of_lagrangian(u):
+    def lagrangian_slopes(u):
         """Its slope by the design, and its change with the problem."""
         (f_slope, A), (f, c) = by_design(u), by_problem(u)
         return f_slope + weights @ A, f + weights @ c
 
-    H, forces = _differences(of_lagrangian, u)
+    H, forces = _differences(lagrangian_slopes, u)
     H = jnp.where(held[:, None] | held[None], jnp.eye(len(u), dtype=u.dtype), H)
     K = jnp.block([[H, A.T], [A, lower]])
     right = jnp.concatenate([jnp.where(held, 0, -forces), jnp.where(active, -shifts, 0)])
@@ -192,7 +184,7 @@ def _differences(function: Callable[[Array], Any], u: Float[Array, " v"]) -> Any
     Eigenvalues of structures have no second derivatives; and those of scenes, which have, would
     take five times as long to compile.
     """
-    step = jnp.finfo(u.dtype).eps ** _STEP
+    step = jnp.finfo(u.dtype).eps ** 0.2  # rounding, eps/h, is as small as the rest, h^4
     steps, weights = np.array([-2, -1, 1, 2]), np.array([1, -8, 8, -1]) / 12
     points = u[None, None] + step * steps[:, None, None] * np.eye(len(u))[None]
     values = jax.vmap(jax.vmap(function))(points.astype(u.dtype))

@@ -15,15 +15,11 @@ from .._base.parts import Record, brief, flag, scalar, whole
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import replaced
 from .constraints import Constraint
-from .design import Design, design, screened, solver_of, stated
+from .design import Design, default_solver, design, designs_to_screen, state_problem
 from .evaluator import Evaluator
 from .problem import DesignProblem
 from .rows import describe
 from .search import Search
-
-_STARTS = 6  # for each member of the front
-_RESOLVED = 1e-6  # relative difference of the ends of a front
-_POINTS_MAX = 1000
 
 
 class Front(Record):
@@ -32,12 +28,12 @@ class Front(Record):
     first: np.ndarray  # (n,), in the units of the objectives
     second: np.ndarray  # (n,)
     quantities: Mapping[str, np.ndarray]  # (n,) each: D and G of a surface, all that is designed
-    names: tuple[str, str]
+    names: tuple[str, str]  # of the two objectives
     ends: tuple[Design, Design]  # the designs for either objective alone
     failed: int  # members of the family without a design that meets every requirement
 
     def scene(self, i: int) -> Any:
-        """The scene or structure of member i."""
+        """The scene or structure of member `i`, from 0."""
         values = {name: column[i] for name, column in self.quantities.items()}
         return replaced(self.ends[0].initial, values)
 
@@ -84,15 +80,25 @@ def pareto(
 ) -> Front:
     """The front of two objectives, both functions of a scene or structure that are minimised.
 
-    `options` are those of `design`, except `objective`, `starts`, `envelope`, `risk` and
-    `quiet_within`: bounds, target, K_n_min, constraints, tolerance and so on hold for every member.
+    **Arguments:**
+
+    - `x`: the scene or structure, as in `design`.
+    - `first`, `second`: functions of a mechanism that `jax` can differentiate.
+    - `points`: members of the front, with its two ends; 16 by default, at least three.
+    - `names`: of the two objectives, for tables and pictures.
+    - `progress`: shows a bar.
+    - `options`: those of `design`, except `objective`, `starts`, `envelope`, `risk` and
+      `quiet_within`: bounds, target, K_n_min, constraints, tolerance and so on hold for every
+      member.
+
+    **Returns:** a `Front`.
 
     **Raises:** `ValueError` for fewer than three points, where no design meets the requirements,
     for objectives without a trade-off, and as `design`.
     """
     from tqdm import tqdm
 
-    points = whole("points", points, 3, _POINTS_MAX)
+    points = whole("points", points, 3, 1000)
     if not (isinstance(names, (tuple, list)) and len(names) == 2):
         raise TypeError(f"names must be those of both objectives, got {brief(names)}")
     for name, objective in zip(("first", "second"), (first, second), strict=True):
@@ -114,7 +120,7 @@ def pareto(
 
     def problem_at(limit: float, scale: float) -> DesignProblem:
         constraints: Any = (*made["constraints"], _Second(second, limit, scale))
-        return stated(x, made | {"constraints": constraints})
+        return state_problem(x, made | {"constraints": constraints})
 
     problem = problem_at(0.0, 1.0)
     places = np.stack([problem.scaled(end.scene) for end in ends])
@@ -123,9 +129,9 @@ def pareto(
     # Ends are found to the solver's tolerance; at either of equal ends both objectives are least.
     if not high > low or _equal(high, low) or _equal(*rows[:, 0].tolist()):
         raise ValueError(f"the least {names[0]} and the least {names[1]} are one design")
-    _, designs = screened(problem, None, made["lattice"])
+    _, designs = designs_to_screen(problem, None, made["lattice"])
     screening = Evaluator(problem).evaluate(designs)
-    solver = made["solver"] or solver_of(problem)
+    solver = made["solver"] or default_solver(problem)
     members = []
     for share in tqdm(np.linspace(1, 0, points), desc="pareto", disable=not progress):
         limit = low + share * (high - low)
@@ -135,9 +141,10 @@ def pareto(
         merit = screening.values / scale + 10 * np.maximum(residuals, 0).sum(axis=1)
         promising = designs[np.argsort(np.nan_to_num(merit, nan=np.inf), kind="stable")]
         between = share * places[0] + (1 - share) * places[1]
-        starts = np.concatenate([places, between[None], promising[: _STARTS - 3]])
+        starts = np.concatenate([places, between[None], promising[:3]])
         evaluator = Evaluator(problem_at(limit, high - low))
-        path, *_ = Search(evaluator, solver, scale).best(starts, progress=False)
+        search = Search(evaluator, solver, scale, options=made["search"])
+        path, *_ = search.best(starts, progress=False)
         # The last limit leaves no room for the slack: there is the second end alone.
         us = np.stack([path[-1], *places])
         ends_here = evaluator.evaluate(us)
@@ -164,7 +171,7 @@ def pareto(
 
 def _equal(one: float, other: float) -> bool:
     """True if two values of an objective differ by no more than its error."""
-    return abs(one - other) <= _RESOLVED * max(abs(one), abs(other))
+    return abs(one - other) <= 1e-6 * max(abs(one), abs(other))
 
 
 def _beats(other, member) -> bool:

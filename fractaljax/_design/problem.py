@@ -25,17 +25,17 @@ from .._mechanism.structure import Structure
 from .._stability.linearise import assembled
 from .._stability.quadratic import leading
 from .._stability.stability import growth_rate
-from .coalescence import neighbour_residuals, of_scene
+from .coalescence import neighbour_residuals, scene_residuals
 from .constraints import Constraint, CycleConstraint
 from .cuts import Cuts
 from .envelope import Envelope
 from .followed import FollowedCycles
-from .growing_modes import MODES_MOST, modes_to_keep
+from .growing_modes import largest_mode_count, modes_to_keep
 from .joints import (
     is_fractal,
     joint_prefix,
+    joint_states,
     slips,
-    states_of,
     with_contact_law,
     with_stiffness,
 )
@@ -69,7 +69,7 @@ class DesignProblem(eqx.Module):
       at the points of a grid over it (`design` searches between them, too).
     - `tolerance`, `quantile`: scatter of quantities; loss and residuals are their quantiles.
     - `area_ratio_min`, `slip_ratio_max`: limits of each fractal contact that the bounds move.
-    - `friction_slope`: whether growth rates count the slope of friction.
+    - `friction_slope`: False leaves the slope of friction out of growth rates.
     - `modes`: how many modes of a structure have a growth rate of their own to keep low; by default
       two more than grow in any of a few designs, of a traced structure at most 16.
 
@@ -79,19 +79,20 @@ class DesignProblem(eqx.Module):
     x: Any  # the given scene or structure
     ends: Float[Array, "2 v"]  # bounds of the quantities
     low: Float[Array, " v"]  # bounds of the variables, logarithms of scales
-    high: Float[Array, " v"]
+    high: Float[Array, " v"]  # the upper ones
     start: Float[Array, " v"]  # the given design, scaled
     nominal_condition: Float[Array, " c"]  # what the quantities of the envelope are in `x`
     target: Float[Array, ""]  # largest growth rate allowed [1/s]
-    growth_scale: Float[Array, ""]
+    growth_scale: Float[Array, ""]  # growth rates are divided by it in residuals [1/s]
     K_n_min: tuple[Float[Array, ""], ...]  # of each of the contacts
     area_ratio_min: Float[Array, ""]
     slip_ratio_max: Float[Array, ""]
     constraints: tuple[Constraint, ...]
     laws: tuple[Contact, ...]  # under each of which the growth rate must be as low
-    scatter: Scatter | None
+    scatter: Scatter | None  # of the tolerance
     grid: Float[Array, "m c"] | None  # conditions over which loss and residuals are the largest
-    names: tuple[str, ...] = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)  # of the variables
+    # True where a variable is the logarithm of its quantity
     logarithmic: tuple[bool, ...] = eqx.field(static=True)
     contacts: tuple[str, ...] = eqx.field(static=True)  # with a law, that the design moves
     objective: Callable[[Any], Any] | None = eqx.field(static=True)
@@ -100,7 +101,7 @@ class DesignProblem(eqx.Module):
     modes: int = eqx.field(static=True)  # that a structure must keep from growing
     # True if rows end with what solvers follow in the place of growth rates.
     smooth: bool = eqx.field(static=True)
-    cuts: Cuts | None
+    cuts: Cuts | None  # neighbourhoods that a design has to leave
     # Where a requirement or the objective is of a cycle.
     cycles: FollowedCycles | None = eqx.field(static=True)
 
@@ -141,7 +142,7 @@ class DesignProblem(eqx.Module):
             setattr(self, name, value)
         self.modes, self.smooth, self.cuts = 0, False, None
         if isinstance(x, Structure):
-            most = min(MODES_MOST, x.n)
+            most = largest_mode_count(x)
             if modes is not None:
                 self.modes = whole("modes", modes, 1, most)
             else:
@@ -149,10 +150,10 @@ class DesignProblem(eqx.Module):
         # A quantile of smooth residuals is not that of the growth rates.
         self.smooth = self.least_growth or self.scatter is None
         if K_n_min is None and self.contacts:
-            self.K_n_min = _own_stiffness(self)
+            self.K_n_min = _initial_stiffness(self)
 
     def with_fields(self, **changes: Any) -> "DesignProblem":
-        """The same problem with some of its fields changed, unchecked."""
+        """The same problem with some of its fields set to `changes`, unchecked."""
         changed = copy.copy(self)
         for name, value in changes.items():
             object.__setattr__(changed, name, value)
@@ -162,16 +163,22 @@ class DesignProblem(eqx.Module):
 
     @eqx.filter_jit
     def loss(self, u: Float[ArrayLike, " v"]) -> Float[Array, ""]:
-        """The objective, in its own unit; by default the squared scaled distance from `start`."""
+        """The objective at `u` (v,), in its own unit.
+
+        By default it is the squared scaled distance from `start`.
+        """
         return self._named_row(u)[0]
 
     @eqx.filter_jit
     def residuals(self, u: Float[ArrayLike, " v"]) -> Float[Array, " k"]:
-        """The requirements (k,), at most 0 where met, of order one; `residual_names` names them."""
+        """The requirements (k,) at `u` (v,), at most 0 where met, of order one.
+
+        `residual_names` names them.
+        """
         return self._named_row(u)[1:]
 
     def mechanism(self, u: Float[ArrayLike, " v"]) -> Any:
-        """The scene or structure of a design."""
+        """The scene or structure of a design `u` (v,)."""
         return self.mechanism_at(jnp.asarray(u, self.low.dtype), self.nominal_condition)
 
     def _named_row(self, u) -> Float[Array, " k"]:
@@ -196,7 +203,7 @@ class DesignProblem(eqx.Module):
     # --- in JAX: one design at one condition ---------------------------------------------
 
     def quantities(self, u: Float[ArrayLike, " v"]) -> dict[str, Array]:
-        """The designed quantities, by name and in SI units."""
+        """The designed quantities at `u` (v,), by name and in SI units."""
         values = self.low + jnp.asarray(u, self.low.dtype) * (self.high - self.low)
         scales = np.array(self.logarithmic)
         values = jnp.where(scales, jnp.exp(jnp.where(scales, values, 0)), values)
@@ -207,7 +214,7 @@ class DesignProblem(eqx.Module):
         return dict(zip(self.names, values, strict=True))
 
     def mechanism_at(self, u: Float[Array, " v"], condition: Float[Array, " c"], shift=None) -> Any:
-        """The scene or structure at scaled variables u, a condition and perhaps a shift (k,)."""
+        """The scene or structure at `u` (v,), a `condition` (c,) and perhaps a `shift` (k,)."""
         values = self.quantities(u) | dict(zip(self.conditions, condition, strict=True))
         if self.scatter is not None and shift is not None:
             values |= self.scatter.tolerance.scattered(self.x, self.scatter.base | values, shift)
@@ -232,7 +239,7 @@ class DesignProblem(eqx.Module):
                     smooth += list(jnp.arcsinh(leading_modes.s.real / self.growth_scale))
             else:
                 rates.append(growth_rate(each, self.friction_slope))
-                smooth += of_scene(
+                smooth += scene_residuals(
                     each, self.friction_slope, rates[-1], self.target, self.growth_scale
                 )
         growth = rates[0]
@@ -270,7 +277,7 @@ class DesignProblem(eqx.Module):
             for name, part in parts.items()
             if part.contact.fractal or name in self.contacts
         }
-        states = states_of(designed_parts)
+        states = joint_states(designed_parts)
         # The load curve of a joint is that of its own law.
         constant_states = {
             name: state for name, state in states.items() if not parts[name].follows_load_curve
@@ -278,7 +285,7 @@ class DesignProblem(eqx.Module):
         return states, with_stiffness(x, constant_states)
 
     def joint_residuals(self, states: Mapping[str, Any]) -> tuple[list[Array], list[Array]]:
-        """Residuals of contacts in known states: inside the model, and stiff enough."""
+        """Residuals of contacts in known `states`: inside the model, and stiff enough."""
         model, stiff = [], []
         for name, K_n_min in zip(self.contacts, self.K_n_min, strict=True):
             state = states[name]
@@ -291,9 +298,10 @@ class DesignProblem(eqx.Module):
         return model, stiff
 
     def at(self, u: Float[Array, " v"], condition: Float[Array, " c"]):
-        """As `_row`; quantiles, and no more than the row, where quantities scatter.
+        """As `_row` at `u` (v,) and a `condition` (c,); quantiles where quantities scatter.
 
-        The default objective is the distance of the design as ordered, without scatter.
+        There is no more than the row then. The default objective is the distance of the design as
+        ordered, without scatter.
         """
         if self.scatter is None:
             return self._row(u, condition)
@@ -307,6 +315,11 @@ class DesignProblem(eqx.Module):
     def robust(self) -> bool:
         """True with an envelope or a tolerance."""
         return bool(self.conditions) or self.scatter is not None
+
+    @property
+    def has_many_joints(self) -> bool:
+        """True if nearly no design of an even spread is inside the limits of all joints."""
+        return len(self.contacts) > 2
 
     @property
     def least_growth(self) -> bool:
@@ -390,7 +403,7 @@ class DesignProblem(eqx.Module):
         return [*model, *growing, *by, *stiff, *others]
 
     def scaled(self, x: Mechanism) -> np.ndarray:
-        """The scaled variables (v,) of a scene or structure."""
+        """The scaled variables (v,) of a scene or structure `x`."""
         values = np.array([float(value_of(x, name)) for name in self.names])
         values = np.log(values, out=values, where=self.logarithmic)
         low, high = np.asarray(self.low, float), np.asarray(self.high, float)
@@ -398,7 +411,7 @@ class DesignProblem(eqx.Module):
 
 
 @exported_jit
-def _own_stiffness(problem: DesignProblem) -> tuple[Array, ...]:
+def _initial_stiffness(problem: DesignProblem) -> tuple[Array, ...]:
     """K_n [N/m] of each contact that a design moves, as it is given."""
     states = problem.stiffened(problem.mechanism(problem.start))[0]
     return tuple(states[name].K_n for name in problem.contacts)

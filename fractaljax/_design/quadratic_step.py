@@ -14,9 +14,6 @@ from jaxtyping import Array, ArrayLike, Float
 
 from .._dynamics.lanes import SMALL, solve_positive
 
-_ITERATIONS = 16  # each brings complementarity down to less than a third, near the end far more
-_TO_BOUNDARY = 0.995  # share of the way to where a variable would be 0
-
 
 def quadratic_step(
     g: Float[Array, " v"],
@@ -26,11 +23,16 @@ def quadratic_step(
     rho: Float[ArrayLike, ""],
     low: Float[Array, " v"],
     high: Float[Array, " v"],
+    iterations: int = 16,
 ) -> tuple[Float[Array, " v"], Float[Array, " k"]]:
-    """The step d (v,) and the multipliers (k,) of the residuals. B is positive definite."""
+    """The step d (v,) and the multipliers (k,) of the residuals. B is positive definite.
+
+    Each of the `iterations` brings complementarity down to less than a third, near the end to far
+    less.
+    """
     eps = jnp.finfo(g.dtype).eps
     # An inverse, as `solve_positive` takes of larger ones, is too inexact near the end.
-    solve = solve_positive if len(g) <= SMALL else _by_factors
+    solve = solve_positive if len(g) <= SMALL else _solve_cholesky
     count = 2 * (len(c) + len(g))
 
     def body(_, carry):
@@ -51,12 +53,12 @@ def quadratic_step(
             return dd, (h_t + t * dm) / w, dm, (h_p - to_low * dd) / p, (h_q + to_high * dd) / q
 
         def longest(step):
-            """The share of a step up to where the first variable is 0."""
+            """The share of a step nearly up to where the first variable is 0."""
             dd, dt, dm, dp, dq = step
             now = (s, w, p, q, t, multiplier, to_low, to_high)
             changes = (dt - A @ dd, -dm, dd, -dd, dt, dm, dp, dq)
-            ways = [jnp.where(b < 0, -a / b, jnp.inf) for a, b in zip(now, changes, strict=True)]
-            return jnp.minimum(1, _TO_BOUNDARY * jnp.min(jnp.concatenate(ways)))
+            shares = [jnp.where(b < 0, -a / b, jnp.inf) for a, b in zip(now, changes, strict=True)]
+            return jnp.minimum(1, 0.995 * jnp.min(jnp.concatenate(shares)))
 
         zero = jnp.zeros_like
         dd, dt, dm, dp, dq = affine = direction(0.0, zero(s), zero(t), zero(p), zero(q))
@@ -79,10 +81,10 @@ def quadratic_step(
     to_low = jnp.full_like(
         d, jnp.max(jnp.abs(g + A.T @ half)) + jnp.max(jnp.abs(B)) * jnp.max(high - low)
     )
-    carry = jax.lax.fori_loop(0, _ITERATIONS, body, (d, t, half, to_low, to_low))
+    carry = jax.lax.fori_loop(0, iterations, body, (d, t, half, to_low, to_low))
     return jnp.clip(carry[0], low, high), carry[2]
 
 
-def _by_factors(W, b) -> Array:
+def _solve_cholesky(W, b) -> Array:
     """The solution of W x = b by the factors of Cholesky."""
     return jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(W), True), b)

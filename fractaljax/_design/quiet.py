@@ -26,18 +26,10 @@ from .._dynamics.starts import ellipsoid, kick_size
 from .._mechanism.mechanism import Mechanism
 from .._stability.stability import growth_rate
 from .cuts import Cuts
+from .design_search import DesignSearch
 from .envelope import Envelope
 from .problem import DesignProblem
-from .search import Found
-
-VERIFIED = 4000  # starts of the last draw
-_TRIED = 64, 256  # of those before
-_LIKELY = 8  # conditions of an envelope at which kicks are tried beside the worst ones
-_EXCHANGES = 16
-_REACH = 0.1  # of a cut at least, in scaled variables; halved where nothing is left
-_BEYOND = 0.005  # of the way to an event that a cut goes on
-_BISECTIONS, _NEARLY = 6, 0.9  # of the way back, and its first step
-_NONE = 1e3  # distance of a plane that is none
+from .search import SearchResult
 
 
 @dataclasses.dataclass
@@ -48,23 +40,31 @@ class Kicks:
     V/omega and V.
     """
 
-    within: float | list[float]  # asked for
+    within: float | list[float]
     seed: int
     progress: bool
+    draws: Sequence[int] = DesignSearch.kick_starts  # how many starts; the last one verifies
 
     @classmethod
-    def of(cls, x: Mechanism, within: Any, seed: int, progress: bool) -> "Kicks":
+    def of(
+        cls,
+        x: Mechanism,
+        within: Any,
+        seed: int,
+        progress: bool,
+        draws: Sequence[int] = DesignSearch.kick_starts,
+    ) -> "Kicks":
         """Those of `design(quiet_within=)`, checked."""
         n = degrees_of_freedom(x)
         jax.eval_shape(hybrid_system, x)  # refuses a joint without V
-        return cls(kick_size("quiet_within", within, n), seed, progress)
+        return cls(kick_size("quiet_within", within, n), seed, progress, draws)
 
     @property
     def size(self) -> float:
-        """The norm of the largest kicks asked for."""
+        """The norm of the largest kicks."""
         return 1.0 if isinstance(self.within, list) else self.within
 
-    def tried(self, x: Mechanism, radius: float, count: int) -> tuple[float, Basin]:
+    def try_one(self, x: Mechanism, radius: float, count: int) -> tuple[float, Basin]:
         """The least of `count` kicks within `radius` that does not come to rest, else `radius`."""
         self.seed += 1
         centre, axes = ellipsoid(compiled_system(x, None), self.within)
@@ -75,19 +75,24 @@ class Kicks:
         moves = np.linalg.norm((outcome.starts[outcome.labels != 0] - centre) / axes, axis=1)
         return moves.min(initial=radius), outcome
 
-    def worst(self, xs: Sequence[Mechanism], radius: float, count: int) -> tuple[float, int, Basin]:
-        """As `tried`, of `count` kicks shared by mechanisms; also which one is kicked so."""
-        each = [self.tried(x, radius, -(-count // len(xs))) for x in xs]
+    def try_all(
+        self, xs: Sequence[Mechanism], radius: float, count: int
+    ) -> tuple[float, int, Basin]:
+        """As `try_one`, of `count` kicks shared by mechanisms; also which one is kicked so."""
+        each = [self.try_one(x, radius, -(-count // len(xs))) for x in xs]
         i = int(np.argmin([least for least, _ in each]))
         return each[i][0], i, each[i][1]
 
-    def least(self, xs: Sequence[Mechanism]) -> tuple[float, int, Basin]:
-        """As `worst`, of the size asked for, by larger and larger draws until a kick is found."""
-        first, *more = _TRIED
-        radius, i, outcome = self.worst(xs, self.size, first)
+    def try_quickly(self, xs: Sequence[Mechanism]) -> tuple[float, int, Basin]:
+        """As `try_all`, of the full size, by larger and larger draws until a kick fails.
+
+        The last draw is left out, if there are others.
+        """
+        first, *more = self.draws[:-1] or self.draws
+        radius, i, outcome = self.try_all(xs, self.size, first)
         for count in more:
             if radius == self.size:
-                radius, i, outcome = self.worst(xs, self.size, count)
+                radius, i, outcome = self.try_all(xs, self.size, count)
         return radius, i, outcome
 
     def survived(self, xs: Sequence[Mechanism]) -> float:
@@ -95,53 +100,57 @@ class Kicks:
         if any(float(growth_rate(x)) >= 0 for x in xs):
             return 0.0
         radius = self.size
-        for count in (*_TRIED, VERIFIED):
-            while (least := self.worst(xs, radius, count)[0]) < radius:
+        for count in self.draws:
+            while (least := self.try_all(xs, radius, count)[0]) < radius:
                 radius = least
         return float(radius)
 
 
-def kicked_at(design: Found, envelope: Envelope | None) -> np.ndarray:
-    """Where a design is kicked (k, c): the worst conditions of its requirements, a few others."""
+def kick_conditions(design: SearchResult, envelope: Envelope | None) -> np.ndarray:
+    """The conditions (k, c) at which a design is kicked: the worst ones, middle and corners."""
     if envelope is None:
         return np.zeros((1, 0))
-    places = np.concatenate([design.evaluation.places[0, 1:], envelope.likely(_LIKELY)])
+    places = np.concatenate([design.evaluation.places[0, 1:], envelope.likely(8)])
     return envelope.values(np.unique(places, axis=0))
 
 
 def quiet(
     problem: DesignProblem,
-    design: Found,
-    solve: Callable[[DesignProblem], Found],
+    design: SearchResult,
+    solve: Callable[[DesignProblem], SearchResult],
     kicks: Kicks,
     envelope: Envelope | None,
-) -> tuple[Found, float]:
+    options: DesignSearch = DesignSearch(),
+) -> tuple[SearchResult, float]:
     """The best design that survives the kicks, and the largest kick survived.
 
     `design` solves `problem`. Where no design survives, the one that did best of those tried.
     """
-    cuts, failed = Cuts.none(_EXCHANGES, problem.low), []
+    cuts, failed = Cuts.none(options.kick_rounds, problem.low), []
 
-    def scenes(design: Found):
-        u = jnp.asarray(design.path[-1])
-        return [problem.mechanism_at(u, jnp.asarray(at)) for at in kicked_at(design, envelope)]
+    def scenes(design: SearchResult):
+        u, conditions = jnp.asarray(design.path[-1]), kick_conditions(design, envelope)
+        return [problem.mechanism_at(u, jnp.asarray(condition)) for condition in conditions]
 
-    for _ in range(_EXCHANGES):
+    for _ in range(options.kick_rounds):
         if design.evaluation.worst[0] > 0:
-            if not failed or float(cuts.reach.max()) < _REACH / 50:
+            if not failed or float(cuts.reach.max()) < options.kick_exclusion / 50:
                 break
             cuts = dataclasses.replace(cuts, reach=cuts.reach / 2)
         else:
-            radius, i, ends = kicks.least(scenes(design))
+            radius, i, ends = kicks.try_quickly(scenes(design))
             if radius == kicks.size:
-                # The last of these is the one that has been found.
-                for better in [*_moved_back(problem, failed, design, solve, kicks, scenes), design]:
-                    radius, i, ends = kicks.worst(scenes(better), kicks.size, VERIFIED)
+                better = []
+                if failed:
+                    centre = failed[0][1].path[-1]
+                    better = _bisect(problem, centre, design, solve, kicks, scenes, options)
+                for each in [*better, design]:
+                    radius, i, ends = kicks.try_all(scenes(each), kicks.size, kicks.draws[-1])
                     if radius == kicks.size:
-                        return better, radius
+                        return each, radius
             u = design.path[-1]
-            normals, gaps = _planes(problem, u, kicked_at(design, envelope)[i], ends)
-            reach = max(_REACH, 2 * gaps[gaps < _NONE].max(initial=0))
+            normals, gaps = _planes(problem, u, kick_conditions(design, envelope)[i], ends)
+            reach = max(options.kick_exclusion, 2 * gaps[np.isfinite(gaps)].max(initial=0))
             cuts = cuts.added(len(failed), u, normals, gaps, reach)
             failed.append((radius, design))
         design = solve(problem.with_fields(cuts=cuts))
@@ -149,22 +158,23 @@ def quiet(
     return best, kicks.survived(scenes(best))
 
 
-def _moved_back(problem, failed, design, solve, kicks, scenes) -> list[Found]:
-    """Better designs that seem to survive, the best first: towards the first one that failed."""
-    better: list[Found] = []
-    if not failed:
-        return better
-    centre = failed[0][1].path[-1]
-    way = design.path[-1] - centre
-    length, low, high, share = float(np.linalg.norm(way)), 0.0, 1.0, _NEARLY
-    for _ in range(_BISECTIONS):
-        plane = np.stack([way / length, np.zeros_like(way)]), np.array([share * length, _NONE])
-        cuts = Cuts.none(_EXCHANGES, problem.low).added(0, centre, *plane, _NONE)
+def _bisect(problem, centre, design, solve, kicks, scenes, options) -> list[SearchResult]:
+    """Better designs that seem to survive, the best first: between `design` and one that failed.
+
+    That one is at `centre` (v,).
+    """
+    better: list[SearchResult] = []
+    offset = design.path[-1] - centre
+    length, low, high, share = float(np.linalg.norm(offset)), 0.0, 1.0, 0.9
+    for _ in range(options.kick_bisections):
+        normals = np.stack([offset / length, np.zeros_like(offset)])
+        gaps = np.array([share * length, np.inf])
+        cuts = Cuts.none(options.kick_rounds, problem.low).added(0, centre, normals, gaps, np.inf)
         other = solve(problem.with_fields(cuts=cuts))
-        if other.evaluation.worst[0] <= 0 and kicks.least(scenes(other))[0] == kicks.size:
+        if other.evaluation.worst[0] <= 0 and kicks.try_quickly(scenes(other))[0] == kicks.size:
             better.insert(0, other)
             high = share
-        elif high == 1:  # a tenth of the way is not worth more
+        elif high == 1:  # a tenth of the distance is not worth more
             break
         else:
             low = share
@@ -174,13 +184,13 @@ def _moved_back(problem, failed, design, solve, kicks, scenes) -> list[Found]:
 
 def _planes(problem: DesignProblem, u: np.ndarray, condition: np.ndarray, ends: Basin):
     """Where the cycle of the largest share ends: normals (2, v) and distances (2,) from u (v,)."""
-    normals, gaps = np.zeros((2, len(u))), np.full(2, _NONE)
+    normals, gaps = np.zeros((2, len(u))), np.full(2, np.inf)
     if ends.cycles and problem.low.dtype == jnp.float64:
         for i in range(len(u)):
             for side, plane in enumerate(_ends(problem, u, condition, i, ends.cycles[0])):
                 if plane is not None:
                     normals[side], gaps[side] = plane
-            if (gaps < _NONE).any():
+            if np.isfinite(gaps).any():
                 break
     return normals, gaps
 
@@ -231,5 +241,6 @@ def _ends(
             normal = normal - np.asarray(slope) / ((end if logarithmic else 1) * (high - low))
         length = np.linalg.norm(normal)
         distance = sign * (place - u[i]) / length
-        planes.append((sign * normal / length, distance + max(_BEYOND * distance, 1e-5)))
+        # A little beyond, where the cycle has ended.
+        planes.append((sign * normal / length, distance + max(0.005 * distance, 1e-5)))
     return planes

@@ -12,10 +12,6 @@ from .._base.programs import exported_jit
 if TYPE_CHECKING:
     from .problem import DesignProblem
 
-BATCH = 32  # designs, each at one condition, evaluated at once
-# Structures take so long that filling up a batch costs more than a call.
-_BATCH_OF_STRUCTURES, _SMALL = 8, 16  # of at most so many degrees of freedom; of larger ones 1
-
 
 def linearise(problem: "DesignProblem", us: np.ndarray, conditions: np.ndarray):
     """Rows (n, 1 + k), their Jacobians (n, 1 + k, v), and what describes designs us (n, v).
@@ -53,9 +49,10 @@ def rows_in_batches(program, problem, us, conditions):
     problem = problem.with_fields(cycles=None, grid=None)
     dtype = problem.low.dtype
     pairs = np.asarray(us, dtype), np.asarray(conditions, dtype)
-    batch = BATCH
+    batch = 32
     if problem.modes:
-        batch = _BATCH_OF_STRUCTURES if problem.x.n <= _SMALL else 1
+        # Structures take so long that filling up a batch costs more than a call.
+        batch = 8 if problem.x.n <= 16 else 1
     return in_batches(functools.partial(program, problem), batch, *pairs)
 
 

@@ -1,9 +1,9 @@
-"""From screened starts onto the constraints, under one condition or the worst of many.
+"""From screened starts to the best designs, under one condition or the worst of many.
 
-The worst case is found by exchange: a design is solved for a few working conditions; then the worst
-of the whole envelope are sought, for each requirement, and where they are worse than the working
-ones they join them, and it is solved again. (A. G. Blankenship and J. E. Falk, "Infinitely
-constrained optimization problems", 1976.)
+The worst case is sought by exchange: a design is optimised for a few working conditions; then the
+worst of the whole envelope are sought, for each requirement, and where they are worse than the
+working ones they join them, and it is optimised again. (A. G. Blankenship and J. E. Falk,
+"Infinitely constrained optimization problems", 1976.)
 """
 
 import dataclasses
@@ -13,30 +13,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .design_search import DesignSearch
 from .evaluator import Evaluation, Evaluator, OnAverage
 from .functions import Functions, compressed, finite
 from .joint_limits import make_joint_limits, restore_joint_limits
-from .lockstep import in_lockstep
+from .lockstep import run_in_lockstep
 from .problem import DesignProblem
 from .rows import linearise
 from .solvers import Solver
-from .starts import designs_near
-from .trust_region import FINE, NEAR, ROUGH, SETTLED, Accuracy, Local, in_trust_region
-
-_ROUNDS = 12  # of the exchange
-_FEW = 2  # variables, in which a lattice of starts leaves nothing to restore
-_RESTORING = 30  # steps from a start to where all requirements are met
-# How many of many ways in a trust region go on, and how many of these to the end at once.
-_KEPT, _KEPT_NEAR, _AT_ONCE = 8, 4, 2
-_AGAIN, _AROUND = 12, 12  # rounds of new starts near the best end of such ways, and how many
-# Gain of the objective that counts in such rounds; what is as good as the best; how many rounds
-# without a gain are the last. One
-# with several ends that agree with the best counts twice.
-_GAINED, _AGREE, _IDLE, _SEVERAL = 1e-3, 1e-3, 3, 2
+from .starts import renew_starts
+from .trust_region import Local, Stages, TrustRegion, minimise_in_trust_region
 
 
-class Found(NamedTuple):
-    """What a search ended with."""
+class SearchResult(NamedTuple):
+    """How a search ended."""
 
     path: np.ndarray  # (s, v), to the best end
     evaluation: Evaluation  # of that
@@ -45,7 +35,7 @@ class Found(NamedTuple):
     least_growth: Any = None  # `limit.LeastGrowth`, where the growth rate is too large
 
 
-def _least_violated(functions: Functions, start: np.ndarray) -> np.ndarray:
+def _restore_feasibility(functions: Functions, start: np.ndarray, steps: int) -> np.ndarray:
     """A design (v,) near `start` with the least sum of squares of its unmet requirements."""
     from scipy.optimize import least_squares
 
@@ -56,7 +46,7 @@ def _least_violated(functions: Functions, start: np.ndarray) -> np.ndarray:
         residuals, jacobian = functions.constraints(u)
         return jacobian * (residuals > 0)[:, None]
 
-    more: Any = {"jac": slopes, "bounds": (0, 1), "max_nfev": _RESTORING}
+    more: Any = {"jac": slopes, "bounds": (0, 1), "max_nfev": steps}
     return least_squares(unmet, np.clip(start, 1e-3, 1 - 1e-3), **more).x
 
 
@@ -68,6 +58,8 @@ class Search:
     solver: Solver | None  # None: in a trust region, for designs of many joints
     scale: float = 1.0  # of the objective
     rough: DesignProblem | None = None  # where steps in a trust region begin (`few_modes.py`)
+    options: DesignSearch = DesignSearch()
+    stages: Stages = Stages()  # of steps in a trust region
 
     @property
     def slack(self) -> np.ndarray:
@@ -81,26 +73,26 @@ class Search:
         return np.where(problem.named_columns, slack, 0.01 * slack)
 
     def best(self, starts: np.ndarray, progress: bool):
-        """The way (s, v) to the best end of all, what it is, and how many starts (n, v) failed.
+        """The path (s, v) to the best end, its evaluation, and how many starts (n, v) failed.
 
-        The first of those whose ends are equally good: the given design leads the starts, and its
-        way begins where the reader does. Last, ways and ends of `least_growth`, if all failed.
+        Of paths whose ends are equally good it is the first, for the given design leads the starts.
+        The last result is that of `least_growth`, if all failed.
         """
         problem, lowest = self.evaluator.problem, None
-        paths, evaluation = self._landed(starts, progress)
+        paths, evaluation = self._solve_from(starts, progress)
         plain = problem.cuts is None and problem.cycles is None
         if (evaluation.worst > 0).all():
             if plain and problem.modes:
-                # Each landing of a structure takes long. With all else met no other design is as
+                # Each path of a structure takes long. With all else met no other design is as
                 # close to the target.
                 near = paths[int(evaluation.worst.argmin())][-1]
                 lowest = self.least_growth([*starts, near])
                 growth, unmet = self.split_residuals(lowest[1])
                 least = int(np.where(unmet <= 0, growth, np.inf).argmin())
                 if unmet[least] <= 0 < growth[least]:
-                    return lowest[0][least], lowest[1].of(least), len(starts), lowest
+                    return lowest[0][least], lowest[1].select(least), len(starts), lowest
             if lowest is None or not (lowest[1].worst <= 0).any():
-                paths, evaluation = self._closest(paths, evaluation)
+                paths, evaluation = self._approach_feasibility(paths, evaluation)
         failed = evaluation.worst > 0
         if failed.all():
             model = evaluation.residuals[:, : problem.model_residuals]
@@ -109,71 +101,73 @@ class Search:
                 lowest = self.least_growth([*starts, paths[best][-1]])
             met = np.zeros(0, bool) if lowest is None else lowest[1].worst <= 0
             if lowest is None or not met.any():
-                return paths[best], evaluation.of(best), len(starts), lowest
+                return paths[best], evaluation.select(best), len(starts), lowest
             # There is a design that meets all after all.
             chosen = np.flatnonzero(met).tolist()
-            landed = self._land([lowest[0][i] for i in chosen])
-            paths = [self._to_best(path) for path in landed]
-            evaluation = self._ends(paths)
+            continued = self._minimise([lowest[0][i] for i in chosen])
+            paths = [self._cut_at_best(path) for path in continued]
+            evaluation = self._evaluate_ends(paths)
             failed = evaluation.worst > 0
         values = np.where(failed, np.inf, evaluation.values)
         best = int(np.flatnonzero(values <= values.min() + 1e-8 * abs(values.min()))[0])
         path, end, count = (
             paths[best],
-            evaluation.of(best),
+            evaluation.select(best),
             max(len(starts) - int((~failed).sum()), 0),
         )
         # A solver may have stopped early: once more from where it is. What is better is often near.
-        ways = [path] if self.solver else [np.array([*path, u]) for u in self._near(path[-1])]
-        ways = self._land(ways, stages=[(self, FINE, len(ways))])
-        ended = self._ends(ways)
+        paths = [path] if self.solver else [np.array([*path, u]) for u in self._renew(path[-1])]
+        paths = self._minimise(paths, stages=[(self, self.stages.fine, len(paths))])
+        ended = self._evaluate_ends(paths)
         values = np.where(ended.worst > 0, np.inf, ended.values)
         best = int(values.argmin())
         if values[best] < end.values[0]:
-            path, end = ways[best], ended.of(best)
+            path, end = paths[best], ended.select(best)
         return path, end, count, None
 
-    def _near(self, u: np.ndarray) -> list[np.ndarray]:
-        """The best end (v,) of ways that begin near the best so far, and the one before it.
+    def _renew(self, u: np.ndarray) -> list[np.ndarray]:
+        """The best end (v,) of paths that begin near the best so far, and the one before it.
 
-        The first is u. All in the rough problem, for as long as rounds gain.
+        The first is u. All are of the rough problem. Rounds go on for as long as they gain.
         """
-        rough, value, ends, idle = self._roughly, np.inf, [u], 0
-        for again in range(_AGAIN):
-            starts = designs_near(rough.evaluator.problem, ends[0], _AROUND, again)
-            ways = [start[None] for start in (starts if again else [u, *starts])]
-            stages = [(rough, NEAR, len(ways)), (rough, SETTLED, _KEPT_NEAR)]
-            ended = np.array([way[-1] for way in rough._land(ways, stages=stages)])
+        rough, options, value, ends, idle = self._rough_search, self.options, np.inf, [u], 0
+        for i in range(options.renewals):
+            starts = renew_starts(rough.evaluator.problem, ends[0], options.renewed_starts, i)
+            paths = [start[None] for start in (starts if i else [u, *starts])]
+            stages = [(rough, self.stages.near, len(paths))]
+            stages.append((rough, self.stages.settled, options.renewed_paths))
+            ended = np.array([path[-1] for path in rough._minimise(paths, stages=stages)])
             evaluation = rough.evaluator.evaluate(ended)
             values = np.where(evaluation.worst > 0, np.inf, evaluation.values)
-            best, has_value = int(values.argmin()), bool(np.isfinite(value))
-            gained = values[best] < (value - _GAINED * abs(value) if has_value else value)
-            alike = has_value and np.isclose(values, value, rtol=_AGREE, atol=0).sum() >= _SEVERAL
-            idle = 0 if gained else idle + 1 + alike
+            best, has_value, rtol = int(values.argmin()), np.isfinite(value), options.renewal_gain
+            gained = values[best] < (value - rtol * abs(value) if has_value else value)
+            agree = bool(has_value and np.isclose(values, value, rtol=rtol, atol=0).sum() >= 2)
+            idle = 0 if gained else idle + 1 + agree
             if values[best] < value:
-                value, ends = float(values[best]), [ended[best], *ends][:_AT_ONCE]
-            if idle >= _IDLE:
+                value, ends = float(values[best]), [ended[best], *ends][: options.finished_paths]
+            if idle >= options.idle_renewals:
                 break
         return ends
 
-    def _landed(self, starts, progress):
-        """The ways from all starts, and what their ends are."""
+    def _solve_from(self, starts, progress):
+        """The paths from all starts, and the evaluation of their ends."""
         problem = self.evaluator.problem
-        paths = self._land([start[None] for start in starts], progress=progress)
-        evaluation = self._ends(paths)
+        paths = self._minimise([start[None] for start in starts], progress=progress)
+        evaluation = self._evaluate_ends(paths)
         lost = np.flatnonzero(evaluation.worst > 0)
-        if self.solver and len(lost) and len(problem.names) > _FEW:
+        # In one or two variables the lattice of starts leaves nothing to restore.
+        if self.solver and len(lost) and len(problem.names) > 2:
             # Far from many requirements a solver may stop: first to where all are met.
-            landed = self._land([starts[i][None] for i in lost], restored=True)
-            for i, path in zip(lost, landed, strict=True):
+            restored = self._minimise([starts[i][None] for i in lost], restored=True)
+            for i, path in zip(lost, restored, strict=True):
                 paths[i] = path
-            evaluation = self._ends(paths)
+            evaluation = self._evaluate_ends(paths)
         return paths, evaluation
 
-    def _closest(self, paths, evaluation):
-        """Ways of which none ends where all is met, on to as close as can be, and their ends.
+    def _approach_feasibility(self, paths, evaluation):
+        """Paths to designs that violate as little as possible, and the evaluation of their ends.
 
-        Inside the model, if that is possible, and there as close as can be to all the rest.
+        They go inside the model, if that is possible, and there as close to the rest as possible.
         """
         problem = self.evaluator.problem
         model = np.arange(len(problem.residual_names)) < problem.model_residuals
@@ -182,38 +176,39 @@ class Search:
             outside = (evaluation.residuals[:, model] > 0).any(axis=1)
             going = evaluation.worst <= 0 if violated is None else outside == (violated is model)
             chosen = np.flatnonzero(going)
-            landed = self._land([paths[i] for i in chosen], violated)
-            for i, path in zip(chosen, landed, strict=True):
+            continued = self._minimise([paths[i] for i in chosen], violated)
+            for i, path in zip(chosen, continued, strict=True):
                 paths[i] = path
-            evaluation = self._ends(paths)
+            evaluation = self._evaluate_ends(paths)
         return paths, evaluation
 
-    def _to_best(self, path: np.ndarray) -> np.ndarray:
-        """A way (s, v) up to the best design on it that meets every requirement, if any does."""
+    def _cut_at_best(self, path: np.ndarray) -> np.ndarray:
+        """A path (s, v) up to the best design on it that meets every requirement, if any does."""
         evaluation = self.evaluator.evaluate(path)
         values = np.where(evaluation.worst <= 0, evaluation.values, np.inf)
         return path[: int(values.argmin()) + 1] if np.isfinite(values).any() else path
 
     def least_growth(self, starts: Sequence[np.ndarray]) -> tuple[list[np.ndarray], Evaluation]:
-        """Ways (s, v) to the least growth rate with all else met, and what their ends are.
+        """Paths (s, v) to the least growth rate with all else met, and how they end.
 
         The largest of all growth rates is minimised, whatever the target.
         """
         growing, others = self.evaluator.problem.growing, self.others
-        paths = self._ways([start[None] for start in starts], growing, others)
+        paths = self._continue([start[None] for start in starts], growing, others)
         if self.solver is None:
-            return paths, self._ends(paths)
-        lost = np.flatnonzero(self.split_residuals(self._ends(paths))[1] > 0).tolist()
-        again = [starts[i][None] for i in lost]
-        for i, way in zip(lost, self._ways(again, growing, others, restored=True), strict=True):
-            paths[i] = way
-        return paths, self._ends(paths)
+            return paths, self._evaluate_ends(paths)
+        lost = np.flatnonzero(self.split_residuals(self._evaluate_ends(paths))[1] > 0).tolist()
+        restored = [starts[i][None] for i in lost]
+        restored = self._continue(restored, growing, others, restored=True)
+        for i, path in zip(lost, restored, strict=True):
+            paths[i] = path
+        return paths, self._evaluate_ends(paths)
 
     def least_unmet(self, starts: Sequence[np.ndarray]) -> tuple[list[np.ndarray], Evaluation]:
         """As `least_growth`, to the least of the largest other residual, whatever grows."""
         others = self.others
-        paths = self._ways([start[None] for start in starts], others, np.zeros_like(others))
-        return paths, self._ends(paths)
+        paths = self._continue([start[None] for start in starts], others, np.zeros_like(others))
+        return paths, self._evaluate_ends(paths)
 
     def split_residuals(self, evaluation: Evaluation) -> tuple[np.ndarray, np.ndarray]:
         """The largest residuals (n,) of growth rates, and of all other requirements."""
@@ -229,11 +224,11 @@ class Search:
         others[0] = False  # the objective
         return others
 
-    def _ends(self, paths) -> Evaluation:
+    def _evaluate_ends(self, paths) -> Evaluation:
         return self.evaluator.evaluate(np.array([path[-1] for path in paths]))
 
-    def _land(self, paths, violated=None, progress=False, restored=False, stages=None):
-        """Ways (s, v) continued to the least objective that meets every requirement.
+    def _minimise(self, paths, violated=None, progress=False, restored=False, stages=None):
+        """Paths (s, v) continued to the least objective that meets every requirement.
 
         With some requirements (k,) marked as violated, to the least of their largest residual that
         meets those before them. If `restored`, by the nearest design that violates all the least.
@@ -248,68 +243,73 @@ class Search:
         elif problem.least_growth:
             # The largest of many modes has kinks where they change places; each has none.
             aim = ~is_named
-        return self._ways(paths, aim, limited, progress, restored, stages)
+        return self._continue(paths, aim, limited, progress, restored, stages)
 
-    def _ways(self, paths, aim, limited, progress=False, restored=False, stages=None):
-        """Ways continued to the least of the columns in `aim` with those in `limited` met.
+    def _continue(self, paths, aim, limited, progress=False, restored=False, stages=None):
+        """Paths continued to the least of the columns in `aim` with those in `limited` met.
 
-        Of many in a trust region the most promising alone go on to the end: of `stages`, each is a
-        search, how accurate, and how many go through it.
+        In a trust region only the most promising go on to the end. Each of `stages` is a search,
+        its steps, and how many paths go through it.
         """
         from tqdm import tqdm
 
-        def run(search, paths, how):
+        def run(search, paths, setting):
             with tqdm(total=len(paths), desc="design", unit="start", disable=not progress) as bar:
 
                 def task(path, ask):
-                    way = search._continued(path, aim, limited, ask, how)
+                    result = search._continue_one(path, aim, limited, ask, setting)
                     bar.update()
-                    return way
+                    return result
 
                 tasks = [functools.partial(task, path) for path in paths]
-                ways = in_lockstep(tasks, search._answer)
+                results = run_in_lockstep(tasks, search._answer)
             if search is self:
-                return ways
-            # A way shows what was evaluated in the whole problem.
-            ends = zip(paths, ways, strict=True)
-            return [(np.concatenate([path, way[-1:]]), merit) for path, (way, merit) in ends]
+                return results
+            # A path shows what was evaluated in the whole problem.
+            pairs = zip(paths, results, strict=True)
+            return [(np.concatenate([path, rough[-1:]]), merit) for path, (rough, merit) in pairs]
 
         if self.solver:
             return [path for path, _ in run(self, paths, restored)]
         if stages is None:
-            rough = self._roughly
+            rough, steps, options = self._rough_search, self.stages, self.options
+            stages = [(rough, steps.rough, len(paths))]
+            stages.append((rough, steps.settled, options.settled_paths))
             # From the end of the rough problem it is not far: fewer need go on.
-            stages = [(rough, ROUGH, len(paths)), (rough, SETTLED, _KEPT), (self, FINE, _AT_ONCE)]
-        ways = [(path, 0.0) for path in paths]
-        for search, accuracy, count in stages:
-            best = np.argsort([merit for _, merit in ways], kind="stable")[:count].tolist()
-            ended = run(search, [ways[i][0] for i in best], accuracy)
-            for i, end in zip(best, ended, strict=True):
-                ways[i] = end
-        return [path for path, _ in ways]
+            stages.append((self, steps.fine, options.finished_paths))
+        results = [(path, 0.0) for path in paths]
+        for search, steps, count in stages:
+            best = np.argsort([merit for _, merit in results], kind="stable")[:count].tolist()
+            continued = run(search, [results[i][0] for i in best], steps)
+            for i, result in zip(best, continued, strict=True):
+                results[i] = result
+        return [path for path, _ in results]
 
     @property
-    def _roughly(self) -> "Search":
+    def _rough_search(self) -> "Search":
         """The search in the rough problem, if there is one."""
         if self.rough is None:
             return self
         evaluator = dataclasses.replace(self.evaluator, problem=self.rough)
         return dataclasses.replace(self, evaluator=evaluator, rough=None)
 
-    def _continued(self, path, aim, limited, ask, how):
-        """One way, continued by asking for rows and for new conditions, and its merit."""
+    def _continue_one(self, path, aim, limited, ask, setting):
+        """One path, continued by asking for rows and for new conditions, and its merit.
+
+        `setting` is whether the solver begins where all is met, or steps in a trust region.
+        """
         path, working = list(path), self.evaluator.working
         extra, merit = not aim[0] or self.evaluator.minimax, 0.0
-        for _ in range(_ROUNDS):
+        for _ in range(self.options.exchange_rounds):
 
             def rows_at(u, working=working):
                 return ask((self._linearise, u, working))
 
             functions = Functions(rows_at, aim, limited, self.slack, self.scale, extra)
             if self.solver:
-                end = self._solved(functions, path[-1], how)
+                end = self._run_solver(functions, path[-1], setting)
             else:
-                end, merit = self._stepped(functions, path[-1], how, working, ask)
+                end, merit = self._run_trust_region(functions, path[-1], setting, working, ask)
             path += [*functions.evaluated, end]
             new = ask((self.evaluator.exchange, path[-1], working))
             if not len(new):
@@ -317,11 +317,12 @@ class Search:
             working = np.concatenate([working, new])
         return np.array(path), merit
 
-    def _solved(self, functions: Functions, start: np.ndarray, restored: bool) -> np.ndarray:
+    def _run_solver(self, functions: Functions, start: np.ndarray, restored: bool) -> np.ndarray:
         """Where the solver ends, perhaps from the nearest design that violates all the least."""
         v, bounds = len(start), np.tile([0.0, 1.0], (len(start), 1))
         if restored:
-            start = _least_violated(dataclasses.replace(functions, extra=False), start)
+            plain = dataclasses.replace(functions, extra=False)
+            start = _restore_feasibility(plain, start, self.options.restoring_steps)
         if functions.extra:
             largest = functions.at(np.append(start, 0))[0][:, functions.aim].max()
             start = np.append(start, largest)
@@ -330,7 +331,7 @@ class Search:
         z = solver(functions.objective, functions.constraints, start, bounds)
         return np.clip(np.asarray(z, float)[:v], 0, 1)
 
-    def _stepped(self, functions: Functions, start, accuracy: Accuracy, working, ask):
+    def _run_trust_region(self, functions: Functions, start, steps: TrustRegion, working, ask):
         """Where steps in a trust region end, and what is left there to lower.
 
         The limits of joints are those at the working conditions (m, c).
@@ -369,7 +370,7 @@ class Search:
         distance = not extra and problem.objective is None
         curvature, penalty = (2.0 / self.scale, 2.0) if distance else (0.0, 10.0)
         met = float(np.min(np.broadcast_to(functions.slack, limited.shape)[limited], initial=1) / 2)
-        end = in_trust_region(at, limits, start, curvature, accuracy, penalty, met)
+        end = minimise_in_trust_region(at, limits, start, curvature, steps, penalty, met)
         return end, at(end).merit(1.0)
 
     def _answer(self, questions):
@@ -391,11 +392,11 @@ class Search:
     def _linearise(self, us, working):
         """Rows and Jacobians of each of us (n, v) at its working conditions."""
         linearised = functools.partial(linearise, self.evaluator.problem)
-        return [self.evaluator.average(*piece) for piece in _at_each(linearised, us, working)]
+        return [self.evaluator.average(*piece) for piece in _evaluate_each(linearised, us, working)]
 
     def _limits(self, us, working):
         """Residuals of joints and their slopes, of each of us (n, v) at its working conditions."""
-        pieces = _at_each(self._limits_of_joints, us, working)
+        pieces = _evaluate_each(self._limits_of_joints, us, working)
         return [(r.ravel(), slopes.reshape(-1, us.shape[1])) for r, slopes in pieces]
 
     @functools.cached_property
@@ -403,7 +404,7 @@ class Search:
         return make_joint_limits(self.evaluator.problem)
 
 
-def _at_each(function, us, working) -> list[tuple[np.ndarray, np.ndarray]]:
+def _evaluate_each(function, us, working) -> list[tuple[np.ndarray, np.ndarray]]:
     """Values and slopes of each of us (n, v) at its own conditions (m, c), in one call."""
     counts = [len(conditions) for conditions in working]
     arrays = function(np.repeat(us, counts, axis=0), np.concatenate(working))[:2]

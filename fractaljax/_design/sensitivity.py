@@ -21,15 +21,6 @@ from .._mechanism.structure import Structure
 from .evaluator import Evaluator, OnAverage
 from .problem import DesignProblem
 
-_STEP = 0.25  # power of eps: of a variable in its bounds, of a quantity as a share of it
-_ACTIVE = 1e-5  # a residual that is met by less than this may be active
-_FITS = 1e-3  # what multipliers may leave of a slope
-_SHOWN = 6  # quantities in a table
-_CHANGE = 0.01  # of each quantity, in a table
-# Weights of steps: of fourth order by designs, of second by quantities, of which there are many.
-_FOURTH = {-2: 1 / 12, -1: -8 / 12, 1: 8 / 12, 2: -1 / 12}
-_CENTRAL, _FORWARD = {-1: -0.5, 1: 0.5}, {0: -1.5, 1: 2.0, 2: -0.5}
-
 
 class Sensitivity(Record):
     """How a design moves with each quantity that it holds fixed: `sensitivity["D"]["P"]` is dD/dP.
@@ -51,7 +42,7 @@ class Sensitivity(Record):
     def __repr__(self) -> str:
         held = {name: float(value_of(self.x, name)) for name in self.ranges}
         changes = {
-            name: {each: _CHANGE * held[each] * slope for each, slope in slopes.items()}
+            name: {each: 0.01 * held[each] * slope for each, slope in slopes.items()}
             for name, slopes in self.slopes.items()
         }
         sizes = {name: abs(float(value_of(self.x, name))) or 1.0 for name in changes}
@@ -59,7 +50,7 @@ class Sensitivity(Record):
             each: max(abs(changes[name][each]) / sizes[name] for name in sizes) for each in held
         }
         lines = [["", *(f"{name} by 1 % more" for name in changes), "same requirements active"]]
-        for each in sorted(weight, key=lambda name: -weight[name])[:_SHOWN]:
+        for each in sorted(weight, key=lambda name: -weight[name])[:6]:
             title = f"{each} [{unit(self.x, each)}]".replace(" [-]", "")
             low, high = self.ranges[each]
             cells = [f"{changes[name][each]:+.3g}" for name in changes]
@@ -103,10 +94,12 @@ def design_sensitivity(
         row, jacobian = rows(problem, u)
         return np.concatenate([jacobian[0] + multipliers @ jacobian[columns], row[columns]])
 
-    v, k, size = len(u), int(active.sum()), float(np.finfo(problem.low.dtype).eps) ** _STEP
+    v, k = len(u), int(active.sum())
+    # A step: of a variable in its bounds, of a quantity as a share of it.
+    size = float(np.finfo(problem.low.dtype).eps) ** 0.25
     H = np.zeros((v, v))
     for j, direction in enumerate(np.eye(v)):
-        for step, weight in _FOURTH.items():
+        for step, weight in ((-2, 1 / 12), (-1, -8 / 12), (1, 8 / 12), (2, -1 / 12)):
             H[:, j] += weight / size * slopes(problem, u + step * size * direction)[:v]
     H = np.where(np.outer(free, free), H, np.diag(1.0 - free))
     K = np.block([[H, (A[active] * free).T], [A[active] * free, np.zeros((k, k))]])
@@ -137,22 +130,27 @@ def design_sensitivity(
     return Sensitivity(slopes=changes, multipliers=costs, ranges=ranges, x=designed)
 
 
-def _multipliers(slope, c, A, u) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Multipliers of residuals (k,), of lower and of upper bounds (v,); None if they do not fit."""
+def _multipliers(
+    slope, c, A, u, near: float = 1e-5
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Multipliers of residuals (k,), of lower and of upper bounds (v,); None if they do not fit.
+
+    A residual or a bound within `near` of its limit may be active.
+    """
     from scipy.optimize import nnls
 
-    v, near = len(u), np.abs(c) <= _ACTIVE
-    low, high = u <= _ACTIVE, u >= 1 - _ACTIVE
-    matrix = np.concatenate([A[near], -np.eye(v)[low], np.eye(v)[high]]).T
+    v, active = len(u), np.abs(c) <= near
+    low, high = u <= near, u >= 1 - near
+    matrix = np.concatenate([A[active], -np.eye(v)[low], np.eye(v)[high]]).T
     size = float(np.abs(slope).max())
     solution = np.zeros(matrix.shape[1])
     if size > 0:
         solution = nnls(matrix, -slope / size)[0] * size if matrix.size else solution
-        if np.linalg.norm(matrix @ solution + slope) > _FITS * size:
+        if np.linalg.norm(matrix @ solution + slope) > 1e-3 * size:
             return None
     by_c, by_low, by_high = np.zeros(len(c)), np.zeros(v), np.zeros(v)
-    first, second = int(near.sum()), int(near.sum() + low.sum())
-    by_c[near], by_low[low], by_high[high] = (
+    first, second = int(active.sum()), int(active.sum() + low.sum())
+    by_c[active], by_low[low], by_high[high] = (
         solution[:first],
         solution[first:second],
         solution[second:],
@@ -180,7 +178,9 @@ def _difference(
     """The derivative of a function of x by a quantity; None where x may not have another one."""
     value = float(value_of(x, name))
     step = size * (abs(value) or 1.0)
-    for steps, sign in ((_CENTRAL, 1), (_FORWARD, 1), (_FORWARD, -1)):
+    # Second order is enough, for there are many quantities.
+    central, one_sided = {-1: -0.5, 1: 0.5}, {0: -1.5, 1: 2.0, 2: -0.5}
+    for steps, sign in ((central, 1), (one_sided, 1), (one_sided, -1)):
         try:
             changed = {n: replaced(x, {name: value + sign * n * step}) for n in steps}
         except ValueError:  # outside its domain
@@ -193,9 +193,9 @@ def _difference(
 def _range(value: float, numbers: np.ndarray, rates: np.ndarray) -> tuple[float, float]:
     """From where to where, around a value, numbers that are at most 0 there stay so."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        ways = -np.minimum(numbers, 0) / rates
-    back = ways[rates < 0].max(initial=-np.inf)
-    return value + float(back), value + float(ways[rates > 0].min(initial=np.inf))
+        changes = -np.minimum(numbers, 0) / rates  # that make each number 0
+    least = changes[rates < 0].max(initial=-np.inf)
+    return value + float(least), value + float(changes[rates > 0].min(initial=np.inf))
 
 
 def _named(problem: DesignProblem, columns, multipliers, jacobian) -> dict[str, float]:

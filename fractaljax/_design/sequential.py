@@ -6,6 +6,7 @@ these corrected to second order. (R. Fletcher, "Practical methods of optimizatio
 12.4 and 14.4.)
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -15,10 +16,31 @@ from jaxtyping import Array, Bool, Float
 
 from .quadratic_step import quadratic_step
 
-_POOR, _GOOD = 0.05, 0.7  # shares of what a step promised, for the next radius
-_HARDER = 10.0  # by how much the penalty grows where a minimum of the merit leaves residuals
-_PENALTY_MAX = 1e6
-_CLOSE = 0.65  # power of eps: the length of a step after which none follows
+
+@dataclasses.dataclass(frozen=True)
+class SequentialOptions:
+    """How sequential quadratic programming chooses its steps; lengths are of scaled variables.
+
+    **Fields:**
+
+    - `radius`: radius of the trust region at first.
+    - `largest_radius`: its largest radius.
+    - `acceptance`: share of the promised gain above which a step is taken.
+    - `agreement`: share above which the radius doubles.
+    - `penalty`: penalty of residuals at first.
+    - `penalty_factor`: by how much it grows where a minimum of the merit leaves residuals.
+    - `largest_penalty`: the penalty beyond which it does not grow.
+    - `closeness`: power of eps, the length of a step after which none follows.
+    """
+
+    radius: float = 0.25
+    largest_radius: float = 0.5
+    acceptance: float = 0.05
+    agreement: float = 0.7
+    penalty: float = 10.0
+    penalty_factor: float = 10.0
+    largest_penalty: float = 1e6
+    closeness: float = 0.65
 
 
 class Row(NamedTuple):
@@ -28,7 +50,7 @@ class Row(NamedTuple):
     c: Float[Array, " k"]
     g: Float[Array, " v"]
     A: Float[Array, "k v"]
-    more: Array  # what else is to be known of the end
+    more: Array  # further numbers of the design
 
     def merit(self, rho) -> Array:
         return self.f + rho * jnp.sum(jnp.maximum(self.c, 0))
@@ -51,7 +73,7 @@ def sequential(
     start: Float[Array, " v"],
     curvature: float,
     steps: int,
-    penalty: float = 10.0,
+    options: SequentialOptions = SequentialOptions(),
 ) -> tuple[Float[Array, " v"], Row, Float[Array, " k"]]:
     """The design in [0, 1]^v near `start` with the least f that has c <= 0, its row, multipliers.
 
@@ -74,31 +96,36 @@ def sequential(
         promised = jnp.where(corrected, state.promised, lowered)
         gained = here.merit(rho) - there.merit(rho)
         size = 1 + jnp.abs(here.merit(rho))
-        # Differences of the merit below its rounding say nothing: such steps are taken.
+        # Differences of the merit below its rounding have no meaning: such steps are taken.
         tiny = promised <= 1e2 * eps * size
         ratio = jnp.where(tiny, 1.0, gained / jnp.where(promised > 0, promised, 1))
         ratio = jnp.where(jnp.isfinite(gained), ratio, -1.0)
-        accepted = (ratio > _POOR) & ~(tiny & (gained < -1e3 * eps * size)) | (step == 0)
+        accepted = (ratio > options.acceptance) & ~(tiny & (gained < -1e3 * eps * size)) | (
+            step == 0
+        )
         worse = jnp.sum(jnp.maximum(there.c, 0)) > jnp.sum(jnp.maximum(model, 0))
         again = ~accepted & ~corrected & worse
         length = jnp.max(jnp.abs(d))
         radius = jnp.where(
             accepted,
-            jnp.where((ratio > _GOOD) & (length > 0.9 * radius), 2 * radius, radius),
+            jnp.where((ratio > options.agreement) & (length > 0.9 * radius), 2 * radius, radius),
             jnp.where(again, radius, jnp.minimum(radius, length) / 3),
         )
-        B = jnp.where(accepted & (step > 0), _learnt(B, here, there, multipliers, d), B)
+        B = jnp.where(accepted & (step > 0), _update_curvature(B, here, there, multipliers, d), B)
         # At a minimum of the merit that leaves residuals the penalty is too small.
-        converged = (accepted & (length <= eps**_CLOSE)) | (radius <= 4 * eps)
+        converged = (accepted & (length <= eps**options.closeness)) | (radius <= 4 * eps)
         harder = (
-            converged & (step > 0) & (jnp.sum(jnp.maximum(here.c, 0)) > 0) & (rho < _PENALTY_MAX)
+            converged
+            & (step > 0)
+            & (jnp.sum(jnp.maximum(here.c, 0)) > 0)
+            & (rho < options.largest_penalty)
         )
         new = _State(
             u=jnp.where(accepted, trial, u),
             here=jax.tree.map(lambda x, old: jnp.where(accepted, x, old), there, here),
             B=B,
-            radius=jnp.where(harder, 0.1, jnp.minimum(radius, 0.5)),
-            rho=jnp.where(harder, _HARDER * rho, rho),
+            radius=jnp.where(harder, 0.1, jnp.minimum(radius, options.largest_radius)),
+            rho=jnp.where(harder, options.penalty_factor * rho, rho),
             bend=jnp.where(again, there.c - model, 0),
             promised=promised,
             multipliers=jnp.where(accepted, multipliers, state.multipliers),
@@ -110,12 +137,14 @@ def sequential(
     first = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     zero, k = jnp.zeros_like(start[0]), first.c
     B = curvature * jnp.eye(len(start), dtype=start.dtype)
-    state = _State(start, first, B, zero + 0.25, zero + penalty, k, zero, k, zero > 0)
+    state = _State(
+        start, first, B, zero + options.radius, zero + options.penalty, k, zero, k, zero > 0
+    )
     end = jax.lax.fori_loop(0, steps, body, state)
     return end.u, end.here, end.multipliers
 
 
-def _learnt(B, here: Row, there: Row, multipliers, d) -> Array:
+def _update_curvature(B, here: Row, there: Row, multipliers, d) -> Array:
     """The curvature of the Lagrangian after a step, by the damped formula of BFGS (Powell)."""
     y = there.g - here.g + (there.A - here.A).T @ multipliers
     Bd = B @ d

@@ -18,10 +18,10 @@ def slsqp(objective: Callable, constraints: Callable, start: np.ndarray, bounds:
     """
     fun, jac = (lambda z: -constraints(z)[0]), (lambda z: -constraints(z)[1])
     limits = {"type": "ineq", "fun": fun, "jac": jac}
-    return minimized(objective, start, bounds, limits, 100)
+    return minimise(objective, start, bounds, limits, 100)
 
 
-def minimized(
+def minimise(
     objective: Callable, start: np.ndarray, bounds: Any, constraints: Any, steps: int, ftol=1e-12
 ):
     """The point (n,) at which SLSQP ends; `objective` gives value and gradient."""

@@ -6,12 +6,8 @@ from .._base.ranges import low_discrepancy
 from .joint_limits import restore_joint_limits
 from .problem import DesignProblem
 
-_PENALTY = 10.0  # of unmet requirements, by which starts are ranked
-_SHARES_NEAR = 8 * (0.06,) + 4 * (0.15,)  # of the bounds, about the best design so far
-_BACK, _SPREAD = (0.8, 0.6, 0.4), 0.3  # of the way to it, and of its distance, about the way
 
-
-def screened_designs(lattice: int, variables: int) -> np.ndarray:
+def spread_designs(lattice: int, variables: int) -> np.ndarray:
     """Scaled designs (n, v): a lattice, in more than two variables a low-discrepancy set."""
     if variables > 2:
         return low_discrepancy(lattice**2, variables)
@@ -20,7 +16,7 @@ def screened_designs(lattice: int, variables: int) -> np.ndarray:
     return np.stack([axis.ravel() for axis in axes], axis=1)
 
 
-def designs_around(
+def draw_designs(
     problem: DesignProblem, centre: np.ndarray, count: int, shares: tuple[float, ...], seed: int
 ) -> np.ndarray:
     """Designs (count, v) drawn from the bounds, drawn to a centre (v,), and inside of all joints.
@@ -34,22 +30,24 @@ def designs_around(
     return restore_joint_limits(problem, centre + share * (drawn - centre), condition)
 
 
-def designs_near(problem: DesignProblem, best: np.ndarray, count: int, again: int) -> np.ndarray:
-    """Designs (count, v) for round `again`: around the best so far (v,), inside of all joints.
+def renew_starts(
+    problem: DesignProblem, best: np.ndarray, count: int, round_number: int
+) -> np.ndarray:
+    """Designs (count, v) for a round of new starts: around the best (v,), inside of all joints.
 
     Where the objective is the distance from the given design, what is better is nearer to that:
-    every other round is on the way back.
+    every other round is on the line to it.
     """
-    if problem.objective is not None or again % 2 == 0:
-        return designs_around(problem, best, count, _SHARES_NEAR, again)
+    if problem.objective is not None or round_number % 2 == 0:
+        # Two of three are closer.
+        return draw_designs(problem, best, count, 8 * (0.06,) + 4 * (0.15,), round_number)
     start = np.asarray(problem.start, float)
-    drawn = np.random.default_rng([again, 1]).uniform(-1, 1, (count, len(start)))
-    size = _SPREAD * float(
-        np.sqrt(3 * np.mean((best - start) ** 2))
-    )  # as far as `best`, and a share
-    way = np.resize(_BACK, count)[:, None] * (best - start)
+    drawn = np.random.default_rng([round_number, 1]).uniform(-1, 1, (count, len(start)))
+    # Draws scatter about the line by 0.3 of its length.
+    size = 0.3 * float(np.sqrt(3 * np.mean((best - start) ** 2)))
+    offset = np.resize((0.8, 0.6, 0.4), count)[:, None] * (best - start)
     condition = np.asarray(problem.nominal_condition)[None]
-    return restore_joint_limits(problem, np.clip(start + way + size * drawn, 0, 1), condition)
+    return restore_joint_limits(problem, np.clip(start + offset + size * drawn, 0, 1), condition)
 
 
 def choose_starts(start: np.ndarray, designs: np.ndarray, rows: np.ndarray, count: int):
@@ -63,7 +61,7 @@ def choose_starts(start: np.ndarray, designs: np.ndarray, rows: np.ndarray, coun
     if finite.any():
         low, high = np.quantile(values[finite], [0.1, 0.9])
         scale = float(high - low) or 1.0
-    merit = values / scale + _PENALTY * np.maximum(rows[:, 1:], 0).sum(axis=1)
+    merit = values / scale + 10 * np.maximum(rows[:, 1:], 0).sum(axis=1)
     merit = np.where(finite, merit, np.inf)
     variables = designs.shape[1]
     neighbours = min(3**variables if variables < 3 else 4 * variables, len(designs))

@@ -71,8 +71,8 @@ def stated_fields(
     envelope = None if envelope is None else Envelope.of(envelope)
     tolerance = None if tolerance is None else Tolerance.of(tolerance)
     bounds = checked_bounds(x, bounds)
-    cycles = _cycles(x, objective, constraints, envelope is not None or tolerance is not None)
-    objective = _followed if isinstance(objective, CycleConstraint) else objective
+    cycles = _make_cycles(x, objective, constraints, envelope is not None or tolerance is not None)
+    objective = _zero if isinstance(objective, CycleConstraint) else objective
     numbers: dict[str, Any] = dict(
         area_ratio_min=scalar("area_ratio_min", area_ratio_min, at_least=1),
         slip_ratio_max=scalar("slip_ratio_max", slip_ratio_max, above=0, at_most=1),
@@ -136,13 +136,13 @@ def stated_fields(
     )
 
 
-def _followed(x) -> float:
+def _zero(x) -> float:
     """Stands for an objective that `FollowedCycles` fills in."""
     return 0.0
 
 
-def _cycles(x, objective, constraints, robust: bool) -> FollowedCycles | None:
-    """What follows the cycles of the designs, where something is asked of them."""
+def _make_cycles(x, objective, constraints, robust: bool) -> FollowedCycles | None:
+    """The cycles of the designs, where they are limited or minimised."""
     of_cycle = objective if isinstance(objective, CycleConstraint) else None
     limits = [each for each in constraints if isinstance(each, CycleConstraint)]
     if of_cycle is None and not limits:

@@ -32,15 +32,7 @@ from .._mechanism.quantities import (
 from .._mechanism.structure import Structure
 from .._stability.stability import growth_rate
 from .envelope import Envelope
-from .truncated import HIGHEST, LOWEST, REACH, is_fractal_dimension, truncated
-
-_NODES = 55  # in one and two dimensions: a Fibonacci number, whose lattice is the best of its size
-_WIDENING = 2.0  # of the distribution that the nodes are drawn from
-_MOST = 6  # quantities that scatter
-_LARGEST = 0.5  # of the logarithm of the largest number: the largest shift of a logarithm
-_SAMPLES = 100_000  # of a scene; of a structure fewer:
-_WORK, _SAMPLES_LEAST = 4e9, 1000  # draws times cubed sizes of the eigenvalue problem
-_EIGENVALUES_AT_ONCE = 1 << 15
+from .truncated import REACH, is_fractal_dimension, truncated
 
 
 class Tolerance(Record):
@@ -57,8 +49,8 @@ class Tolerance(Record):
     **Raises:** `ValueError` unless the covariance is symmetric, positive semidefinite and not 0.
     """
 
-    names: tuple[str, ...] = eqx.field(static=True)
-    covariance: Float[Array, "k k"]
+    names: tuple[str, ...] = eqx.field(static=True)  # of the quantities, or of their logarithms
+    covariance: Float[Array, "k k"]  # of what is named, in SI units
 
     def __init__(self, names: Sequence[str], covariance: ArrayLike):
         self.names = tuple(names)
@@ -83,7 +75,10 @@ class Tolerance(Record):
 
     @classmethod
     def of(cls, scatter: Any) -> "Tolerance":
-        """A tolerance, a mapping of names to standard deviations, or an identification."""
+        """A tolerance from `scatter`.
+
+        It is a tolerance, a mapping of names to standard deviations, or an identification.
+        """
         if isinstance(scatter, Tolerance):
             return scatter
         if hasattr(scatter, "D_standard_error") and hasattr(scatter, "covariance"):
@@ -113,7 +108,7 @@ class Tolerance(Record):
         """Refuse names that `x` lacks, and a scatter that leaves a domain within six deviations.
 
         That of a fractal dimension is truncated instead. `ranges` are those inside which a quantity
-        is moved otherwise.
+        varies otherwise.
         """
         names = quantity_names(x)
         for name, (label, sigma) in zip(
@@ -121,7 +116,7 @@ class Tolerance(Record):
         ):
             if name not in names:
                 raise ValueError(f"tolerance names {label!r}; there are {', '.join(names)}")
-            for each in [] if is_traced(x) else _moved_by(x, name):
+            for each in [] if is_traced(x) else _scattered_names(x, name):
                 ends = ranges.get(each, ranges.get(name, (float(value_of(x, each)),)))
                 low, high = min(ends), max(ends)
                 if is_fractal_dimension(x, each):
@@ -139,13 +134,14 @@ class Tolerance(Record):
                         f"{error}"
                     ) from None
         require_independent(x, self.quantities)
-        if len(self.names) > _MOST:
-            raise ValueError(f"tolerance takes at most {_MOST} quantities, got {len(self.names)}")
+        if len(self.names) > 6:  # nodes double with each
+            raise ValueError(f"tolerance takes at most 6 quantities, got {len(self.names)}")
 
     def shifts(self, deviates: np.ndarray) -> np.ndarray:
-        """Shifts (n, k) of the quantities, or of their logarithms, from standard normal deviates.
+        """Shifts (n, k) of quantities, or of their logarithms, from normal `deviates` (n, k).
 
-        Correlated by the Cholesky factor of the correlation matrix, which may be singular.
+        The deviates have variance 1; they are correlated by the Cholesky factor of the correlation
+        matrix, which may be singular.
         """
         C = np.asarray(self.covariance, float)
         sigma = np.sqrt(np.diagonal(C))
@@ -159,16 +155,16 @@ class Tolerance(Record):
         return {
             each: jnp.asarray(value_of(x, each))
             for name in self.quantities
-            for each in _moved_by(x, name)
+            for each in _scattered_names(x, name)
         }
 
     def scattered(self, x: Mechanism, values: Mapping[str, Any], shift: Any) -> dict[str, Any]:
-        """The quantities at `values` by name, moved by shifts (k,), or (k, n) for values (n,).
+        """The quantities at `values` by name, shifted by (k,), or by (k, n) for values (n,).
 
-        `values` holds a plain name, "D", where it is moved for all joints at once.
+        `values` holds a plain name, "D", where it stands for all joints at once.
         """
         values_at = {}
-        shifts = self._inside(x, values, shift)
+        shifts = self._truncate(x, values, shift)
         for name, label, by in zip(self.quantities, self.names, shifts, strict=True):
             for each, value in _values(x, name, values).items():
                 if name == label:
@@ -178,20 +174,20 @@ class Tolerance(Record):
                     values_at[each] = value * jnp.exp(jnp.clip(by, -most, most))
         return values_at
 
-    def _inside(self, x: Mechanism, values: Mapping[str, Any], shift: Any) -> list[Any]:
-        """The shifts, those of fractal dimensions truncated and what is correlated moved along.
+    def _truncate(self, x: Mechanism, values: Mapping[str, Any], shift: Any) -> list[Any]:
+        """The shifts with those of fractal dimensions truncated, and of all that is correlated.
 
-        A second dimension is truncated by itself: it does not move the first.
+        A second dimension is truncated by itself: it does not shift the first.
         """
         shifts, fixed = [*shift], set()
         for i, (name, label) in enumerate(zip(self.quantities, self.names, strict=True)):
             if not is_fractal_dimension(x, name):
                 continue
-            low, high = -math.inf, math.inf  # all joints move by the same amount
+            low, high = -math.inf, math.inf  # all joints shift by the same amount
             for value in _values(x, name, values).values():
                 below, above = (
                     end - value if name == label else jnp.log(end / value)
-                    for end in (LOWEST, HIGHEST)
+                    for end in (2.0, 3.0)  # of fractal dimensions
                 )
                 low, high = jnp.maximum(low, below), jnp.minimum(high, above)
             variance = self.covariance[i, i]
@@ -205,30 +201,35 @@ class Tolerance(Record):
 
 
 def _values(x: Mechanism, name: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of what a name moves, each by its own name."""
-    return {each: values[name if name in values else each] for each in _moved_by(x, name)}
+    """The values of all quantities that a name stands for."""
+    return {each: values[name if name in values else each] for each in _scattered_names(x, name)}
 
 
 def _largest(dtype) -> float:
-    """The largest shift of a logarithm, for any error: the number stays finite, and above 0."""
-    return _LARGEST * math.log(float(jnp.finfo(dtype).max))
+    """The largest shift of a logarithm: no error makes a number infinite or 0."""
+    return 0.5 * math.log(float(jnp.finfo(dtype).max))
 
 
-def _moved_by(x: Mechanism, name: str) -> list[str]:
-    """The name itself; of a structure those of all joints that a plain name moves."""
+def _scattered_names(x: Mechanism, name: str) -> list[str]:
+    """The name itself; for a structure the names in all joints that a plain name stands for."""
     return sorted(target_quantities(x, name)) if isinstance(x, Structure) else [name]
 
 
-def nodes(dimensions: int) -> tuple[np.ndarray, np.ndarray]:
-    """Standard normal deviates (n, dimensions) and their weights (n,), which sum to 1."""
+def nodes(dimensions: int, count: int = 55, widening: float = 2.0) -> tuple[np.ndarray, np.ndarray]:
+    """Standard normal deviates (n, dimensions) and their weights (n,), which sum to 1.
+
+    There are `count` in one and two dimensions, a Fibonacci number, whose lattice is the best of
+    its size; every further dimension doubles them. They are drawn from a distribution wider by
+    the factor `widening`.
+    """
     from scipy.special import ndtri
 
-    z = ndtri(low_discrepancy(_NODES * 2 ** max(dimensions - 2, 0), dimensions))
+    z = ndtri(low_discrepancy(count * 2 ** max(dimensions - 2, 0), dimensions))
     # Zero mean and unit covariance exactly.
     z = z - z.mean(axis=0)
     z = np.linalg.solve(np.linalg.cholesky(z.T @ z / len(z)), z.T).T
-    weights = np.exp(-(z**2).sum(axis=1) * (_WIDENING**2 - 1) / 2)
-    return z * _WIDENING, weights / weights.sum()
+    weights = np.exp(-(z**2).sum(axis=1) * (widening**2 - 1) / 2)
+    return z * widening, weights / weights.sum()
 
 
 def quantile(values: Float[Array, "n ..."], weights: Float[Array, " n"], level) -> Array:
@@ -293,10 +294,19 @@ def squeal_probability(
     Draws whose growth rate is NaN, as where a preloaded joint has no closed equilibrium, are
     `undetermined`.
 
-    `tolerance` is an `Identification`, a `Tolerance` or a mapping of standard deviations; with an
-    `envelope` every draw is at a condition drawn evenly from it. A name without a joint, "D", of a
-    structure moves all joints that have one by the same amount. `samples` are 100,000 by default,
-    fewer, down to 1000, of a structure of more than 17 degrees of freedom.
+    **Arguments:**
+
+    - `x`: a scene or structure of scalars.
+    - `tolerance`: an `Identification`, a `Tolerance` or a mapping of standard deviations. A name
+      without a joint, "D", of a structure moves all joints that have one by the same amount.
+    - `envelope`: an `Envelope` or a mapping; every draw is at a condition drawn evenly from it. By
+      default there is none.
+    - `friction_slope`: False leaves the slope of friction out of growth rates.
+    - `samples`: number of draws, 100,000 by default, fewer, down to 1000, of a structure of more
+      than 17 degrees of freedom.
+    - `seed`: of the draws, 0 by default.
+
+    **Returns:** a `SquealProbability`.
 
     **Raises:** `ValueError` for quantities that `x` lacks, or scattered beyond their domain; D is
     truncated to its own instead (see `Tolerance`).
@@ -304,7 +314,8 @@ def squeal_probability(
     tolerance, values = Tolerance.of(tolerance), {}
     n = x.n if isinstance(x, Structure) else 2
     if samples is None:
-        samples = int(np.clip(_WORK / (2 * n) ** 3, _SAMPLES_LEAST, _SAMPLES))
+        # Eigenvalues take a time that grows with the cube of their number.
+        samples = int(np.clip(4e9 / (2 * n) ** 3, 1000, 100_000))
     if envelope is not None:
         envelope = Envelope.of(envelope)
         envelope.check(x, ())
@@ -318,7 +329,7 @@ def squeal_probability(
     values |= {name: np.broadcast_to(column, samples) for name, column in scattered.items()}
     dtype = jax.tree.leaves(x)[0].dtype
     rows = np.stack([np.asarray(column, dtype) for column in values.values()], axis=1)
-    batch = max(64, _EIGENVALUES_AT_ONCE // n**2)
+    batch = max(64, 32_768 // n**2)  # about as much memory for all sizes
     growth = in_batches(
         lambda rows: _growth_rates(x, tuple(values), rows, friction_slope),
         min(batch, samples),
@@ -329,6 +340,6 @@ def squeal_probability(
 
 
 def proportion(hits: int, count: int) -> SquealProbability:
-    """A proportion and its standard error, which is not zero where all or nothing was hit."""
+    """A proportion and its standard error, which is never zero."""
     smoothed = (hits + 1) / (count + 2)
     return SquealProbability(hits / count, math.sqrt(smoothed * (1 - smoothed) / count))

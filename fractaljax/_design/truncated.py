@@ -18,15 +18,13 @@ from .._mechanism.quantities import stored_quantities
 from .._surface.surface import Surface
 
 REACH = 6.0  # standard deviations that must stay inside the domain of a quantity
-LOWEST, HIGHEST = 2.0, 3.0  # of a fractal dimension
-_INSIDE = 1e-6  # closest that a draw comes to an end: single precision tells it from 2
-_MEANING = dataclasses.fields(Surface)[0].metadata["meaning"]
 
 
 def is_fractal_dimension(x: Mechanism, name: str) -> bool:
     """True if a quantity is the D of a surface, of all joints or of one."""
     quantities = stored_quantities(x)
-    return name in quantities and quantities[name].meaning == _MEANING
+    fields = {field.name: field for field in dataclasses.fields(Surface)}
+    return name in quantities and quantities[name].meaning == fields["D"].metadata["meaning"]
 
 
 def truncated(shift: Any, sigma: Array, low: Any, high: Any) -> Array:
@@ -40,5 +38,6 @@ def truncated(shift: Any, sigma: Array, low: Any, high: Any) -> Array:
     lost = [jnp.maximum(ndtr(end / scale) - ndtr(-REACH), 0) for end in (low, -high)]
     here, there = jnp.where(up, lost[1], lost[0]), jnp.where(up, lost[0], lost[1])
     below = here + ndtr(-jnp.abs(shift) / scale) * (1 - here - there)
-    shifted = jnp.clip(jnp.where(up, -1, 1) * scale * ndtri(below), low + _INSIDE, high - _INSIDE)
+    closest = 1e-6  # that a draw comes to an end: single precision tells it from 2
+    shifted = jnp.clip(jnp.where(up, -1, 1) * scale * ndtri(below), low + closest, high - closest)
     return jnp.where((here + there > 0) & (sigma > 0), shifted, shift)

@@ -33,19 +33,13 @@ from .quiet import Kicks
 from .summary import growth_text
 from .tolerance import Tolerance, squeal_probability
 
-_WAVES = 100  # of the side of the area, for a law that needs a shortest wavelength
-_ACCEPTED = 0.05  # probability of squeal
-_RATIOS, _RATIOS_OF_STRUCTURES = 65, 17  # values of K_t/K_n between its ends
-_RANGE = 100.0  # a suggestion changes a scale up to so many times, either way
-_DAMPING = 0.5  # and a damping ratio up to this
-
 
 class Question(NamedTuple):
     """One assumption, changed."""
 
     assumed: str  # in the scene
     name: str  # instead
-    found: str  # what was found, in words
+    answer: str  # in words
     quiet: bool
     undetermined: bool = False  # it is not quiet because it has no answer
 
@@ -58,7 +52,7 @@ class Question(NamedTuple):
 class Verdict(Record):
     """What a quiet scene rests on, as `verdict` returns it; printed, it is a table."""
 
-    questions: tuple[Question, ...]
+    questions: tuple[Question, ...]  # assumptions that were changed, with the answers
     incurable: bool  # whether the slope of the friction feeds in more than all damping takes out
     omitted: tuple[str, ...] = ()  # what `verdict` would ask with other arguments, in brackets
 
@@ -75,7 +69,7 @@ class Verdict(Record):
 
     def __repr__(self) -> str:
         columns: list[dict[str, str]] = [
-            {question.name: question.found for question in self.questions},
+            {question.name: question.answer for question in self.questions},
             {question.name: question.outcome for question in self.questions},
         ]
         lines = [table(["growth rate [1/s]", ""], columns)]
@@ -110,13 +104,26 @@ def verdict(
     """Ask of a scene or a structure whether it stays quiet where an assumption is another.
 
     Its growth rate [1/s] as it is; with the load P in the friction, or without it where it is
-    there; under every other of the contact `laws`, with its surface, material and load, and by
-    `AsperityContact` and `PerssonContact` if the nominal `area` [m^2] is given, one for all joints
-    or by joint, with wavelengths from its side down to a hundredth of it; and with K_t/K_n between
-    its own, the fractal law's and Mindlin's, the worst of 65 values, or 17 of a structure. With a
-    `tolerance` or an `Identification`, and an `envelope`, the probability of squeal (see
-    `squeal_probability`), quiet below 5 percent; with `quiet_within` (see `design`) the largest
-    kick survived. What no argument asks for is named. The joints of a structure change together.
+    there; under other contact laws; with K_t/K_n between its own, the fractal law's and Mindlin's,
+    the worst of 65 values, or 17 of a structure; the probability of squeal, quiet below 5 percent;
+    and the largest kick survived. What no argument asks for is named. The joints of a structure
+    change together.
+
+    **Arguments:**
+
+    - `x`: a scene or structure of scalars.
+    - `area`: nominal area [m^2], one for all joints or {joint: area}, for `AsperityContact` and
+      `PerssonContact` with wavelengths from its side down to a hundredth of it. By default they are
+      left out.
+    - `laws`: other contact laws, each with the surface, material and load of `x`.
+    - `tolerance`: as in `squeal_probability`, by default none.
+    - `envelope`: as in `squeal_probability`, by default none.
+    - `quiet_within`: the kick that has to be survived, as in `design`; by default none.
+    - `friction_slope`: False leaves the slope of friction out of growth rates.
+    - `seed`: of all that is drawn, 0 by default.
+    - `progress`: shows a bar.
+
+    **Returns:** a `Verdict`.
 
     **Raises:** `ValueError` for what holds arrays, for an area without a surface or of a joint that
     is not there, and as those functions.
@@ -142,9 +149,11 @@ def verdict(
     ]
     if (stiff := np.asarray(growth.stiff)).any():
         ratios, own_ratios = (np.asarray(r)[..., stiff] for r in (growth.ratios, growth.own_ratios))
-        questions.append(_of_ratios(ratios, np.array(rates[len(cases) :]), own_ratios))
+        questions.append(
+            _stiffness_ratio_question(ratios, np.array(rates[len(cases) :]), own_ratios)
+        )
     if tolerance is not None:
-        questions.append(_scattered(x, tolerance, envelope, friction_slope, seed))
+        questions.append(_scatter_question(x, tolerance, envelope, friction_slope, seed))
     if quiet_within is not None:
         kicks = Kicks.of(x, quiet_within, seed, flag("progress", progress))
         survived, size = kicks.survived([x]), kicks.size
@@ -203,14 +212,14 @@ def _laws_of(x: Mechanism, area: Any) -> list[tuple[type[Contact], dict[str, Con
     for name, part in parts.items():
         A = scalar(f"area {name}".strip(), area[name], above=0)
         contact, L = part.contact, jnp.sqrt(A)
-        arguments = contact.surface, contact.material, contact.P
-        asperity[name] = AsperityContact(*arguments, L / _WAVES)
-        persson[name] = PerssonContact(*arguments, A, L, L / _WAVES)
+        arguments, L_s = (contact.surface, contact.material, contact.P), L / 100
+        asperity[name] = AsperityContact(*arguments, L_s)
+        persson[name] = PerssonContact(*arguments, A, L, L_s)
     return [(AsperityContact, asperity), (PerssonContact, persson)]
 
 
-class _Found(NamedTuple):
-    """What `_growth_rates` finds, of the j joints whose contacts have a material."""
+class _GrowthRates(NamedTuple):
+    """What `_growth_rates` returns, of the j joints whose contacts have a material."""
 
     rates: Array  # (m + k,) [1/s], of the mechanisms and then at the ratios
     ratios: Array  # (k, j) of K_t to K_n
@@ -220,7 +229,7 @@ class _Found(NamedTuple):
 
 
 @functools.partial(exported_jit, static_argnames="friction_slope")
-def _growth_rates(mechanisms: tuple[Mechanism, ...], friction_slope: bool) -> _Found:
+def _growth_rates(mechanisms: tuple[Mechanism, ...], friction_slope: bool) -> _GrowthRates:
     """Growth rates of m mechanisms, and of the first over K_t/K_n, in one program.
 
     The ratios of each joint lie between its own, the fractal law's and Mindlin's.
@@ -238,7 +247,7 @@ def _growth_rates(mechanisms: tuple[Mechanism, ...], friction_slope: bool) -> _F
         stiffness[name] = pairs[0]
         mindlin = jnp.asarray(mindlin_ratio(contact.material.nu), pairs[0][0].dtype)
         ends.append(jnp.stack([*(K_t / K_n for K_n, K_t in pairs), mindlin]))
-    count = _RATIOS if isinstance(first, Scene) else _RATIOS_OF_STRUCTURES
+    count = 65 if isinstance(first, Scene) else 17  # eigenvalues of a structure take long
     low, high, own_ratio = (
         jnp.stack([of(end) for end in ends]) if ends else jnp.zeros(0)
         for of in (jnp.min, jnp.max, lambda end: end[0])
@@ -268,13 +277,15 @@ def _growth_rates(mechanisms: tuple[Mechanism, ...], friction_slope: bool) -> _F
         rates = jnp.concatenate([rates, at_ratios])
         trace = stability(first, friction_slope).eigenvalues.real.sum()
     stiff = [K_n > 0 for K_n, _ in stiffness.values()]
-    return _Found(
+    return _GrowthRates(
         rates, ratios, own_ratio, jnp.stack(stiff) if stiff else jnp.zeros(0, bool), trace
     )
 
 
-def _of_ratios(ratios: np.ndarray, rates: np.ndarray, own_ratio: np.ndarray) -> Question:
-    """The worst growth rate between the own K_t/K_n, the fractal law's and Mindlin's."""
+def _stiffness_ratio_question(
+    ratios: np.ndarray, rates: np.ndarray, own_ratio: np.ndarray
+) -> Question:
+    """The worst growth rate between the K_t/K_n of the joint, the fractal law's and Mindlin's."""
     worst = int(np.argmax(rates))
     name = f"K_t/K_n from {ratios[0].min():.3g} to {ratios[-1].max():.3g}"
     words = f"{growth_text(rates[worst])} at {_extent(ratios[worst])}"
@@ -288,7 +299,10 @@ def _extent(values) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def _scattered(x, tolerance, envelope, friction_slope, seed) -> Question:
+def _scatter_question(
+    x, tolerance, envelope, friction_slope, seed, accepted: float = 0.05
+) -> Question:
+    """The probability of squeal, quiet below `accepted`."""
     tolerance = Tolerance.of(tolerance)
     probability = squeal_probability(
         x, tolerance, envelope, friction_slope=friction_slope, seed=seed
@@ -299,17 +313,17 @@ def _scattered(x, tolerance, envelope, friction_slope, seed) -> Question:
     if probability.undetermined:
         words += f", has no sliding equilibrium with {probability.undetermined:.3g}"
     exact = f"{names} without scatter"
-    quiet = probability.value + probability.undetermined < _ACCEPTED
-    undetermined = not quiet and probability.value < _ACCEPTED
+    quiet = probability.value + probability.undetermined < accepted
+    undetermined = not quiet and probability.value < accepted
     return Question(exact, f"{names} scatter{over}", words, quiet, undetermined)
 
 
 class Suggestion(Record):
     """The least change of each quantity that makes a scene quiet, as `suggest` returns it."""
 
-    scene: Scene
+    scene: Scene  # as given
     values: dict[str, float | None]  # by name; None where none inside its bounds does
-    bounds: dict[str, tuple[float, float]]
+    bounds: dict[str, tuple[float, float]]  # (lower, upper) by name, inside which was sought
 
     def __repr__(self) -> str:
         rows = {}
@@ -330,18 +344,27 @@ def suggest(
 ) -> Suggestion:
     """The least change of one quantity at a time that brings the growth rate to `target`.
 
-    What a surface cannot cure, damping, friction or load may. `bounds` maps quantities to (lower,
-    upper), by default: each damping ratio up to 0.5; the friction as a whole down to a hundredth;
-    the smallest friction up to the static one, which is the slope, where the law has both; the load
-    and the belt velocity from a hundredth to a hundred times. Each is a `design` of its own, with
+    What a surface cannot cure, damping, friction or load may. Each is a `design` of its own, with
     its `target`, but without limits on K_n and on the regime of the joint.
+
+    **Arguments:**
+
+    - `scene`: a scene of scalars.
+    - `bounds`: {name: (lower, upper)} of quantities in SI units, by default: each damping ratio up
+      to 0.5; the friction as a whole down to a hundredth; the smallest friction up to the static
+      one, which is the slope, where the law has both; the load and the belt velocity from a
+      hundredth to a hundred times.
+    - `target`: largest growth rate [1/s], by default that of `design`.
+    - `friction_slope`: False leaves the slope of friction out of growth rates.
+
+    **Returns:** a `Suggestion`.
 
     **Raises:** `ValueError` as `design`.
     """
     require_kind("scene", scene, Scene)
     require_scalar(scene)
     if bounds is None:
-        bounds = _suggested(scene)
+        bounds = _suggested_bounds(scene)
     values: dict[str, float | None] = {}
     for name, ends in bounds.items():
         best = design(
@@ -362,14 +385,15 @@ def suggest(
     )
 
 
-def _suggested(scene: Scene) -> dict[str, tuple[float, float]]:
+def _suggested_bounds(scene: Scene) -> dict[str, tuple[float, float]]:
+    factor = 100.0  # the largest change of a scale, up or down
     values = {name: float(value_of(scene, name)) for name in ("xi_1", "xi_2", "mu", "V")}
-    bounds = {name: (values[name], max(_DAMPING, 2 * values[name])) for name in ("xi_1", "xi_2")}
-    bounds["mu"] = values["mu"] / _RANGE, values["mu"]
+    bounds = {name: (values[name], max(0.5, 2 * values[name])) for name in ("xi_1", "xi_2")}
+    bounds["mu"] = values["mu"] / factor, values["mu"]
     names = quantity_names(scene)
     if {"mu_s", "mu_m"} <= set(names) and scene.friction.mu_m < scene.friction.mu_s:
         bounds["mu_m"] = float(scene.friction.mu_m), float(scene.friction.mu_s)
     for name in ("P", "V"):
         if name in names and (value := float(value_of(scene, name))) > 0:
-            bounds[name] = value / _RANGE, value * _RANGE
+            bounds[name] = value / factor, value * factor
     return bounds

@@ -6,14 +6,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .cycle import SQUARINGS
 from .events import Cubic
-from .hybrid import SECTION, HybridSystem
+from .guard import SECTION
+from .hybrid import HybridSystem
 from .lanes import log_spectral_radius
 from .orbit import PeriodicOrbit
 from .segments import Segments, cumulative, next_start
-
-HARDLY = 1e-3  # growth per period up to which a repelling orbit is kept
+from .transition import switch
 
 
 def _quintic(y, d, x):
@@ -50,7 +49,7 @@ def admissible(system: HybridSystem, segments: Segments, middle) -> Bool[Array, 
     g = jnp.concatenate([g, guards(lowest)])
     # The quintic has this accuracy on a segment of the default length.
     holds = jnp.all(g > -1e-8 * scale[None], axis=(0, 1)) & (h > -1e-10)
-    _, after = system.switch(ends, s, segments.guard)
+    _, after = switch(system, ends, s, segments.guard)
     return jnp.all(holds & jnp.all(after == next_start(s), axis=0), axis=0)
 
 
@@ -60,7 +59,8 @@ def growth_of(system: HybridSystem, orbit: PeriodicOrbit) -> Float[Array, " g"]:
     The multipliers of an excitation, which are 1, are left out too. Without an orbit it is NaN.
     """
     jacobian = system.mechanism_state(jnp.swapaxes(system.mechanism_state(orbit.jacobian), 0, 1))
-    log = log_spectral_radius(jnp.swapaxes(jacobian, 0, 1), SQUARINGS)
+    # After 40 squarings the logarithm of a power's size is too small by rounding alone.
+    log = log_spectral_radius(jnp.swapaxes(jacobian, 0, 1), squarings=40)
     return jnp.where(orbit.converged, log, jnp.nan)
 
 

@@ -10,6 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 from .._base.parts import number
 from .._mechanism.mechanism import Mechanism
 from .cycle import CycleResult, LimitCycle
+from .cycle_search import CycleSearch
 from .excitation import Excitation
 from .limit_cycle import check_arguments, find_cycle, refine_cycle, scale_problem
 from .scaled import degrees_of_freedom, hybrid_system
@@ -22,12 +23,19 @@ def attractors(
     excitation: Excitation | None = None,
     rtol: float | None = None,
     max_returns: int = 5000,
+    search: CycleSearch = CycleSearch(),
 ) -> list[LimitCycle]:
     """Every distinct motion that the starts end in, including those without a cycle.
 
-    Two cycles are the same if their periods and amplitudes agree to 1e-6. `starts` is (k, 2n),
-    [x, v] in m and m/s; by default 32 spread about the equilibrium, up to velocities of 2 V. The
-    list is in the order of the starts. The options are those of `limit_cycle`.
+    Two cycles are the same if their periods and amplitudes agree to 1e-6. The list is in the order
+    of the starts.
+
+    **Arguments:**
+
+    - `mechanism`: as in `limit_cycle`.
+    - `starts`: (k, 2n), [x, v] in m and m/s; by default 32 spread about the equilibrium, up to
+      velocities of 2 V.
+    - `excitation`, `rtol`, `max_returns`: as in `limit_cycle`.
 
     **Raises:** `ValueError` for starts of another shape, and what `limit_cycle` raises.
     """
@@ -37,7 +45,8 @@ def attractors(
     starts = number("starts", jnp.asarray(starts, dtype=float))
     if starts.ndim != 2 or starts.shape[1] != 2 * n:
         raise ValueError(f"starts must have shape (k, {2 * n}), got {starts.shape}")
-    returns, segments, static = check_arguments(mechanism, starts, excitation, rtol, max_returns)
+    inputs = mechanism, starts, excitation
+    returns, segments, static = check_arguments(*inputs, rtol, max_returns, search)
     system, growth = scale_problem(mechanism, excitation)
     cycles = jax.vmap(
         lambda start: find_cycle(system, growth, start, returns, segments=segments, **static)

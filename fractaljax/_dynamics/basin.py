@@ -1,8 +1,8 @@
 """Basins of attraction: what each of many starts ends in, and the share of each outcome.
 
 All starts run side by side, coarsely, as in `search.py`, and leave the run once they are labelled:
-near an attracting orbit that is known, decaying at the equilibrium, or diverging. One that stays
-without a label is searched in full; the orbit found becomes a known one.
+near an attracting orbit that an earlier start led to, decaying at the equilibrium, or diverging.
+One that stays without a label is searched in full; its orbit then labels others.
 """
 
 import concurrent.futures
@@ -18,32 +18,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float, Int
 
-from .._base.parts import Record, concrete, flag, whole
+from .._base.parts import Record, concrete, flag, require_kind, whole
 from .._base.programs import exported_jit
 from .._base.table import table
 from .._mechanism.mechanism import Mechanism
+from .basin_search import BasinSearch
+from .contact_state import FORWARD
 from .cycle import CycleResult, LimitCycle
 from .events import step
 from .excitation import Excitation, compiled_system
-from .hybrid import NONE, SECTION, HybridSystem
+from .guard import NONE, SECTION
+from .hybrid import HybridSystem
 from .limit_cycle import limit_cycle
 from .scaled import check_rtol, degrees_of_freedom
 from .segments import next_start
 from .starts import starts_of
+from .transition import first_contact_state
 
-_LANES, _FEW_LANES = 256, 32  # run side by side, for many starts and for few
-_CHUNKS = 4  # of lanes, shared by the cores; fixed, so that no result depends on their number
-_STEPS_OF = 0.1, 0.2  # lengths, in scaled time: no eigenfrequency exceeds 1
-_FINE = 64  # rounds of the shorter steps, for a start may be near the boundary of two basins
-_STEPS = 128  # in a round
-_SAMPLED = 4  # steps between two samples of the energy
-_ROUNDS = 16  # before the starts that have ended make room for others
-_WINDOW = 4  # rounds over which the energy of a motion without switches is averaged
-_APPROACHES = 0.15  # relative distance from a known orbit below which an approach counts
-_NEAR = 0.02  # relative distance below which few rounds are enough
-_FEW, _STAYS = 3, 8  # rounds of approach, or near without approach
-_PATIENCE = 8  # rounds without a label after which a start is searched in full
-_FAILURES = 8  # full searches without an orbit; then all others are left to the coarse run
 # A cycle is labelled by its index.
 _RUNNING, _EQUILIBRIUM, _DIVERGES, _UNDECIDED, _LOST = -1, -2, -3, -4, -5
 
@@ -99,14 +90,14 @@ class _Lanes(Record):
     y: Float[Array, "2n k"]
     s: Float[Array, "f k"]
     guard: Int[Array, " k"]  # that ended the last step
-    seen: Float[Array, "2n k"]  # the last return to the section
+    section_state: Float[Array, "2n k"]  # at the last return to the section
     returns: Int[Array, " k"]
     rounds: Int[Array, " k"]
     smooth: Int[Array, " k"]  # rounds since the last switch
     energy: Float[Array, "2n k"]  # of the modes, summed over samples of this window
     log: Float[Array, "2n k"]  # amplitude of the modes in the last window
     rate: Float[Array, "2n k"]  # change of `log` since the previous window
-    owner: Int[Array, " k"]  # the nearest known cycle
+    owner: Int[Array, " k"]  # the nearest cycle
     distance: Float[Array, " k"]  # from it
     approach: Int[Array, " k"]  # rounds in which the distance fell
     near: Int[Array, " k"]  # rounds in which it was small
@@ -139,7 +130,7 @@ class _Modes(eqx.Module):
     free: bool = eqx.field(static=True)  # not excited: only then is there an equilibrium
 
     @classmethod
-    def of(cls, system: HybridSystem, starts) -> "_Modes":
+    def from_system(cls, system: HybridSystem, starts) -> "_Modes":
         n, linearisation = system.n, map(np.asarray, _linearised(system, starts))
         equilibrium, A, closures, normals, bound = linearisation
         values, vectors = map(np.asarray, np.linalg.eig(A))
@@ -156,20 +147,21 @@ class _Modes(eqx.Module):
         deviation = y - self.equilibrium[:, None]
         return jnp.sum(self.inverse[:, :, None] * deviation[None], axis=1)
 
-    def grown(self, y, log) -> Array:
+    def grow(self, y, log) -> Array:
         """States (2n, k) after the amplitudes have grown by exp(log), log (2n, k)."""
         c = self.amplitudes(y) * jnp.exp(log)
         return self.equilibrium[:, None] + jnp.sum(self.vectors[:, :, None] * c[None], axis=1).real
 
 
 @jax.jit
-def _first(system: HybridSystem, y) -> _Lanes:
+def _start_lanes(system: HybridSystem, y) -> _Lanes:
+    """Lanes that start from states (2n, k)."""
     none, zero = jnp.zeros(y.shape[1], int), jnp.zeros(y.shape[1], y.dtype)
     return _Lanes(
         y=y,
-        s=system.contact_state(y),
+        s=first_contact_state(system, y),
         guard=none + NONE,
-        seen=y,
+        section_state=y,
         returns=none,
         rounds=none,
         smooth=none,
@@ -184,13 +176,14 @@ def _first(system: HybridSystem, y) -> _Lanes:
     )
 
 
-def _step_length(rounds, dtype) -> Array:
-    return jnp.where(rounds < _FINE, *_STEPS_OF).astype(dtype)
+def _step_length(search: BasinSearch, rounds, dtype) -> Array:
+    fine = rounds < search.fine_rounds
+    return jnp.where(fine, search.step / 2, search.step).astype(dtype)
 
 
-def _advance(system: HybridSystem, modes: _Modes, lanes: _Lanes) -> _Lanes:
+def _advance(search: BasinSearch, system: HybridSystem, modes: _Modes, lanes: _Lanes) -> _Lanes:
     """Advance every lane by one round of steps."""
-    h = _step_length(lanes.rounds, lanes.y.dtype)
+    h = _step_length(search, lanes.rounds, lanes.y.dtype)
 
     def one(_, carry):
         y, s, guard, section_state, returns, switches = carry
@@ -201,34 +194,35 @@ def _advance(system: HybridSystem, modes: _Modes, lanes: _Lanes) -> _Lanes:
 
     def some(_, carry):
         carry, energy = carry
-        carry = jax.lax.fori_loop(0, _SAMPLED, one, carry)
+        carry = jax.lax.fori_loop(0, search.sample_steps, one, carry)
         return carry, energy + jnp.abs(modes.amplitudes(carry[0])) ** 2
 
-    start = lanes.y, lanes.s, lanes.guard, lanes.seen, lanes.returns, jnp.zeros_like(lanes.returns)
-    count = _STEPS // _SAMPLED
-    (*state, switches), energy = jax.lax.fori_loop(0, count, some, (start, lanes.energy))
-    updates = dict(zip(("y", "s", "guard", "seen", "returns"), state, strict=True))
+    names = "y", "s", "guard", "section_state", "returns"
+    start = *(getattr(lanes, name) for name in names), jnp.zeros_like(lanes.returns)
+    (*state, switches), energy = jax.lax.fori_loop(0, search.samples, some, (start, lanes.energy))
+    updates = dict(zip(names, state, strict=True))
     updates |= {"rounds": lanes.rounds + 1, "energy": energy}
     updates |= {"smooth": jnp.where(switches > 0, 0, lanes.smooth + 1)}
     return dataclasses.replace(lanes, **updates)
 
 
-def _decay(modes: _Modes, lanes: _Lanes):
+def _decay(search: BasinSearch, modes: _Modes, lanes: _Lanes):
     """Mask of the lanes that come to rest, and the lanes with slow changes extrapolated.
 
     For a motion without switches, the mean energy of its modes is tracked over windows of several
     rounds, in which ripples average out.
     """
     switched = lanes.smooth == 0
-    slips = jnp.all(lanes.s == 1, axis=0) & modes.free
-    full = ~switched & slips & (lanes.smooth % _WINDOW == 0)
-    samples = _WINDOW * _STEPS // _SAMPLED
+    slips = jnp.all(lanes.s == FORWARD, axis=0) & modes.free
+    full = ~switched & slips & (lanes.smooth % search.window == 0)
+    samples = search.window * search.samples
     log = jnp.log(lanes.energy / samples + jnp.finfo(lanes.y.dtype).tiny) / 2
     rate, before = log - lanes.log, lanes.rate
     ways = modes.reach[:, :, None] * jnp.exp(log)[None]
     way, share = jnp.max(jnp.sum(ways, axis=1), axis=0), jnp.max(ways, axis=0)
     small = share < 0.02 * way[None]
-    window = _WINDOW * _STEPS * _step_length(lanes.rounds - 1, lanes.y.dtype)
+    step = _step_length(search, lanes.rounds - 1, lanes.y.dtype)
+    window = samples * search.sample_steps * step
     linear = modes.values.real[:, None] * window[None]
     steady = jnp.abs(rate - before) < 0.2 * jnp.abs(rate)
     # No switch is reached any more, and every mode decays about as fast as in small motions.
@@ -240,60 +234,62 @@ def _decay(modes: _Modes, lanes: _Lanes):
     windows = jnp.min(jnp.where(small, jnp.inf, windows), axis=0)
     skips = full & jnp.all(small | steady, axis=0) & (windows > 1) & (windows < 1000)
     log_skipped = windows[None] * jnp.where(small, jnp.minimum(linear, 0), rate)
-    y = jnp.where(skips & ~decays, modes.grown(lanes.y, jnp.where(skips, log_skipped, 0)), lanes.y)
-    again, unknown, nan = switched | full, switched | skips, jnp.nan
+    y = jnp.where(skips & ~decays, modes.grow(lanes.y, jnp.where(skips, log_skipped, 0)), lanes.y)
+    reset = switched | skips
     return decays, dataclasses.replace(
         lanes,
         y=y,
-        energy=jnp.where(again, 0, lanes.energy),
-        log=jnp.where(unknown, nan, jnp.where(full, log, lanes.log)),
-        rate=jnp.where(unknown, nan, jnp.where(full, rate, before)),
+        energy=jnp.where(switched | full, 0, lanes.energy),
+        log=jnp.where(reset, jnp.nan, jnp.where(full, log, lanes.log)),
+        rate=jnp.where(reset, jnp.nan, jnp.where(full, rate, before)),
     )
 
 
-def _label(modes: _Modes, lanes: _Lanes, returned, points, owners) -> _Lanes:
-    """The lanes after a round, labelled where their outcome is known."""
+def _label(search: BasinSearch, modes: _Modes, lanes: _Lanes, returned, points, owners) -> _Lanes:
+    """The lanes after a round, labelled where their outcome is certain."""
     centre = modes.equilibrium[:, None]
     size = jnp.max(jnp.abs(lanes.y), axis=0)
-    decays, lanes = _decay(modes, lanes)
-    gaps = jnp.max(jnp.abs(lanes.seen[:, None] - points[:, :, None]), axis=0)
+    decays, lanes = _decay(search, modes, lanes)
+    at = lanes.section_state
+    gaps = jnp.max(jnp.abs(at[:, None] - points[:, :, None]), axis=0)
     owner = owners[jnp.argmin(gaps, axis=0)]
-    distance = jnp.min(gaps, axis=0) / (1 + jnp.max(jnp.abs(lanes.seen - centre), axis=0))
+    distance = jnp.min(gaps, axis=0) / (1 + jnp.max(jnp.abs(at - centre), axis=0))
     same = owner == lanes.owner
-    closer = same & (distance < lanes.distance) & (distance < _APPROACHES)
+    closer = same & (distance < lanes.distance) & (distance < search.approach_distance)
     approach = jnp.where(closer, lanes.approach + 1, 0)
-    near = jnp.where(same & (distance < _NEAR), lanes.near + 1, 0)
-    patience = jnp.where(distance < _NEAR, _FEW, _STAYS)
-    arrived = (approach >= patience) | (near >= _STAYS)
+    is_near = distance < search.near_distance
+    near = jnp.where(same & is_near, lanes.near + 1, 0)
+    patience = jnp.where(is_near, search.near_rounds, search.approach_rounds)
+    arrived = (approach >= patience) | (near >= search.approach_rounds)
     label = jnp.where(decays, _EQUILIBRIUM, jnp.where(arrived & returned, owner, _RUNNING))
 
-    def since(new, old):
+    def update(new, old):
         return jnp.where(returned, new, old)
 
     return dataclasses.replace(
         lanes,
-        owner=since(owner, lanes.owner),
-        distance=since(distance, lanes.distance),
-        approach=since(approach, lanes.approach),
-        near=since(near, lanes.near),
+        owner=update(owner, lanes.owner),
+        distance=update(distance, lanes.distance),
+        approach=update(approach, lanes.approach),
+        near=update(near, lanes.near),
         label=jnp.where(size > modes.bound, _DIVERGES, jnp.where(jnp.isnan(size), _LOST, label)),
     )
 
 
-@jax.jit
-def _run(system, modes: _Modes, points, owners, lanes: _Lanes) -> _Lanes:
-    """Run rounds until a quarter of the lanes are labelled, at most `_ROUNDS`."""
+@functools.partial(jax.jit, static_argnums=0)
+def _run(search: BasinSearch, system, modes: _Modes, points, owners, lanes: _Lanes) -> _Lanes:
+    """Run rounds until a quarter of the lanes are labelled, at most `search.rounds`."""
     most = 3 * jnp.sum(lanes.label == _RUNNING) // 4
 
     def going(carry):
         lanes, rounds = carry
         running = jnp.sum(lanes.label == _RUNNING)
-        return (running > most) & (rounds < _ROUNDS)
+        return (running > most) & (rounds < search.rounds)
 
     def body(carry):
         old, rounds = carry
-        new = _advance(system, modes, old)
-        new = _label(modes, new, new.returns > old.returns, points, owners)
+        new = _advance(search, system, modes, old)
+        new = _label(search, modes, new, new.returns > old.returns, points, owners)
         running = old.label == _RUNNING
         return jax.tree.map(lambda new, old: jnp.where(running, new, old), new, old), rounds + 1
 
@@ -306,15 +302,15 @@ def section_points(cycle: LimitCycle) -> Float[np.ndarray, "2n m"]:
     return np.asarray(next_start(segments.y))[:, np.asarray(segments.guard) == SECTION]
 
 
-class _KnownOrbits:
-    """The attracting orbits known so far."""
+class _Orbits:
+    """The attracting orbits so far."""
 
     def __init__(self, size: int):
         self.cycles: list[LimitCycle] = []
         self._points, self._owners = np.zeros((size, 0)), np.zeros(0, int)
 
-    def number(self, cycle: LimitCycle) -> int:
-        """Index of a cycle among the known ones; a new one is added to them."""
+    def index_of(self, cycle: LimitCycle) -> int:
+        """Index of a cycle among the orbits; a new one is added to them."""
         points = section_points(cycle)
         if self._owners.size:
             gaps = np.abs(self._points - points[:, :1]).max(axis=0)
@@ -347,16 +343,17 @@ def basin(
     rtol: float | None = None,
     max_returns: int = 5000,
     progress: bool = True,
+    search: BasinSearch = BasinSearch(),
 ) -> Basin:
     """What the motions from many starts end in: the equilibrium, which limit cycle, or neither.
 
     Every start runs on, coarsely, until its returns to the section of `limit_cycle` approach those
-    of a known attracting orbit: in three rounds of several returns within 2 % of its size, or in
-    eight within 15 %. It comes to rest once its linear modes reach no switch and each decays at
-    0.6 of its linear rate or faster. A start that gets no label is searched in full by
-    `limit_cycle`, and an orbit found there is known from then on. Starts without a label after
-    `max_returns` are undecided; the reason is that of their own full search, or else that of the
-    last full search that found no orbit.
+    of an attracting orbit: in three rounds of several returns within 2 % of its size, or in eight
+    within 15 %. It comes to rest once its linear modes reach no switch and each decays at 0.6 of
+    its linear rate or faster. A start that gets no label is searched in full by `limit_cycle`, and
+    from then on others may approach its orbit. Starts without a label after `max_returns` are
+    undecided; the reason is that of their own full search, or else that of the last full search
+    that led to no orbit.
 
     **Arguments:**
 
@@ -366,10 +363,15 @@ def basin(
     - `radius`: instead of a box, a ball about the sliding equilibrium. It is the Euclidean norm of
       the state in units of V/omega and V, with omega as in `limit_cycle`; or the semi-axes (2n,) of
       an ellipsoid in m and m/s.
-    - `starts`: the number of Sobol points, scrambled by `seed`; or the starts, (k, 2n), then
-      without box and ball.
+    - `starts`: the number of Sobol points, 4000 by default; or the starts, (k, 2n), then without
+      box and ball.
+    - `seed`: scrambles the Sobol points, 0 by default.
     - `excitation`, `rtol`, `max_returns`: as in `limit_cycle`; no excited motion ends in
       equilibrium.
+    - `progress`: shows a bar.
+    - `search`: numbers of the coarse run, such as how near an orbit a start gets its label.
+
+    **Returns:** a `Basin`.
 
     **Raises:** `ValueError` for corners, semi-axes or starts of another shape, a box that is empty,
     for box, ball or starts given twice or not at all, and what `limit_cycle` raises.
@@ -381,34 +383,36 @@ def basin(
     dtype = system.F.dtype
     tolerance = check_rtol(rtol, dtype)
     max_returns, progress = whole("max_returns", max_returns, 1), flag("progress", progress)
+    require_kind("search", search, BasinSearch)
     initial_states = starts_of(system, n, low, high, starts, whole("seed", seed, 0), radius)
     y = system.with_excitation(
         jnp.asarray(initial_states.T / np.asarray(system.units)[:, None], dtype), 0.0
     )
-    lanes, modes = jax.tree.map(np.array, _first(system, y)), _Modes.of(system, y)
+    lanes, modes = jax.tree.map(np.array, _start_lanes(system, y)), _Modes.from_system(system, y)
     options: dict[str, Any] = {"excitation": excitation, "rtol": tolerance, "throw": False}
-    orbits, reasons = _KnownOrbits(2 * system.n), {}
-    search = functools.partial(limit_cycle, mechanism, max_returns=max_returns, **options)
-    _label_all(system, lanes, orbits, reasons, search, modes, max_returns, progress)
+    orbits, reasons = _Orbits(2 * system.n), {}
+    find_cycle = functools.partial(limit_cycle, mechanism, max_returns=max_returns, **options)
+    _label_all(search, system, lanes, orbits, reasons, find_cycle, modes, max_returns, progress)
     return _conclude(initial_states, lanes.label, orbits.cycles, reasons)
 
 
-def _label_all(system, lanes, orbits, reasons, search, modes, max_returns, progress):
+def _label_all(search, system, lanes, orbits, reasons, find_cycle, modes, max_returns, progress):
     """Label every lane of NumPy arrays in place."""
     from tqdm import tqdm
 
     k = len(lanes.label)
-    searched, failures, patience = np.zeros(k, bool), 0, _PATIENCE
+    searched, failures, patience = np.zeros(k, bool), 0, search.patience
     failure, failure_by_start = CycleResult.exhausted, {}  # of the last full search
     bar = tqdm(total=k, desc="basin", unit="start", disable=not progress)
     with bar, concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
         while (running := np.flatnonzero(lanes.label == _RUNNING)).size:
             bar.update(k - running.size - bar.n)
-            size = _FEW_LANES if running.size <= _FEW_LANES * _CHUNKS else _LANES
-            chosen = running[: size * _CHUNKS]
+            few = max(1, search.lanes // 8)
+            size = few if running.size <= few * search.chunks else search.lanes
+            chosen = running[: size * search.chunks]
             chunks = [chosen[i : i + size] for i in range(0, len(chosen), size)]
-            run = functools.partial(_run, system, modes, *orbits.padded(lanes.y.dtype))
-            results = pool.map(run, [_some(lanes, chunk, size) for chunk in chunks])
+            run = functools.partial(_run, search, system, modes, *orbits.padded(lanes.y.dtype))
+            results = pool.map(run, [_select(lanes, chunk, size) for chunk in chunks])
             for chunk, result in zip(chunks, results, strict=True):
                 for whole_array, piece in zip(
                     jax.tree.leaves(lanes), jax.tree.leaves(result), strict=True
@@ -422,19 +426,19 @@ def _label_all(system, lanes, orbits, reasons, search, modes, max_returns, progr
             lanes.label[over] = _UNDECIDED
             reasons |= {i: failure_by_start.get(i, failure) for i in np.flatnonzero(over).tolist()}
             # A motion without switches is slow, but not lost.
-            slow = (lanes.smooth >= _WINDOW) & (lanes.rounds < 16 * patience)
+            slow = (lanes.smooth >= search.window) & (lanes.rounds < 16 * patience)
             lost = left & ~over & ~searched & (lanes.rounds >= patience)
             lost &= (lanes.approach == 0) & ~slow
-            if failures >= _FAILURES or not lost.any():
+            if failures >= search.failures or not lost.any():
                 continue
             i = int(np.argmax(np.where(lost, lanes.rounds, -1)))
             searched[i] = True
             # At a return the time of an excitation is 0 again.
-            state = lanes.seen[:, i] if lanes.returns[i] else lanes.y[:, i]
-            cycle = search(system.mechanism_state(jnp.asarray(state)) * system.units)
+            state = lanes.section_state[:, i] if lanes.returns[i] else lanes.y[:, i]
+            cycle = find_cycle(system.mechanism_state(jnp.asarray(state)) * system.units)
             result, before = cycle.result, len(orbits.cycles)
             if bool((result == CycleResult.converged) | (result == CycleResult.inaccurate)):
-                lanes.label[i] = orbits.number(cycle)
+                lanes.label[i] = orbits.index_of(cycle)
             elif bool(result == CycleResult.equilibrium):
                 lanes.label[i] = _EQUILIBRIUM
             elif bool(result == CycleResult.diverged):
@@ -444,16 +448,16 @@ def _label_all(system, lanes, orbits, reasons, search, modes, max_returns, progr
                 failures, failure = failures + 1, result
                 failure_by_start[i] = result
             # Full searches that find nothing new become less and less frequent.
-            patience = _PATIENCE if len(orbits.cycles) > before else 2 * patience
+            patience = search.patience if len(orbits.cycles) > before else 2 * patience
         bar.update(k - bar.n)
 
 
-def _some(lanes: _Lanes, chosen: np.ndarray, size: int) -> _Lanes:
+def _select(lanes: _Lanes, chosen: np.ndarray, size: int) -> _Lanes:
     """The chosen lanes, padded to `size` with one that counts as labelled."""
     padded = np.concatenate([chosen, np.repeat(chosen[-1:], size - len(chosen))])
-    some = jax.tree.map(lambda x: x[..., padded], lanes)
-    some.label[len(chosen) :] = _UNDECIDED
-    return some
+    selected = jax.tree.map(lambda x: x[..., padded], lanes)
+    selected.label[len(chosen) :] = _UNDECIDED
+    return selected
 
 
 def _conclude(starts, labels, cycles, reasons) -> Basin:

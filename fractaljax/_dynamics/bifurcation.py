@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from .._base.parts import Record, flag
-from .._continuation import Curve, CurveEnd, passing
+from .._continuation import Curve, CurveEnd, passing_steps
 from .._mechanism.quantities import value_of
 from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
@@ -24,9 +24,9 @@ Range = tuple[str, float, float]
 class BifurcationMap(Record):
     """All boundaries in a window of two quantities, as `bifurcation_map` finds them."""
 
-    mechanism: Scene | Structure
+    mechanism: Scene | Structure  # with all other quantities
     x: Range = eqx.field(static=True)  # name and range
-    y: Range = eqx.field(static=True)
+    y: Range = eqx.field(static=True)  # name and range
     boundary: Boundary  # of stability against small disturbances
     curves: tuple[EventCurve, ...]  # of cycles; their x and y are those of the map
     branches: tuple[Branch, ...]  # in one quantity or the other through `mechanism`
@@ -72,6 +72,7 @@ def bifurcation_map(
     - `radius`, `starts`, `seed`: as in `basin`.
     - `step`, `points`: as in `continue_cycle`.
     - `lines`: as in `hopf_boundary`.
+    - `progress`: shows a bar.
 
     **Returns:** a `BifurcationMap`.
 
@@ -91,22 +92,24 @@ def bifurcation_map(
     curves: list[EventCurve] = []
     unfollowed: list[BranchEvent] = []
     for name, window in windows.items():
-        mine: list[Branch] = []
+        followed: list[Branch] = []
         for start in (*basins.cycles, "hopf"):
-            if start != "hopf" and any(_holds(mechanism, branch, start) for branch in mine):
+            on_branch = (_passes_cycle(mechanism, branch, start) for branch in followed)
+            if start != "hopf" and any(on_branch):
                 continue
             try:
                 branch = continue_cycle(mechanism, name, window, start, **options)
             except ValueError:  # no Hopf point, or one whose cycles cannot be followed
                 continue
-            if not any(_same(branch, other) for other in mine):
-                mine.append(branch)
-        branches += mine
-        events = [event for branch in mine for event in branch.limits if event.kind != "Hopf"]
+            if not any(_share_hopf_point(branch, other) for other in followed):
+                followed.append(branch)
+        branches += followed
+        events = [event for branch in followed for event in branch.limits if event.kind != "Hopf"]
         other = y if name == x[0] else x
         for event in tqdm(events, desc=f"events in {name}", disable=not progress):
             at = {name: float(event.value), other[0]: float(value_of(mechanism, other[0]))}
-            if any(_on(curve, at, (x, y)) for curve in curves if curve.kind == event.kind):
+            alike = [curve for curve in curves if curve.kind == event.kind]
+            if any(_passes_point(curve, at, (x, y)) for curve in alike):
                 continue
             try:
                 curve = continue_event(mechanism, event, other[0], other[1:], **options)
@@ -125,7 +128,7 @@ def bifurcation_map(
     )
 
 
-def _holds(mechanism, branch: Branch, cycle: Any) -> bool:
+def _passes_cycle(mechanism, branch: Branch, cycle: Any) -> bool:
     """True if a branch passes through a cycle of the mechanism."""
     value = float(value_of(mechanism, branch.name))
     crosses = np.flatnonzero(np.diff(np.sign(branch.parameter - value)) != 0)
@@ -141,7 +144,7 @@ def _holds(mechanism, branch: Branch, cycle: Any) -> bool:
     return False
 
 
-def _same(branch: Branch, other: Branch) -> bool:
+def _share_hopf_point(branch: Branch, other: Branch) -> bool:
     """True if two branches begin at one Hopf point."""
     values = [float(event.value) for event in other.hopf]
     return any(
@@ -149,11 +152,11 @@ def _same(branch: Branch, other: Branch) -> bool:
     )
 
 
-def _on(curve: EventCurve, at: dict[str, float], ranges) -> bool:
+def _passes_point(curve: EventCurve, at: dict[str, float], ranges) -> bool:
     """True if a curve passes through the point `at` of the map."""
     windows = [Window.over(*each) for each in ranges]
     pairs = zip(windows, (curve.x, curve.y), strict=True)
     places = np.stack([window.place(values) for window, values in pairs], axis=1)
     point = np.array([float(window.place(at[window.name])) for window in windows])
     polyline = Curve(places, CurveEnd.edge, CurveEnd.edge)
-    return len(places) > 1 and len(passing(polyline, point, 1e-6)) > 0
+    return len(places) > 1 and len(passing_steps(polyline, point, 1e-6)) > 0

@@ -18,17 +18,15 @@ from .._mechanism.quantities import (
     with_optional,
 )
 from .._mechanism.scene import Scene
+from .contact_state import FORWARD
 from .cycle import LimitCycle, Orbit
-from .follow import SMALL, BranchEnd, Follower
-from .hybrid import NONE, SECTION
-from .itinerary import Family, Phase, Shooting, Solution, solution_of
+from .follow import BranchEnd, Follower
+from .guard import NONE, SECTION
+from .itinerary import Family, Phase, Shooting, Solution, build_solution
 from .limit_cycle import limit_cycle
 from .scaled import check_rtol, degrees_of_freedom
 from .sensitivity import event_value
 from .shooting import Chain, Lifted, Window, linearised
-
-_BESIDE = 1e-3, 1e-4, 1e-2  # steps from an event to a regular cycle
-_SCANNED = 129  # places in the window at which Hopf points are searched for
 
 
 class BranchEvent(Record):
@@ -48,7 +46,7 @@ class BranchEvent(Record):
     _rtol: float = eqx.field(static=True, default=0.0, repr=False)
 
     def value_at(self, x: Mechanism) -> Float[jax.Array, ""]:
-        """`value` as a function of the mechanism, whose other quantities are as on the branch.
+        """`value` as a function of the mechanism `x`, whose other quantities are as on the branch.
 
         It serves for derivatives at that mechanism: the event is not followed to another one.
         """
@@ -58,25 +56,25 @@ class BranchEvent(Record):
 class Branch(Record):
     """A branch of periodic orbits with k points, as `continue_cycle` returns it."""
 
-    name: str = eqx.field(static=True)
+    name: str = eqx.field(static=True)  # of the quantity that is followed
     parameter: Float[np.ndarray, " k"]  # the quantity
     period: Float[np.ndarray, " k"]  # [s]
     amplitude: Float[np.ndarray, "k n"]  # peak to peak [m]
     velocity_min: Float[np.ndarray, "k n"]  # [m/s]
     velocity_max: Float[np.ndarray, "k n"]  # [m/s]
     stick_fraction: Float[np.ndarray, "k m"]  # of the period, as in `limit_cycle`
-    open_fraction: Float[np.ndarray, "k m"]
+    open_fraction: Float[np.ndarray, "k m"]  # of the period, as in `limit_cycle`
     stable: Bool[np.ndarray, " k"]  # True where small deviations from the cycle die out
     multipliers: Complex[np.ndarray, "k 2n"]  # the one that is 1 comes last
     state: Float[np.ndarray, "k 2n"]  # [x, v] where t.x of the first joint is largest [m, m/s]
     error: Float[np.ndarray, " k"]  # estimated, of the states, relative
-    itinerary: tuple[str, ...] = eqx.field(static=True)
-    events: tuple[BranchEvent, ...]
-    start: BranchEnd
-    end: BranchEnd
+    itinerary: tuple[str, ...] = eqx.field(static=True)  # phases of the cycle at each point
+    events: tuple[BranchEvent, ...]  # in the order of the branch
+    start: BranchEnd  # what it begins at
+    end: BranchEnd  # what it ends at
 
     def of_kind(self, kind: str) -> list[BranchEvent]:
-        """The events of one kind."""
+        """The events of one `kind`, such as "fold" or "Hopf"."""
         return [event for event in self.events if event.kind == kind]
 
     @property
@@ -167,12 +165,12 @@ def continue_cycle(
     if isinstance(start, str):
         if start != "hopf":
             raise ValueError(f'start must be a LimitCycle or "hopf", got {start!r}')
-        ended = _from_hopf(follower, float(interval.place(value_of(frozen, name))))
+        ended = _follow_hopf(follower, float(interval.place(value_of(frozen, name))))
     elif isinstance(start, BranchEvent):
-        ended = _from_event(follower, start)
+        ended = _follow_event(follower, start)
     else:
-        ended = _from_cycle(follower, start)
-    return _branch(follower, x, name, *ended)
+        ended = _follow_cycle(follower, start)
+    return _build_branch(follower, x, name, *ended)
 
 
 def checked_window(x: Mechanism, name: str, window) -> tuple[float, float]:
@@ -187,7 +185,7 @@ def checked_window(x: Mechanism, name: str, window) -> tuple[float, float]:
     return low, high
 
 
-def _from_cycle(follower: Follower, cycle):
+def _follow_cycle(follower: Follower, cycle):
     """Follow both ways from a limit cycle; return the reason for either end."""
     if cycle is None:
         cycle = limit_cycle(follower.x)
@@ -196,21 +194,21 @@ def _from_cycle(follower: Follower, cycle):
         raise ValueError("start must be one limit cycle that exists")
     if cycle._system.excited or not isinstance(cycle._orbit, Orbit):
         raise ValueError("start must be a cycle without excitation and regularisation")
-    solution = solution_of(cycle, follower.x, starting_position(follower.x, follower.window))
-    return follower.follow_both_directions(lambda: _begun(follower, solution, held=True))
+    solution = build_solution(cycle, follower.x, starting_position(follower.x, follower.window))
+    return follower.follow_both_directions(lambda: _start_shooting(follower, solution, held=True))
 
 
-def _from_event(follower: Follower, event: BranchEvent):
+def _follow_event(follower: Follower, event: BranchEvent):
     """Follow both ways from a cycle beside an event; from a Hopf point, along its cycles."""
     q = starting_position(follower.x, follower.window)
     solution = event._cycle
     if solution is None:
-        return _from_hopf(follower, q)
+        return _follow_hopf(follower, q)
     solution = solution._replace(x=follower.x, u=np.append(solution.u[:-1], q))
 
     def begun():
-        shooting, at, tangent = _begun(follower, solution)
-        for length in _BESIDE:
+        shooting, at, tangent = _start_shooting(follower, solution)
+        for length in (1e-3, 1e-4, 1e-2):  # steps to a regular cycle
             for offset in (length * tangent, -length * tangent):
                 corrected = shooting.curves.corrected(at + offset)
                 if corrected is not None and shooting.admissibility(corrected[0]) > 0:
@@ -229,7 +227,7 @@ def starting_position(x: Mechanism, window: Window) -> float:
     return min(max(q, 0.0), 1.0)
 
 
-def _begun(follower: Follower, solution: Solution, held=False):
+def _start_shooting(follower: Follower, solution: Solution, held=False):
     """Equations, unknowns and tangent at a known orbit; if `held`, at exactly its quantity."""
     shooting = Shooting(follower.family, solution, solution.phases, solution.times)
     corrected = shooting.curves.corrected(shooting.begin, shooting.quantity if held else None)
@@ -238,16 +236,16 @@ def _begun(follower: Follower, solution: Solution, held=False):
     return shooting, corrected[0], shooting.curves.tangent(corrected[1])
 
 
-def _from_hopf(follower: Follower, q: float):
+def _follow_hopf(follower: Follower, q: float):
     """Follow the cycles that begin at the Hopf point nearest to q."""
-    scanned = np.linspace(0, 1, _SCANNED)
+    scanned = np.linspace(0, 1, 129)
     matrices = jax.vmap(lambda q: linearised(follower.x, follower.window, q)[1])(
         jnp.asarray(scanned)
     )
     values = np.linalg.eigvals(np.asarray(matrices))
     growth, frequency = np.real(values), np.imag(values)
     last = np.argmax(np.where(frequency > 1e-9, growth, -np.inf), axis=1)
-    growth, frequency = (x[np.arange(_SCANNED), last] for x in (growth, frequency))
+    growth, frequency = (x[np.arange(len(scanned)), last] for x in (growth, frequency))
     crossings = np.flatnonzero(np.diff(np.sign(growth)) != 0)
     hopf_points = [follower.family.hopf_near(scanned[i], frequency[i]) for i in crossings]
     hopf_points = [point for point in hopf_points if point is not None and 0 <= point[0] <= 1]
@@ -263,7 +261,7 @@ def _from_hopf(follower: Follower, q: float):
     vector = vector * np.exp(-1j * np.angle(t @ vector[:n]))
     vector = vector / np.abs(vector).max()
     period = 2 * np.pi / frequency
-    blank = _smooth(follower, y, vector, frequency, at)
+    blank = _harmonic_orbit(follower, y, vector, frequency, at)
     shooting = Shooting(follower.family, blank, blank.phases, [0, period])
     begin = shooting.begin
     held = int(np.argmax(np.abs(vector.real[:n])))
@@ -278,12 +276,12 @@ def _from_hopf(follower: Follower, q: float):
     return BranchEnd.hopf, end
 
 
-def _smooth(follower, y, vector, frequency, q) -> Solution:
+def _harmonic_orbit(follower, y, vector, frequency, q) -> Solution:
     """A small harmonic orbit about the equilibrium y as one phase of slip."""
-    N, size = 64, 1.5 * SMALL
+    N, size = 64, 1.5 * follower.family.tracing.small
     angle = 2 * np.pi * np.arange(N) / N
     states = y[:, None] + size * (vector[:, None] * np.exp(1j * angle)).real
-    slips = (1,) * len(follower.family.template.P)
+    slips = (FORWARD,) * len(follower.family.template.P)
     u = np.concatenate([states[:, 0], [2 * np.pi / frequency], np.zeros(7), [q]])
     chain = Chain(
         s=jnp.ones((len(slips), N)),
@@ -303,7 +301,7 @@ def _side(places, stable, i: int) -> int:
     return int(np.sign(sum(np.sign(places[k] - places[i]) for k in beside)))
 
 
-def _branch(follower: Follower, x, name: str, start, end) -> Branch:
+def _build_branch(follower: Follower, x, name: str, start, end) -> Branch:
     """The `Branch`, with values of the events that depend on x."""
     points, window = follower.points, follower.window
     rows = {key: np.array([point.row[key] for point in points]) for key in points[0].row}

@@ -12,16 +12,15 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._base.parts import Record, concrete, nan_where, refused
 from .._base.programs import exported_jit
+from .contact_state import OPEN, STICK, find_state
 from .extremes import extreme_values, time_below_zero
-from .hybrid import NONE, OPEN, UNUSED, HybridSystem
+from .guard import NONE, UNUSED
+from .hybrid import HybridSystem
 from .lanes import log_spectral_radius, product
 from .maps import exact_maps
 from .segments import Segments, flow, mean_square, next_start
 
-SQUARINGS = 40  # of a monodromy matrix
-_SAMPLES = 1024  # of a smooth orbit, for a mean
 VELOCITY_REFERENCE = 1e-9  # [m/s], of levels
-STATE_NAMES = {1: "+", -1: "-", 0: "stick", OPEN: "open"}  # of contact states, in a `Switch`
 
 
 class CycleResult(eqx.Enumeration):
@@ -40,7 +39,10 @@ class CycleResult(eqx.Enumeration):
         "the motion is not a number, as some number of the mechanism or of the start is not"
     )
     too_long = "a period takes more steps than are kept: ask for more segments"
-    not_periodic = "the motion does not repeat within 16 returns (a longer period, or none)"
+    not_periodic = (
+        "the motion does not repeat within the longest period that was looked for, 16 returns by "
+        "default (a longer period, or none)"
+    )
     too_stiff = (
         "the regularised law takes more than max_steps steps: allow more, choose a solver such as "
         "diffrax.Kvaerno5, or leave the regularisation out"
@@ -63,7 +65,7 @@ def repels(
     missed = jnp.max(jnp.abs(jnp.sum(monodromy * along[None], axis=1) - along))
     across = jnp.eye(len(along), dtype=along.dtype) - along[:, None] * along[None]
 
-    log = log_spectral_radius(across @ monodromy @ across, SQUARINGS)
+    log = log_spectral_radius(across @ monodromy @ across, squarings=40)  # exact to rounding
     tolerance = 10 * (missed + error) + 1e3 * jnp.finfo(along.dtype).eps
     return log > tolerance
 
@@ -142,7 +144,7 @@ class Orbit(eqx.Module):
                 rows, offset, system.faces, system.opens, strict=True
             )
         ]
-        return Fractions(share(0), share(OPEN)[_tangential(system)], jnp.stack(pulls))
+        return Fractions(share(STICK), share(OPEN)[_tangential(system)], jnp.stack(pulls))
 
     def monodromy(self, system: HybridSystem) -> Float[Array, "2n 2n"]:
         """The product of the maps of all segments, with the saltation at every switch."""
@@ -193,7 +195,7 @@ class LimitCycle(Record):
     error: Float[Array, ""]  # estimated relative error of period and states
     returns: Int[Array, ""]  # of the Poincare map in one period
     regularisation_error: Float[Array, ""]  # largest relative difference from the exact law
-    result: CycleResult
+    result: CycleResult  # a member of CycleResult
     of_scene: bool = eqx.field(static=True, repr=False)  # fractions are of directions, not joints
     _system: HybridSystem = eqx.field(repr=False)
     _orbit: Any = eqx.field(repr=False)  # Orbit, or regularised.SmoothOrbit
@@ -291,7 +293,8 @@ class LimitCycle(Record):
             )
             square = jnp.where(jnp.isfinite(self.period), square, jnp.nan)
         else:
-            square = jnp.mean(self.orbit(_SAMPLES)[1] ** 2, axis=0)
+            # The mean of a smooth periodic function converges fast with the number of samples.
+            square = jnp.mean(self.orbit(1024)[1] ** 2, axis=0)
         return jnp.sqrt(square[len(square) // 2 :])
 
     @property
@@ -303,25 +306,29 @@ class LimitCycle(Record):
         return 20 * jnp.log10(self.velocity_rms / VELOCITY_REFERENCE)
 
     def orbit(self, n: int = 512) -> tuple[Float[Array, " n"], Float[Array, "n 2dofs"]]:
-        """Times [s] and states [x, v] in m and m/s, evenly spaced over one period from `state`."""
+        """Times (n,) [s] and states (n, 2 dofs), [x, v] in m and m/s, over one period from `state`.
+
+        They are evenly spaced; `n` is their number, 512 by default.
+        """
         return _sampled(self._orbit, self._system, self.period, n=n)
 
     def spectrum(self, n: int = 512) -> tuple[Float[Array, " n/2"], Float[Array, "n/2 dofs"]]:
         """Harmonics: frequencies [Hz] and peak amplitudes [m] of the degrees of freedom.
 
-        The Fourier coefficients of n samples of the orbit, without the mean.
+        The Fourier coefficients of `n` samples of the orbit, 512 by default, without the mean.
         """
         return self.harmonics(jnp.eye(len(self.state) // 2, dtype=self.state.dtype), n)
 
     def harmonics(self, rows, n: int = 512) -> tuple[Float[Array, " n/2"], Float[Array, "n/2 k"]]:
-        """As `spectrum`, for the displacements rows @ x with rows (k, dofs)."""
+        """As `spectrum` with its `n`, for the displacements rows @ x with `rows` (k, dofs)."""
         return _harmonics(self._orbit, self._system, self.period, rows, n=n)
 
     def contact_states(self, n: int = 512) -> Float[Array, "n f"]:
         """Contact states from the times of `orbit(n)` on: +1, -1 slip, 0 stick, 2 open.
 
         Slip is forward at +1 and backward at -1. As in a `Trajectory`, there is one for each
-        direction of friction, the tangential one of a joint first.
+        direction of friction, the tangential one of a joint first. `n` is the number of times, 512
+        by default.
 
         **Raises:** `ValueError` for the regularised law, which has none.
         """
@@ -341,7 +348,7 @@ class LimitCycle(Record):
             raise ValueError("switches() needs one cycle, outside of jit: index the batch first")
         if not isinstance(self._orbit, Orbit):
             raise ValueError("a regularised cycle has no switches")
-        segments, names = self._orbit.segments, STATE_NAMES
+        segments = self._orbit.segments
         used = np.asarray(segments.guard) != UNUSED
         states = np.asarray(segments.s)[:, used].astype(int)
         times = np.cumsum(np.asarray(segments.duration)[used]) / float(self._system.omega)
@@ -349,7 +356,8 @@ class LimitCycle(Record):
         for k, time in enumerate(times):
             before, after = states[:, k], np.roll(states, -1, axis=1)[:, k]
             for i in np.flatnonzero(before != after):
-                switches.append(Switch(float(time), int(i) + 1, names[before[i]], names[after[i]]))
+                names = (find_state(states[i]).name for states in (before, after))
+                switches.append(Switch(float(time), int(i) + 1, *names))
         return switches
 
 

@@ -20,8 +20,6 @@ from .itinerary import Family
 from .pinned import Event, Pinned
 from .shooting import Window
 
-_STRAIGHT = 0.95  # cosine of the angle by which a curve may turn at a change of itinerary
-
 
 class EventCurve(Record):
     """Curve in two quantities along which cycles fold, graze, or change stability.
@@ -35,11 +33,11 @@ class EventCurve(Record):
     y: Float[np.ndarray, " k"]  # the second one
     period: Float[np.ndarray, " k"]  # of the cycle at the event [s]
     amplitude: Float[np.ndarray, "k n"]  # peak to peak [m]
-    itinerary: tuple[str, ...] = eqx.field(static=True)
+    itinerary: tuple[str, ...] = eqx.field(static=True)  # phases of the cycle at each point
     side: int = eqx.field(static=True)  # 1: stable cycles are on its left from first to last point,
     # -1: on its right, 0: on both sides or on none
     start: BranchEnd
-    end: BranchEnd
+    end: BranchEnd  # what it ends at
 
     def swapped(self) -> "EventCurve":
         """The same curve with the quantities in the other order."""
@@ -76,7 +74,8 @@ class _CurveFollower(Follower):
         new, begin, ahead = onward
         gap, came = begin[new.quantity :] - z[shooting.quantity :], reached - z
         before, after = came[shooting.quantity :], ahead[new.quantity :]
-        straight = before @ after > _STRAIGHT * np.linalg.norm(before) * np.linalg.norm(after)
+        # It may turn by 18 degrees at a change of itinerary.
+        straight = before @ after > 0.95 * np.linalg.norm(before) * np.linalg.norm(after)
         if straight and np.linalg.norm(gap) < 2 * np.linalg.norm(came):
             return onward
         del self.points[count:]
@@ -127,14 +126,14 @@ def continue_event(
     held = Event.of(condition, detail, solution)
     solution = solution._replace(x=frozen, r=starting_position(frozen, second))
 
-    def begun():
+    def start_curve():
         pinned = Pinned(family, second, held, solution, solution.phases, solution.times)
         corrected = pinned.curves.corrected(pinned.begin, pinned.quantity + 1)
         if corrected is None or np.linalg.norm(corrected[0] - pinned.begin) > 0.1:
             raise ValueError("event must be one of a branch of x itself")
         return pinned, corrected[0], pinned.curves.tangent(corrected[1])
 
-    start, end = follower.follow_both_directions(begun)
+    start, end = follower.follow_both_directions(start_curve)
     places = np.array([point.place for point in follower.points])
     rows: dict[str, Any] = {
         key: np.array([point.row[key] for point in follower.points])

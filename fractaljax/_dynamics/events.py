@@ -5,8 +5,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .hybrid import NONE, SECTION, HybridSystem
+from .guard import NONE, SECTION
+from .hybrid import HybridSystem
 from .lanes import first_least, row_numbers
+from .step_length import step_length
+from .transition import switch
 
 # Longest steps in units of h over the highest rate: of a stable step, where h is 0.3, and of a step
 # that can be cut into stable segments of the eighth order.
@@ -133,7 +136,7 @@ def step(system: HybridSystem, y, s, last, h, reach=None):
     f_0 = system.field(y, s)
     usual = jnp.broadcast_to(h, y.shape[1:])
     longest = usual if reach is None else jnp.minimum(reach, STABLE * unit)
-    h = system.step_length(y, s, f_0, longest, usual)
+    h = step_length(system, y, s, f_0, longest, usual)
     shorter, step = jnp.where(h < longest, usual / h, 0), h[None]
     f_b = system.field(y + step / 2 * f_0, s)
     f_c = system.field(y + step / 2 * f_b, s)
@@ -160,7 +163,7 @@ def step(system: HybridSystem, y, s, last, h, reach=None):
     hit = theta <= 1
     guard = jnp.where(hit, first, NONE)
     end = jnp.where(hit[None], between(jnp.where(hit, theta, 1)[None]), y_1)
-    y_end, s_end = system.switch(end, s, guard)
+    y_end, s_end = switch(system, end, s, guard)
     if reach is not None:
         rates = slice(system.n, None)
         error = h / 6 * jnp.max(jnp.abs(f_d - f_1)[rates], axis=0)

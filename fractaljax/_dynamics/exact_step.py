@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 
 from .events import Cubic, guards_and_rates, without_start
-from .hybrid import NONE, HybridSystem
+from .guard import NONE
+from .hybrid import HybridSystem
 from .segments import flow
-
-_REJECTIONS = 20  # of a step whose error is above rtol
-_MOST_GUESSES = 60  # of the time of an event; usually four suffice
+from .step_length import step_length
+from .transition import switch
 
 
 def _event(system: HybridSystem, y, s, h, g_0, g_1, d_0, d_1):
@@ -62,7 +62,8 @@ def _event(system: HybridSystem, y, s, h, g_0, g_1, d_0, d_1):
 
     def searching(carry):
         *_, converged, count = carry
-        return ~jnp.all(converged) & (count < _MOST_GUESSES)
+        # Usually four guesses suffice; 60 bisections reach rounding.
+        return ~jnp.all(converged) & (count < 60)
 
     def refine(carry):
         t, low, high, converged, count = carry
@@ -91,7 +92,7 @@ def _event(system: HybridSystem, y, s, h, g_0, g_1, d_0, d_1):
 
 def _smooth_step(system: HybridSystem, y, s, longest, left, rtol):
     """A step in contact state s, as long as rtol allows: the state at its end, and its length."""
-    h = jnp.minimum(system.step_length(y, s, system.field(y, s), longest, longest), left)
+    h = jnp.minimum(step_length(system, y, s, system.field(y, s), longest, longest), left)
     allowed = rtol * (1 + jnp.max(jnp.abs(y)))
 
     def step(h):
@@ -100,7 +101,7 @@ def _smooth_step(system: HybridSystem, y, s, longest, left, rtol):
 
     def rejected(carry):
         (*_, error), count = carry
-        return ~(error <= 1) & (count < _REJECTIONS)
+        return ~(error <= 1) & (count < 20)  # 0.2^20 of a step is rounding
 
     def shorter(carry):
         (_, h, error), count = carry
@@ -126,4 +127,4 @@ def step_to_switch(system: HybridSystem, y, s, longest, left, rtol):
         lambda: (h, jnp.array(NONE)),
     )
     end = jnp.where(guard == NONE, y_1, flow(system, y, dt, s))
-    return *system.switch(end, s, guard), dt, guard
+    return *switch(system, end, s, guard), dt, guard

@@ -60,7 +60,7 @@ class Excitation(Record):
         self.phase = _numbers("phase", phase)
 
     def parts(self, mechanism: Mechanism) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-        """The forces (n,) [N] that multiply cos(Omega t) and sin(Omega t).
+        """The forces (n,) [N] on `mechanism` that multiply cos(Omega t) and sin(Omega t).
 
         **Raises:** `ValueError` for a degree of freedom that the mechanism does not have, one given
         twice, or arrays of another shape.

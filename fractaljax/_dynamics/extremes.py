@@ -11,9 +11,6 @@ from .hybrid import HybridSystem
 from .lanes import first_least, row_numbers
 from .segments import Segments, cumulative, flow, next_start
 
-_CROSSINGS = 16  # segments in which x2 may change sign
-_MINIMA = 4  # nearly equal minima of a displacement or a velocity
-
 
 def _along(system: HybridSystem, y, s, t, row):
     """row @ y and its first two time derivatives, each lane at its own time t."""
@@ -75,8 +72,13 @@ def _minima_jvp(primals, tangents):
     return (value, t), (jnp.where(exists, change, 0), jnp.zeros_like(t))
 
 
-def extreme_values(system: HybridSystem, segments: Segments, rows) -> Float[Array, "2 r"]:
-    """Smallest and largest value along the orbit of linear functions rows @ y, rows (r, 2n)."""
+def extreme_values(
+    system: HybridSystem, segments: Segments, rows, minima: int = 4
+) -> Float[Array, "2 r"]:
+    """Smallest and largest value along the orbit of linear functions rows @ y, rows (r, 2n).
+
+    `minima` is the largest number of nearly equal minima of a displacement or a velocity.
+    """
     y, h, s = segments.y, segments.duration, segments.s
     nodes = _at_nodes(system, segments, lambda x: system.times(rows, x))
     g_0, g_1, d_0, d_1 = (jnp.concatenate([x, -x]) for x in nodes)
@@ -87,11 +89,11 @@ def extreme_values(system: HybridSystem, segments: Segments, rows) -> Float[Arra
     cubic, small = Cubic.through(*through), jnp.max(rounding(y))
     theta, inside = cubic.minimum()
     least = jnp.where(inside & (d_1 - d_0 > small / 64), cubic(theta), jnp.inf)
-    least, k = (x.ravel() for x in _lowest(least, _MINIMA))
-    of_row, length = jnp.arange(len(k)) // _MINIMA, h[k]
+    least, k = (x.ravel() for x in _lowest(least, minima))
+    of_row, length = jnp.arange(len(k)) // minima, h[k]
     selected = (system, y[:, k], s[:, k], length, rows[of_row].T)
     value, _ = _minima(selected, theta[of_row, k] * length, least < jnp.inf)
-    value = jnp.min(value.reshape(-1, _MINIMA), axis=1)
+    value = jnp.min(value.reshape(-1, minima), axis=1)
     # At the end of a segment both are equal to rounding, and only the parabola tracks it.
     node = jnp.min(g_0, axis=1)
     value = jnp.where(value <= node + small, value, node)
@@ -107,8 +109,13 @@ def _at_nodes(system: HybridSystem, segments: Segments, values: Callable) -> lis
     return [starts, jnp.roll(starts, -1, axis=-1), *slopes]
 
 
-def time_below_zero(system: HybridSystem, segments: Segments, row, offset) -> Float[Array, ""]:
-    """Time for which row @ y + offset is negative in one period."""
+def time_below_zero(
+    system: HybridSystem, segments: Segments, row, offset, crossings: int = 16
+) -> Float[Array, ""]:
+    """Time for which row @ y + offset is negative in one period.
+
+    `crossings` is the largest number of segments in which it changes sign.
+    """
     y, h, s = segments.y, segments.duration, segments.s
     g_0, g_1, d_0, d_1 = _at_nodes(system, segments, lambda x: system.times(row[None], x)[0])
     g_0, g_1 = g_0 + offset, g_1 + offset
@@ -119,7 +126,7 @@ def time_below_zero(system: HybridSystem, segments: Segments, row, offset) -> Fl
     back = [reversed_sign * x for x in (g_1, g_0, -d_1, -d_0)]
     cubics = Cubic.through(*(jnp.stack(x) for x in zip((g_0, g_1, d_0, d_1), back, strict=True)))
     first, last = first_root(cubics)
-    until, number = cumulative(first <= 1), jnp.arange(_CROSSINGS)
+    until, number = cumulative(first <= 1), jnp.arange(crossings)
     crosses, k = number < until[-1], jnp.argmax(until[None] > number[:, None], axis=1)
     t = jax.lax.stop_gradient(jnp.concatenate([first[k], 1 - last[k]]))
     twice = jnp.concatenate([k, k])

@@ -14,16 +14,12 @@ import numpy as np
 from .._base.programs import exported_jit
 from .._continuation import cubic
 from .._mechanism.mechanism import Mechanism
-from .hybrid import OPEN, SECTION, HybridSystem
+from .contact_state import OPEN, STICK
+from .guard import SECTION
+from .hybrid import HybridSystem
 from .itinerary import Family, Shooting, Solution
 from .itinerary_change import ItineraryChange
 from .shooting import largest_friction, linearised, measured, rate_at
-
-_FINER = 8  # attempts at a mesh that is fine enough
-SMALL = 0.03  # size of a smooth orbit, in units of V/omega, below which a Hopf point is near
-_FAST = 10.0  # coefficient of friction over the static one, beyond which laws are meaningless
-_SAMPLED = 512  # states of an orbit at which that is checked
-_ROUNDING = 1e-9  # a guard this far below zero still holds
 
 
 class BranchEnd(eqx.Enumeration):
@@ -76,7 +72,7 @@ class Follower:
             "amplitude": (high - low)[:n],
             "velocity_min": low[n:],
             "velocity_max": high[n:],
-            "stick_fraction": h @ (states == 0) / h.sum(),
+            "stick_fraction": h @ (states == STICK) / h.sum(),
             "open_fraction": h @ (states == OPEN) / h.sum(),
             "stable": bool(np.abs(values[:-1]).max() < 1),
             "multipliers": values,
@@ -128,16 +124,16 @@ class Follower:
         while not isinstance(state, BranchEnd):
             if len(self.points) - origin >= self.most:
                 return BranchEnd.long
-            state = self._within_itinerary(*state, origin)
+            state = self._follow_itinerary(*state, origin)
         return state
 
-    def _within_itinerary(self, shooting: Shooting, z, ahead, origin):
+    def _follow_itinerary(self, shooting: Shooting, z, ahead, origin):
         """Follow one itinerary on one mesh; return where to go on, or the reason for the end."""
         smooth = shooting.phases[0].guard == SECTION
         for reached, turned, leaves in shooting.curves.steps(z, ahead):
             if smooth and self._shrinks(shooting, reached):
                 return self._hopf(shooting, z)
-            if shooting.admissibility(reached) < -_ROUNDING:
+            if shooting.admissibility(reached) < -1e-9:  # below zero by more than rounding
                 return self._leaves_itinerary(shooting, z, reached)
             if self._closes(shooting, z, ahead, reached):
                 return BranchEnd.closed
@@ -155,7 +151,7 @@ class Follower:
                 return self._remeshed(shooting, z, ahead)
         if smooth and self._shrinks(shooting, z, 5):
             return self._hopf(shooting, z)
-        return self._lost(shooting, z)
+        return self._reason_of_failure(shooting, z)
 
     def _leaves_itinerary(self, shooting: Shooting, z, reached):
         """Go from an admissible z to where the orbit ceases to be admissible, and on from there."""
@@ -168,13 +164,15 @@ class Follower:
         change.note_grazing()
         return BranchEnd.jump
 
-    def _lost(self, shooting: Shooting, z) -> BranchEnd:
+    def _reason_of_failure(self, shooting: Shooting, z) -> BranchEnd:
         """Reason why Newton's method fails beyond z, perhaps friction that grows without bound."""
         solution = shooting.solution(z)
-        times = np.linspace(0, solution.times[-1], _SAMPLED, endpoint=False)
-        y, _ = self.family.sampled(solution, times, _SAMPLED)
-        sampled_orbit = solution.x, self.window, solution.u[-1], y
-        return BranchEnd.fast if float(largest_friction(*sampled_orbit)) > _FAST else BranchEnd.lost
+        samples = self.family.tracing.samples
+        times = np.linspace(0, solution.times[-1], samples, endpoint=False)
+        y, _ = self.family.sampled(solution, times, samples)
+        friction = float(largest_friction(solution.x, self.window, solution.u[-1], y))
+        # Beyond ten times the static coefficient laws are meaningless.
+        return BranchEnd.fast if friction > 10 else BranchEnd.lost
 
     def reverse(self) -> None:
         """Reverse the order of the points and the direction of the events."""
@@ -203,11 +201,11 @@ class Follower:
     def _remeshed(self, old: Shooting, z, ahead):
         """Where to go on with a new mesh of the same itinerary, refined until it is accurate."""
         times = old.times(z)
-        for _ in range(_FINER):
+        for _ in range(self.family.tracing.refinements):
             new = old.again(old.solution(z), old.phases, times)
             corrected = new.curves.corrected(new.begin)
             if corrected is None:
-                return self._lost(old, z)
+                return self._reason_of_failure(old, z)
             solution = new.solution(corrected[0])
             orbit = solution.x, self.window, solution.chain, solution.lifted, solution.u
             if float(measured(*orbit)[2]) <= self.family.rtol / 2:
@@ -253,7 +251,7 @@ class Follower:
 
             at = self.root(shooting, z, reached, slope)
             if at is not None:
-                self._noted("fold", shooting, at, ("fold",))
+                self._record_event("fold", shooting, at, ("fold",))
 
         def doubling(at):
             return float(np.prod(shooting.multipliers(at)[:-1] + 1).real)
@@ -267,9 +265,9 @@ class Follower:
             if test(z) * test(reached) < 0:
                 at = self.root(shooting, z, reached, test)
                 if at is not None and abs(test(at)) < 1e-6:
-                    self._noted(kind, shooting, at, ("multiplier",))
+                    self._record_event(kind, shooting, at, ("multiplier",))
 
-    def _noted(self, kind, shooting, at, condition) -> None:
+    def _record_event(self, kind, shooting, at, condition) -> None:
         self.record(shooting, at)
         itinerary = shooting.itinerary()
         self.note(kind, shooting, at, itinerary, itinerary, condition)
@@ -282,7 +280,7 @@ class Follower:
         x, y = shooting.mechanism(z), u[: 2 * self.n]
         equilibrium = np.asarray(linearised(x, self.window, u[-1])[0])
         s = np.array(shooting.phases[0].s, float)
-        small = np.abs(y - equilibrium).max() < factor * SMALL
+        small = np.abs(y - equilibrium).max() < factor * self.family.tracing.small
         return bool(small or float(rate_at(x, self.window, u[-1], y, s)) >= 0)
 
     def _hopf(self, shooting, z):

@@ -9,9 +9,11 @@ import numpy as np
 from .._base.programs import exported_jit
 from .._continuation import Continuation
 from .._mechanism.mechanism import Mechanism
+from .contact_state import BACKWARD, FORWARD, STICK, find_state
 from .cycle import LimitCycle
 from .excitation import compiled_system
-from .hybrid import NONE, OPEN, SECTION, UNUSED, HybridSystem
+from .guard import NONE, SECTION, UNUSED
+from .hybrid import HybridSystem
 from .shooting import (
     Chain,
     Lifted,
@@ -23,15 +25,7 @@ from .shooting import (
     resampled,
     return_jacobian,
 )
-
-_SAMPLES = 512  # of an orbit, which show where friction is stiff
-_LENGTH = 0.25  # longest segment at rtol 1e-9, in scaled time
-_MEMORY = 64  # last evaluations kept; states between are extrapolated from the nearest
-_CLOSINGS = 4  # most attempts at closing the gaps
-_FAR = 0.3  # gap from which on an evaluation is not kept
-_BETWEEN = -0.9, 3.0  # where a cubic through two evaluations serves, in their distance
-_STALE = 1.3  # growth of a phase after which its segments are cut anew
-_SYMBOLS = {1: "+", -1: "-", 0: "0", OPEN: "o"}
+from .tracing import BranchTracing
 
 
 class Phase(NamedTuple):
@@ -57,7 +51,7 @@ class Solution(NamedTuple):
 
 
 @exported_jit
-def _along(system: HybridSystem, y):
+def _tangential_displacements(system: HybridSystem, y):
     """t.x of each face (f, k) in states (2n, k)."""
     return system.along(y[: system.n])
 
@@ -65,11 +59,18 @@ def _along(system: HybridSystem, y):
 class Family:
     """The cycles of one mechanism with one quantity free, and how finely they are cut."""
 
-    def __init__(self, x: Mechanism, window: Window, step: float, rtol: float):
-        self.x, self.window, self.step = x, window, step
+    def __init__(
+        self,
+        x: Mechanism,
+        window: Window,
+        step: float,
+        rtol: float,
+        tracing: BranchTracing = BranchTracing(),
+    ):
+        self.x, self.window, self.step, self.tracing = x, window, step, tracing
         self.template = compiled_system(x, None)
         self.n = self.template.n
-        self.h, self.rtol = _LENGTH * (rtol / 1e-9) ** 0.125, rtol
+        self.h, self.rtol = tracing.segment * (rtol / 1e-9) ** 0.125, rtol
         self.segments = 0  # most so far; never fewer, since another number compiles anew
 
     def sampled(self, orbit: Solution, times, places: int):
@@ -104,9 +105,9 @@ class Family:
 
     def maximum(self, orbit: Solution, period) -> float:
         """The approximate time of the largest t.x."""
-        times = np.linspace(0, period, _SAMPLES, endpoint=False)
-        y, _ = self.sampled(orbit, times, _SAMPLES)
-        return float(times[np.argmax(np.asarray(_along(self.template, y))[0])])
+        times = np.linspace(0, period, self.tracing.samples, endpoint=False)
+        y, _ = self.sampled(orbit, times, len(times))
+        return float(times[np.argmax(np.asarray(_tangential_displacements(self.template, y))[0])])
 
 
 class Shooting:
@@ -120,6 +121,7 @@ class Shooting:
     def __init__(self, family: Family, old: Solution, phases, times):
         """`phases` begin at `times` (m + 1,) on an old orbit; the last time is their end."""
         self.family, self.phases, self.x = family, tuple(phases), old.x
+        self.tracing = family.tracing
         n, m = family.n, len(self.phases)
         self.quantity = 2 * n + m  # its index among the unknowns
         chain, moments, N = self._mesh(old, np.asarray(times, float))
@@ -130,7 +132,8 @@ class Shooting:
         self.chain, self.m, self.length = chain, m, h.copy()
         blank = jnp.zeros((2 * n, len(u), N), y.dtype)
         self.memory = [Lifted(jnp.asarray(u), y, blank)]
-        self.keys, self.gaps = self.key(u, old.r)[None], np.array([_FAR])  # of the memory
+        self.keys = self.key(u, old.r)[None]  # of the memory
+        self.gaps = np.array([self.tracing.kept_gap])
         self.evaluations: dict[bytes, Any] = {}  # at the last points
         self.spectra: dict[bytes, np.ndarray] = {}  # at the last two points
         self.last: tuple[Any, ...] | None = None  # point without gaps, its residual and Jacobian
@@ -166,7 +169,7 @@ class Shooting:
         """The chain of segments, of equal weight within a phase, their start times and number."""
         starts, lengths = times[:-1], np.diff(times)
         span = times[-1] - times[0]
-        clock = np.linspace(0, span, _SAMPLES + 1)
+        clock = np.linspace(0, span, self.tracing.samples + 1)
         if self.family.template.scales is not None:
             # Where a law falls within a small part of the velocity the old segments are short.
             phase, begin = np.asarray(old.chain.phase), np.asarray(old.chain.begin)
@@ -207,18 +210,20 @@ class Shooting:
     def _orders(self):
         """Orders of the guards' zeros (k, M) at the start and at the end of each phase."""
         system = self.family.template
-        faces = len(self.phases[0].s)
-        count = 1 + 2 * faces + sum(system.opens)
+        numbers = system.guard_numbers
+        count = numbers.count
         before, after = np.zeros((count, self.padded), int), np.zeros((count, self.padded), int)
         for p, phase in enumerate(self.phases):
             last = self.phases[p - 1]
             for i, (was, now) in enumerate(zip(last.s, phase.s, strict=True)):
-                if abs(now) == 1 and was == 0:
+                if now not in (FORWARD, BACKWARD):
+                    continue
+                if was == STICK:
                     # Released by its own limit w starts with its second derivative.
-                    before[1 + 2 * i, p] = 2 if (last.guard - 1) // 2 == i else 1
-                elif abs(now) == 1 and was == -now:
-                    before[1 + 2 * i, p] = 1
-            if last.guard > 2 * faces and last.s != phase.s:
+                    before[numbers.lower(i), p] = 2 if numbers.face(last.guard) == i else 1
+                elif was == -now:
+                    before[numbers.lower(i), p] = 1
+            if numbers.opens_joint(last.guard) and last.s != phase.s:
                 before[last.guard, p] = 1
             if phase.guard > 0:
                 after[phase.guard, p] = 1
@@ -245,8 +250,8 @@ class Shooting:
 
     def lengths(self, z) -> np.ndarray:
         """The durations of the phases in scaled time."""
-        of_phases = slice(2 * self.family.n, self.quantity)
-        return z[of_phases] * self.scale[of_phases]
+        durations = slice(2 * self.family.n, self.quantity)
+        return z[durations] * self.scale[durations]
 
     def times(self, z) -> np.ndarray:
         """Start time of each phase, and the end of the last."""
@@ -258,7 +263,7 @@ class Shooting:
     def stale(self, z) -> bool:
         """True if a phase has grown so much that it must be cut anew."""
         h = self.lengths(z)
-        return bool((h > _STALE * self.length + 1e-2).any())
+        return bool((h > self.tracing.growth * self.length + 1e-2).any())
 
     def index(self, p: int) -> int:
         """The coordinate that is the duration of phase p."""
@@ -279,7 +284,8 @@ class Shooting:
             return near
         shares = ways @ way / np.maximum((ways**2).sum(axis=1), 1e-300)
         off = np.abs(way - shares[:, None] * ways).max(axis=1)
-        fits = (shares > _BETWEEN[0]) & (shares < _BETWEEN[1]) & (self.gaps < self.closable)
+        # At 0 is the nearest evaluation and at -1 the other one.
+        fits = (shares > -0.9) & (shares < 3.0) & (self.gaps < self.closable)
         fits &= off < 0.3 * distance
         if not fits.any():
             return near
@@ -311,19 +317,20 @@ class Shooting:
             self.extrapolated(at, self.full(z)),
         )
         rows = np.arange(2 * self.family.n + self.m)
-        for _ in range(_CLOSINGS):
+        for _ in range(self.tracing.closings):
             arguments = x, window, self.chain, states, u
             residual, jacobian, states, gap = condensed(*arguments)
             residual, gap = np.asarray(residual)[rows], float(gap)
             # Newton's method closes gaps as well; the residual is uncertain by their squares.
             if not gap > self.gap or (gap < self.closable and 10 * gap**2 < np.abs(residual).max()):
                 break
-        if gap < _FAR:
-            self.memory = [*self.memory[-_MEMORY:], states]
-            self.keys = np.concatenate([self.keys[-_MEMORY:], at[None]])
-            self.gaps = np.append(self.gaps[-_MEMORY:], gap)
+        last = self.tracing.memory
+        if gap < self.tracing.kept_gap:
+            self.memory = [*self.memory[-last:], states]
+            self.keys = np.concatenate([self.keys[-last:], at[None]])
+            self.gaps = np.append(self.gaps[-last:], gap)
         evaluation = residual, np.asarray(jacobian)[np.ix_(rows, self.active)]
-        self.evaluations = dict([*self.evaluations.items()][-_MEMORY:]) | {key: evaluation}
+        self.evaluations = dict([*self.evaluations.items()][-last:]) | {key: evaluation}
         if gap <= self.gap and self.linear:
             self.last = z, *evaluation
         return evaluation
@@ -338,7 +345,7 @@ class Shooting:
         key = self.key(u, z[-1])
         i = self._nearest(key)
         lifted, gap = self.memory[i], max(np.abs(self.keys[i] - key).max(), self.gaps[i])
-        for _ in range(_CLOSINGS):
+        for _ in range(self.tracing.closings):
             if gap <= self.closed:
                 break
             *_, lifted, gap = condensed(x, self.family.window, self.chain, lifted, u)
@@ -348,8 +355,9 @@ class Shooting:
         """Floquet multipliers (2n,) by size, and 1 last."""
         key = z.tobytes()
         if key not in self.spectra:
-            of_return = return_jacobian(self.evaluated(z)[1], 2 * self.family.n, np)
-            self.spectra = dict([*self.spectra.items()][-1:]) | {key: multipliers_of(of_return)}
+            jacobian = return_jacobian(self.evaluated(z)[1], 2 * self.family.n, np)
+            multipliers = floquet_multipliers(jacobian)
+            self.spectra = dict([*self.spectra.items()][-1:]) | {key: multipliers}
         return self.spectra[key]
 
     def lowest(self, z) -> tuple[float, Place]:
@@ -364,7 +372,7 @@ class Shooting:
         return shortest if shortest <= 0 else min(shortest, self.lowest(z)[0])
 
     def itinerary(self) -> str:
-        return " ".join("".join(_SYMBOLS[i] for i in phase.s) for phase in self.phases)
+        return " ".join("".join(find_state(i).symbol for i in phase.s) for phase in self.phases)
 
 
 def bucket(count: int, least: int) -> int:
@@ -378,7 +386,7 @@ def bucket(count: int, least: int) -> int:
     return size
 
 
-def multipliers_of(return_jacobian) -> np.ndarray:
+def floquet_multipliers(return_jacobian) -> np.ndarray:
     """Floquet multipliers by size, and 1 last, from the Jacobian of the return map.
 
     This Jacobian has the eigenvalue 0 in place of the multiplier 1.
@@ -388,7 +396,7 @@ def multipliers_of(return_jacobian) -> np.ndarray:
     return np.append(values[order[:-1]], 1.0)
 
 
-def solution_of(cycle: LimitCycle, x: Mechanism, q: float) -> Solution:
+def build_solution(cycle: LimitCycle, x: Mechanism, q: float) -> Solution:
     """The orbit of a limit cycle of x as phases, in its own scaled units."""
     segments = cycle._orbit.segments
     guard = np.asarray(segments.guard)

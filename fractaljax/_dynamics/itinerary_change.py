@@ -10,16 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .hybrid import SECTION
+from .contact_state import STATES, find_state
+from .guard import SECTION, GuardNumbers
 from .itinerary import Phase, Shooting
 from .shooting import after_switch, guards_at
 
 if TYPE_CHECKING:
     from .follow import Follower
-
-_NEW = (1e-3, 1e-4, 1e-2)  # durations of a phase that appears, as a share of the period
-_NARROW = 3e-8  # share of a step within which the end of an itinerary is located
-_SHORT = 1e-6  # duration of a phase that vanishes, as a share of the period
 
 
 class ItineraryChange:
@@ -30,7 +27,7 @@ class ItineraryChange:
         self.inside, self.outside = self._bracket(z, reached)
         p = int(np.argmin(shooting.durations(self.inside)))
         # A phase this short is about to vanish, though rounding may touch one of its guards first.
-        vanishes = shooting.durations(self.inside)[p] < _SHORT
+        vanishes = shooting.durations(self.inside)[p] < 1e-6
         if shooting.durations(self.outside).min() <= 0:
             vanishes, p = True, int(np.argmin(shooting.durations(self.outside)))
         self.vanishing = p if vanishes else None
@@ -38,18 +35,19 @@ class ItineraryChange:
     def onward(self):
         """Where the branch goes on from here; None if nowhere."""
         p = self.vanishing
-        candidates = itertools.chain(() if p is None else self._vanishing(p), self._touching())
+        vanishing = () if p is None else self._pass_vanishing_phase(p)
+        candidates = itertools.chain(vanishing, self._pass_touching_guard())
         return next((candidate for candidate in candidates if candidate is not None), None)
 
     def note_grazing(self) -> None:
         """Record the grazing beyond which no cycle goes on."""
         shooting, p, grazing = self.shooting, self.vanishing, None
         if p is None:
-            at = self._touch()
+            at = self._locate_touch()
             if at is not None:
                 grazing = at, ("touch", shooting.lowest(at)[1])
         else:
-            at = self._without_duration(self.inside, p)
+            at = self._shrink_phase(self.inside, p)
             if at is not None:
                 grazing = at, ("vanish", p)
         if grazing is not None:
@@ -71,28 +69,29 @@ class ItineraryChange:
                 (inside if value > 0 else outside)[share] = at
             return value if share > 0 else max(value, 1e-15)
 
-        share: Any = scipy.optimize.brentq(along, 0.0, 1.0, xtol=_NARROW)
-        along(min(share + _NARROW, 1.0))
+        narrow = 3e-8  # share of the step within which the end is located
+        share: Any = scipy.optimize.brentq(along, 0.0, 1.0, xtol=narrow)
+        along(min(share + narrow, 1.0))
         # Rounding may hide the side on which a point is: retreat further and further inside.
-        retreat = _NARROW
+        retreat = narrow
         while retreat < share and along(share - retreat) <= 0:
             retreat *= 4
         last = min(outside)
         return inside[max(share for share in inside if share < last)], outside[last]
 
-    def _touch(self) -> np.ndarray | None:
+    def _locate_touch(self) -> np.ndarray | None:
         """The point of the curve at which a guard touches zero."""
         shooting, ends = self.shooting, (self.inside, self.outside)
         return self.branch.root(shooting, *ends, lambda z: shooting.lowest(z)[0])
 
-    def _without_duration(self, z, p: int) -> np.ndarray | None:
+    def _shrink_phase(self, z, p: int) -> np.ndarray | None:
         """The point of the curve near z at which phase p has no duration."""
         shooting, at = self.shooting, z.copy()
         at[shooting.index(p)] = 0
         corrected = shooting.curves.corrected(at, shooting.index(p))
         return None if corrected is None else corrected[0]
 
-    def _vanishing(self, p: int) -> Iterator[Any]:
+    def _pass_vanishing_phase(self, p: int) -> Iterator[Any]:
         """Continuations where phase p, nearly vanished inside, is left out or changes places."""
         shooting, z = self.shooting, self.inside
         phases, m = shooting.phases, shooting.m
@@ -105,39 +104,39 @@ class ItineraryChange:
             if m > 2:
                 kept = [phases[i] for i in order] + [Phase(new.s, new.guard)]
                 edges = np.concatenate(
-                    [[begin], [_after(times[i + 1], begin, times) for i in order]]
+                    [[begin], [_first_time_after(times[i + 1], begin, times) for i in order]]
                 )
                 edges = np.append(edges, begin + times[-1])
             else:
                 kept, begin = [Phase(new.s, SECTION)], self.family.maximum(solution, times[-1])
                 edges = np.array([begin, begin + times[-1]])
-            yield self._merged(shooting.again(solution, kept, edges))
+            yield self._merge(shooting.again(solution, kept, edges))
         elif old.guard == phases[p].guard:
             # A slip to and fro before a stick: without it the stick begins at its limit.
-            kept, edges = _without(phases, times, p, old.guard)
-            yield self._merged(shooting.again(solution, kept, edges))
+            kept, edges = _remove_phase(phases, times, p, old.guard)
+            yield self._merge(shooting.again(solution, kept, edges))
         # Otherwise the duration of the phase can be brought to zero.
-        at = self._without_duration(z, p)
+        at = self._shrink_phase(z, p)
         if at is None:
             return
         solution, times = shooting.solution(at), shooting.times(at)
         condition = ("vanish", p)
-        faces = len(new.s)
-        if _face(old.guard, faces) != _face(phases[p].guard, faces):
-            changed = [i for i in range(faces) if phases[p].s[i] != new.s[i]]
-            s = tuple(new.s[i] if i in changed else old.s[i] for i in range(faces))
+        numbers = shooting.family.template.guard_numbers
+        if _part(old.guard, numbers) != _part(phases[p].guard, numbers):
+            changed = [i for i in range(len(new.s)) if phases[p].s[i] != new.s[i]]
+            s = tuple(new.s[i] if i in changed else old.s[i] for i in range(len(new.s)))
             swapped = list(phases)
             swapped[p - 1] = Phase(old.s, phases[p].guard)
             swapped[p] = Phase(s, old.guard)
-            yield self._inserted(at, swapped, times, p, "order of switches", condition)
+            yield self._insert_phase(at, swapped, times, p, "order of switches", condition)
         for guard in (old.guard, phases[p].guard):
-            kept, edges = _without(phases, times, p, guard)
-            yield self._direct(at, kept, edges, p, condition)
+            kept, edges = _remove_phase(phases, times, p, guard)
+            yield self._drop_phase(at, kept, edges, p, condition)
 
-    def _touching(self) -> Iterator[Any]:
+    def _pass_touching_guard(self) -> Iterator[Any]:
         """Continuations where a guard touches zero between two switches, or at one."""
         shooting = self.shooting
-        at = self._touch() if shooting.durations(self.outside).min() > 0 else None
+        at = self._locate_touch() if shooting.durations(self.outside).min() > 0 else None
         if at is None:
             return
         _, place = shooting.lowest(at)
@@ -151,17 +150,20 @@ class ItineraryChange:
         y = np.asarray(self.family.sampled(solution, np.array([moment]), 1)[0])[:, 0]
         q, guard = solution.u[-1], int(place.guard)
         s = np.array(phase.s, float)
-        face = (guard - 1) // 2
+        numbers = shooting.family.template.guard_numbers
+        face = numbers.face(guard)
         tried = []
         if since <= 0 or since >= h:
-            tried = self._at_switch(phase, face, guard) if since <= 0 else []
+            tried = self._states_before(phase, face, guard) if since <= 0 else []
         else:
             engine = np.asarray(
                 after_switch(solution.x, self.family.window, q, y, s, guard)
             ).astype(int)
             tried = [tuple(int(i) for i in engine)]
             if face < len(s):
-                for other in (0, 1, -1):
+                # Those of a closed joint, first the one that holds the face.
+                closed = [state for state in STATES if state.closed]
+                for other in (row.code for row in sorted(closed, key=lambda row: bool(row.force))):
                     tried.append(tuple(other if i == face else j for i, j in enumerate(phase.s)))
         condition = ("touch", place)
         for state in dict.fromkeys(tried):
@@ -181,17 +183,20 @@ class ItineraryChange:
             else:
                 phases[p : p + 1] = [Phase(phase.s, guard), excursion, phase]
                 edges, new = np.insert(times, p + 1, [moment, moment]), p + 1
-            yield self._inserted(at, phases, edges, new, "grazing", condition)
+            yield self._insert_phase(at, phases, edges, new, "grazing", condition)
 
-    def _at_switch(self, phase, face, guard):
+    def _states_before(self, phase, face, guard):
         """Contact states that may come before a phase whose guard is zero at its very start."""
         if face >= len(phase.s):
             return []
-        slip = 1 if guard == 1 + 2 * face else -1
-        state = slip if phase.s[face] == 0 else 0
+        row, numbers = find_state(phase.s[face]), self.shooting.family.template.guard_numbers
+        change = row.lower if guard == numbers.lower(face) else row.upper
+        if change is None:
+            return []
+        state = change.to[0]
         return [tuple(state if i == face else j for i, j in enumerate(phase.s))]
 
-    def _merged(self, new: Shooting):
+    def _merge(self, new: Shooting):
         """Continuation where an excursion vanishes, at the grazing of the orbit without it."""
         corrected = new.curves.corrected(new.begin)
         if corrected is None or np.linalg.norm(corrected[0] - new.begin) > 0.2:
@@ -210,19 +215,19 @@ class ItineraryChange:
                 if graze is None:
                     continue
                 direction = (at - start) * (1 if new.lowest(at)[0] > 0 else -1)
-                self._change(
+                self._record_change(
                     "grazing", new, graze, self.shooting, new, ("touch", new.lowest(graze)[1])
                 )
                 tangent = new.curves.tangent(new.equations(graze)[1])
                 return new, graze, tangent if tangent @ direction > 0 else -tangent
         return None
 
-    def _inserted(self, at, phases, edges, index, kind, condition):
+    def _insert_phase(self, at, phases, edges, index, kind, condition):
         """Continuation with a new phase, which has no duration at the event itself."""
         shooting = self.shooting
         solution = shooting.solution(at)
         period = edges[-1] - edges[0]
-        for share in _NEW:
+        for share in (1e-3, 1e-4, 1e-2):  # durations of the phase, as shares of the period
             new = shooting.again(solution, phases, edges)
             begin = new.begin.copy()
             begin[new.index(index)] = share * period / new.scale[new.index(index)]
@@ -232,13 +237,13 @@ class ItineraryChange:
             if new.admissibility(corrected[0]) <= 0:
                 continue
             tangent = new.curves.tangent(corrected[1])
-            self._change(kind, shooting, at, shooting, new, condition)
+            self._record_change(kind, shooting, at, shooting, new, condition)
             self.branch.record(new, corrected[0])
             forward = tangent[new.index(index)] > 0
             return self.branch.accurate(new, corrected[0], tangent if forward else -tangent)
         return None
 
-    def _direct(self, at, phases, edges, p: int, condition):
+    def _drop_phase(self, at, phases, edges, p: int, condition):
         """Continuation without phase p, which has vanished between two others."""
         shooting = self.shooting
         new = shooting.again(shooting.solution(at), phases, edges)
@@ -251,7 +256,7 @@ class ItineraryChange:
             if beside is None or new.admissibility(beside[0]) <= 0:
                 continue
             if self._switches(new, beside[0], p):
-                self._change("grazing", shooting, at, shooting, new, condition)
+                self._record_change("grazing", shooting, at, shooting, new, condition)
                 return new, beside[0], direction
         return None
 
@@ -265,12 +270,12 @@ class ItineraryChange:
         state = after_switch(solution.x, self.family.window, solution.u[-1], y, s, last.guard)
         return tuple(int(i) for i in np.asarray(state)) == shooting.phases[p].s
 
-    def _change(self, kind, where, at, old, new, condition) -> None:
+    def _record_change(self, kind, where, at, old, new, condition) -> None:
         self.branch.record(where, at)
         self.branch.note(kind, where, at, old.itinerary(), new.itinerary(), condition)
 
 
-def _without(phases, times, p: int, guard: int):
+def _remove_phase(phases, times, p: int, guard: int):
     """Phases and the times at which they begin without phase p, which has no duration."""
     kept = list(phases)
     kept[p - 1] = Phase(kept[p - 1].s, guard)
@@ -278,11 +283,11 @@ def _without(phases, times, p: int, guard: int):
     return kept, np.delete(times, p)
 
 
-def _after(time, begin, times) -> float:
+def _first_time_after(time, begin, times) -> float:
     """A time on a periodic orbit, as the first one after `begin`."""
     return time if time > begin else time + times[-1]
 
 
-def _face(guard: int, faces: int) -> int:
-    """The face of a guard or, for guards beyond the faces, its joint."""
-    return (guard - 1) // 2 if guard <= 2 * faces else guard - faces
+def _part(guard: int, numbers: GuardNumbers) -> int:
+    """The face of a guard; for the guard of an opening its own number."""
+    return guard if numbers.opens_joint(guard) else numbers.face(guard)

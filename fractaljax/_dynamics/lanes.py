@@ -9,9 +9,6 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 SMALL = 6  # unknowns up to which elimination is written out, which runs faster
-_ELIMINATED = 16  # unknowns up to which elimination is not left to a library
-_SUMMED = 8  # rows up to which a product of matrices is written as a sum
-_QUICK = 512  # bytes of an array up to which XLA on a CPU runs a loop's operations in turn
 
 
 def together(size: int, count: int) -> int:
@@ -19,7 +16,7 @@ def together(size: int, count: int) -> int:
 
     A loop with larger arrays takes twice as long, as XLA then runs its operations side by side.
     """
-    most = max(1, _QUICK // size)
+    most = max(1, 512 // size)  # up to so many bytes XLA on a CPU runs them in turn
     return min(1 << (most.bit_length() - 1), count & -count)
 
 
@@ -56,7 +53,7 @@ def solve(W, b) -> Array:
         return (diagonal[::-1] * b - off_diagonal * b[::-1]) / (
             diagonal * diagonal[::-1] - off_diagonal * off_diagonal[::-1]
         )
-    if len(b) <= _ELIMINATED:
+    if len(b) <= 16:  # from there on a library is faster
         return _by_elimination(W, b)
     W, b = jnp.moveaxis(W, (0, 1), (-2, -1)), jnp.moveaxis(b, 0, -1)
     return jnp.moveaxis(jnp.linalg.solve(W, b[..., None])[..., 0], -1, 0)
@@ -136,10 +133,10 @@ def product(A, B, *, written_out: bool = False) -> Array:
 
     `written_out` is quicker where it stands alone: XLA leaves large reductions to a library.
     """
-    if len(A) <= _SUMMED and written_out:
-        terms = (A[:, k, None] * B[k][None] for k in range(len(B)))
-        return sum(terms, start=jnp.zeros((), A.dtype))
-    if len(A) <= _SUMMED:
+    if len(A) <= 8:
+        if written_out:
+            terms = (A[:, k, None] * B[k][None] for k in range(len(B)))
+            return sum(terms, start=jnp.zeros((), A.dtype))
         return jnp.sum(A[:, :, None] * B[None], axis=1)
     if A[0, 0].size == B[0, 0].size == 1:
         # For one lane the library's product, which would have to move any other axes.

@@ -14,32 +14,24 @@ from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import joints_of
 from .._mechanism.scene import Scene
 from .._stability.stability import growth_rate
-from . import search
-from .assessment import CONVERGED
 from .cycle import CycleResult, LimitCycle, Orbit
+from .cycle_search import CycleSearch
 from .excitation import Excitation, excited_system
 from .hybrid import HybridSystem
 from .orbit import orbit
-from .scaled import FEW, check_rtol, degrees_of_freedom, scaled_start, start_state
+from .scaled import (
+    check_rtol,
+    degrees_of_freedom,
+    scaled_start,
+    start_state,
+    steps_follow_motion,
+)
+from .search import find_attractor
 from .segments import Segments
+from .status import Status
 
 if TYPE_CHECKING:
     from diffrax import AbstractSolver
-
-_SEGMENTS = 64  # one return takes some 35 at rtol 1e-9
-_MOST_SEGMENTS = 4096
-
-# In the order of the numbers in `search`.
-_RESULTS = (
-    CycleResult.exhausted,
-    CycleResult.converged,
-    CycleResult.equilibrium,
-    CycleResult.diverged,
-    CycleResult.not_periodic,
-    CycleResult.exhausted,
-    CycleResult.too_long,
-    CycleResult.not_finite,
-)
 
 
 # Kept out of the cycle's program, which another contact law then does not compile again.
@@ -52,18 +44,29 @@ def scale_problem(mechanism: Mechanism, excitation) -> tuple[HybridSystem, Float
     return system, growth / system.omega
 
 
-@functools.partial(exported_jit, static_argnames=("of_scene", "segments", "rtol"))
+@functools.partial(exported_jit, static_argnames=("of_scene", "segments", "rtol", "search"))
 def find_cycle(
-    system: HybridSystem, growth, start, max_returns, *, of_scene: bool, segments: int, rtol: float
+    system: HybridSystem,
+    growth,
+    start,
+    max_returns,
+    *,
+    of_scene: bool,
+    segments: int,
+    rtol: float,
+    search: CycleSearch,
 ) -> LimitCycle:
+    """The limit cycle that the motion of a scaled system from a start ends in.
+
+    Its period is cut into at most `segments`.
+    """
     frozen, growth = jax.lax.stop_gradient((system, growth))
     equilibrium, y = frozen.equilibrium(), scaled_start(frozen, start)
     h = 0.25 if system.fastest is None else 0.2  # a finer mesh saves a second solution
     h = jnp.asarray(h * (rtol / 1e-9) ** 0.125, y.dtype)
     max_returns = max_returns.astype(y.dtype)
-    attractor = search.find(
-        frozen, y, equilibrium, growth, max_returns, h, jnp.asarray(rtol, y.dtype), segments
-    )
+    limits = max_returns, h, jnp.asarray(rtol, y.dtype)
+    attractor = find_attractor(frozen, y, equilibrium, growth, *limits, segments, search)
     attractor = jax.lax.stop_gradient(attractor)
 
     y, duration = orbit(system, attractor.segments)
@@ -71,9 +74,9 @@ def find_cycle(
     period = jnp.sum(duration)
     error = attractor.error
     status = CycleResult.exhausted
-    for outcome, result in enumerate(_RESULTS):
-        status = CycleResult.where(attractor.status == outcome, result, status)
-    exists = attractor.status == CONVERGED
+    for outcome in Status:
+        status = CycleResult.where(attractor.status == outcome, outcome.result, status)
+    exists = attractor.status == Status.CONVERGED
     rounding_of_growth = 1e3 * jnp.finfo(y.dtype).eps
     unstable = exists & (attractor.growth > 100 * error + rounding_of_growth)
     status = CycleResult.where(unstable, CycleResult.unstable, status)
@@ -102,9 +105,9 @@ def refine_cycle(cycle: LimitCycle, arguments: tuple, count: int, static: dict) 
     """
     if concrete(cycle.period) is None or cycle.period.ndim:
         return cycle
-    while count < _MOST_SEGMENTS:
+    while count < static["search"].most_segments:
         # 512 segments keep 16,384 steps: a motion without a period shall not take longer.
-        too_long = bool(cycle.result == CycleResult.too_long) and count < 8 * _SEGMENTS
+        too_long = bool(cycle.result == CycleResult.too_long) and count < 512
         if not too_long and not bool(cycle.result == CycleResult.inaccurate):
             break
         count *= 8
@@ -112,19 +115,22 @@ def refine_cycle(cycle: LimitCycle, arguments: tuple, count: int, static: dict) 
     return cycle
 
 
-def check_arguments(mechanism, start, excitation, rtol, max_returns, segments=None):
+def check_arguments(mechanism, start, excitation, rtol, max_returns, search, segments=None):
     """Options of a search: `max_returns` as a number, segment count, and what is static."""
     n, joints = degrees_of_freedom(mechanism), joints_of(mechanism)
     if excitation is not None:
         require_kind("excitation", excitation, Excitation)
+    require_kind("search", search, CycleSearch)
     rtol = check_rtol(rtol, jnp.result_type(*jax.tree.leaves((mechanism, start, excitation))))
     returns = jnp.asarray(whole("max_returns", max_returns, 1), float)
-    count = _SEGMENTS if segments is None else whole("segments", segments, 16)
+    # One return takes some 35 segments at rtol 1e-9.
+    count = 64 if segments is None else whole("segments", segments, 16)
     if segments is None and any(x.follows_load_curve for x in joints.values()):
         count *= 8  # towards an opening segments are short: less than a second compilation
-    elif segments is None and (n > FEW or len(joints) > 1):
+    elif segments is None and (steps_follow_motion(n) or len(joints) > 1):
         count *= 4  # a period may be long beside that of the highest frequency, or of many phases
-    return returns, count, {"of_scene": isinstance(mechanism, Scene), "rtol": rtol}
+    of_scene = isinstance(mechanism, Scene)
+    return returns, count, {"of_scene": of_scene, "rtol": rtol, "search": search}
 
 
 def limit_cycle(
@@ -138,6 +144,7 @@ def limit_cycle(
     max_returns: int = 5000,
     max_steps: int = 4096,
     segments: int | None = None,
+    search: CycleSearch = CycleSearch(),
     throw: bool = True,
 ) -> LimitCycle:
     """The limit cycle that the motion from `start` ends in, by the exact law of dry friction.
@@ -147,8 +154,9 @@ def limit_cycle(
     A coarse run from `start` is compared at its returns to a section: the maxima of t.x, the
     tangential displacement of the first joint (of x1 in a scene). Where they repeat, Newton's
     method solves for the periodic orbit, and every derivative is the implicit one of its
-    equations. A period has at most 16 returns. Derivatives with respect to `start` are zero. An
-    orbit that repels so weakly that the motion does not leave it is returned as `unstable`.
+    equations. A period has at most 16 returns, unless `search` says otherwise. Derivatives with
+    respect to `start` are zero. An orbit that repels so weakly that the motion does not leave it is
+    returned as `unstable`.
 
     **Arguments:**
 
@@ -167,7 +175,8 @@ def limit_cycle(
       difference of period and amplitudes, and the result `depends_on_eps` where it is above
       1e-3. Derivatives differ by far more than values do.
     - `solver`: a diffrax solver for the regularised law, Tsit5 by default; an implicit one, such
-      as Kvaerno5, for a small eps. `max_steps` bounds its steps in one period.
+      as Kvaerno5, for a small eps.
+    - `max_steps`: most steps of that solver in one period, 4096 by default.
     - `rtol`: relative tolerance of period and states, 1e-9 by default and at least 9.1e-13; in
       float32 both are 4.9e-4. It sets the number of segments.
     - `max_returns`: returns of the coarse run after which the search gives up.
@@ -176,6 +185,8 @@ def limit_cycle(
       return takes some 35, more where the highest frequency is far above that of the motion.
       Outside of compiled programs a longer period gets more; inside, the result says that it
       needs them.
+    - `search`: options of the coarse run, of what counts as near to an orbit or an equilibrium, and
+      of when to give up.
     - `throw`: raise unless the result is `converged`. Otherwise `result` says what was found, and
       everything is NaN where there is no cycle.
 
@@ -185,7 +196,7 @@ def limit_cycle(
     """
     start = None if start is None else start_state(start, degrees_of_freedom(mechanism))
     inputs = mechanism, start, excitation
-    returns, count, static = check_arguments(*inputs, rtol, max_returns, segments)
+    returns, count, static = check_arguments(*inputs, rtol, max_returns, search, segments)
     arguments = *scale_problem(mechanism, excitation), start, returns
     cycle = find_cycle(*arguments, segments=count, **static)
     if segments is None:

@@ -9,14 +9,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .hybrid import UNUSED, HybridSystem
+from .guard import UNUSED
+from .hybrid import HybridSystem
 from .lanes import product
 from .runge_kutta import runge_kutta, stability_polynomial
 from .segments import Segments, chosen_guard, next_start, tableau
-
-_POWERS = 4  # of a matrix, to evaluate a polynomial of it
-_FEW = 512  # segments, over all lanes, up to which all are taken at once
-_TOGETHER, _LEAST = 128, 8  # if more, segments at a time: over all lanes, least of each
 
 
 class Maps(eqx.Module):
@@ -31,7 +28,7 @@ def exact_maps(system: HybridSystem, segments: Segments) -> Maps:
     """Derivatives of the segments, as exact as their steps are."""
     # The stages of many degrees of freedom fill the cache: one segment at a time.
     size = len(segments.duration) if system.fastest is None else 1
-    _, A, b = in_blocks(functools.partial(_maps, system), unmoved, size, segments)
+    _, A, b = in_blocks(functools.partial(_maps, system), identity_maps, size, segments)
     return Maps(A, b, _guard_slopes(system, segments))
 
 
@@ -42,17 +39,20 @@ def coarse_maps(system: HybridSystem, segments: Segments) -> Maps:
     """
     polynomial_maps = functools.partial(_polynomial_maps, system)
     size = segments_together(segments) if system.fastest is None else 1
-    _, A, b = in_blocks(polynomial_maps, unmoved, size, segments, next_start(segments.y))
+    _, A, b = in_blocks(polynomial_maps, identity_maps, size, segments, next_start(segments.y))
     return Maps(A, b, _guard_slopes(system, segments))
 
 
 def segments_together(segments: Segments) -> int:
-    """How many segments of each lane Newton's method takes at a time: all if they are few."""
+    """How many segments of each lane Newton's method takes at a time.
+
+    They are all of at most 512 over all lanes; of more, 128 over all lanes, but at least 8 of each.
+    """
     length, lanes = len(segments.duration), segments.duration[0].size
-    return length if length * lanes <= _FEW else max(_TOGETHER // lanes, _LEAST)
+    return length if length * lanes <= 512 else max(128 // lanes, 8)
 
 
-def unmoved(segments: Segments, *_) -> tuple[Array, Array, Array]:
+def identity_maps(segments: Segments, *_) -> tuple[Array, Array, Array]:
     """Ends, A and b of segments that are not used."""
     y = segments.y
     return y, jnp.moveaxis(_identity(y), 2, 0), jnp.zeros_like(y)
@@ -90,7 +90,7 @@ def _maps(system: HybridSystem, segments: Segments) -> tuple[Array, Array, Array
     def field(columns):
         # The state and its tangents side by side: one array, one compiled loop per stage.
         along, slope = jax.linearize(lambda y: system.field(y, s), columns[:, 0])
-        tangents = _of_each(slope, columns[:, 1:])
+        tangents = _apply_slope(slope, columns[:, 1:])
         return jnp.concatenate([along[:, None], tangents], axis=1)
 
     columns = jnp.concatenate([y[:, None], _identity(y)], axis=1)
@@ -108,21 +108,22 @@ def _polynomial_maps(system: HybridSystem, segments: Segments, ends):
     b = system.field(ends, s)
     state = (y + ends) / 2 + h[None] / 12 * (system.field(y, s) - b)  # its mean in time
     _, slope = jax.linearize(lambda y: system.field(y, s), state)
-    mean = _of_each(slope, _identity(y)) * h[None, None]
+    mean = _apply_slope(slope, _identity(y)) * h[None, None]
     eye, mean = (jnp.moveaxis(x, 2, 0) for x in (_identity(y), mean))
     powers, times = [eye, mean], jax.vmap(functools.partial(product, written_out=True))
-    for _ in range(_POWERS - 1):
+    count = 4  # powers that are evaluated, of the last of which the rest is a polynomial
+    for _ in range(count - 1):
         powers.append(times(powers[-1], mean))
     coefficients = stability_polynomial(tableau()).tolist()
     A = None
-    for first in reversed(range(0, len(coefficients), _POWERS)):
-        block = coefficients[first : first + _POWERS]
+    for first in reversed(range(0, len(coefficients), count)):
+        block = coefficients[first : first + count]
         terms = sum(c * power for c, power in zip(block, powers, strict=False))
         A = terms if A is None else times(A, powers[-1]) + terms
     return ends, A, b
 
 
-def _of_each(slope: Callable, tangents) -> Array:
+def _apply_slope(slope: Callable, tangents) -> Array:
     """The slope along each of the tangents (2n, k, ...)."""
     return jax.vmap(slope, in_axes=1, out_axes=1)(tangents)
 

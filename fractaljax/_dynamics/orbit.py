@@ -16,14 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from .hybrid import NONE, HybridSystem
+from .guard import NONE
+from .hybrid import HybridSystem
 from .lanes import chosen, product, solve
 from .maps import Maps, axis_of, coarse_maps, exact_maps, in_blocks, segments_together
 from .segments import Segments, chosen_guard, flow, next_start
-
-_ITERATIONS = 20
-_SHORTEST = 1e-12  # least duration, in scaled time, that a segment is counted with
-_HOPELESS = 8  # iterations after which steps must be small, relative to the orbit
 
 
 def _chain(body: Callable, carry, arrays: tuple, lanes: int, count=None) -> tuple[Any, Array]:
@@ -76,8 +73,9 @@ def corrections(
         off = jnp.where(last[None], off / jnp.where(last, -off[-1], 1)[None], 0)
         return W + W[:, -1:] * off[None], off[:-1]
 
-    # With one dt for all, short segments of a phase that becomes shorter would be negative.
-    duration = jnp.maximum(jnp.abs(segments.duration), _SHORTEST)
+    # With one dt for all, short segments of a phase that becomes shorter would be negative. A
+    # phase without duration still gets its share.
+    duration = jnp.maximum(jnp.abs(segments.duration), 1e-12)
     b = jnp.where(used[None], local.b * duration[None], 0)
     columns = np.eye(n + 2, dtype=gap.dtype).reshape(n + 2, n + 2, *(1,) * lanes)
     shifts, stretches = columns[n], columns[n + 1]
@@ -135,13 +133,19 @@ class PeriodicOrbit(eqx.Module):
 
 
 def solve_periodic_orbits(
-    system: HybridSystem, segments: Segments, active, reach, rtol: ArrayLike = 0
+    system: HybridSystem,
+    segments: Segments,
+    active,
+    reach,
+    rtol: ArrayLike = 0,
+    iterations: int = 20,
 ) -> PeriodicOrbit:
     """The periodic orbits near the segments of g lanes, in the lanes that are `active` (g,).
 
     They are solved together: a lane that has converged waits for the others. A lane gives up if
     its first state would move further than `reach` (g,). A relative error of less than `rtol` (g,)
-    may be left, and where the error is below `rtol` it is corrected.
+    may be left, and where the error is below `rtol` it is corrected. It is estimated after at most
+    that many `iterations`.
     """
     y, s, guard, used = segments.y, segments.s, segments.guard, segments.used
     # Durations in other lanes may be anything.
@@ -164,7 +168,7 @@ def solve_periodic_orbits(
     far = jnp.where(active, big, jnp.inf).astype(y.dtype)
 
     def running(carry):
-        return carry[-1] <= _ITERATIONS
+        return carry[-1] <= iterations
 
     def body(carry):
         orbits, local, change, before, count = carry
@@ -173,7 +177,7 @@ def solve_periodic_orbits(
         left = change * jnp.clip(change / before, 1e-3, 1)
         going = (left > tolerance) & (change < jnp.inf)
         # The last iteration has steps of half the length: the change is the error.
-        ends_here = ~jnp.any(going) | (count == _ITERATIONS)
+        ends_here = ~jnp.any(going) | (count == iterations)
         # Near the orbit the maps serve again, while they do well.
         slow = change > before / 8
         stale = going & ((change > 1e-3 * size) | slow)
@@ -206,7 +210,8 @@ def solve_periodic_orbits(
         )
         new = jnp.maximum(largest, longest)
         displacement = jnp.max(jnp.abs(y[:, 0] + dy[:, 0] - start), axis=0)
-        hopeless = (count >= _HOPELESS) & (new > 1e-2 * size)
+        # Steps that are still large after eight iterations hardly ever converge.
+        hopeless = (count >= 8) & (new > 1e-2 * size)
         new = jnp.where((displacement <= reach) & (new < big) & ~hopeless, new, jnp.inf)
         converged = left <= 10 * tolerance
         accurate = converged & (error <= rtol)
@@ -219,7 +224,7 @@ def solve_periodic_orbits(
         middle = jnp.where(used[None], middle, y)
         orbits = PeriodicOrbit(Segments(y, h, s, guard), converged, error, middle, jacobian)
         change, before = jnp.where(going, jnp.stack([new, change]), jnp.stack([change, before]))
-        return orbits, local, change, before, jnp.where(ends_here, _ITERATIONS, count) + 1
+        return orbits, local, change, before, jnp.where(ends_here, iterations, count) + 1
 
     none = PeriodicOrbit.none(Segments(y, duration, s, guard))
     orbits, *_ = jax.lax.while_loop(running, body, (none, no_maps, far, far, 0))

@@ -15,7 +15,7 @@ import numpy as np
 
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import substituted
-from .hybrid import SECTION
+from .guard import SECTION
 from .itinerary import Family, Phase, Shooting, Solution
 from .shooting import (
     Place,
@@ -25,10 +25,6 @@ from .shooting import (
     reduced_guard,
     return_jacobian,
 )
-
-_STEP = 1e-7  # of differences
-_AWAY = 1e4  # weight of the second quantity, which the states between do not follow
-_NEAR = 1e-6  # scaled time within which a moment is that of a switch
 
 
 class Event(NamedTuple):
@@ -48,7 +44,8 @@ class Event(NamedTuple):
         if condition != "touch":
             return cls(condition)
         k, theta, chain = int(detail.segment), float(detail.theta), solution.chain
-        begins, ends = chain.begin[k] == 0, chain.begin[k] + chain.share[k] > 1 - _NEAR
+        # Shares of a phase add up to 1 to rounding.
+        begins, ends = chain.begin[k] == 0, chain.begin[k] + chain.share[k] > 1 - 1e-6
         if theta == 0 and begins:
             return cls(condition, detail, side=-1)
         return cls(condition, detail, side=1 if theta == 1 and ends else 0)
@@ -59,6 +56,7 @@ class Pinned(Shooting):
 
     gap = 1e-11  # differences of the Jacobian need more than the orbit does
     closable = linear = 0.0
+    difference = 1e-7  # step of the differences, half the digits of the residual
 
     def __init__(self, family: Family, second: Window, event: Event, old: Solution, phases, times):
         self.second, self.event, self.borders = second, event, None
@@ -77,7 +75,8 @@ class Pinned(Shooting):
         return np.append(u[self.active] / self.scale[: len(self.active)], r)
 
     def key(self, u, r=0.0) -> np.ndarray:
-        return np.append(u, _AWAY * r)
+        # The states between do not follow the second quantity: any change of it is a large one.
+        return np.append(u, 1e4 * r)
 
     def mechanism(self, z) -> Mechanism:
         return mechanism(self.x, self.second, z[-1])
@@ -97,7 +96,7 @@ class Pinned(Shooting):
     def equations(self, z):
         residual, jacobian = self._orbit(z)
         beside = z.copy()
-        step = beside[-1] = z[-1] + (_STEP if z[-1] < 0.5 else -_STEP)
+        step = beside[-1] = z[-1] + (self.difference if z[-1] < 0.5 else -self.difference)
         step -= z[-1]
         other, other_jacobian = self._orbit(beside)
         column = (other - residual) / step
@@ -113,8 +112,8 @@ class Pinned(Shooting):
             row, along = np.zeros(len(z) - 1), 0.0
             for left, right in pairs:
                 # left . dJ right, by the symmetry of second derivatives, is left . dJ along right.
-                displaced = z + _STEP * np.append(right, [0.0, 0.0])
-                row = row + left @ (self._orbit(displaced)[1] - jacobian) / _STEP
+                displaced = z + self.difference * np.append(right, [0.0, 0.0])
+                row = row + left @ (self._orbit(displaced)[1] - jacobian) / self.difference
                 along += left @ (other_jacobian - jacobian)[:, :-1] @ right / step
         rows = np.column_stack([jacobian, column])
         return np.append(residual, value), np.vstack([rows, np.append(row, along)])
@@ -190,10 +189,11 @@ class Pinned(Shooting):
         s = tuple(np.asarray(old.chain.s)[:, k].astype(int))
         period = times[-1] - times[0]
         first, last = times[:-1] - times[0], times[1:] - times[0]
-        begun = (moment - times[0] - first + _NEAR) % period - _NEAR
+        near = 1e-6  # scaled time within which the moment is that of a switch
+        begun = (moment - times[0] - first + near) % period - near
         left, side = last - first - begun, self.event.side
         for p in np.flatnonzero([phase.s == s for phase in self.phases]):
-            outside = left[p] < -_NEAR if side == 0 else abs((begun, left)[side > 0][p]) > _NEAR
+            outside = left[p] < -near if side == 0 else abs((begun, left)[side > 0][p]) > near
             if not outside and last[p] > first[p]:
                 self._place_in(int(p), begun[p] / (last[p] - first[p]), was)
                 return

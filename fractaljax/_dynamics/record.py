@@ -8,11 +8,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .events import MOST, step
-from .hybrid import NONE, SECTION, UNUSED, HybridSystem
+from .guard import NONE, SECTION, UNUSED
+from .hybrid import HybridSystem
 from .lanes import together
 from .segments import Segments, cumulative, flow
+from .step_length import crowding, density
+from .transition import first_contact_state
 
-_PHASES = 256  # most phases in an orbit
 # The last rows of a record: the guard that ended a step, and sums over the steps up to its end,
 # less the sums of the whole run: time, weight, switches with returns, and returns.
 _ROWS = GUARD, TIME, WEIGHT, ENDED, RETURNED = range(-5, 0)
@@ -51,7 +53,7 @@ class Steps(eqx.Module):
         ended = used & (segments.guard != NONE), used & (segments.guard == SECTION)
         if system.fastest is None:
             longest = jnp.broadcast_to(h[None], time.shape)
-            weight = system.density(segments.y, segments.s, longest) * time
+            weight = density(system, segments.y, segments.s, longest) * time
         else:
             _, error = flow(system, segments.y, time, segments.s, error=True)
             weight = jnp.max(jnp.abs(error), axis=0) ** 0.125
@@ -97,7 +99,7 @@ class Record(Steps):
     @classmethod
     def begin(cls, system: HybridSystem, y, length: int) -> "Record":
         """The record of runs from y, with room for `length` steps."""
-        s, lanes = system.contact_state(y), y.shape[1]
+        s, lanes = first_contact_state(system, y), y.shape[1]
         steps = jnp.zeros((len(y) + len(s) + len(_ROWS), length, lanes), y.dtype)
         none = jnp.zeros(lanes, int)
         sums = jnp.zeros_like(steps[TIME:, 0])
@@ -118,7 +120,7 @@ class Record(Steps):
             y, s, guard, sums, reach, some = carry
             y_new, s_new, dt, guard, shorter, reach = step(system, y, s, guard, h, reach)
             least = jnp.maximum(1 if reach is None else h / reach, shorter)
-            weight = jnp.maximum(least, system.crowding(y, s)) * dt
+            weight = jnp.maximum(least, crowding(system, y, s)) * dt
             ended = guard != NONE, guard == SECTION
             sums = sums + jnp.stack([dt, weight, *(x.astype(dt.dtype) for x in ended)])
             row = jnp.concatenate([y, s, guard.astype(y.dtype)[None], sums])
@@ -208,14 +210,16 @@ class Phases(eqx.Module):
         return cls(exists, starts + 1, ends, jnp.where(exists, weight, 0))
 
 
-def cut(system: HybridSystem, steps: Stretch, first, last, h, length: int) -> Segments:
+def cut(
+    system: HybridSystem, steps: Stretch, first, last, h, length: int, most_phases: int = 256
+) -> Segments:
     """The steps after `first` (g,) up to `last` (g,) in at most `length` segments.
 
     Segments of a phase have equal weight, at most h (g,) where so few suffice. Unused segments have
-    no duration.
+    no duration. Phases beyond `most_phases` are left out, so that no orbit closes.
     """
     n = 2 * system.n
-    phases = Phases.between(steps, first, last, min(length, _PHASES))
+    phases = Phases.between(steps, first, last, min(length, most_phases))
     # The number of segments of each phase.
     free = jnp.maximum(length - jnp.sum(phases.exists, axis=-1), 1)
     h = jnp.maximum(h, jnp.sum(phases.weight, axis=-1) / free)[:, None]

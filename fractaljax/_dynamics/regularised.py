@@ -22,10 +22,6 @@ from .excitation import excited_system
 from .hybrid import HybridSystem
 from .scaled import scaled_start
 
-_SETTLING = 64  # slowest periods of the transient
-_LONGEST = 4  # most returns in one period
-_SAME = 1e-5  # scaled: states no further apart repeat
-_TOLERANCE = 1e-3  # largest relative difference from the exact law's cycle
 DENSE = diffrax.SaveAt(t0=True, steps=True, dense=True)
 
 
@@ -80,10 +76,13 @@ class SmoothOrbit(eqx.Module):
         return self._monodromy
 
 
-def _settle(system: HybridSystem, eps, y, solver, rtol, max_steps):
+def _settle(
+    system: HybridSystem, eps, y, solver, rtol, max_steps, periods: int = 64, longest: int = 4
+):
     """State and period where the motion from y nearly repeats, and the returns in that period.
 
-    The last result is True if all were reached within `max_steps` steps.
+    The transient takes that many of the slowest `periods`, and the period has at most `longest`
+    returns. The last result is True if all were reached within `max_steps` steps for each.
     """
     K = jnp.diag(system.K) if system.K.ndim == 1 else system.K
     K = K[:-1, :-1] if system.excited else K
@@ -108,14 +107,15 @@ def _settle(system: HybridSystem, eps, y, solver, rtol, max_steps):
         reached = solution.result == diffrax.RESULTS.successful
         return y, (y, system.excitation_period, reached)
 
-    steps, settling = _SETTLING * max_steps, _SETTLING * slowest
+    steps, settling = periods * max_steps, periods * slowest
     if system.excited:
         settling = jnp.ceil(settling / system.excitation_period) * system.excitation_period
         next_return = next_period
     settled = run(y, settling, rtol=max(rtol, 1e-7), max_steps=steps)
-    _, (ends, times, within) = jax.lax.scan(next_return, settled.ys[0], length=1 + _LONGEST)
+    _, (ends, times, within) = jax.lax.scan(next_return, settled.ys[0], length=1 + longest)
     gaps = jnp.max(jnp.abs(ends[1:] - ends[:1]), axis=1)
-    returns = 1 + jnp.argmax(gaps <= 2 * jnp.min(gaps) + _SAME)
+    # States that are 1e-5 from each other repeat, however near the nearest are.
+    returns = 1 + jnp.argmax(gaps <= 2 * jnp.min(gaps) + 1e-5)
     followed = (settled.result == diffrax.RESULTS.successful) & jnp.all(within)
     return (ends[0], jnp.cumsum(times[1:])[returns - 1]), returns, followed
 
@@ -230,7 +230,8 @@ def regularised_cycle(
     error = jnp.asarray(error, y.dtype)
     unstable = repels(*jax.lax.stop_gradient((monodromy, rates[0])), error)
     status = CycleResult.where(unstable, CycleResult.unstable, CycleResult.converged)
-    status = CycleResult.where(difference <= _TOLERANCE, status, CycleResult.depends_on_eps)
+    # A tenth of a per cent, more than which nobody measures.
+    status = CycleResult.where(difference <= 1e-3, status, CycleResult.depends_on_eps)
     # The tangential spring of a joint that opens lets go, and the tangents do not see the jump.
     held = [jnp.any(system.L[faces[-1]] != 0) & (len(faces) > 1) for faces in system.faces]
     jumps = jnp.any(opens & jnp.stack(held) & (below > 0))

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -10,19 +11,20 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, DTypeLike, Float
 
 from .._base.parts import concrete, number, require_kind, require_scalar
-from .._contact.load_curve import tabulated
 from .._friction import Coulomb, Friction
 from .._mechanism.joint import Joint
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.scene import Scene, stiffness
 from .._mechanism.structure import Structure, require_single
 from .hybrid import HybridSystem
+from .joint_force import JointForce, TwoSidedSpring, joint_force
 from .lanes import log_spectral_radius
+from .law_scales import law_scales
 
-FEW = 8  # degrees of freedom up to which steps are those of the highest frequency
-_UNIT = 1e-6  # m/s: unit of velocity of a structure without joints
-_BEYOND = 1e30  # in that unit: a velocity that no motion has
-_SQUARINGS = 10  # of the matrix whose spectral radius bounds all rates
+
+def steps_follow_motion(n: int) -> bool:
+    """True for so many degrees of freedom that steps do not resolve the highest frequency."""
+    return n > 8
 
 
 def degrees_of_freedom(mechanism: Mechanism) -> int:
@@ -73,11 +75,11 @@ def _stick_as_one(structure: Structure, joint: Joint, other: Joint) -> bool:
 def hybrid_system(mechanism: Any) -> HybridSystem:
     """The scaled system of a scene or a structure."""
     is_structure = isinstance(mechanism, Structure)
-    system = _of_structure(mechanism) if is_structure else _of_scene(mechanism)
-    return system.with_scales()
+    system = _structure_system(mechanism) if is_structure else _scene_system(mechanism)
+    return replace(system, scales=law_scales(system))
 
 
-def _of_scene(scene: Scene) -> HybridSystem:
+def _scene_system(scene: Scene) -> HybridSystem:
     o = scene.oscillator
     K_n, K_t = stiffness(scene)
     a, b = o.omega_1**2 + K_t / o.m, o.omega_2**2 + K_n / o.m
@@ -86,11 +88,8 @@ def _of_scene(scene: Scene) -> HybridSystem:
     unit, zero = o.m * omega * o.V, jnp.zeros_like(f)
     K = jnp.stack([a, b]) / omega**2
     P = zero if scene.normal_load is None else scene.normal_load / unit
-    law, curve = scene.friction, None
-    if scene.follows_load_curve:
-        curve = tabulated(scene.contact.load_curve(law.mu_s, law.mu_m))
     return HybridSystem(
-        laws=(law,),
+        laws=(scene.friction,),
         speed=o.V,
         omega=omega,
         force_unit=unit,
@@ -104,17 +103,16 @@ def _of_scene(scene: Scene) -> HybridSystem:
         ),
         P=jnp.stack([P, zero]),
         V=jnp.ones_like(K),
-        curves=(curve,),
+        joint_forces=(joint_force(scene),),
         faces=((0, 1),),
         sharing=((0,),),
-        opens=(bool(scene.preload),),
     )
 
 
-def _of_structure(structure: Structure) -> HybridSystem:
+def _structure_system(structure: Structure) -> HybridSystem:
     n, dtype = structure.n, structure.M.dtype
     K, rows, weights, offsets, speeds, faces = structure.K, [], [], [], [], []
-    curves = []
+    joint_forces: list[JointForce] = []
     for name, joint in zip(structure.joint_names, structure.joints, strict=True):
         if joint.V is None:
             raise ValueError(f"joint {name}: V must be given, for the motion depends on it")
@@ -124,14 +122,13 @@ def _of_structure(structure: Structure) -> HybridSystem:
         rows.append(t)
         speeds.append(joint.V)
         faces.append((len(rows) - 1,))
-        P, law = joint.normal_load, joint.friction
-        followed = joint.follows_load_curve
-        curve = joint.contact.load_curve(law.mu_s, law.mu_m) if followed else None
-        curves.append(None if curve is None else tabulated(curve))
+        P = joint.normal_load
         offsets.append(jnp.zeros((), dtype) if P is None else P)
         if joint.normal is None:
+            joint_forces.append(TwoSidedSpring())
             weights.append(jnp.zeros(n, dtype))
             continue
+        joint_forces.append(joint_force(joint))
         normal = jnp.asarray(structure.direction(joint.normal), dtype)
         K = K + K_n * jnp.outer(normal, normal)
         weights += [K_n * normal, -K_t * t]
@@ -139,12 +136,14 @@ def _of_structure(structure: Structure) -> HybridSystem:
         rows.append(normal)
         speeds.append(joint.V)
         faces[-1] = (len(rows) - 2, len(rows) - 1)
+    speed_unit = 1e-6  # m/s, of a structure without joints
     laws, sharing = _shared([joint.friction for joint in structure.joints], faces)
     if not structure.joints:
         # A face without load, on a belt too fast for any motion: it never rubs or switches.
         unit = jnp.eye(n, dtype=dtype)[0]
         rows, weights, offsets = [unit], [0 * unit], [0 * unit[0]]
-        speeds, faces, curves = [jnp.asarray(_BEYOND * _UNIT, dtype)], [(0,)], [None]
+        speeds, faces = [jnp.asarray(1e30 * speed_unit, dtype)], [(0,)]
+        joint_forces.append(TwoSidedSpring())
         laws, sharing = (Coulomb(jnp.ones((), dtype)),), ((0,),)
     T, L, V, P = jnp.stack(rows), jnp.stack(weights), jnp.stack(speeds), jnp.stack(offsets)
     force = jnp.zeros(n, dtype) if structure.F is None else structure.F
@@ -155,8 +154,7 @@ def _of_structure(structure: Structure) -> HybridSystem:
     K, C, B, F = jnp.split(by_mass, [n, 2 * n, 2 * n + len(rows)], axis=1)
     # Between the highest eigenfrequency and n^(1/4) times it.
     omega = jnp.sum(K * K.T) ** 0.25
-    opens = tuple(bool(joint.preload) and joint.normal is not None for joint in structure.joints)
-    speed = V[0] if structure.joints else jnp.asarray(_UNIT, dtype)
+    speed = V[0] if structure.joints else jnp.asarray(speed_unit, dtype)
     unit = omega * speed
     return HybridSystem(
         laws=laws,
@@ -171,12 +169,11 @@ def _of_structure(structure: Structure) -> HybridSystem:
         L=L / omega**2,
         P=P / unit,
         V=V / speed,
-        curves=tuple(curves),
+        joint_forces=tuple(joint_forces),
         faces=tuple(faces),
         sharing=sharing,
-        opens=opens or (False,),
         jointless=not structure.joints,
-        fastest=_fastest(K / omega**2, C / omega) if n > FEW else None,
+        fastest=_fastest(K / omega**2, C / omega) if steps_follow_motion(n) else None,
     ).with_products()
 
 
@@ -185,7 +182,8 @@ def _fastest(K, C) -> Float[Array, ""]:
     n = len(K)
     eye, zero = jnp.eye(n, dtype=K.dtype), jnp.zeros_like(K)
     A = jax.lax.stop_gradient(jnp.block([[zero, eye], [-K, -C]]))
-    return jnp.exp(log_spectral_radius(A, _SQUARINGS))
+    # The logarithm is too large by ln(2n) / 2^10 or so.
+    return jnp.exp(log_spectral_radius(A, squarings=10))
 
 
 def _shared(laws: Sequence[Friction], faces: Sequence[tuple[int, ...]]):

@@ -8,6 +8,7 @@ Components are the first axis of every array and scenes the last, which compiles
 """
 
 import functools
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,16 +16,16 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Float, Int
 
-from .acceptance import HARDLY, admissible, growth_of, has_shorter_period
-from .assessment import RUNNING, Candidates, Progress, SearchOptions, assess, concluded, passed
-from .hybrid import UNUSED, HybridSystem
+from .acceptance import admissible, growth_of, has_shorter_period
+from .assessment import Candidates, Problem, Progress, assess, conclude_round, count_rounds
+from .cycle_search import CycleSearch
+from .guard import UNUSED
+from .hybrid import HybridSystem
 from .lanes import chosen
 from .orbit import PeriodicOrbit, solve_periodic_orbits
 from .record import Record, Steps, Stretch, cut
 from .segments import Segments
-
-_OPTIONS = SearchOptions()
-_MESHES = 6  # most on which a candidate is solved, each finer, until accurate
+from .status import Status
 
 
 class Attractor(eqx.Module):
@@ -49,7 +50,9 @@ def _no_segments(y, faces: int, length: int) -> Segments:
     )
 
 
-def _solve_candidates(system, record, lane, active, candidates: Candidates, *, length, options):
+def _solve_candidates(
+    system, record, lane, active, candidates: Candidates, *, length, search: CycleSearch
+):
     """The orbits near the steps of lanes (g,): segments, error and growth, and if accepted.
 
     An orbit of a shorter period is not: the same segments resolve that period better alone.
@@ -61,7 +64,7 @@ def _solve_candidates(system, record, lane, active, candidates: Candidates, *, l
 
     def going(carry):
         orbits, _, tries = carry
-        return (tries == 0) | ((tries < _MESHES) & jnp.any(unsettled(orbits)))
+        return (tries == 0) | ((tries < search.meshes) & jnp.any(unsettled(orbits)))
 
     def mesh(orbit, h, of_run):
         # The orbit's phases have other lengths and weights than those of the run.
@@ -76,7 +79,7 @@ def _solve_candidates(system, record, lane, active, candidates: Candidates, *, l
         segments = mesh(orbits.segments, h, of_run)
         pending = active & (of_run | unsettled(orbits))
         new = solve_periodic_orbits(
-            system, segments, pending, options.reach * scale, candidates.rtol
+            system, segments, pending, search.reach * scale, candidates.rtol
         )
         # The method is of order 8; where the motion is less smooth, halving is enough.
         has_error = new.error > 0  # False for NaN
@@ -90,24 +93,23 @@ def _solve_candidates(system, record, lane, active, candidates: Candidates, *, l
     near = jnp.max(jnp.abs(orbit.y[:, 0] - candidates.y), axis=0) < 0.2 * scale
     moves = jnp.max(jnp.abs(orbit.y[n:]), axis=(0, 1)) > 1e-4
     growth = growth_of(system, orbits)
-    ok = active & orbits.converged & near & moves & (growth < HARDLY)
+    ok = active & orbits.converged & near & moves & (growth < search.repelling)
     ok = ok & admissible(system, orbit, orbits.middle)
     ok = ok & ~has_shorter_period(orbit, candidates.returns)
     return orbit, jnp.stack([orbits.error, growth]), ok
 
 
-def _in_groups(system, record, ready, gap, candidates, orbit, error, *, options, length):
+def _solve_in_groups(problem: Problem, record, ready, gap, candidates, orbit, error):
     """The orbits of all lanes, new where accepted; lanes that are ready are solved in groups."""
-    lanes = len(ready)
-    size = min(lanes, options.group)
+    system, lanes = problem.system, len(ready)
+    size = min(lanes, problem.search.group)
 
     def solve_lanes(lane, active, candidates):
         # The systems of several lanes, each for all of its segments.
         batched = system.omega.ndim > 0
         lane_system = jax.tree.map(lambda x: x[..., None, lane], system) if batched else system
-        return _solve_candidates(
-            lane_system, record, lane, active, candidates, length=length, options=options
-        )
+        options = {"length": problem.length, "search": problem.search}
+        return _solve_candidates(lane_system, record, lane, active, candidates, **options)
 
     if size == lanes:
         *new, ok = solve_lanes(jnp.arange(lanes), ready, candidates)
@@ -138,16 +140,28 @@ def _in_groups(system, record, ready, gap, candidates, orbit, error, *, options,
     return jax.lax.while_loop(going, solve, carry)[:3]
 
 
-def _find(
-    system, start, equilibrium, growth, max_returns, h, rtol, *, length, options
+def _kept_steps(length: int, search: CycleSearch) -> int:
+    """Number of steps that the record of a run keeps: whole rounds, and more than one of them.
+
+    A segment is about a step long, and a run may take long to come near its orbit.
+    """
+    rounds = -(-max(32 * length, search.kept_steps) // search.round_steps)
+    return max(rounds, 2) * search.round_steps
+
+
+def _search_lanes(
+    system, start, equilibrium, growth, max_returns, h, rtol, *, length: int, search: CycleSearch
 ) -> Attractor:
     lanes = start.shape[1]
-    record = Record.begin(system, start, max(32 * length, options.record))
+    record = Record.begin(system, start, _kept_steps(length, search))
     bound = system.bound(start, equilibrium)
+    problem = Problem(
+        system, equilibrium, growth, bound, max_returns, h, rtol, length=length, search=search
+    )
     none, far = jnp.zeros(lanes, int), jnp.full(lanes, jnp.inf, start.dtype)
     zero = jnp.zeros(lanes, start.dtype)
     progress = Progress(
-        status=none + RUNNING,
+        status=none + Status.RUNNING,
         period_returns=none,
         distance=far,
         approach=none,
@@ -160,45 +174,30 @@ def _find(
     )
 
     orbit, error = _no_segments(start, len(record.s), length), jnp.stack([zero, zero])
-    look = functools.partial(assess, options=options, length=length)
 
     def running(carry):
-        return jnp.any(carry[1].status == RUNNING)
+        return jnp.any(carry[1].status == Status.RUNNING)
 
     def body(carry):
         record, progress, orbit, error, rounds = carry
         # A run that takes long to settle may be near the boundary of two basins.
-        counted = passed(system, rounds, jnp.max(progress.returns), options)
-        finer = sum(counted >= after for after in options.finer_after)
-        h_run = (options.step / 2.0**finer).astype(start.dtype)
-        record = record.advance(system, h_run, options.round_steps)
-        limits = equilibrium, bound, growth, max_returns, h, rtol
-        assessment = look(system, record, progress, orbit, rounds, *limits)
+        counted = count_rounds(problem, rounds, jnp.max(progress.returns))
+        halve_after = search.finer_after, 3 * search.finer_after
+        halvings: Any = sum(counted >= after for after in halve_after)
+        h_run = (search.step / 2.0**halvings).astype(start.dtype)
+        record = record.advance(system, h_run, search.round_steps)
+        assessment = assess(problem, record, progress, orbit, rounds)
+        near, rest = assessment.near, assessment.rest
 
         def solve_ready():
-            return _in_groups(
-                system,
-                record,
-                assessment.ready,
-                assessment.gap,
-                assessment.candidates,
-                orbit,
-                error,
-                options=options,
-                length=length,
-            )
+            candidates = assessment.candidates
+            return _solve_in_groups(problem, record, near.ready, near.gap, candidates, orbit, error)
 
         # XLA moves loop-invariant work out of a loop, where it is done even if the loop is not.
-        none = orbit, error, jnp.zeros_like(assessment.ready)
-        orbit, error, accepted = jax.lax.cond(jnp.any(assessment.ready), solve_ready, lambda: none)
-        progress = concluded(assessment, progress, orbit, accepted, options.accepted)
-        return (
-            record.continue_from(assessment.y, assessment.extrapolates),
-            progress,
-            orbit,
-            error,
-            rounds + 1,
-        )
+        none = orbit, error, jnp.zeros_like(near.ready)
+        orbit, error, accepted = jax.lax.cond(jnp.any(near.ready), solve_ready, lambda: none)
+        progress = conclude_round(assessment, progress, orbit, accepted, search.accepted)
+        return record.continue_from(rest.y, rest.extrapolates), progress, orbit, error, rounds + 1
 
     _, progress, orbit, error, _ = jax.lax.while_loop(
         running, body, (record, progress, orbit, error, 0)
@@ -209,7 +208,7 @@ def _find(
     )
 
 
-def find(
+def find_attractor(
     system: HybridSystem,
     start,
     equilibrium,
@@ -218,7 +217,7 @@ def find(
     h,
     rtol,
     length: int,
-    options: SearchOptions = _OPTIONS,
+    search: CycleSearch,
 ) -> Attractor:
     """The attractor of the motion from `start`, its orbit on `length` segments, in scaled units.
 
@@ -226,7 +225,7 @@ def find(
     are no longer than h, or as short as `rtol` needs, where so few suffice. Under `jax.vmap` the
     scenes become the last axis.
     """
-    search = functools.partial(_find, length=length, options=options)
+    search_lanes = functools.partial(_search_lanes, length=length, search=search)
 
     def lanes_first(attractors):
         return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), attractors)
@@ -234,7 +233,7 @@ def find(
     @custom_vmap
     def one(arguments):
         system, *rest = arguments
-        attractor = search(system, *(x[..., None] for x in rest))
+        attractor = search_lanes(system, *(x[..., None] for x in rest))
         return jax.tree.map(lambda x: x[0], lanes_first(attractor))
 
     @one.def_vmap
@@ -248,7 +247,7 @@ def find(
             arguments,
             in_batched[0],
         )
-        attractors = lanes_first(search(*arguments))
+        attractors = lanes_first(search_lanes(*arguments))
         return attractors, jax.tree.map(lambda _: True, attractors)
 
     return one((system, start, equilibrium, growth, max_returns, h, rtol))

@@ -9,11 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .hybrid import UNUSED, HybridSystem
+from .guard import UNUSED
+from .hybrid import HybridSystem
 from .lanes import row_numbers
 from .runge_kutta import runge_kutta
-
-_BLOCK = 8  # terms of a sum; XLA leaves longer sums to a library
 
 
 class Segments(eqx.Module):
@@ -66,14 +65,17 @@ def chosen_guard(system: HybridSystem, y, s, guard) -> Array:
     return jnp.sum(jnp.where(row_numbers(guards) == guard[None], guards, 0), axis=0)
 
 
-def cumulative(x) -> Array:
-    """The cumulative sums of x (..., k), which compile faster than jnp.cumsum."""
+def cumulative(x, block: int = 8) -> Array:
+    """The cumulative sums of x (..., k), which compile faster than jnp.cumsum.
+
+    They are sums over each `block`, as XLA leaves longer sums to a library, and over the blocks.
+    """
     k = x.shape[-1]
-    if k <= _BLOCK or k % _BLOCK:
+    if k <= block or k % block:
         at = jnp.arange(k)
         return jnp.sum(jnp.where(at[None] <= at[:, None], x[..., None, :], 0), axis=-1)
-    inside = cumulative(x.reshape(*x.shape[:-1], k // _BLOCK, _BLOCK))
-    before = cumulative(inside[..., -1]) - inside[..., -1]
+    inside = cumulative(x.reshape(*x.shape[:-1], k // block, block), block)
+    before = cumulative(inside[..., -1], block) - inside[..., -1]
     return (inside + before[..., None]).reshape(x.shape)
 
 

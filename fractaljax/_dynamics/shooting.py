@@ -20,10 +20,13 @@ from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import substituted
 from .events import Cubic
 from .extremes import extreme_values
-from .hybrid import NONE, UNUSED, HybridSystem
+from .guard import NONE, UNUSED
+from .hybrid import HybridSystem
 from .runge_kutta import runge_kutta
 from .scaled import hybrid_system
 from .segments import Segments, chosen_guard, flow, next_start, tableau
+from .step_length import density
+from .transition import switch
 
 
 class Window(eqx.Module):
@@ -182,8 +185,9 @@ class Place(NamedTuple):
     after: Int[Array, ""]  # and at its end
 
 
-_NODES = 5
-_TINY = 1e-12  # scaled time from a switch that counts as zero
+def _at_switch(time) -> Array:
+    """True for scaled times from a switch that are zero to rounding."""
+    return time <= 1e-12
 
 
 def reduced_guard(system: HybridSystem, chain: Chain, y, h, at: Place, theta) -> Array:
@@ -201,7 +205,7 @@ def reduced_guard(system: HybridSystem, chain: Chain, y, h, at: Place, theta) ->
     value, rate = values[at.guard], rates[at.guard]
     time, rest = since + theta * h[k], left + (1 - theta) * h[k]
     # At its own zero the guard's rate takes the place of the quotient.
-    at_start, at_end = (at.before > 0) & (time <= _TINY), (at.after > 0) & (rest <= _TINY)
+    at_start, at_end = (at.before > 0) & _at_switch(time), (at.after > 0) & _at_switch(rest)
     plain = value / jnp.where(at_start | (at.before == 0), 1, time**at.before)
     plain = plain / jnp.where(at_end | (at.after == 0), 1, rest)
     at_start_value = rate / jnp.where(at.after > 0, rest, 1)
@@ -219,7 +223,7 @@ def lowest(x: Mechanism, window: Window, chain: Chain, lifted: Lifted, u, before
     system = window.system(x, u[-1])
     y, n = lifted.at(u), system.n
     h = durations(chain, u, n)
-    theta = jnp.arange(_NODES, dtype=y.dtype) / (_NODES - 1)
+    theta = jnp.arange(5, dtype=y.dtype) / 4  # the ends of a segment, and three places inside
 
     def samples(share):
         states = flow(system, y, share * h, chain.s)
@@ -231,8 +235,8 @@ def lowest(x: Mechanism, window: Window, chain: Chain, lifted: Lifted, u, before
     time = ((chain.begin[None] + theta[:, None] * chain.share[None]) * phase[None])[None]
     rest = phase[None, None] - time
     p, q = before[:, chain.phase][:, None], after[:, chain.phase][:, None]
-    at_start, at_end = (p > 0) & (time <= _TINY), (q > 0) & (rest <= _TINY)
-    time, rest = jnp.where(time <= _TINY, 1, time), jnp.where(rest <= _TINY, 1, rest)
+    at_start, at_end = (p > 0) & _at_switch(time), (q > 0) & _at_switch(rest)
+    time, rest = jnp.where(_at_switch(time), 1, time), jnp.where(_at_switch(rest), 1, rest)
     over = jnp.where(at_start, 1, time**p) * jnp.where(at_end, 1, rest**q)
     reduced = jnp.where(at_start, rate, jnp.where(at_end, -rate, value)) / over
     # After a stick ends, a slip begins with a zero of second order, whose sign the stick's decides.
@@ -293,7 +297,7 @@ def resampled(x, window: Window, chain: Chain, lifted: Lifted, u, times, longest
     k = jnp.minimum(jnp.searchsorted(ends, times, side="right"), last)
     s = chain.s[:, k]
     y = flow(system, lifted.at(u)[:, k], times - (ends - h)[k], s)
-    return y, system.density(y, s, jnp.broadcast_to(longest, k.shape))
+    return y, density(system, y, s, jnp.broadcast_to(longest, k.shape))
 
 
 @exported_jit
@@ -346,7 +350,7 @@ def largest_friction(x, window: Window, q, y):
 @jax.jit
 def after_switch(x, window: Window, q, y, s, guard):
     """The contact state after a guard of contact state s has reached zero at y."""
-    return window.system(x, q).switch(y, s, guard)[1]
+    return switch(window.system(x, q), y, s, guard)[1]
 
 
 @jax.jit

@@ -28,11 +28,14 @@ from .._base.parts import (
 )
 from .._base.programs import exported_jit
 from .._mechanism.mechanism import Mechanism
+from .contact_state import OPEN, STICK
 from .exact_step import step_to_switch
 from .excitation import Excitation, excited_system
-from .hybrid import NONE, OPEN, HybridSystem
+from .guard import NONE
+from .hybrid import HybridSystem
 from .scaled import check_rtol, degrees_of_freedom, start_state
 from .segments import chosen_guard, flow
+from .transition import first_contact_state, switch
 
 if TYPE_CHECKING:
     from diffrax import AbstractSolver
@@ -60,7 +63,7 @@ class Trajectory(Record):
     contact_states: Float[
         Array, "n f"
     ]  # from each time on: +1, -1 slip forward, backward, 0 stick, 2 open
-    result: SimulationResult
+    result: SimulationResult  # a member of SimulationResult
     _system: HybridSystem | None = eqx.field(repr=False)  # None with `saveat`
     _solution: Any = eqx.field(repr=False)  # diffrax's, of the regularised law
 
@@ -167,7 +170,7 @@ def _find_steps(system: HybridSystem, y, end, h, rtol, *, max_steps: int) -> _St
         return y, s_new, t, k + 1, *recorded
 
     n = max_steps
-    s = system.contact_state(y)
+    s = first_contact_state(system, y)
     empty = jnp.zeros(n, y.dtype), jnp.ones((len(s), n), y.dtype), jnp.full(n, NONE)
     start = y, s, jnp.zeros((), y.dtype), 0, *empty
     y, s, t, count, duration, states, guards = jax.lax.while_loop(running, body, start)
@@ -197,7 +200,7 @@ def _repeat(system: HybridSystem, y, t0, end, steps: _Steps) -> Trajectory:
         # Zero, with minus the derivative of the time at which the guard is zero.
         off = value - jax.lax.stop_gradient(value)
         late = off / jax.lax.stop_gradient(jnp.where(slope == 0, 1, slope))
-        y_2, _ = system.switch(y_1 - late * rate, s, guard)
+        y_2, _ = switch(system, y_1 - late * rate, s, guard)
         return (y_2, t + dt - late), (y_2, t + dt - late, s_new)
 
     following = jnp.concatenate([steps.s[:, 1:], steps.s[:, -1:]], axis=1)
@@ -257,7 +260,7 @@ def _regularised(
         last = jnp.where(jnp.isfinite(solution.ys), solution.ys, 0)
         times, states = saveat, jnp.where(jnp.isfinite(solution.ys), solution.ys, jnp.nan)[:-1]
     sliding = system.speed * jax.vmap(lambda y: system.sliding(y[system.n :]))(states)
-    contact_states = jnp.where(jnp.abs(sliding) < eps, 0, jnp.sign(sliding))
+    contact_states = jnp.where(jnp.abs(sliding) < eps, STICK, jnp.sign(sliding))
     if any(system.opens):
         contact_states = jnp.where(system.open_faces(states.T).T, OPEN, contact_states)
     far = jnp.max(jnp.abs(last)) > system.bound(y, system.equilibrium())

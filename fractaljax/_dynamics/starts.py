@@ -10,8 +10,6 @@ from .._base.parts import number, scalar, whole
 from .._base.programs import exported_jit
 from .hybrid import HybridSystem
 
-_MOST_STARTS = 1_000_000
-
 
 @exported_jit
 def _centre(system: HybridSystem) -> tuple[Array, Array]:
@@ -29,7 +27,7 @@ def starts_of(system, n, low, high, starts, seed, radius) -> Float[np.ndarray, "
         if points.ndim != 2 or points.shape[1] != 2 * n or not len(points):
             raise ValueError(f"starts must have shape (k, {2 * n}), got {points.shape}")
         return points
-    count = whole("starts", starts, 1, _MOST_STARTS)
+    count = whole("starts", starts, 1, 1_000_000)  # more would take days
     if radius is not None:
         centre, axes = ellipsoid(system, kick_size("radius", radius, n))
         return centre + _in_unit_ball(count, 2 * n, seed) * axes

@@ -7,19 +7,15 @@ from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
 from .._stability.stability import stability
 from .._stability.summary import friction_remark, stiffness_remarks, verdict
+from .contact_state import STATES
 from .cycle import CycleResult, LimitCycle
 
-_MOST = 12  # degrees of freedom of a structure, and multipliers, that are listed
-_CONTACT_STATES = {
-    "+": "slips, dx/dt < V",
-    "-": "slips, dx/dt > V",
-    "stick": "sticks",
-    "open": "open",
-}
 
+def cycle_table(mechanism: Scene | Structure, cycle: LimitCycle, most: int = 12) -> str:
+    """The result of the search for one limit cycle, its numbers and its switches.
 
-def cycle_table(mechanism: Scene | Structure, cycle: LimitCycle) -> str:
-    """The result of the search for one limit cycle, its numbers and its switches."""
+    At most that many multipliers and degrees of freedom of a structure are listed.
+    """
     lacking = stiffness_remarks(mechanism)
     outcome = {"result": str(CycleResult[cycle.result])}
     outcome |= verdict(stability(mechanism), without_joint=bool(lacking))
@@ -39,7 +35,7 @@ def cycle_table(mechanism: Scene | Structure, cycle: LimitCycle) -> str:
     multipliers = (np.round(np.asarray(cycle.multipliers), 6) + 0).tolist()
     whole |= {
         f"Floquet multiplier {i}": f"{s.real:+.6f} {s.imag:+.6f}i  (modulus {abs(s):.6f})"
-        for i, s in enumerate(multipliers[:_MOST], start=1)
+        for i, s in enumerate(multipliers[:most], start=1)
     }
     directions = [
         {
@@ -51,11 +47,11 @@ def cycle_table(mechanism: Scene | Structure, cycle: LimitCycle) -> str:
     ]
     if isinstance(mechanism, Structure):
         names = mechanism.names or [f"x{i}" for i in range(1, mechanism.n + 1)]
-        most = sorted(range(mechanism.n), key=lambda i: -cycle.amplitude[i])[:_MOST]
+        largest = sorted(range(mechanism.n), key=lambda i: -cycle.amplitude[i])[:most]
         tables = ["\n".join(lacking)] * bool(lacking) + [
             table([""], [whole]),
             table(list(mechanism.joint_names), _joint_columns(cycle)),
-            table([names[i] for i in most], [directions[i] for i in most]),
+            table([names[i] for i in largest], [directions[i] for i in largest]),
         ]
         return "\n\n".join(tables)
     scene = mechanism
@@ -90,12 +86,13 @@ def _joint_columns(cycle: LimitCycle) -> list[dict[str, str]]:
 
 
 def _switching(switches, period) -> str:
+    words = {state.name: state.description.format(velocity="dx/dt") for state in STATES}
     columns = {
         "time [ms]": [f"{at.time * 1e3:.6f}" for at in switches],
         "of the period": [f"{at.time / period:.2%}" for at in switches],
         "direction": [f"x{at.direction}" for at in switches],
-        "before": [_CONTACT_STATES[at.before] for at in switches],
-        "after": [_CONTACT_STATES[at.after] for at in switches],
+        "before": [words[at.before] for at in switches],
+        "after": [words[at.after] for at in switches],
     }
     names = [f"switch {i}" for i in range(1, len(switches) + 1)]
     rows = [dict(zip(names, cells, strict=True)) for cells in columns.values()]

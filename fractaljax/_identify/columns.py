@@ -18,7 +18,7 @@ _TITLES = {  # in lower case and without units
 _UNCLEAR = ("mask", "flag", "flags", "status", "code")  # 1 may stand for good or for bad
 
 
-def choose(table: Table, selection: Mapping[str, str | int] | None) -> Table:
+def choose_columns(table: Table, selection: Mapping[str, str | int] | None) -> Table:
     """The columns of positions, if any, and heights, in this order; NaN where flags say so.
 
     `selection` has names of columns, or numbers from 0, by role: x, y, z, and the flags valid or
@@ -58,7 +58,7 @@ def choose(table: Table, selection: Mapping[str, str | int] | None) -> Table:
     return Table(numbers, picked, [table.units[place] for place in order], table.settings, {})
 
 
-def unclear(table: Table, error: ValueError) -> ValueError:
+def suggest_columns(table: Table, error: ValueError) -> ValueError:
     """The error, with a hint how to select columns if there is more than one."""
     return _choice(table, str(error)) if table.numbers.shape[1] > 1 else error
 

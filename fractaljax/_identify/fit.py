@@ -6,22 +6,21 @@ every bin holds each wave of Eq. 13 once, wherever in the bin it is.
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from .._base.parts import Record
-from .spectrum import Spectrum
+from .spectrum import PowerSpectrum
 
-FLAT_DEVIATION = (
-    0.35  # standard deviation of the unknown flat share, relative to the law at Nyquist
-)
-_SPREAD = 0.15  # variance of the flat share, relative to that of its prior
-_SCATTER_ROUNDS = 4
-_STEPS = 20
-_TERMS = 40  # of aliased waves: the last is beyond rounding up to Nyquist, p up to 8
-_STEP = 1e-6  # in p, of a difference quotient
+
+class FlatPrior(NamedTuple):
+    """Normal prior of an unknown flat share, relative to the law at the Nyquist frequency."""
+
+    mean: float = 0.0
+    deviation: float = 0.35  # tuned on synthetic surfaces
 
 
 class PowerLaw(Record):
@@ -77,29 +76,30 @@ def shape(u: np.ndarray, p: float, aliased: bool) -> np.ndarray:
 def shape_by_p(u: np.ndarray, aliased: bool) -> Callable[[float], tuple[np.ndarray, np.ndarray]]:
     """Function of p that returns `shape` and its derivative by p; the rest is computed once."""
     log_u = np.log(u)
-    even_powers = (u / 2) ** np.arange(0, 2 * _TERMS, 2)[:, None] if aliased else None
+    terms, step = 40, 1e-6  # up to Nyquist and p = 8, further terms are below rounding
+    even_powers = (u / 2) ** np.arange(0, 2 * terms, 2)[:, None] if aliased else None
 
     def at(p):
         value = np.exp(-p * log_u)
         slope = -log_u * value
         if even_powers is not None:
-            sums = _aliased(p), _aliased(p + _STEP)
-            others, change = np.array([sums[0], (sums[1] - sums[0]) / _STEP]) @ even_powers
+            sums = _aliased(p, terms), _aliased(p + step, terms)
+            others, change = np.array([sums[0], (sums[1] - sums[0]) / step]) @ even_powers
             value, slope = value + others, slope + change
         return value, slope
 
     return at
 
 
-def _aliased(p: float) -> np.ndarray:
-    """Coefficients of even powers of u/2 in the sum over all j but 0 of |u + 2j|^-p.
+def _aliased(p: float, terms: int) -> np.ndarray:
+    """Coefficients of the first even powers of u/2 in the sum over all j but 0 of |u + 2j|^-p.
 
     (1 + x)^-p + (1 - x)^-p = 2 sum over even k of p(p+1)...(p+k-1)/k! x^k, at x = u/(2j).
     """
     from scipy.special import zeta
 
-    s, k = max(p, 1.02), np.arange(2 * _TERMS)  # the sum diverges at 1
-    binomial = np.cumprod(np.append(1.0, (s + k) / (k + 1)))[: 2 * _TERMS : 2]
+    s, k = max(p, 1.02), np.arange(2 * terms)  # the sum diverges at 1
+    binomial = np.cumprod(np.append(1.0, (s + k) / (k + 1)))[: 2 * terms : 2]
     return 2 ** (1 - p) * binomial * zeta(s + k[::2])
 
 
@@ -119,7 +119,7 @@ def bin_edges(band: tuple[float, float], ratio: float) -> np.ndarray:
 class Bins:
     """Means over the bins of a band that hold any ordinates."""
 
-    def __init__(self, spectrum: Spectrum, band, ratio):
+    def __init__(self, spectrum: PowerSpectrum, band, ratio):
         low, high = band[0] * (1 - 1e-9), band[1] * (1 + 1e-9)
         inside = (spectrum.f >= low) & (spectrum.f <= high)
         edges = bin_edges(band, ratio)
@@ -136,13 +136,12 @@ class Bins:
 
 
 def fit(
-    spectrum: Spectrum,
+    spectrum: PowerSpectrum,
     band: tuple[float, float],
     ratio: float,
     *,
     aliased: bool = False,
-    flat_mean: float = 0.0,
-    flat_deviation: float = FLAT_DEVIATION,
+    flat_prior: FlatPrior = FlatPrior(),
     scatter: float | None = None,
     factor: Callable | None = None,
     start: PowerLaw | None = None,
@@ -151,12 +150,11 @@ def fit(
     """The power law of a spectrum over a band [1/m], in bins of `ratio`.
 
     Waves beyond the Nyquist frequency follow the same law (`aliased`), or are unknown: a flat share
-    of either sign, with a normal prior of `flat_mean` and `flat_deviation` in units of the law at
-    Nyquist. (Aliased power is flat in the band, and so is the lack of waves that a profile should
-    cross at an angle.) A given `scatter` is not estimated, so that the deviances of laws that share
-    it are comparable. A `factor(f)` returns a and b of exp(a + b p), which multiplies the law.
-    Iterations begin at the law `start` and end when ln A, p and the flat share change by less than
-    `tol`.
+    of either sign, with the prior `flat_prior`. (Aliased power is flat in the band, and so is the
+    lack of waves that a profile should cross at an angle.) A given `scatter` is not estimated, so
+    that the deviances of laws that share it are comparable. A `factor(f)` returns a and b of
+    exp(a + b p), which multiplies the law. Iterations begin at the law `start` and end when ln A, p
+    and the flat share change by less than `tol`.
     """
     bins = Bins(spectrum, band, ratio)
     u, widths = bins.f / spectrum.nyquist, bins.spread / bins.f**2
@@ -185,12 +183,12 @@ def fit(
         )
         return ratios, np.stack([np.ones_like(ratios), *slopes], axis=1)
 
-    mean = np.array([0.0, 0.0, flat_mean])
-    prior = np.diag([0.0, 0.0, 1 / flat_deviation**2])
+    mean = np.array([0.0, 0.0, flat_prior.mean])
+    prior = np.diag([0.0, 0.0, 1 / flat_prior.deviation**2])
 
     def solve(at, variance):
         """Fisher scoring."""
-        for _ in range(_STEPS):
+        for _ in range(20):  # at most
             ratios, slope = relative(at)
             weighted = slope.T / variance
             score = weighted @ (ratios - 1) - prior @ (at - mean)
@@ -205,11 +203,11 @@ def fit(
         return at, *relative(at)
 
     if start is None:
-        at = np.array([np.log(bins(bins.power / law(2.0)[0]).mean()), 2.0, flat_mean])
+        at = np.array([np.log(bins(bins.power / law(2.0)[0]).mean()), 2.0, flat_prior.mean])
     else:
         at = np.array([start.log_A, start.p, start.flat])
     estimated, ratios, slope = scatter or 0.0, *relative(at)
-    for _ in range(_SCATTER_ROUNDS):
+    for _ in range(4):  # at most; the scatter hardly changes the law
         at, ratios, slope = solve(at, bins.variance + estimated)
         if scatter is not None:
             break
@@ -219,10 +217,10 @@ def fit(
     variance = bins.variance + estimated
     data = slope.T / variance @ slope
     inverse = np.linalg.inv(data + prior)
-    # The prior of the flat share is wide, but its actual scatter about the mean is smaller.
-    covariance = inverse @ (data + _SPREAD * prior) @ inverse
+    # The prior of the flat share is wide, but its variance about the mean is 0.15 of that.
+    covariance = inverse @ (data + 0.15 * prior) @ inverse
     deviance = 2 * np.sum((ratios - 1 - np.log(np.maximum(ratios, 1e-300))) / variance)
-    deviance += ((at[2] - flat_mean) / flat_deviation) ** 2
+    deviance += ((at[2] - flat_prior.mean) / flat_prior.deviation) ** 2
     log_A, p, flat = map(float, at)
     return PowerLaw(
         log_A=log_A,

@@ -16,33 +16,34 @@ from collections.abc import Callable
 import equinox as eqx
 import numpy as np
 
-from .preparation import filled
-from .spectrum import Spectrum
-
-_ROUNDS, _SURROGATES = 2, 2
-_TAIL = 0.5  # of the Nyquist frequency: above, a power law that continues into a map's corners
+from .preparation import fill_gaps
 
 
-def without_gaps(
-    spectra: tuple[Spectrum, ...],
+def correct_for_gaps(
+    spectra: tuple[PowerSpectrum, ...],
     gaps: list[np.ndarray],
     steps: tuple[float, ...],
-    spectra_of: Callable[[list[np.ndarray]], tuple[Spectrum, ...]],
-) -> tuple[Spectrum, ...]:
+    estimate: Callable[[list[np.ndarray]], tuple[PowerSpectrum, ...]],
+    *,
+    rounds: int = 2,
+    surrogates: int = 2,
+) -> tuple[PowerSpectrum, ...]:
     """The spectra of filled segments, or of a filled map, corrected for where its `gaps` are.
 
-    `steps` [m] between points along its axes; `spectra_of` gives the spectra of heights.
+    `steps` [m] between points along its axes; `estimate` returns the spectra of heights.
     """
     corrected = spectra
-    for rank in range(_ROUNDS):
+    for rank in range(rounds):
         change = [np.zeros(each.f.size) for each in spectra]
-        for i in range(_SURROGATES):
+        for i in range(surrogates):
             random = np.random.default_rng([rank, i])
             whole = [_surrogate(corrected[0], gap.shape, steps, random) for gap in gaps]
-            holed = [filled(np.where(gap, np.nan, z)) for z, gap in zip(whole, gaps, strict=True)]
-            pairs = zip(spectra_of(holed), spectra_of(whole), strict=True)
+            holed = [
+                fill_gaps(np.where(gap, np.nan, z)) for z, gap in zip(whole, gaps, strict=True)
+            ]
+            pairs = zip(estimate(holed), estimate(whole), strict=True)
             for total, (after, before) in zip(change, pairs, strict=True):
-                total += np.log(after.power / before.power) / _SURROGATES
+                total += np.log(after.power / before.power) / surrogates
         corrected = tuple(
             eqx.tree_at(lambda each: each.power, each, each.power * np.exp(-by))
             for each, by in zip(spectra, change, strict=True)
@@ -57,7 +58,8 @@ def _surrogate(spectrum, shape, steps, random) -> np.ndarray:
     f = np.hypot(axes[0][:, None], axes[1]) if first else axes[0]
     f.flat[0] = spectrum.f[0]
     log_f, log_power = np.log(spectrum.f), np.log(spectrum.power)
-    tail = spectrum.f > _TAIL * spectrum.nyquist
+    # Above the Nyquist frequency, in the corners of a map, the law of the upper half continues.
+    tail = spectrum.f > 0.5 * spectrum.nyquist
     slope, level = np.polyfit(log_f[tail], log_power[tail], 1)
     log = np.log(f)
     radial = np.where(f > spectrum.nyquist, level + slope * log, np.interp(log, log_f, log_power))

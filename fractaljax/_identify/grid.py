@@ -4,14 +4,12 @@ import math
 
 import numpy as np
 
-_JITTER = 0.1  # of a step: largest deviation of positions from equal steps
-_FEW = 0.01  # of the points: where more are left out, rounded positions are tried first
 
-
-def equal_steps(x: np.ndarray) -> tuple[float, np.ndarray]:
+def equal_steps(x: np.ndarray, *, jitter: float = 0.1) -> tuple[float, np.ndarray]:
     """The step of increasing positions x (n,), and how many steps each is from the first.
 
-    Points may be left out, and positions may be rounded to few decimals.
+    Points may be left out, and positions may be rounded to few decimals, or be off by a share
+    `jitter` of a step.
 
     **Raises:** `ValueError` where positions do not increase, or are not on such a grid.
     """
@@ -27,11 +25,11 @@ def equal_steps(x: np.ndarray) -> tuple[float, np.ndarray]:
     counts = np.rint(steps / np.quantile(steps, 0.5, method="lower"))
     k = np.concatenate([[0], np.cumsum(counts)])
     dx, spread = _line(x, k)
-    fits = counts.min() > 0 and k[-1] < 2 * x.size and spread <= 2 * _JITTER * dx
-    if not fits or k[-1] > (1 + _FEW) * x.size:
+    fits = counts.min() > 0 and k[-1] < 2 * x.size and spread <= 2 * jitter * dx
+    if not fits or k[-1] > 1.01 * x.size:  # many left out, or positions that were rounded
         every = np.arange(x.size)
         rounded_dx, spread = _line(x, every)
-        if spread <= 1.1 * _rounding(x, rounded_dx):
+        if spread <= 1.1 * _rounding(x, rounded_dx, jitter):
             return rounded_dx, every
     if not fits:
         raise ValueError(
@@ -48,9 +46,9 @@ def _line(x, k) -> tuple[float, float]:
     return float(slope), float(np.ptp(x - slope * k))
 
 
-def _rounding(x, dx) -> float:
-    """Power of ten from 0.1 to 2 steps of which all positions are multiples, or 0."""
-    coarse, fine = (math.floor(math.log10(share * dx)) for share in (2, _JITTER))
+def _rounding(x, dx, least) -> float:
+    """Power of ten from `least` to 2 steps of which all positions are multiples, or 0."""
+    coarse, fine = (math.floor(math.log10(share * dx)) for share in (2, least))
     for quantum in 10.0 ** np.arange(coarse, fine - 1, -1):
         if np.abs(x / quantum - np.rint(x / quantum)).max() < 1e-6:
             return quantum

@@ -6,7 +6,6 @@ import re
 
 from .units import Unit, metres, scale, unit_named
 
-_LARGEST_BARE = 1e-3  # m: up to it, a size without a unit is in metres if the factor is
 _SETTING = re.compile(r"\W*([^\W\d][^=:;,\t]*)[=:;,\t]\s*(\S.*?)\s*")
 _PLAIN = re.compile(r"\W*[^\W\d][^=:]*[=:]")  # sets anything
 _KEY_UNIT = re.compile(r"\s*(?:[\[(]\s*(?:->|to\b|in\b)?|->)\s*([^\[\]()]*?)\s*[\])]?$")
@@ -115,7 +114,8 @@ def height_scale(settings: Settings, column_unit: str | None, user_unit: Unit) -
 def step(settings: Settings, axis: str, user_step: float | None, unit: Unit) -> float | None:
     """The size of a pixel along an axis [m]; None if the header has none.
 
-    Without a unit of its own it is in `unit`, or in metres if the factor leads to metres.
+    Without a unit of its own it is in `unit`, or in metres if the factor leads to metres and it is
+    at most 1e-3.
 
     **Raises:** `ValueError` naming the line if its unit is unknown and there is no `user_step`.
     """
@@ -126,7 +126,7 @@ def step(settings: Settings, axis: str, user_step: float | None, unit: Unit) -> 
         return pixel.number * metres(pixel.unit)
     if pixel.unit is None and unit is not None:
         return pixel.number * metres(unit)
-    if pixel.unit is None and factor and factor.unit == "m" and pixel.number <= _LARGEST_BARE:
+    if pixel.unit is None and factor and factor.unit == "m" and pixel.number <= 1e-3:
         return pixel.number
     if user_step is None:
         raise ValueError(

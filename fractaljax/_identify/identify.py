@@ -9,21 +9,28 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from .._base.parts import Record
+from .._base.parts import Record, require_kind
 from .._base.table import table
 from .._surface.surface import Surface
-from .band import HIGHEST, LOWEST, PER_RESOLUTION, check_band, chosen_band
+from .analysis import SpectralAnalysis
+from .band import check_band, choose_band, highest_frequency
 from .fit import PowerLaw
-from .gaps import without_gaps
+from .gaps import correct_for_gaps
 from .measurement import Measurement
-from .patches import between_patches
-from .preparation import prepared, spacing
+from .patches import patch_covariance
+from .preparation import Preprocessing, prepare_heights, spacing
 from .quantisation import quantisation_limit
-from .source import measured
-from .spectrum import Spectrum, log_mean_cosine_power, map_spectra, profile_spectrum
+from .source import read_heights
+from .spectrum import PowerSpectrum, log_mean_cosine_power, map_spectra, profile_spectrum
 from .structure_function import StructureFunction, structure_function
 from .stylus import tip_limit
-from .warnings import height_warnings, quantisation_warnings, result_warnings, spectrum_warnings
+from .warnings import (
+    WarningThresholds,
+    height_warnings,
+    quantisation_warnings,
+    result_warnings,
+    spectrum_warnings,
+)
 
 
 class Identification(Record):
@@ -32,24 +39,24 @@ class Identification(Record):
     G is that of Eq. 13, which the contact law uses.
     """
 
-    D: float
+    D: float  # fractal dimension
     G: float  # m
-    D_standard_error: float
-    ln_G_standard_error: float
+    D_standard_error: float  # of D
+    ln_G_standard_error: float  # of ln G
     covariance: Float[np.ndarray, "2 2"]  # of (D, ln G)
     G_profile: float  # m: by Majumdar's and Bhushan's formula
-    gamma: float
+    gamma: float  # that of Eq. 13
     band: tuple[float, float]  # 1/m
     limit: float  # 1/m: of the instrument, or the Nyquist frequency
-    aliased: bool
+    aliased: bool  # True if waves finer than two points are sampled, not averaged out
     noise_floor: float  # m^3
-    law: PowerLaw
-    spectrum: Spectrum
-    structure_function: StructureFunction
-    missing: int
-    outliers: int
-    unused: int
-    warnings: tuple[str, ...] = eqx.field(static=True)
+    law: PowerLaw  # the fitted power law
+    spectrum: PowerSpectrum  # what is fitted
+    structure_function: StructureFunction  # an independent estimate
+    missing: int  # number of missing heights
+    outliers: int  # number of heights taken out as spikes
+    unused: int  # number of heights in segments that are too short
+    warnings: tuple[str, ...] = eqx.field(static=True)  # what to doubt, one line each
 
     @property
     def decades(self) -> float:
@@ -95,36 +102,53 @@ def identify(
     stylus_radius: float | None = None,
     aliased: bool | None = None,
     gamma: float = 1.5,
+    preprocessing: Preprocessing = Preprocessing(),
+    analysis: SpectralAnalysis = SpectralAnalysis(),
+    thresholds: WarningThresholds = WarningThresholds(),
 ) -> Identification:
-    """D and G of heights z [m], a profile (n,) or a map (n, m), from their power spectrum.
+    """D and G of a measured profile or map, from its power spectrum.
 
-    Points are dx [m] apart along the first axis, dy (default dx) along the second; NaN is missing.
-    z may also be a `Measurement`, the path of a file that `read_measurement` reads without
-    options but dx and dy, or a topography of SurfaceTopography: with `heights()`, a `unit`, and
-    `pixel_size` or `positions()`. These have dx and dy, which the arguments must not contradict,
-    and `resolution` and `stylus_radius`, which the arguments replace.
     The surface is assumed to be that of Eq. 13, a profile a cut through it. Standard errors of a
-    map include its variation from place to place; those of a profile assume that there is none.
-    The effect of filled gaps on the spectrum is estimated on surrogates and removed.
+    map include its variation from place to place; those of a profile assume that there is none. The
+    effect of filled gaps on the spectrum is estimated on surrogates and removed.
 
+    **Arguments:**
+
+    - `z`: heights [m], a profile (n,) or a map (n, m); NaN is missing. Or a `Measurement`, the path
+      of a file that `read_measurement` reads without options but dx and dy, or a topography of
+      SurfaceTopography: with `heights()`, a `unit`, and `pixel_size` or `positions()`. These have
+      dx and dy, which the arguments must not contradict, and `resolution` and `stylus_radius`,
+      which the arguments replace.
+    - `dx`: distance of points along the first axis [m].
+    - `dy`: distance of points along the second axis [m], by default dx.
     - `band`: lowest and highest frequency [1/m] of the fit; chosen by default.
-    - `resolution` [m]: lateral resolution, or the cut-off wavelength of a Gaussian filter.
-    - `stylus_radius` [m] of the tip. It and `resolution` limit a band chosen by default.
-    - `aliased`: whether waves finer than two points are sampled, and so aliased, or averaged out;
-      decided from the spectrum by default.
-    - `gamma` of Eq. 13, also the ratio of the ends of a bin: waves may come in steps of it.
+    - `resolution`: lateral resolution [m], or the cut-off wavelength of a Gaussian filter; by
+      default none.
+    - `stylus_radius`: radius of the tip [m], by default none. It and `resolution` limit a band
+      chosen by default.
+    - `aliased`: True if waves finer than two points are sampled, and so aliased, False if they are
+      averaged out; decided from the spectrum by default.
+    - `gamma`: that of Eq. 13, 1.5 by default, also the ratio of the ends of a bin: waves may come
+      in steps of it.
+    - `preprocessing`, `analysis`, `thresholds`: options of the heights before their spectrum, of
+      the spectrum and the band, and of the warnings.
+
+    **Returns:** an `Identification`.
 
     **Raises:** `ValueError` for heights that are too few, flat, complex, infinite or not (n,) or
     (n, m); distances that are missing, not above 0 or not those of z; a band that is empty or
     outside the data, or that the instrument leaves empty; and as `read_measurement` does.
     """
-    read = measured(z, dx, dy)
+    require_kind("preprocessing", preprocessing, Preprocessing)
+    require_kind("analysis", analysis, SpectralAnalysis)
+    require_kind("thresholds", thresholds, WarningThresholds)
+    read = read_heights(z, dx, dy, preprocessing)
     z, dx, dy = read.z, read.dx, read.dx if read.dy is None else read.dy
     resolution = read.resolution if resolution is None else resolution
     stylus_radius = read.stylus_radius if stylus_radius is None else stylus_radius
     steps = (dx, dy)[: z.ndim]
     ratio = float(Surface(2.5, 1e-9, gamma).gamma)
-    heights = prepared(z)
+    heights = prepare_heights(z, preprocessing)
     if z.ndim == 1:
         lines = heights.segments
         length = dx * max(segment.size for segment in lines)
@@ -132,27 +156,29 @@ def identify(
         lines = [*heights.despiked.T]
         length = min(z.shape[0] * dx, z.shape[1] * dy)
 
-    def spectra_of(segments):
+    def estimate_spectra(segments):
         if z.ndim == 1:
-            return (profile_spectrum(segments, dx),)
+            return (profile_spectrum(segments, dx, analysis.tapers),)
         return map_spectra(segments[0], dx, dy)
 
-    spectra = spectra_of(heights.segments)
+    spectra = estimate_spectra(heights.segments)
     if any(gap.any() for gap in heights.gaps):
-        spectra = without_gaps(spectra, heights.gaps, steps, spectra_of)
+        spectra = correct_for_gaps(spectra, heights.gaps, steps, estimate_spectra)
     spectrum = spectra[0]
     top = spectrum.nyquist
     if resolution is not None:
-        top = min(top, 1 / (PER_RESOLUTION * spacing("resolution", resolution)))
+        top = min(top, 1 / (analysis.resolutions * spacing("resolution", resolution)))
+    periods = analysis.fewest_periods
     if stylus_radius is not None:
-        top = min(top, tip_limit(spectrum, length, ratio, spacing("stylus_radius", stylus_radius)))
-    limit, least = quantisation_limit(heights.despiked, steps), 2 * LOWEST / length
+        radius = spacing("stylus_radius", stylus_radius)
+        top = min(top, tip_limit(spectrum, length, ratio, radius, fewest_periods=periods))
+    limit, least = quantisation_limit(heights.despiked, steps), 2 * periods / length
     if band is None:
         usable = top if limit < least else min(top, limit)
-        chosen = chosen_band(spectrum, length, ratio, usable)
-        reach = min(top, HIGHEST[spectrum.kind] * spectrum.nyquist)
+        chosen = choose_band(spectrum, length, ratio, usable, analysis)
+        reach = min(top, highest_frequency(spectrum))
     else:
-        chosen = check_band(band, spectrum, length, ratio, top)
+        chosen = check_band(band, spectrum, length, ratio, top, sigmas=analysis.sigmas)
         reach = chosen.high
     if aliased is not None:
         chosen = chosen._replace(
@@ -161,7 +187,7 @@ def identify(
     noise, ends = chosen.noise, (chosen.low, chosen.high)
     law = noise.fit(spectrum, ends, ratio)
     if z.ndim == 2:
-        between = between_patches(heights.segments[0], dx, dy, spectrum, law, ends, ratio)
+        between = patch_covariance(heights.segments[0], dx, dy, spectrum, law, ends, ratio)
         covariance = law.covariance + np.pad(between, (0, 1))
         law = eqx.tree_at(lambda law: law.covariance, law, covariance)
     log_G, log_G_profile, covariance = _parameters(law, ratio)
@@ -175,10 +201,10 @@ def identify(
     errors = np.sqrt(np.diag(covariance))
     warnings = [
         *chosen.warnings,
-        *spectrum_warnings(law, chosen, spectra, ratio),
-        *height_warnings(heights.despiked, steps),
-        *quantisation_warnings(heights.despiked, limit, chosen.high, reach, least),
-        *result_warnings(law.D, errors, other, heights),
+        *spectrum_warnings(law, chosen, spectra, ratio, thresholds),
+        *height_warnings(heights.despiked, steps, thresholds),
+        *quantisation_warnings(heights.despiked, limit, chosen.high, reach, least, thresholds.held),
+        *result_warnings(law.D, errors, other, heights, thresholds),
     ]
     with np.errstate(over="ignore"):
         G, G_profile = map(float, np.exp([log_G, log_G_profile]))

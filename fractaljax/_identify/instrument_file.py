@@ -8,18 +8,23 @@ from pathlib import Path
 
 import numpy as np
 
+from .._base.file_limits import FileLimits
 from .._base.parts import one_line
 from .grid import profile_on_grid
 from .measurement import Measurement, measurement
 from .topography import instrument_limits
-from .units import Unit, agreed, scale
+from .units import Unit, reconcile, scale
 
 _ANY_BYTES = {"hgt": ".hgt", "nms": ".nms"}  # formats that accept any bytes: by suffix only
-_MOST_UNPACKED, _MOST_POINTS = 2**31, 2**27  # bytes, and heights
 
 
 def read_instrument_file(
-    path: Path, dx: float | None, dy: float | None, unit: Unit, channel: str | int | None
+    path: Path,
+    dx: float | None,
+    dy: float | None,
+    unit: Unit,
+    channel: str | int | None,
+    limits: FileLimits,
 ) -> Measurement:
     """Read a file in a format known to SurfaceTopography; arguments as in `read_measurement`.
 
@@ -34,7 +39,7 @@ def read_instrument_file(
                 "a file other than plain text, .npy or .npz needs SurfaceTopography:"
                 ' python -m pip install "fractaljax[formats]"'
             ) from None
-        _refuse_large_archive(path)
+        _refuse_large_archive(path, limits.instrument)
         with _in_one_line(f"unknown to SurfaceTopography {package.__version__}, or damaged"):
             reader = package.open_topography(str(path))
         with reader, _in_one_line("it cannot be read"):
@@ -45,32 +50,32 @@ def read_instrument_file(
             if kind == "xyz" or (kind == "asc" and not (chosen.unit and chosen.physical_sizes)):
                 raise ValueError("it is plain text: save it as .csv with columns of numbers only")
             points = math.prod(int(n) for n in np.ravel(chosen.nb_grid_pts))
-            if not 0 < points <= _MOST_POINTS:
-                raise ValueError(f"it holds {points} heights, at most {_MOST_POINTS} are read")
+            if not 0 < points <= limits.heights:
+                raise ValueError(f"it holds {points} heights, at most {limits.heights} are read")
             topography, z, x = _heights(chosen)
             source = reader.name()
     metre = scale(topography.unit, unit, "heights", "--unit")
     if x is not None:
         z, step = profile_on_grid(x * metre, z)
-        dx = agreed("dx", step, dx)
+        dx = reconcile("dx", step, dx)
     elif chosen.physical_sizes is not None:
         sizes = np.ravel(topography.physical_sizes)
         steps = [float(L) * metre / n for L, n in zip(sizes, z.shape, strict=True)]
-        dx = agreed("dx", steps[0], dx)
-        dy = agreed("dy", steps[1], dy) if z.ndim == 2 else dy
+        dx = reconcile("dx", steps[0], dx)
+        dy = reconcile("dy", steps[1], dy) if z.ndim == 2 else dy
     instrument = topography.info.get("instrument") or {}
     words = [source, f"channel {chosen.name!r}", instrument.get("vendor"), instrument.get("name")]
     source = f"{path.name}: {', '.join(word for word in words if word)}"
     return measurement(z * metre, dx, dy, source, **instrument_limits(topography.info))
 
 
-def _refuse_large_archive(path):
+def _refuse_large_archive(path, most):
     """Refuse a zip archive, as many formats are, that unpacks to more than fits in memory."""
     if zipfile.is_zipfile(path):
         with _in_one_line("the archive is damaged"), zipfile.ZipFile(path) as packed:
             size = sum(member.file_size for member in packed.infolist())
-        if size > _MOST_UNPACKED:
-            raise ValueError(f"it unpacks to {size} bytes, at most {_MOST_UNPACKED} are read")
+        if size > most:
+            raise ValueError(f"it unpacks to {size} bytes, at most {most} are read")
 
 
 @contextlib.contextmanager

@@ -13,29 +13,35 @@ at all lengths, so that two maps side by side differ about as much as two patche
 import numpy as np
 
 from .fit import Bins, PowerLaw
-from .spectrum import Spectrum, map_spectra
-
-_ALONG = 4  # patches along each side
-_CHANCE = 1.3  # mean of the larger eigenvalue of a covariance of 16 draws of variance 1
-_FEWEST = 2  # bins that ln A and p need
+from .spectrum import PowerSpectrum, map_spectra
 
 
-def between_patches(
-    z: np.ndarray, dx: float, dy: float, spectrum: Spectrum, law: PowerLaw, band, ratio: float
+def patch_covariance(
+    z: np.ndarray,
+    dx: float,
+    dy: float,
+    spectrum: PowerSpectrum,
+    law: PowerLaw,
+    band,
+    ratio: float,
+    *,
+    along: int = 4,
+    chance_ratio: float = 1.3,
 ) -> np.ndarray:
     """Covariance (2, 2) of (ln A, p) between patches of a map without gaps, beyond chance.
 
-    Bins count by their influence on `law`. Waves too long for a patch are left out; 0 where fewer
-    than two bins remain.
+    There are `along` patches along each side; `chance_ratio` is that of S and P by chance. Bins
+    count by their influence on `law`. Waves too long for a patch are left out; 0 where fewer than
+    two bins remain.
     """
     from scipy.linalg import eigh
 
-    n, m = (size // _ALONG for size in z.shape)
-    cut = z[: _ALONG * n, : _ALONG * m].reshape(_ALONG, n, _ALONG, m).swapaxes(1, 2)
+    n, m = (size // along for size in z.shape)
+    cut = z[: along * n, : along * m].reshape(along, n, along, m).swapaxes(1, 2)
     spectra = [map_spectra(patch, dx, dy)[0] for patch in cut.reshape(-1, n, m)]
     bins = [Bins(each, band, ratio) for each in spectra]
     shared = np.isin(Bins(spectrum, band, ratio).which, bins[0].which)
-    if shared.sum() < _FEWEST:
+    if shared.sum() < 2:
         return np.zeros((2, 2))
     power = np.stack([each(each.power / law(each.f)) for each in bins])
     influence = law.influence[:2, shared]
@@ -43,4 +49,4 @@ def between_patches(
     chance = influence * bins[0].variance @ influence.T
     excess, vectors = eigh(covariance, chance)
     vectors = chance @ vectors
-    return vectors * np.maximum(excess - _CHANCE, 0) @ vectors.T
+    return vectors * np.maximum(excess - chance_ratio, 0) @ vectors.T

@@ -8,22 +8,36 @@ quantised ones, sigma being their standard deviation. The steps do not matter at
 share is small. Heights held over two points repeat in first differences instead.
 """
 
+import dataclasses
 import math
 
 import numpy as np
 
-_REPEATED = 0.2  # share of equal second differences below which D changes by less than its error
-_FIRST = 1.5  # the share of equal first differences is larger by this factor
-_INTERPOLATED = 0.05  # interpolated heights fall below this share at once
-_WINDOW = 0.01  # of the rms second difference: closer ones are equal
-_AROUND = 5  # windows that estimate the density of continuous heights
-FEWEST = 32  # differences
-_MOST = 2**16  # differences used
-_GROWTH = 1.25  # of the lags tried
-_HIGHEST = 0.25  # cycles per step: half the Nyquist frequency
+
+@dataclasses.dataclass(frozen=True)
+class QuantisationTest:
+    """When differences of heights count as equal, and how many equal ones matter.
+
+    **Fields:**
+
+    - `repeated`: share of equal second differences; with less of them, D changes by less than its
+      error.
+    - `first`: factor by which the share of equal first differences is larger.
+    - `interpolated`: share below which that of interpolated heights falls at once.
+    - `window`: largest distance of equal differences, relative to the rms second difference.
+    - `fewest`: number of differences; with fewer, the test tells nothing.
+    """
+
+    repeated: float = 0.2
+    first: float = 1.5
+    interpolated: float = 0.05
+    window: float = 0.01
+    fewest: int = 32
 
 
-def quantisation_limit(z: np.ndarray, steps: tuple[float, ...]) -> float:
+def quantisation_limit(
+    z: np.ndarray, steps: tuple[float, ...], test: QuantisationTest = QuantisationTest()
+) -> float:
     """Frequency [1/m] up to which quantisation does not matter: infinite if it never does.
 
     z (n,) or (n, m) with NaN for gaps, `steps` [m] between points along its axes. 0 if it matters
@@ -32,22 +46,22 @@ def quantisation_limit(z: np.ndarray, steps: tuple[float, ...]) -> float:
     limit = math.inf
     for axis, step in enumerate(steps):
         lines, lag = np.moveaxis(z, axis, 0), 1
-        while (share := _repeated(lines, lag)) >= _REPEATED:
-            lag = max(lag + 1, int(_GROWTH * lag))
+        while (share := _repeated(lines, lag, test)) >= test.repeated:
+            lag = max(lag + 1, int(1.25 * lag))
             if 2 * lag >= len(lines):
                 return 0.0
         if lag > 1:
-            lag *= 1 if share > _INTERPOLATED else 2  # interpolation is also a filter
-            limit = min(limit, _HIGHEST / (lag * step))
+            lag *= 1 if share > test.interpolated else 2  # interpolation is also a filter
+            limit = min(limit, 0.25 / (lag * step))  # half the Nyquist frequency of these points
     return limit
 
 
-def differences(z: np.ndarray, order: int, lag: int = 1) -> np.ndarray:
-    """First or second differences along the first axis, without gaps, thinned if very many."""
+def differences(z: np.ndarray, order: int, lag: int = 1, most: int = 2**16) -> np.ndarray:
+    """First or second differences along the first axis, without gaps, thinned to at most `most`."""
     for _ in range(order):
         z = z[lag:] - z[:-lag]
     finite = z[np.isfinite(z)]
-    return finite[:: -(-finite.size // _MOST) or 1]
+    return finite[:: -(-finite.size // most) or 1]
 
 
 def rounding(z: np.ndarray) -> float:
@@ -55,19 +69,19 @@ def rounding(z: np.ndarray) -> float:
     return 8 * np.finfo(float).eps * np.nanmax(np.abs(z))
 
 
-def _repeated(z, lag) -> float:
+def _repeated(z, lag, test) -> float:
     """Share of the most frequent difference, beyond that of a continuous density."""
-    shares = []
-    for order, usual in ((2, 1.0), (1, _FIRST)):
+    shares, around = [], 5  # windows, to estimate the density of continuous heights
+    for order, usual in ((2, 1.0), (1, test.first)):
         ordered = np.sort(differences(z, order, lag))
-        if ordered.size < FEWEST:
+        if ordered.size < test.fewest:
             return 1.0
-        half = max(_WINDOW * ordered.std(), rounding(z))
+        half = max(test.window * ordered.std(), rounding(z))
         inner, outer = (
             np.searchsorted(ordered, ordered + width, "right")
             - np.searchsorted(ordered, ordered - width)
-            for width in (half, _AROUND * half)
+            for width in (half, around * half)
         )
-        beyond = inner - (outer - inner) / (_AROUND - 1)
+        beyond = inner - (outer - inner) / (around - 1)
         shares.append(float(beyond.max() / ordered.size / usual))
     return max(shares)

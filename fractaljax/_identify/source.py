@@ -5,12 +5,14 @@ from typing import Any
 
 from .files import read_measurement
 from .measurement import Measurement
-from .preparation import checked, spacing
+from .preparation import Preprocessing, check_heights, spacing
 from .topography import from_topography, is_topography
-from .units import agreed
+from .units import reconcile
 
 
-def measured(z: Any, dx: float | None, dy: float | None) -> Measurement:
+def read_heights(
+    z: Any, dx: float | None, dy: float | None, options: Preprocessing = Preprocessing()
+) -> Measurement:
     """Heights (n,) or (n, m) with their steps [m], checked.
 
     **Raises:** `ValueError` as `identify` does; `OSError` if a file cannot be read.
@@ -26,10 +28,10 @@ def measured(z: Any, dx: float | None, dy: float | None) -> Measurement:
         z = from_topography(z, dx, dy)
     if isinstance(z, Measurement):
         where = "of the measurement"
-        dx, dy = agreed("dx", z.dx, dx, where), agreed("dy", z.dy, dy, where)
+        dx, dy = reconcile("dx", z.dx, dx, where), reconcile("dy", z.dy, dy, where)
         limits = {"resolution": z.resolution, "stylus_radius": z.stylus_radius}
         z, source = z.z, z.source
-    z = checked(z)
+    z = check_heights(z, options)
     if dx is None:
         raise ValueError("dx is needed beside heights: the step between them in m, such as dx=1e-6")
     if z.ndim == 1 and dy is not None:

@@ -18,10 +18,7 @@ from numpy.typing import ArrayLike
 
 from .._base.parts import Record
 from .._surface.surface import Surface
-
-_TAPERS = 3  # of a profile: two thirds of the variance of Hann's window
-_NEAR = 0.02  # in ln f: closer ordinates become one, no law can tell them apart
-_HANN_INFLATION = (35 / 18) ** 2  # variance of a mean over modes, Hann's window along both axes
+from .analysis import SpectralAnalysis
 
 
 def log_mean_cosine_power(p):
@@ -38,7 +35,7 @@ def theoretical_spectrum(surface: Surface, f: ArrayLike, kind: str = "profile") 
     return np.exp(log_radial + (log_mean_cosine_power(p) if kind == "profile" else 0.0))
 
 
-class Spectrum(Record):
+class PowerSpectrum(Record):
     """Ordinates of a measured spectrum in rising order of frequency."""
 
     f: Float[np.ndarray, " k"]  # 1/m
@@ -50,16 +47,18 @@ class Spectrum(Record):
     nyquist: float  # 1/m
 
 
-def profile_spectrum(segments: list[np.ndarray], dx: float) -> Spectrum:
+def profile_spectrum(
+    segments: list[np.ndarray], dx: float, tapers: int = SpectralAnalysis.tapers
+) -> PowerSpectrum:
     """Spectrum of contiguous segments of one profile, by sine tapers (Riedel, Sidorenko 1995)."""
-    parts = [_segment_spectrum(z, dx) for z in segments]
+    parts = [_segment_spectrum(z, dx, tapers) for z in segments]
     f, power, count, spread = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return _merged(f, power, count, count / f, spread, "profile", 0.5 / dx)
+    return _merge_ordinates(f, power, count, count / f, spread, "profile", 0.5 / dx)
 
 
-def _segment_spectrum(z, dx):
+def _segment_spectrum(z, dx, count):
     n = z.size
-    order, t = np.arange(1, _TAPERS + 1), (np.arange(n) + 0.5) / n
+    order, t = np.arange(1, count + 1), (np.arange(n) + 0.5) / n
     tapers = np.sin(np.pi * order[:, None] * t) * math.sqrt(2 / n)
     # The line goes through the ends, not by least squares: sine tapers leak any offset at the ends.
     z = z - np.linspace(z[0], z[-1], n)
@@ -71,18 +70,20 @@ def _segment_spectrum(z, dx):
     return f, power[1:], np.full(f.size, 1 / inflation), np.full(f.size, width)
 
 
-def _merged(f, power, count, weight, spread, kind, nyquist) -> Spectrum:
-    """Merge ordinates within two percent of each other."""
+def _merge_ordinates(f, power, count, weight, spread, kind, nyquist) -> PowerSpectrum:
+    """Merge ordinates within two percent of each other, between which no law differs."""
     order = np.argsort(f, kind="stable")
     f, power, count, weight, spread = (x[order] for x in (f, power, count, weight, spread))
-    start = np.flatnonzero(np.diff(np.floor(np.log(f / f[0]) / _NEAR + 0.5), prepend=-1))
+    start = np.flatnonzero(np.diff(np.floor(np.log(f / f[0]) / 0.02 + 0.5), prepend=-1))
     total = np.add.reduceat(weight, start)
 
     def mean(values):
         return np.add.reduceat(weight * values, start) / total
 
     count = total**2 / np.add.reduceat(weight**2 / count, start)
-    return Spectrum(np.exp(mean(np.log(f))), mean(power), count, total, mean(spread), kind, nyquist)
+    return PowerSpectrum(
+        np.exp(mean(np.log(f))), mean(power), count, total, mean(spread), kind, nyquist
+    )
 
 
 def map_power(z: np.ndarray, dx: float, dy: float) -> tuple[np.ndarray, ...]:
@@ -109,7 +110,7 @@ def remove_plane(z):
     return z - along_x * x[:, None] - along_y * y
 
 
-def map_spectra(z: np.ndarray, dx: float, dy: float) -> tuple[Spectrum, ...]:
+def map_spectra(z: np.ndarray, dx: float, dy: float) -> tuple[PowerSpectrum, ...]:
     """Spectra of a map without gaps: of all waves, of waves nearer to x, and nearer to y.
 
     Each is a sum over radial bins one frequency step wide, divided by their area. 2 pi |f| times
@@ -122,6 +123,7 @@ def map_spectra(z: np.ndarray, dx: float, dy: float) -> tuple[Spectrum, ...]:
     index = np.rint(f / step).astype(int).ravel()
     area = np.pi * np.arange(1, bins + 1) * step**2 * lengths[0] * lengths[1]
     width = np.mean([1 / (3 * length**2) for length in lengths])
+    inflation = (35 / 18) ** 2  # variance of a mean over modes, Hann's window along both axes
 
     def radial(chosen, share):
         weight = (count * chosen).ravel()
@@ -131,7 +133,7 @@ def map_spectra(z: np.ndarray, dx: float, dy: float) -> tuple[Spectrum, ...]:
         )
         at, power_at = frequencies / modes, 2 * np.pi * powers / (share * area)
         spread = np.full(bins, width)
-        return _merged(at, power_at, modes / _HANN_INFLATION, 1 / at, spread, "map", nyquist)
+        return _merge_ordinates(at, power_at, modes / inflation, 1 / at, spread, "map", nyquist)
 
     near_x = np.abs(fx[:, None]) > fy
     return radial(np.ones_like(near_x), 1.0), radial(near_x, 0.5), radial(~near_x, 0.5)

@@ -10,8 +10,8 @@ from jaxtyping import ArrayLike
 
 from .._surface.measured_spectrum import MeasuredSpectrum
 from .measurement import Measurement
-from .preparation import prepared
-from .source import measured
+from .preparation import prepare_heights
+from .source import read_heights
 from .spectrum import map_spectra, remove_plane
 
 
@@ -46,12 +46,12 @@ def spectrum_of(
     **Raises:** `ValueError` for a profile, for heights and steps as `identify` does, and for a
     `shortest` that leaves fewer than two points.
     """
-    read = measured(z, dx, dy)
+    read = read_heights(z, dx, dy)
     if read.z.ndim != 2 or read.dy is None:
         raise ValueError(
             f"z must be a map (n, m), got shape {read.z.shape}; identify takes profiles"
         )
-    heights = prepared(read.z).segments[0]
+    heights = prepare_heights(read.z).segments[0]
     spectrum = map_spectra(heights, read.dx, read.dy)[0]
     longest = min(read.z.shape[0] * read.dx, read.z.shape[1] * read.dy)
     top = spectrum.nyquist if shortest is None else 1 / shortest
@@ -76,7 +76,7 @@ def _warn_unless_gaussian(z: np.ndarray, largest_skewness: float, largest_kurtos
     Ssk, Sku = np.mean(z**3) / Sq**3, np.mean(z**4) / Sq**4
     if abs(Ssk) > largest_skewness or Sku > largest_kurtosis:
         warnings.warn(
-            f"heights are far from Gaussian (Ssk {Ssk:.2g}, Sku {Sku:.2g}): a law that has only their"
-            " spectrum can be off by four times; MeasuredContact.from_heights presses the map itself",
+            f"heights are far from Gaussian (Ssk {Ssk:.2g}, Sku {Sku:.2g}): a law that has only"
+            " their spectrum can be off by four times; use MeasuredContact.from_heights",
             stacklevel=3,
         )

@@ -17,12 +17,6 @@ from jaxtyping import Float
 from .._base.parts import Record
 from .spectrum import log_mean_cosine_power
 
-_BLOCKS = 10  # for the standard error
-_SHARED = 1.4  # waves longer than a block are in several, which then agree too well
-_TINY = 1e-300  # m^2
-_BOUNDS, _AT_BOUND = (1.005, 2.995), 1e-4  # of p
-_SHORTEST, _SHARE, _LAGS = 4, 12, 12  # lags from 4 points to a twelfth of the length, 12 of them
-
 
 class StructureFunction(Record):
     """D and G by the structure function alone: NaN where no power law of a surface fits it."""
@@ -50,46 +44,55 @@ def structure_function(
     *,
     end: float | None,
     noise: float = 0.0,
+    blocks: int = 10,
 ) -> StructureFunction:
     """D and G of lines, NaN where missing, dx [m] apart, from distances within a band [1/m].
 
     Heights may have no waves above the frequency `end` [1/m]. White noise of mean square `noise`
-    [m^2] is subtracted.
+    [m^2] is subtracted. Twelve lags go from four points to a twelfth of the length. The standard
+    error comes from the jackknife over `blocks` of each line.
     """
-    shortest = max(math.ceil(1 / (band[1] * dx) - 1e-9), _SHORTEST)
-    longest = min(max(z.size for z in lines) // _SHARE, int(0.4 / (band[0] * dx)))
+    shortest = max(math.ceil(1 / (band[1] * dx) - 1e-9), 4)
+    longest = min(max(z.size for z in lines) // 12, int(0.4 / (band[0] * dx)))
     longest = max(longest, 2 * shortest)
-    lags = np.unique(np.rint(np.geomspace(shortest, longest, _LAGS)).astype(int))
-    sums, counts = np.zeros((2, _BLOCKS, lags.size))
+    lags = np.unique(np.rint(np.geomspace(shortest, longest, 12)).astype(int))
+    sums, counts = np.zeros((2, blocks, lags.size))
     for z in lines:
-        for j, lag in enumerate(lags[2 * lags < z.size - _BLOCKS]):
+        for j, lag in enumerate(lags[2 * lags < z.size - blocks]):
             squares = (z[2 * lag :] - 2 * z[lag:-lag] + z[: -2 * lag]) ** 2
-            edges, finite = np.arange(_BLOCKS) * squares.size // _BLOCKS, ~np.isnan(squares)
+            edges, finite = np.arange(blocks) * squares.size // blocks, ~np.isnan(squares)
             sums[:, j] += np.add.reduceat(np.where(finite, squares, 0), edges)
             counts[:, j] += np.add.reduceat(finite, edges, dtype=float)
     tau = lags * dx
 
-    def estimate(blocks):
-        W = np.maximum(sums[blocks].sum(axis=0) / counts[blocks].sum(axis=0) - 6 * noise, _TINY)
-        return W, *_fit(tau, W, end)
+    def estimate(used):
+        W = _positive(sums[used].sum(axis=0) / counts[used].sum(axis=0) - 6 * noise)
+        return W, *_fit(tau, W, end, bounds)
 
-    every = np.arange(_BLOCKS)
+    bounds = 1.005, 2.995  # of p: at 1 and 3 the integral diverges
+    every = np.arange(blocks)
     W, p, log_C = estimate(every)
-    if min(abs(p - bound) for bound in _BOUNDS) < _AT_BOUND:
+    if min(abs(p - bound) for bound in bounds) < 1e-4:
         return StructureFunction(tau, W, math.nan, math.nan, math.nan)
     others = [estimate(np.delete(every, i))[1] for i in every]
-    error = _SHARED * math.sqrt((_BLOCKS - 1) * np.var(others)) / 2
+    # Waves longer than a block are in several blocks, which agree too well without the factor 1.4.
+    error = 1.4 * math.sqrt((blocks - 1) * np.var(others)) / 2
     with np.errstate(over="ignore"):  # C = m(p) G^(3-p)/2
         G = float(np.exp((log_C + math.log(2) - log_mean_cosine_power(p)) / (3 - p)))
     return StructureFunction(tau, W, (7 - p) / 2, G, error)
 
 
-def _fit(tau, W, end) -> tuple[float, float]:
+def _positive(W):
+    """W [m^2] where it has a logarithm, else a tiny number."""
+    return np.maximum(W, 1e-300)
+
+
+def _fit(tau, W, end, bounds) -> tuple[float, float]:
     """p and ln C by least squares of ln W over ln tau, with equal weights."""
     from scipy.optimize import fminbound
 
     def difference(p):
-        return np.log(W) - np.log(np.maximum(second_differences(p, tau, end), _TINY))
+        return np.log(W) - np.log(_positive(second_differences(p, tau, end)))
 
-    p: Any = fminbound(lambda p: difference(p).var(), *_BOUNDS, xtol=1e-9)
+    p: Any = fminbound(lambda p: difference(p).var(), *bounds, xtol=1e-9)
     return float(p), float(difference(p).mean())

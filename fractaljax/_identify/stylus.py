@@ -10,26 +10,33 @@ Peaks are several times as sharp as the rms: the tip follows while kappa(f) < 1/
 
 import math
 
-from .fit import fit
-from .spectrum import Spectrum
-
-_PEAKS = 6.0  # c, from tips rolled over synthetic profiles
-_LEAST = 4.0  # ratio of the ends of the first band
+from .analysis import SpectralAnalysis
+from .fit import FlatPrior, fit
+from .spectrum import PowerSpectrum
 
 
-def tip_limit(spectrum: Spectrum, length: float, ratio: float, radius: float) -> float:
+def tip_limit(
+    spectrum: PowerSpectrum,
+    length: float,
+    ratio: float,
+    radius: float,
+    *,
+    fewest_periods: float = SpectralAnalysis.fewest_periods,
+    peaks: float = 6.0,
+) -> float:
     """Frequency [1/m] up to which a tip of a radius [m] follows, at most the Nyquist frequency.
 
-    Above the limit the spectrum is distorted, so the band grows from below until its own law says
-    that the tip fails at its upper end.
+    The band begins at `fewest_periods` in the length. `peaks` is the c above, from tips rolled over
+    synthetic profiles. Above the limit the spectrum is distorted, so the band grows from below
+    until its own law says that the tip fails at its upper end.
     """
-    low = 5 / length
-    high = _LEAST * low
+    low = fewest_periods / length
+    high = 4 * low
     while high < spectrum.nyquist:
-        law = fit(spectrum, (low, high), ratio, flat_deviation=1e-3)
+        law = fit(spectrum, (low, high), ratio, flat_prior=FlatPrior(deviation=1e-3))
         p = min(law.p, 4.5)
         squared = (2 * math.pi) ** 4 * float(law(high)) * high**5 / (5 - p)
-        relative = math.sqrt(squared) * _PEAKS * radius
+        relative = math.sqrt(squared) * peaks * radius
         if relative > 1:
             return high * relative ** (-2 / (5 - p))
         high *= ratio**0.5

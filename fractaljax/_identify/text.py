@@ -18,7 +18,6 @@ _GAPS = {"", "nan", "na", "n/a", "null", "none", "bad", "invalid"}
 _WORDS = {"true": 1.0, "false": 0.0}  # of flags
 _FIRST = ("t", "T", "f", "F")
 _BITS = re.compile(r"[01]\s*/\s*[01]")  # in place of a unit for flags
-_LONGEST_LINE = 2**23  # characters
 # No leading zeros: in 1,034.5 a comma separates thousands.
 _NUMBER = re.compile(r"[-+]?((0|[1-9]\d*)(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _LIKE_A_NUMBER = re.compile(r"[-+.\"]*\d")
@@ -93,13 +92,14 @@ def read_table(content: bytes, encoding: str) -> Table:
     return Table(table[:, :width], titles, units, settings, words)
 
 
-def _lines(content: bytes, encoding: str) -> Iterator[tuple[int, str]]:
+def _lines(content: bytes, encoding: str, longest: int = 2**23) -> Iterator[tuple[int, str]]:
+    """The number and the text of each line, of at most `longest` characters."""
     if encoding == "utf-16":
         content, encoding = content.decode(encoding).encode(), "utf-8"
     file = io.TextIOWrapper(io.BytesIO(content.rstrip(b"\r\n ")), encoding)
     for at, line in enumerate(file, start=1):
-        if len(line) > _LONGEST_LINE:
-            raise ValueError(f"line {at} is longer than {_LONGEST_LINE} characters")
+        if len(line) > longest:
+            raise ValueError(f"line {at} is longer than {longest} characters")
         yield at, line.rstrip("\n")
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from .grid import profile_on_grid
 from .measurement import Measurement, measurement
-from .units import agreed, metres
+from .units import metres, reconcile
 
 _LIMITS = {"resolution": "resolution", "tip_radius": "stylus_radius"}
 _ANGSTROM = {"A": "Å"}  # as SurfaceTopography may spell it
@@ -44,8 +44,8 @@ def from_topography(topography: Any, dx: float | None, dy: float | None) -> Meas
     else:
         raise ValueError("z must have a pixel_size, or be a profile with positions()")
     where = "of the topography"
-    dx = agreed("dx", steps[0], dx, where)
-    dy = agreed("dy", steps[1], dy, where) if z.ndim == 2 else dy
+    dx = reconcile("dx", steps[0], dx, where)
+    dy = reconcile("dy", steps[1], dy, where) if z.ndim == 2 else dy
     info = getattr(topography, "info", None) or {}
     return measurement(z, dx, dy, type(topography).__name__, **instrument_limits(info))
 

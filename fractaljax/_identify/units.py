@@ -41,13 +41,13 @@ def scale(file_unit: str | None, user_unit: Unit, what: str, option: str) -> flo
     from_file, from_user = (
         None if u is None else metres(u, f" of {what}") for u in (file_unit, user_unit)
     )
-    unit = agreed(f"the unit of {what}", from_file, from_user)
+    unit = reconcile(f"the unit of {what}", from_file, from_user)
     if unit is None:
         raise ValueError(f"the file does not say in which unit {what} are: give it ({option} um)")
     return unit
 
 
-def agreed(
+def reconcile(
     name: str, stored: float | None, argument: float | None, where: str = "in the file"
 ) -> float | None:
     """The value stored in a file, or else the user's argument. They must not differ."""

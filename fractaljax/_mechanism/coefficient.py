@@ -23,7 +23,6 @@ _OPERATORS: dict[type, Callable] = {
     ast.USub: operator.neg,
     ast.UAdd: operator.pos,
 }
-_LONGEST = 500  # characters
 
 
 class Expression(NamedTuple):
@@ -32,10 +31,10 @@ class Expression(NamedTuple):
     text: str
 
     def __call__(self, p: Parameters) -> Any:
-        return _value(_parsed(self.text), p)
+        return _value(_parse(self.text), p)
 
 
-def coefficient_of(name: str, coefficient: Any, parameters: Parameters) -> Callable | ArrayLike:
+def check_coefficient(name: str, coefficient: Any, parameters: Parameters) -> Callable | ArrayLike:
     """A number, or a function of the parameters; a text becomes an `Expression`.
 
     A function that reads no parameter is replaced by its value.
@@ -83,12 +82,12 @@ def evaluated(coefficient: Callable | None, p: Parameters) -> Any:
     return None if coefficient is None else coefficient(p)
 
 
-def _parsed(text: str) -> ast.expr:
+def _parse(text: str) -> ast.expr:
     wrong = ValueError(
         f"a coefficient must be a formula of parameters, numbers, pi, + - * / ** and "
         f"{', '.join(_FUNCTIONS)}, got {brief(text)}"
     )
-    if len(text) > _LONGEST:
+    if len(text) > 500:  # `_value` must not recurse deeper than Python allows
         raise wrong
     try:
         tree = ast.parse(text.strip(), mode="eval").body

@@ -8,7 +8,7 @@ from jaxtyping import ArrayLike, Float
 from .._base.parts import concrete, nan_where, number, scalar
 from .matrices import (
     MatrixLike,
-    array_of,
+    as_array,
     fitting,
     fitting_or_sparse,
     is_sparse,
@@ -20,9 +20,16 @@ from .matrices import (
 
 
 def rayleigh_damping(M: MatrixLike, K: MatrixLike, alpha: ArrayLike, beta: ArrayLike) -> MatrixLike:
-    """C = alpha M + beta K (n, n) [N s/m], alpha in 1/s and beta in s.
+    """C = alpha M + beta K (n, n) [N s/m], the damping matrix of Rayleigh.
 
     C is sparse if M and K are sparse matrices with more than 2000 rows.
+
+    **Arguments:**
+
+    - `M`: mass matrix (n, n) [kg], an array or a sparse matrix of SciPy.
+    - `K`: stiffness matrix (n, n) [N/m], likewise.
+    - `alpha`: factor of M [1/s], a scalar.
+    - `beta`: factor of K [s], a scalar.
 
     **Raises:** `ValueError` unless alpha >= 0 and beta >= 0 are scalars and M and K are square
     matrices of the same size; `TypeError` for anything but real numbers.
@@ -31,19 +38,24 @@ def rayleigh_damping(M: MatrixLike, K: MatrixLike, alpha: ArrayLike, beta: Array
     K = fitting_or_sparse("K", K, M.shape)
     a, b = (scalar(name, x, at_least=0) for name, x in (("alpha", alpha), ("beta", beta)))
     if is_sparse(M) != is_sparse(K):
-        M, K = (array_of(name, X) for name, X in (("M", M), ("K", K)))
+        M, K = (as_array(name, X) for name, X in (("M", M), ("K", K)))
     return float(a) * M + float(b) * K if is_sparse(M) else a * M + b * K
 
 
 def modal_damping(M: MatrixLike, K: MatrixLike, ratio: ArrayLike) -> Float[Array, "n n"]:
-    """C (n, n) [N s/m] that gives every mode of M and K the damping ratio `ratio`.
+    """C (n, n) [N s/m] that gives the modes of M and K their damping ratios.
 
-    `ratio` is a scalar, or (n,) in the order of rising frequency. C = L X diag(2 ratio omega)
-    X^T L^T with M = L L^T and X the eigenvectors of L^-1 K L^-T: differentiable where the
-    frequencies are distinct.
+    C = L X diag(2 ratio omega) X^T L^T with M = L L^T and X the eigenvectors of L^-1 K L^-T:
+    differentiable where the frequencies are distinct.
 
-    **Raises:** `ValueError` unless ratio >= 0, M is symmetric and positive definite, and K
-    is symmetric and has the size of M; `TypeError` for anything but real numbers.
+    **Arguments:**
+
+    - `M`: mass matrix (n, n) [kg].
+    - `K`: stiffness matrix (n, n) [N/m], symmetric.
+    - `ratio`: damping ratio [-], a scalar for every mode, or (n,) in the order of rising frequency.
+
+    **Raises:** `ValueError` unless ratio >= 0, M is symmetric and positive definite, and K is
+    symmetric and has the size of M; `TypeError` for anything but real numbers.
     """
     M = mass_matrix(square("M", M))
     K, ratio = fitting("K", K, M.shape), number("damping_ratio", ratio, at_least=0)

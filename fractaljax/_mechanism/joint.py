@@ -114,7 +114,7 @@ class Joint(Part):
     """
 
     contact: Any  # a Contact; its other attributes depend on its class
-    friction: Friction
+    friction: Friction  # friction law, evaluated at the sliding velocity of the joint
     tangential: Stored = eqx.field(static=True)
     normal: Stored | None = eqx.field(static=True)
     preload: bool | str = eqx.field(static=True, metadata={"note": PRELOAD_NOTE})

@@ -9,11 +9,10 @@ from .matrix_entries import assemble, check_size
 
 _TYPES = ("f8", "f4", "i4", "i2", "u2", "u1")
 _FULL, _TEXT, _SPARSE = range(3)
-_LONGEST_NAME = 64  # bytes
 
 
-def read_matlab_4(content: bytes) -> dict[str, Any]:
-    """The variables of a file by name, as arrays or sparse matrices.
+def read_matlab_4(content: bytes, largest: int) -> dict[str, Any]:
+    """The variables of a file by name, as arrays or sparse matrices of at most `largest` rows.
 
     A variable that is no matrix of real numbers is returned as a `ValueError`.
 
@@ -31,7 +30,7 @@ def read_matlab_4(content: bytes) -> dict[str, Any]:
         number, what = divmod(rest, 10)
         sound = machine == (order == ">") and number < len(_TYPES) and what <= _SPARSE
         sound = sound and min(rows, columns) >= 0 and imaginary in (0, 1)
-        if not (sound and 1 <= length <= _LONGEST_NAME):
+        if not (sound and 1 <= length <= 64):  # of the name, with the zero that ends it
             raise ValueError(f"it is no file of MATLAB's version 4, or damaged at byte {place}")
         name = content[place + 20 : place + 20 + length].partition(b"\0")[0]
         name = name.decode("ascii", "backslashreplace")
@@ -46,30 +45,30 @@ def read_matlab_4(content: bytes) -> dict[str, Any]:
         values = np.frombuffer(content[start : start + size], dtype).astype(dtype.newbyteorder("="))
         values = values.reshape((rows, columns), order="F")
         try:
-            variables[name] = _matrix(name, what, bool(imaginary), values)
+            variables[name] = _matrix(name, what, bool(imaginary), values, largest)
         except ValueError as error:
             variables[name] = error
     return variables
 
 
-def _matrix(name: str, what: int, is_complex: bool, values: np.ndarray) -> Any:
+def _matrix(name: str, what: int, is_complex: bool, values: np.ndarray, largest: int) -> Any:
     if what == _TEXT:
         raise ValueError(f"{name} must be real numbers, got text")
     # The imaginary parts of a sparse matrix are a fourth column.
     if is_complex or (what == _SPARSE and values.shape[1] == 4):
         raise ValueError(f"{name} must be real numbers, got complex ones")
-    return values if what == _FULL else _sparse(name, values)
+    return values if what == _FULL else _sparse(name, values, largest)
 
 
-def _sparse(name: str, table: np.ndarray) -> Any:
+def _sparse(name: str, table: np.ndarray, largest: int) -> Any:
     """The sparse matrix from lines of row, column and value; the last line is its shape."""
     whole = np.isfinite(table[:, :2]).all() and (table[:, :2] == np.rint(table[:, :2])).all()
     if table.shape[1] != 3 or not len(table) or not whole:
         raise ValueError(f"{name} is damaged: it has no rows, columns and values")
     rows, columns = map(int, table[-1, :2])
-    check_size(name, (rows, columns))
+    check_size(name, (rows, columns), largest)
     i, j, values = table[:-1].T
     inside = (i >= 1) & (i <= rows) & (j >= 1) & (j <= columns)
     if not inside.all():
         raise ValueError(f"{name} is damaged: an entry lies outside {rows} x {columns}")
-    return assemble(name, (rows, columns), i - 1, j - 1, values)
+    return assemble(name, (rows, columns), i - 1, j - 1, values, largest)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from .._base.file_limits import FileLimits
 from .matlab4_file import read_matlab_4
 from .matrix_entries import check_size
 
@@ -24,8 +25,8 @@ _KINDS |= {17: "an object"}
 _COMPLEX, _LOGICAL = 0x800, 0x200  # flags
 
 
-def read_matlab(content: bytes, most: int) -> dict[str, Any]:
-    """The variables of a .mat file by name, as arrays or sparse, at most `most` bytes in total.
+def read_matlab(content: bytes, limits: FileLimits) -> dict[str, Any]:
+    """The variables of a .mat file by name, as arrays or sparse matrices within `limits`.
 
     A variable that is no matrix of real numbers is returned as a `ValueError`.
 
@@ -35,14 +36,15 @@ def read_matlab(content: bytes, most: int) -> dict[str, Any]:
         raise ValueError("it is of MATLAB's version 7.3; save it with -v7")
     order = _ORDERS.get(content[124:128])
     if order is None and b"\0" in content[:4]:  # always so in version 4, never in a text
-        return read_matlab_4(content)
+        return read_matlab_4(content, limits.dofs)
     if order is None:
         raise ValueError("it is no file of MATLAB's version 5 to 7, or 4")
     variables: dict[str, Any] = {}
+    most = limits.matrices
     for kind, element in _elements(content[128:], order, padded=False):
         most -= len(element)
         if kind == _COMPRESSED:
-            element = _unpacked(element, most)
+            element = _unpack(element, most)
             most -= len(element)
             kind, element = next(_elements(element, order), (0, b""))
         if kind != _MATRIX:
@@ -53,13 +55,13 @@ def read_matlab(content: bytes, most: int) -> dict[str, Any]:
             raise ValueError(f"it holds {name} twice")
         if name:  # the parts of objects have none
             try:
-                variables[name] = _matrix(name, flags, parts, order)
+                variables[name] = _matrix(name, flags, parts, order, limits.dofs)
             except ValueError as error:
                 variables[name] = error
     return variables
 
 
-def _unpacked(element: bytes, most: int) -> bytes:
+def _unpack(element: bytes, most: int) -> bytes:
     inflate = zlib.decompressobj()
     try:
         content = inflate.decompress(element, max(most, 0) + 1)
@@ -97,13 +99,13 @@ def _header(parts: list[tuple[int, bytes]], order: str) -> tuple[str, int]:
     return parts[at][1].decode("ascii", "backslashreplace"), flags
 
 
-def _of_bytes(data: bytes, begun: np.ndarray) -> bool:
+def _holds_bytes(data: bytes, begun: np.ndarray) -> bool:
     """True if the values of sparse columns, which begin at `begun`, have one byte each."""
     count = int(begun[-1]) if len(begun) else 0
     return count <= len(data) < 8 * count
 
 
-def _matrix(name: str, flags: int, parts: list[tuple[int, bytes]], order: str) -> Any:
+def _matrix(name: str, flags: int, parts: list[tuple[int, bytes]], order: str, largest: int) -> Any:
     import scipy.sparse
 
     if flags & 0xFF not in _NUMBERS or flags & _COMPLEX:
@@ -113,7 +115,7 @@ def _matrix(name: str, flags: int, parts: list[tuple[int, bytes]], order: str) -
     sparse = flags & 0xFF == _SPARSE
     arrays: list[np.ndarray] = []
     for kind, data in [parts[1], *parts[3:]]:
-        if sparse and flags & _LOGICAL and len(arrays) == 3 and _of_bytes(data, arrays[2]):
+        if sparse and flags & _LOGICAL and len(arrays) == 3 and _holds_bytes(data, arrays[2]):
             kind = 2  # MATLAB calls the bytes of sparse logicals doubles
         dtype = np.dtype(order + _TYPES.get(kind, "f8"))
         if kind not in _TYPES or len(data) % dtype.itemsize:
@@ -125,7 +127,7 @@ def _matrix(name: str, flags: int, parts: list[tuple[int, bytes]], order: str) -
     try:
         if not sparse:
             return arrays[1].reshape(shape, order="F")
-        check_size(name, shape)
+        check_size(name, shape, largest)
         _, i, begun, values = arrays  # with room for more entries, which SciPy drops
         matrix = scipy.sparse.csc_array((values, i, begun), shape=shape)
         matrix.check_format(full_check=True)

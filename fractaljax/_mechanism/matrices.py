@@ -13,10 +13,9 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Float
 
 from .._base.parts import Numbers, concrete, nan_where, number
-from .coefficient import Parameters, coefficient_of, evaluated
+from .coefficient import Parameters, check_coefficient, evaluated
 
 MatrixLike = Any  # an array, a nested list, or a sparse matrix of SciPy's
-LARGEST_DENSE = 2000  # degrees of freedom; sparse matrices of more stay sparse
 
 
 class Sparse:
@@ -70,7 +69,7 @@ def matrix_sum(
 
     A numeric coefficient is multiplied into its matrix.
 
-    **Raises:** as `fit` and `coefficient_of`, naming the term.
+    **Raises:** as `fit` and `check_coefficient`, naming the term.
     """
     terms = matrix if is_sum(matrix) else [(None, matrix)]
     arrays, coefficients = [], []
@@ -78,7 +77,7 @@ def matrix_sum(
         term = f"{name}, term {i}" if terms is matrix else name
         X = fit(term, X)
         if coefficient is not None:
-            coefficient = coefficient_of(f"the coefficient of {term}", coefficient, p)
+            coefficient = check_coefficient(f"the coefficient of {term}", coefficient, p)
         if coefficient is not None and not callable(coefficient):
             X, coefficient = (
                 X * (np.asarray(coefficient).item() if is_sparse(X) else coefficient),
@@ -113,7 +112,7 @@ def is_sparse(X: Any) -> bool:
     return hasattr(X, "toarray")
 
 
-def array_of(name: str, value: MatrixLike) -> Numbers:
+def as_array(name: str, value: MatrixLike) -> Numbers:
     """An array of finite real numbers from a nested list, an array or a SciPy sparse matrix.
 
     **Raises:** `TypeError` for anything else; `ValueError` for NaN and infinity.
@@ -135,24 +134,24 @@ def array_of(name: str, value: MatrixLike) -> Numbers:
 
 
 def square(name: str, value: MatrixLike) -> Float[Array, "n n"]:
-    """As `array_of`, with a `ValueError` unless it is a square matrix."""
-    array = array_of(name, value)
+    """As `as_array`, with a `ValueError` unless it is a square matrix."""
+    array = as_array(name, value)
     if array.ndim != 2 or array.shape[0] != array.shape[1] or not array.size:
         raise ValueError(f"{name} must be a square matrix, got shape {array.shape}")
     return array
 
 
 def fitting(name: str, value: MatrixLike, shape: tuple[int, ...]) -> Numbers:
-    """As `array_of`, with a `ValueError` for any shape but the one that M demands."""
-    array = array_of(name, value)
+    """As `as_array`, with a `ValueError` for any shape but the one that M demands."""
+    array = as_array(name, value)
     if array.shape != shape:
         raise ValueError(f"{name} must have shape {shape} as M demands, got {array.shape}")
     return array
 
 
-def square_or_sparse(name: str, value: MatrixLike) -> Any:
-    """As `square`, but a large sparse matrix stays sparse, checked likewise."""
-    if not is_sparse(value) or value.ndim != 2 or max(value.shape) <= LARGEST_DENSE:
+def square_or_sparse(name: str, value: MatrixLike, largest_dense: int = 2000) -> Any:
+    """As `square`, but a sparse matrix of more than `largest_dense` rows stays sparse."""
+    if not is_sparse(value) or value.ndim != 2 or max(value.shape) <= largest_dense:
         return square(name, value)
     if value.shape[0] != value.shape[1]:
         raise ValueError(f"{name} must be a square matrix, got shape {value.shape}")

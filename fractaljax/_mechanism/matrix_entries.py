@@ -5,26 +5,32 @@ from typing import Any
 
 import numpy as np
 
-from .matrix_market import REAL, WHOLE, as_floats, numbers_of, refuse_line, wrong_line
+from .matrix_market import REAL, WHOLE, as_floats, parse_numbers, refuse_line, wrong_line
 
-LARGEST = 1_000_000  # degrees of freedom
-_LARGEST_LABEL = 2**40  # of a node; degrees of freedom are below 2**20
 _FORMAT = re.compile(rb"\((?:\d*P,?)?(\d*)([IEDFG])(\d+)(?:\.\d+(?:E\d+)?)?\)")
 _KINDS = {b"r": "real", b"i": "integer"}
 _SYMMETRIES = {b"u": 0, b"r": 0, b"s": 1, b"z": -1}  # rectangular, symmetric, skew
 
 
-def assemble(name: str, shape: tuple[int, int], i: Any, j: Any, values: Any, mirror: int = 0):
+def assemble(
+    name: str,
+    shape: tuple[int, int],
+    i: Any,
+    j: Any,
+    values: Any,
+    largest: int,
+    mirror: int = 0,
+):
     """The sparse matrix of `shape` with `values` (n,) in rows i and columns j, counted from 0.
 
-    `mirror` 1 makes a triangle symmetric and -1 skew. Duplicate entries are refused, because
-    no format says whether to add them.
+    It has at most `largest` rows and columns. `mirror` 1 makes a triangle symmetric and -1 skew.
+    Duplicate entries are refused, because no format says whether to add them.
 
     **Raises:** `ValueError` naming the entry.
     """
     import scipy.sparse
 
-    check_size(name, shape)
+    check_size(name, shape, largest)
     i, j, values = np.asarray(i, np.int64), np.asarray(j, np.int64), np.asarray(values, float)
     if mirror:
         off = i != j
@@ -39,21 +45,25 @@ def assemble(name: str, shape: tuple[int, int], i: Any, j: Any, values: Any, mir
     return scipy.sparse.coo_array((values, (i, j)), shape=shape).tocsr()
 
 
-def check_size(name: str, shape: tuple[int, ...]) -> None:
-    """**Raises:** `ValueError` for a shape that is too large or empty."""
-    if not 1 <= min(shape) <= max(shape) <= LARGEST:
-        raise ValueError(f"{name} must have from 1 to {LARGEST} rows and columns, got {shape}")
+def check_size(name: str, shape: tuple[int, ...], largest: int) -> None:
+    """**Raises:** `ValueError` for a shape that is empty or larger than `largest`."""
+    if not 1 <= min(shape) <= max(shape) <= largest:
+        raise ValueError(f"{name} must have from 1 to {largest} rows and columns, got {shape}")
 
 
 def label_dofs(node: np.ndarray, dof: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
-    """The index (n,) of each (node, dof) in sorted order, and the names "node.dof"."""
-    if max(np.abs(node).max(initial=0) / _LARGEST_LABEL, dof.max(initial=0) / 2**20) >= 1:
+    """The index (n,) of each (node, dof) in sorted order, and the names "node.dof".
+
+    **Raises:** `ValueError` for a node of 2^40 or more and a dof of 2^20 or more: a label is one
+    integer of 64 bits.
+    """
+    if max(np.abs(node).max(initial=0) / 2**40, dof.max(initial=0) / 2**20) >= 1:
         raise ValueError("a node or a degree of freedom has too large a number")
     labels, place = np.unique(node * 2**20 + dof, return_inverse=True)
     return place, tuple(f"{label >> 20}.{label % 2**20}" for label in labels.tolist())
 
 
-def read_abaqus(name: str, content: bytes):
+def read_abaqus(name: str, content: bytes, largest: int):
     """The matrix of an Abaqus .mtx file, the names of its dofs, and True if it was mirrored.
 
     Lines hold row node, dof, column node, dof and value (FORMAT=MATRIX INPUT and LABELS), or row,
@@ -67,7 +77,7 @@ def read_abaqus(name: str, content: bytes):
         raise ValueError("it is neither a Matrix Market file nor a matrix of Abaqus")
     labels = ["row", "column"] if first == 3 else ["node", "dof", "node", "dof"]
     whole = rb"\d{1,15}+" if first == 3 else rb"-?\d{1,15}+"  # internal nodes are negative
-    numbers = numbers_of(body, 0, [whole] * (first - 1) + [REAL], [*labels, "number"])
+    numbers = parse_numbers(body, 0, [whole] * (first - 1) + [REAL], [*labels, "number"])
     refuse_line(~np.isfinite(numbers[:, -1]), body, 0, "must be finite")
     index, values = numbers[:, :-1].astype(np.int64), numbers[:, -1]
     names = None
@@ -84,10 +94,10 @@ def read_abaqus(name: str, content: bytes):
     off = i != j
     paired = np.isin(i[off] * size + j[off], j[off] * size + i[off]).any()
     mirrored = not paired and bool(off.any())
-    return assemble(name, (size, size), i, j, values, int(mirrored)), names, mirrored
+    return assemble(name, (size, size), i, j, values, largest, int(mirrored)), names, mirrored
 
 
-def read_harwell_boeing(name: str, content: bytes):
+def read_harwell_boeing(name: str, content: bytes, largest: int):
     """The matrix of an ASCII Harwell-Boeing or Rutherford-Boeing file, without right-hand sides.
 
     `scipy.io.hb_read` cannot serve: it refuses symmetric files and files with a right-hand side,
@@ -124,9 +134,10 @@ def read_harwell_boeing(name: str, content: bytes):
     if entries and not (index.min() >= 1 and index.max() <= rows):
         raise ValueError(f"its row indices must be from 1 to {rows}")
     j = np.repeat(np.arange(columns), steps.astype(int))
-    if _SYMMETRIES[kind[1:2]] and rows != columns:
+    mirror = _SYMMETRIES[kind[1:2]]
+    if mirror and rows != columns:
         raise ValueError(f"it holds {rows} x {columns} numbers and calls them symmetric")
-    return assemble(name, (rows, columns), index - 1, j, values, _SYMMETRIES[kind[1:2]])
+    return assemble(name, (rows, columns), index - 1, j, values, largest, mirror)
 
 
 def fixed_fields(

@@ -13,15 +13,15 @@ from typing import Any
 
 import numpy as np
 
+from .._base.file_limits import FileLimits
 from .._base.files import read_bounded
 from .._base.numpy_file import read_members, read_npy
 from .._base.parts import one_line
 from .matlab_file import read_matlab
-from .matrix_entries import LARGEST, assemble, check_size, read_abaqus, read_harwell_boeing
+from .matrix_entries import assemble, check_size, read_abaqus, read_harwell_boeing
 from .matrix_market import BANNER, read_entries
 from .nastran import read_dmig, read_op4
 
-_MOST = 2**30  # bytes of an unpacked file
 _PACKED = {".gz": gzip.open, ".bz2": bz2.open}
 _COMPLEX = re.compile("must be real numbers, got .*complex")
 _DAMPING = (
@@ -55,8 +55,8 @@ class Matrices:
     declaring them symmetric.
     """
 
-    matrices: dict[str, Any]
-    names: tuple[str, ...] | None = None
+    matrices: dict[str, Any]  # by name
+    names: tuple[str, ...] | None = None  # of the degrees of freedom, where the file has them
     unread: dict[str, str] = dataclasses.field(default_factory=dict)
     mirrored: tuple[str, ...] = ()
 
@@ -75,21 +75,27 @@ class Matrices:
         return f"Matrices({'; '.join([*shown, *self.notes, *left])})"
 
 
-def read_matrices(path: str | os.PathLike) -> Matrices:
+def read_matrices(path: str | os.PathLike, limits: FileLimits = FileLimits()) -> Matrices:
     """Read the matrices of a finite-element model, sparse.
 
     `.npz`: one sparse matrix of `scipy.sparse.save_npz`, or arrays of `numpy.savez`. `.mat`: MATLAB
     version 4 to 7. `.mtx`: Matrix Market, or Abaqus (*MATRIX OUTPUT). `.op4`: OUTPUT4 of Nastran.
     `.pch`, `.bdf`, `.dat`: DMIG cards of Nastran. `.hb`, `.rb`, `.rua`, `.rsa`, `.matrix`:
-    Harwell-Boeing in ASCII, which Ansys writes with HBMAT. Each may be compressed as .gz or .bz2.
-    A single matrix is named after its file. Symmetric matrices are filled. Matrices of Abaqus and
+    Harwell-Boeing in ASCII, which Ansys writes with HBMAT. Each may be compressed as .gz or .bz2. A
+    single matrix is named after its file. Symmetric matrices are filled. Matrices of Abaqus and
     DMIG cards come with sorted names of degrees of freedom, "node.dof". At most 1 GiB and 1000000
-    degrees of freedom are read.
+    degrees of freedom are read, or what `limits` says.
 
     A matrix that is complex, not finite, or neither square nor one column (except rectangular ones
     of Nastran), and text or a cell array of MATLAB leave the others readable: `unread` says why.
     Abaqus does not say whether it writes one triangle: `mirrored` names matrices that were filled
     because no entry has a mirror image.
+
+    **Arguments:**
+
+    - `path`: the file, whose ending tells its format.
+
+    **Returns:** `Matrices`, in the units of the file.
 
     **Raises:** `OSError` if the file cannot be read; `ValueError`, one line that begins with the
     file name, for an unknown format, a damaged file, and a file without a matrix as above.
@@ -101,12 +107,12 @@ def read_matrices(path: str | os.PathLike) -> Matrices:
         reader = _READERS.get(inner.suffix.lower())
         if reader is None:
             raise ValueError(f"of unknown format; known are {', '.join(_READERS)}, .gz and .bz2")
-        content = read_bounded(path, _MOST)
-        unpacked = _unpacked(content, packed) if packed else content
-        candidates, names, *mirrored = reader(inner.stem, unpacked)
+        content = read_bounded(path, limits.matrices)
+        unpacked = _unpack(content, packed, limits.matrices) if packed else content
+        candidates, names, *mirrored = reader(inner.stem, unpacked, limits)
         if not candidates:
             raise ValueError("it holds no matrix")
-        matrices, unread = _sorted(candidates, any_shape=reader in (_op4, _dmig))
+        matrices, unread = _check_candidates(candidates, reader in (_op4, _dmig), limits.dofs)
         if not matrices:
             raise ValueError("; ".join(unread.values()))
         by_name = _ByName(matrices, path.name, unread)
@@ -115,32 +121,34 @@ def read_matrices(path: str | os.PathLike) -> Matrices:
         raise ValueError(f"{path.name}: {error}") from None
 
 
-def _unpacked(content: bytes, packed: str) -> bytes:
+def _unpack(content: bytes, packed: str, most: int) -> bytes:
     try:
         with _PACKED[packed](io.BytesIO(content), "rb") as file:
-            content = file.read(_MOST + 1)
+            content = file.read(most + 1)
     except (zlib.error, struct.error, EOFError, OSError):
         raise ValueError("it is damaged") from None
-    if len(content) > _MOST:
-        raise ValueError(f"it unpacks to more than {_MOST / 1e6:g} MB, the most that is read")
+    if len(content) > most:
+        raise ValueError(f"it unpacks to more than {most / 1e6:g} MB, the most that is read")
     return content
 
 
-def _sorted(candidates: dict[str, Any], any_shape: bool) -> tuple[dict[str, Any], dict[str, str]]:
+def _check_candidates(
+    candidates: dict[str, Any], any_shape: bool, largest: int
+) -> tuple[dict[str, Any], dict[str, str]]:
     """The valid matrices, and by name the reason why each other candidate is invalid."""
     matrices, unread = {}, {}
     for name, value in candidates.items():
         try:
             if isinstance(value, ValueError):
                 raise value
-            matrices[name] = _sound(name, value, any_shape)
+            matrices[name] = _check_matrix(name, value, any_shape, largest)
         except ValueError as error:
             why = str(error)
             unread[name] = why + _DAMPING * bool(_COMPLEX.search(why))
     return matrices, unread
 
 
-def _sound(name: str, value: Any, any_shape: bool):
+def _check_matrix(name: str, value: Any, any_shape: bool, largest: int):
     """A checked sparse matrix in float64 from a dense or sparse one."""
     import scipy.sparse
 
@@ -152,7 +160,7 @@ def _sound(name: str, value: Any, any_shape: bool):
     fits = any_shape or value.shape[-1:] in ((1,), value.shape[:1])
     if value.ndim != 2 or not fits:
         raise ValueError(f"{name} must be square or one column, got shape {shape}")
-    check_size(name, value.shape)
+    check_size(name, value.shape, largest)
     with np.errstate(over="ignore"):  # numbers may be longer than 64 bits
         matrix = scipy.sparse.csr_array(value, dtype=np.float64)
     if not np.isfinite(matrix.data).all():
@@ -162,10 +170,10 @@ def _sound(name: str, value: Any, any_shape: bool):
     return matrix
 
 
-def _npz(stem: str, content: bytes):
+def _npz(stem: str, content: bytes, limits: FileLimits):
     import scipy.sparse
 
-    members = read_members(content, _MOST)
+    members = read_members(content, limits.matrices)
     if "format" not in members:
         return {name: _array(member, name) for name, member in members.items()}, None
     kind = next(
@@ -183,7 +191,7 @@ def _npz(stem: str, content: bytes):
         if not kind:
             raise ValueError("its format is unknown")
         shape = tuple(arrays["shape"].tolist())
-        check_size(stem, shape)
+        check_size(stem, shape, limits.dofs)
         matrix = getattr(scipy.sparse, f"{kind}_array")((arrays["data"], *index), shape=shape)
         if kind in ("csr", "csc", "bsr"):
             matrix.check_format(full_check=True)
@@ -199,35 +207,35 @@ def _array(member: bytes, name: str) -> np.ndarray | ValueError:
         return error
 
 
-def _mtx(stem: str, content: bytes):
+def _mtx(stem: str, content: bytes, limits: FileLimits):
     content = content.removeprefix(b"\xef\xbb\xbf")  # the byte order mark of UTF-8
     banner = content.lstrip()
     if banner[: len(BANNER)].lower() != BANNER.lower():
-        matrix, names, mirrored = read_abaqus(stem, content)
+        matrix, names, mirrored = read_abaqus(stem, content, limits.dofs)
         return {stem: matrix}, names, mirrored
     # Blank lines move behind the banner, where they are allowed; line numbers are kept.
     blank = content[: len(content) - len(banner)].count(b"\n")
     content = banner.replace(b"\n", b"\n" * (1 + blank), 1)
-    shape, i, j, values = read_entries(io.BytesIO(content), LARGEST, _MOST)
+    shape, i, j, values = read_entries(io.BytesIO(content), limits.dofs, limits.matrices)
     if np.iscomplexobj(values):
         return {stem: ValueError(f"{stem} must be real numbers, got complex ones")}, None
-    return {stem: assemble(stem, shape, i, j, values)}, None
+    return {stem: assemble(stem, shape, i, j, values, limits.dofs)}, None
 
 
-def _mat(_, content: bytes):
-    return read_matlab(content, _MOST), None
+def _mat(_, content: bytes, limits: FileLimits):
+    return read_matlab(content, limits), None
 
 
-def _op4(_, content: bytes):
-    return read_op4(content), None
+def _op4(_, content: bytes, limits: FileLimits):
+    return read_op4(content, limits.dofs), None
 
 
-def _dmig(_, content: bytes):
-    return read_dmig(content)
+def _dmig(_, content: bytes, limits: FileLimits):
+    return read_dmig(content, limits.dofs)
 
 
-def _harwell_boeing(stem: str, content: bytes):
-    return {stem: read_harwell_boeing(stem, content)}, None
+def _harwell_boeing(stem: str, content: bytes, limits: FileLimits):
+    return {stem: read_harwell_boeing(stem, content, limits.dofs)}, None
 
 
 _READERS = {

@@ -17,8 +17,6 @@ _WORDS = {
     "field": ("real", "double", "integer", "complex"),
     "symmetry": ("general", "symmetric", "skew-symmetric", "hermitian"),
 }
-MOST_DENSE = 16_000_000  # numbers of a matrix in the dense format
-_PIECE = 2**22  # bytes of text converted at a time
 # Numbers of C and Fortran: 1, -1.5, .5, 1e6, 1.0D+06, and 1.0+100 in narrow fields.
 REAL = rb"[+-]?(?:\d++\.?\d*+|\.\d++)(?:[eEdDqQ][+-]?\d++|[+-]\d++)?"
 WHOLE = rb"[+-]?\d++"
@@ -63,7 +61,7 @@ def read_entries(
     parts = 2 if field == "complex" else 1
     tokens = [rb"\d++"] * len(columns) + [WHOLE if field == "integer" else REAL] * parts
     labels = columns + ["number"] * parts
-    numbers = numbers_of(body := text[header.end() :], before, tokens, labels)
+    numbers = parse_numbers(body := text[header.end() :], before, tokens, labels)
     late = np.arange(len(numbers)) >= count
     refuse_line(late, body, before, f"must not be there, after all of {count} numbers")
     if len(numbers) < count:
@@ -94,17 +92,22 @@ def read_entries(
 
 
 def _size(
-    line: bytes, number: int, coordinates: bool, symmetry: str, largest: int
+    line: bytes,
+    number: int,
+    coordinates: bool,
+    symmetry: str,
+    largest: int,
+    most_dense: int = 16_000_000,
 ) -> tuple[tuple[int, int], int]:
-    """The shape, and the number of entries in the file."""
+    """The shape, and the number of entries in the file, at most `most_dense` of a dense array."""
     count, sizes = 3 if coordinates else 2, line.split()
     if len(sizes) != count or not all(re.fullmatch(rb"\d{1,15}", size) for size in sizes):
         raise wrong_line(number, line, f"must have the {count} whole numbers of the size")
     rows, columns, *entries = map(int, sizes)
     if max(rows, columns) > largest:
         raise ValueError(f"holds {rows} x {columns} numbers; reduce the model to {largest} at most")
-    if not coordinates and rows * columns > MOST_DENSE:
-        raise ValueError(f"holds {rows} x {columns} numbers; as a dense array at most {MOST_DENSE}")
+    if not coordinates and rows * columns > most_dense:
+        raise ValueError(f"holds {rows} x {columns} numbers; as a dense array at most {most_dense}")
     if min(rows, columns) < 1 or (symmetry != "general" and rows != columns):
         raise wrong_line(number, line, f"must have the size of a matrix that is {symmetry}")
     most = rows * columns
@@ -115,7 +118,7 @@ def _size(
     return (rows, columns), entries[0] if entries else most
 
 
-def numbers_of(body: bytes, before: int, tokens: list[bytes], labels: list[str]) -> np.ndarray:
+def parse_numbers(body: bytes, before: int, tokens: list[bytes], labels: list[str]) -> np.ndarray:
     """The numbers (lines, tokens) of the lines that are not blank, each checked as text.
 
     `tokens` are the patterns of the numbers of a line, `labels` their names in messages, and
@@ -132,8 +135,8 @@ def numbers_of(body: bytes, before: int, tokens: list[bytes], labels: list[str])
 def as_floats(text: bytes) -> np.ndarray:
     """Numbers between blanks that match `REAL`, as floats (n,)."""
     pieces, start = [np.empty(0)], 0
-    while start < len(text):  # in pieces: split text takes ten times the memory
-        end = text.find(b"\n", start + _PIECE) % (len(text) + 1)  # -1 is the end
+    while start < len(text):  # in pieces of 4 MiB: split text takes ten times the memory
+        end = text.find(b"\n", start + 2**22) % (len(text) + 1)  # -1 is the end
         plain = text[start:end].translate(bytes.maketrans(b"dDqQ", b"eeee"))
         plain = re.sub(rb"[+-](?<=[\d.][+-])", rb"e\g<0>", plain)
         pieces.append(np.array(plain.split(), float))

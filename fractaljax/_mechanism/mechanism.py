@@ -24,13 +24,16 @@ class Mechanism(Part):
     def replace(self, **changes: Any) -> Self:
         """A copy with named quantities of any part changed: `replace(D=2.5, mu_s=0.3)`.
 
-        Whole parts have names as well: `replace(friction=Coulomb(0.4))`. A quantity passed together
-        with the part that holds it is changed in the new part. For a structure, M, C, K and F can
-        be replaced; `replace(D=2.5)` changes every joint that has a D, and
-        `replace(**{"left.D": 2.5})` the joint named left, also together with a D for all.
-
         Under a trace (`jit`, `vmap`) a value outside its domain becomes NaN, and so do all results
         that depend on it.
+
+        **Arguments:**
+
+        - `changes`: new values in SI units, by the names of quantities. Whole parts have names as
+          well: `replace(friction=Coulomb(0.4))`. A quantity passed together with the part that
+          holds it is changed in the new part. For a structure, M, C, K and F can be replaced;
+          `replace(D=2.5)` changes every joint that has a D, and `replace(**{"left.D": 2.5})` the
+          joint named left, also together with a D for all.
 
         **Raises:** `ValueError` for a name unknown after the change, listing the known ones, and
         for concrete values outside their domain.
@@ -51,8 +54,12 @@ class Mechanism(Part):
     def load(cls, path: str | os.PathLike) -> Self:
         """Read a TOML file, as `save` writes it; docs/model.md has the keys of a structure.
 
-        **Raises:** `OSError` if a file cannot be read; `ValueError` naming the file and the key
-        for an entry that is unknown, missing, ill-fitting or outside its domain.
+        **Arguments:**
+
+        - `path`: the TOML file; files that it names are beside it.
+
+        **Raises:** `OSError` if a file cannot be read; `ValueError` naming the file and the key for
+        an entry that is unknown, missing, ill-fitting or outside its domain.
         """
         with naming(path):
             return cls._from_document(read_toml(read_bounded(path)), Path(path).parent)

@@ -13,10 +13,13 @@ _KEYS = ("points", "dofs", "cells")
 class Mesh:
     """Nodes and the cells between them; meshes with equal arrays are equal.
 
-    `points` (nodes, 2) or (nodes, 3) [m] are the positions of the nodes. `dofs`, of the same
-    shape, is the degree of freedom of each displacement, or -1 where it is fixed. `cells`
-    (cells, 3) or (cells, 4) are the nodes of triangles or quadrilaterals, on the surface if the
-    body is solid.
+    **Arguments:**
+
+    - `points`: (nodes, 2) or (nodes, 3), positions of the nodes [m].
+    - `dofs`: the degree of freedom of each displacement, from 0, of the same shape, or -1 where it
+      is fixed.
+    - `cells`: (cells, 3) or (cells, 4), the nodes, from 0, of triangles or quadrilaterals, on the
+      surface if the body is solid.
 
     **Raises:** `ValueError` for other shapes, and for indices of nodes that do not exist.
     """
@@ -47,8 +50,11 @@ class Mesh:
         self._digest = content.hexdigest()
 
     @classmethod
-    def of_arrays(cls, arrays: Mapping[str, Any], name: str) -> "Mesh":
-        """The mesh in the arrays of a file. **Raises:** `ValueError` naming the file `name`."""
+    def from_arrays(cls, arrays: Mapping[str, Any], name: str) -> "Mesh":
+        """The mesh in `arrays`, by name, of the file called `name`.
+
+        **Raises:** `ValueError` naming the file.
+        """
         if missing := [key for key in _KEYS if key not in arrays]:
             raise ValueError(f"{name} lacks {', '.join(missing)}: a mesh is {', '.join(_KEYS)}")
         try:
@@ -57,7 +63,10 @@ class Mesh:
             raise ValueError(f"{name}: {error}") from None
 
     def require(self, n: int) -> "Mesh":
-        """The mesh itself. **Raises:** `ValueError` unless its degrees of freedom are below n."""
+        """The mesh itself, for a structure of `n` degrees of freedom.
+
+        **Raises:** `ValueError` unless its degrees of freedom are below n.
+        """
         _require_whole("dofs", self.dofs, -1, n)
         return self
 
@@ -71,7 +80,7 @@ class Mesh:
         return self.points.shape[1] == 3
 
     def displacements(self, x: Shaped[np.ndarray, "*k n"]) -> Shaped[np.ndarray, "*k nodes dim"]:
-        """Displacements of the nodes from the displacements x of all degrees of freedom."""
+        """Displacements of the nodes from `x` (..., n), those of all degrees of freedom."""
         return np.where(self.dofs < 0, 0, x[..., self.dofs])
 
     def __eq__(self, other) -> bool:

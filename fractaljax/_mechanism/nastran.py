@@ -19,7 +19,7 @@ _OP4_FORMAT = re.compile(r"(?:1P,?)?(\d+)[ED](\d+)\.\d+(?:E\d+)?(?:\|I16)?")
 _Column = tuple[int, int, np.ndarray]  # number and first row, both from 1, and values
 
 
-def read_op4(content: bytes) -> dict[str, Any]:
+def read_op4(content: bytes, largest: int) -> dict[str, Any]:
     """The sparse matrices of an OUTPUT4 file by their names.
 
     Such a file holds symmetric matrices in full. A matrix that is complex, too large or damaged is
@@ -32,28 +32,30 @@ def read_op4(content: bytes) -> dict[str, Any]:
     for name, shape, kind, columns in _binary(content, word) if word else _text(content):
         if name in matrices:
             raise ValueError(f"it gives {name} twice")
-        unfit = _unfit(name, shape, kind)
+        unfit = _unfit(name, shape, kind, largest)
         try:
             pieces = list(columns)
-            matrices[name] = unfit or _of_columns(name, shape, pieces)
+            matrices[name] = unfit or _assemble_columns(name, shape, pieces, largest)
         except ValueError as error:  # the rest of the file cannot be located
             raise (unfit or error) from None
     return matrices
 
 
-def _unfit(name: str, shape: tuple[int, int], kind: int) -> ValueError | None:
+def _unfit(name: str, shape: tuple[int, int], kind: int, largest: int) -> ValueError | None:
     """The reason why a matrix cannot be read, from its first record."""
     try:
         if kind not in (1, 2):
             remark = "complex ones" if kind in (3, 4) else "of 1 to 4"
             raise ValueError(f"{name} must be real numbers, got type {kind}, {remark}")
-        check_size(name, shape)
+        check_size(name, shape, largest)
     except ValueError as error:
         return error
     return None
 
 
-def _of_columns(name: str, shape: tuple[int, int], pieces: list[_Column]) -> Any:
+def _assemble_columns(
+    name: str, shape: tuple[int, int], pieces: list[_Column], largest: int
+) -> Any:
     """The sparse matrix from its columns, or the `ValueError` that it is damaged."""
     number, first = (np.array([piece[k] for piece in pieces], int) for k in (0, 1))
     length = np.array([len(piece[2]) for piece in pieces], int)
@@ -63,7 +65,7 @@ def _of_columns(name: str, shape: tuple[int, int], pieces: list[_Column]) -> Any
     if i.size and (number.min() < 1 or i.min() < 0 or i.max() >= shape[0]):
         return ValueError(f"{name} is damaged: an entry lies outside {shape[0]} x {shape[1]}")
     try:
-        return assemble(name, shape, i, np.repeat(number - 1, length), values)
+        return assemble(name, shape, i, np.repeat(number - 1, length), values, largest)
     except ValueError as error:
         return error
 
@@ -180,7 +182,7 @@ def _name(text: bytes) -> str:
     return name
 
 
-def read_dmig(content: bytes):
+def read_dmig(content: bytes, largest: int):
     """The sparse matrices in DMIG cards by their names, and the names of the degrees of freedom.
 
     Other cards are ignored. All matrices share the degrees of freedom that occur in any of them; a
@@ -226,11 +228,11 @@ def read_dmig(content: bytes):
         raise ValueError("it holds no DMIG card that begins a matrix")
     if not set(entries) <= set(heads):
         raise ValueError(f"no DMIG card begins {', '.join(sorted(set(entries) - set(heads)))}")
-    matrices, names = _dmig_matrices(heads, entries) if heads else ({}, None)
+    matrices, names = _dmig_matrices(heads, entries, largest) if heads else ({}, None)
     return matrices | unfit, names
 
 
-def _dmig_matrices(heads, entries):
+def _dmig_matrices(heads, entries, largest):
     index, values = {}, {}
     for name in heads:
         rows = entries.get(name, [])
@@ -257,7 +259,8 @@ def _dmig_matrices(heads, entries):
                 raise ValueError(
                     f"{name} has {len(column_names)} columns, {width} by its first card"
                 )
-        matrices[name] = assemble(name, (len(names), width), i, j, values[name], int(form == 6))
+        shape, mirror = (len(names), width), int(form == 6)
+        matrices[name] = assemble(name, shape, i, j, values[name], largest, mirror)
     return matrices, names
 
 

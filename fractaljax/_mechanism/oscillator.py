@@ -67,10 +67,17 @@ def equilibrium(
     """The static displacements (x_01, x_02) [m] of Eq. 40, from its linear system.
 
     [[K_1 + K_t, -mu K_n], [mu K_t, K_2 + K_n]] x_0 = [F, -F]/sqrt(2); its determinant is positive.
-    `P` [N] is the load of a preloaded joint, whose friction mu P is added to the first component.
 
-    **Raises:** `TypeError` unless given an `Oscillator`; `ValueError` unless K_n >= 0, K_t >= 0,
-    P > 0 and mu is finite.
+    **Arguments**, of any shapes that broadcast:
+
+    - `oscillator`: the mass on the belt.
+    - `K_n`, `K_t`: normal and tangential contact stiffness [N/m].
+    - `mu`: friction coefficient [-].
+    - `P`: load of a preloaded joint [N], whose friction mu P is added to the first component; by
+      default there is none.
+
+    **Raises:** `TypeError` unless given an `Oscillator`; `ValueError` unless K_n >= 0, K_t >= 0, P
+    > 0 and mu is finite.
     """
     require_kind("oscillator", oscillator, Oscillator)
     K_n, K_t = number("K_n", K_n, at_least=0), number("K_t", K_t, at_least=0)

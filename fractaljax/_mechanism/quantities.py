@@ -34,7 +34,6 @@ from .mechanism import Mechanism
 from .scene import Scene, stiffness
 from .structure import Structure, require_single, too_large
 
-_CHECKED_AT_ONCE = 1 << 16  # points of a grid
 STIFFNESS_RATIO, FREQUENCY_RATIO, FRICTION = "K_t/K_n", "omega_1/omega_2", "mu"
 
 
@@ -164,28 +163,28 @@ def replaced(x: Mechanism, values: Mapping[str, ArrayLike]) -> Any:
     return x.replace(**_settings(x, checked))
 
 
-def require_inside(x: Mechanism, axes: Mapping[str, np.ndarray]) -> None:
+def require_inside(x: Mechanism, axes: Mapping[str, np.ndarray], batch: int = 2**16) -> None:
     """Refuse a grid of independent quantities, with values (n,) each, if a point is not allowed.
 
-    The points are checked in batches: the whole grid is never built.
+    The points are checked `batch` at a time: the whole grid is never built.
 
     **Raises:** `ValueError` as in `replaced`.
     """
     ends = {name: np.array([values.min(), values.max()]) for name, values in axes.items()}
     # Domains are intervals, and their limits are monotonic in other quantities, so the corners
     # decide. The exception is mu(V), by which `mu` scales the friction law.
-    _require_all_inside(x, ends)
+    _require_all_inside(x, ends, batch)
     if FRICTION in axes and isinstance(x, Scene):
         law = {"V", *stored_quantities(x.friction)}
         among = {name: values for name, values in axes.items() if name in law}
         if among:
-            _require_all_inside(x, {FRICTION: ends[FRICTION], **among})
+            _require_all_inside(x, {FRICTION: ends[FRICTION], **among}, batch)
 
 
-def _require_all_inside(x, axes):
+def _require_all_inside(x, axes, batch):
     shape = tuple(values.size for values in axes.values())
     points = math.prod(shape)
-    batch = min(points, _CHECKED_AT_ONCE)
+    batch = min(points, batch)
     for begin in range(0, points, batch):
         # The last batch overlaps the one before, so that all batches share one compiled shape.
         begin = min(begin, points - batch)

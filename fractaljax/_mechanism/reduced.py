@@ -60,9 +60,16 @@ class ReducedStructure(ParametricStructure):
     It has the parameters, the joints and the mesh of the large structure and can be used like any
     structure. Only eigenvalues in `band` are those of the large structure, and only they count in
     its stability. `replace` of a matrix gives a plain structure.
+
+    **Arguments:**
+
+    - `M`, `C`, `K`, `joints`, `parameters`, `F`: as in `ParametricStructure`, of the r degrees of
+      freedom.
+    - `reduction`: the basis, the band and the accuracy.
+    - `mesh`: that of the large structure, by default none.
     """
 
-    reduction: Reduction = eqx.field(static=True)
+    reduction: Reduction = eqx.field(static=True)  # the basis and the accuracy
 
     def __init__(
         self, M, C, K, joints, parameters, F, reduction: Reduction, mesh: Mesh | None = None
@@ -83,16 +90,19 @@ class ReducedStructure(ParametricStructure):
     def _full_n(self, n: int) -> int:
         return len(self.reduction.V)
 
-    def _own_mesh(self) -> None:
+    def _matching_mesh(self) -> None:
         return None
 
     def _touched(self) -> np.ndarray | None:
         return self.reduction.touched
 
     def full(self, q: ArrayLike) -> Numbers:
-        """Displacements or velocities (..., n) of all degrees of freedom from q (..., r).
+        """Displacements or velocities (..., n) of all degrees of freedom from the reduced ones.
 
-        A state (..., 2r) gives a state (..., 2n). Mode shapes may be complex.
+        **Arguments:**
+
+        - `q`: (..., r), real or, as a mode shape, complex; a state (..., 2r) gives a state (...,
+          2n).
 
         **Raises:** `ValueError` for another size.
         """
@@ -103,9 +113,9 @@ class ReducedStructure(ParametricStructure):
         return (halves @ V.T.astype(halves.dtype)).reshape(*q.shape[:-1], -1)
 
     @classmethod
-    def from_file(cls, given: dict[str, Any]) -> "ReducedStructure":
+    def from_file(cls, arguments: dict[str, Any]) -> "ReducedStructure":
         """The reduced structure of a file, from the arguments that `read_structure` returns."""
-        about: dict[str, Any] = dict(given.pop("reduced"))
+        about: dict[str, Any] = dict(arguments.pop("reduced"))
         keys = ("V", "W", "residuals", "over", "band", "tol", "friction_slope", "error")
         missing = [key for key in keys if about.get(key) is None]
         if missing:
@@ -121,35 +131,35 @@ class ReducedStructure(ParametricStructure):
             reduction = Reduction(**about)
         except TypeError:
             raise ValueError(f"[reduced] has an unknown key among {brief(list(about))}") from None
-        arguments = {key: x for key, x in given.items() if key not in ("names", "notes")}
-        return cls(**{"parameters": {}, **arguments}, reduction=reduction)
+        rest = {key: x for key, x in arguments.items() if key not in ("names", "notes")}
+        return cls(**{"parameters": {}, **rest}, reduction=reduction)
 
     def _more_tables(self):
-        of = self.reduction
-        coarse = {} if of.coarse is None else {"coarse_tol": of.coarse.tol}
+        reduction = self.reduction
+        coarse = {} if reduction.coarse is None else {"coarse_tol": reduction.coarse.tol}
         return {
             "reduced": {
                 **coarse,
-                "band": of.band,
-                "tol": of.tol,
-                "error": of.error,
-                "friction_slope": of.friction_slope,
-                "names": of.names,
-                "points": of.points,
-                "over": of.over,
+                "band": reduction.band,
+                "tol": reduction.tol,
+                "error": reduction.error,
+                "friction_slope": reduction.friction_slope,
+                "names": reduction.names,
+                "points": reduction.points,
+                "over": reduction.over,
             }
         }
 
     def _more_arrays(self):
-        of = self.reduction
-        more = {} if of.touched is None else {"touched": of.touched}
-        if of.coarse is not None:
-            more |= {"coarse_V": of.coarse.V, "coarse_W": of.coarse.W}
+        reduction = self.reduction
+        more = {} if reduction.touched is None else {"touched": reduction.touched}
+        if reduction.coarse is not None:
+            more |= {"coarse_V": reduction.coarse.V, "coarse_W": reduction.coarse.W}
         return {
             **more,
-            "V": of.V,
-            "W": of.W,
-            "residuals": np.stack([np.real(of.residuals), np.imag(of.residuals)]),
+            "V": reduction.V,
+            "W": reduction.W,
+            "residuals": np.stack([np.real(reduction.residuals), np.imag(reduction.residuals)]),
         }
 
     def _shown(self):

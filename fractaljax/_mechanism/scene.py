@@ -41,8 +41,8 @@ class Scene(Mechanism):
     """
 
     contact: Any  # a Contact; its other attributes depend on its class
-    friction: Friction
-    oscillator: Oscillator
+    friction: Friction  # friction law at the belt
+    oscillator: Oscillator  # the mass, its springs and the belt
     preload: bool | str = eqx.field(static=True, metadata={"note": PRELOAD_NOTE})
 
     def __init__(
@@ -82,7 +82,7 @@ class Scene(Mechanism):
 
     @classmethod
     def from_toml(cls, text: str) -> "Scene":
-        """The scene whose `to_toml` is this text; errors as in `load`, without the file name."""
+        """The scene whose `to_toml` is `text`; errors as in `load`, without the file name."""
         return cls._from_document(read_toml(text.encode()), Path())
 
     def to_toml(self) -> str:
@@ -94,7 +94,7 @@ class Scene(Mechanism):
         return write_toml("A fractaljax scene, in SI units.", part_table(self, JOINT_LAWS))
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write the scene to a TOML file, whole or not at all.
+        """Write the scene to a TOML file at `path`, whole or not at all.
 
         **Raises:** `OSError` if the file cannot be written; `ValueError` as in `to_toml`.
         """
@@ -103,9 +103,15 @@ class Scene(Mechanism):
 
 @jax.jit
 def stiffness(scene: Scene) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """(K_n, K_t) of the contact [N/m], from Eqs. 30 and 36 or as given.
+    """Normal and tangential stiffness (K_n, K_t) [N/m] of the contact, by its law.
 
-    **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`.
+    **Arguments:**
+
+    - `scene`: a `Scene` of scalars, whose friction law gives mu_s and mu_m: Eqs. 30 and 36 for a
+      fractal contact.
+
+    **Raises:** `TypeError` for what is not a scene; `ValueError` if it holds arrays: use
+    `jax.vmap`.
     """
     require_kind("scene", scene, Scene)
     require_scalar(scene)

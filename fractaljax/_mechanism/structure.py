@@ -49,14 +49,22 @@ from .structure_file import npz_bytes, read_structure, structure_text
 class Structure(Mechanism):
     """M x'' + C x' + K x = F with joints: a reduced finite-element model of n degrees of freedom.
 
-    `M` (n, n) [kg] is symmetric and positive definite. `K` (n, n) [N/m] and `C` (n, n) [N s/m],
-    zero if None, need not be symmetric. Sparse matrices of SciPy's are accepted; with more than
-    2000 rows they stay sparse, and `reduce` makes a small structure from them. Rotations have
-    their own units. `joints` is one `Joint`, a sequence of them (named joint_1, joint_2, ...) or a
-    mapping from names. `F` (n,) [N], or a mapping from degrees of freedom to forces, presses the
-    joints together: the slope of a friction law acts through the static equilibrium under it.
-    `names` of the degrees of freedom and a `Mesh` for pictures are optional. `notes` report
-    changes made on reading the matrices' files, such as a mirrored triangle; `load` sets them.
+    **Arguments:**
+
+    - `M`: mass matrix (n, n) [kg], symmetric and positive definite. Sparse matrices of SciPy's are
+      accepted; with more than 2000 rows they stay sparse, and `reduce` makes a small structure from
+      them. Rotations have their own units.
+    - `C`: damping matrix (n, n) [N s/m] without the joints, which need not be symmetric; zero if
+      None.
+    - `K`: stiffness matrix (n, n) [N/m] without the joints, which need not be symmetric.
+    - `joints`: one `Joint`, a sequence of them (named joint_1, joint_2, ...) or a mapping from
+      names.
+    - `F`: (n,) [N], or a mapping from degrees of freedom to forces, by default none. It presses the
+      joints together: the slope of a friction law acts through the static equilibrium under it.
+    - `names`: names of the n degrees of freedom, by default none.
+    - `mesh`: a `Mesh` for pictures, by default none.
+    - `notes`: changes made on reading the matrices' files, such as a mirrored triangle; `load` sets
+      them.
 
     **Raises:** `ValueError` or `TypeError` saying which matrix does not fit, is not finite or not
     positive definite, which degree of freedom is unknown, or which joint is wrong.
@@ -64,12 +72,12 @@ class Structure(Mechanism):
 
     sums: dict[str, MatrixSum]  # of "M", "C" and "K"
     parameters: dict[str, Float[Array, ""]]  # of the coefficients in them
-    F: Float[Array, " n"] | None
-    joints: tuple[Joint, ...]
-    joint_names: tuple[str, ...] = eqx.field(static=True)
-    names: tuple[str, ...] | None = eqx.field(static=True)
-    mesh: Mesh | None = eqx.field(static=True)
-    notes: tuple[str, ...] = eqx.field(static=True)
+    F: Float[Array, " n"] | None  # static force [N]
+    joints: tuple[Joint, ...]  # in the order of their names
+    joint_names: tuple[str, ...] = eqx.field(static=True)  # of the joints
+    names: tuple[str, ...] | None = eqx.field(static=True)  # of the degrees of freedom
+    mesh: Mesh | None = eqx.field(static=True)  # for pictures
+    notes: tuple[str, ...] = eqx.field(static=True)  # of changes on reading
 
     def __init__(
         self,
@@ -122,8 +130,8 @@ class Structure(Mechanism):
 
     @classmethod
     def from_scene(cls, scene: Scene) -> "Structure":
-        """The mass on a belt (Eq. 39) as a structure of two degrees of freedom, x1 and x2."""
-        M, C, K, F = _of_oscillator(scene.oscillator)
+        """The mass on a belt (Eq. 39) of `scene` as a structure with the displacements x1, x2."""
+        M, C, K, F = _oscillator_matrices(scene.oscillator)
         return cls(
             M=M,
             C=C,
@@ -181,7 +189,7 @@ class Structure(Mechanism):
         return arrays[0].dtype if arrays else jnp.result_type(float)
 
     def index(self, dof: Dof | np.integer) -> int:
-        """The index of a degree of freedom from its index or name.
+        """The index of a degree of freedom from `dof`, its index or name.
 
         **Raises:** `ValueError` if there is none; `TypeError` for anything else.
         """
@@ -194,7 +202,7 @@ class Structure(Mechanism):
         return dofs.index(dof)
 
     def direction(self, direction: Direction) -> np.ndarray:
-        """The weights d (n,) for which d.x is the displacement in a direction, given as in `Joint`.
+        """The weights d (n,) for which d.x is the displacement in `direction`, given as in `Joint`.
 
         **Raises:** `ValueError` for a direction that is zero or not of length n, and as `index`.
         """
@@ -255,7 +263,7 @@ class Structure(Mechanism):
         if changes.keys() & {*self.sums, "F"}:
             arguments = {name: changes.get(name, self._terms(name)) for name in self.sums}
             arguments |= {"joints": joints, "F": changes.get("F", self.F), "names": self.names}
-            arguments |= {"mesh": self._own_mesh(), "notes": self.notes}
+            arguments |= {"mesh": self._matching_mesh(), "notes": self.notes}
             if not self.parameters:
                 return Structure(**arguments)
             return ParametricStructure(**arguments, parameters=parameters)
@@ -267,7 +275,7 @@ class Structure(Mechanism):
             _check_coefficients(new)
         return new
 
-    def _own_mesh(self) -> Mesh | None:
+    def _matching_mesh(self) -> Mesh | None:
         """The mesh, if it has the degrees of freedom of the matrices, else None."""
         return self.mesh
 
@@ -308,7 +316,7 @@ class Structure(Mechanism):
         return {}
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write a TOML file and, in the same folder, the matrices as a .npz file of the same name.
+        """Write a TOML file at `path` and, beside it, the matrices as a .npz file of the same name.
 
         Both files are written or neither: an error leaves the files of an earlier structure intact.
 
@@ -337,12 +345,18 @@ class Structure(Mechanism):
 class ParametricStructure(Structure):
     """A structure whose matrices depend on named parameters: rotation, friction, temperature, ...
 
-    Each of `M`, `C` and `K` is a matrix, or a list of (coefficient, matrix) to be summed. A
-    coefficient is a number, a function of the parameters, `lambda p: p["Omega"] ** 2 - 1`, or the
-    same as text, "Omega**2 - 1", with + - * / **, pi, sqrt, exp, log, sin, cos and tan, which a
-    file can hold. For example, a gyroscopic term is ("Omega", G) in C and a circulatory one
-    ("mu", N) in K. `parameters` maps names to numbers. `replace(Omega=...)`, sweeps and designs
-    accept these names, and derivatives reach each parameter. All else is as in `Structure`.
+    Derivatives reach each parameter; `replace(Omega=...)`, sweeps and designs accept their names.
+
+    **Arguments:**
+
+    - `M`, `C`, `K`: each a matrix as in `Structure`, or a list of (coefficient, matrix) to be
+      summed. A coefficient is a number, a function of the parameters,
+      `lambda p: p["Omega"] ** 2 - 1`, or the same as text, "Omega**2 - 1", with + - * / **, pi,
+      sqrt, exp, log, sin, cos and tan, which a file can hold. For example, a gyroscopic term is
+      ("Omega", G) in C and a circulatory one ("mu", N) in K.
+    - `joints`: as in `Structure`, by default none.
+    - `parameters`: {name: number}, by default none.
+    - `F`, `names`, `mesh`, `notes`: as in `Structure`.
 
     **Raises:** as `Structure`; `ValueError` for a coefficient that is not finite or reads an
     unknown parameter, and for a parameter with the name of another quantity.
@@ -373,7 +387,7 @@ class ParametricStructure(Structure):
 
 
 @exported_jit
-def _of_oscillator(oscillator: Oscillator):
+def _oscillator_matrices(oscillator: Oscillator):
     """M, C, K and F of the mass on a belt."""
     m, f = oscillator.m, oscillator.F / jnp.sqrt(2.0)
     omega = jnp.stack([oscillator.omega_1, oscillator.omega_2])
@@ -417,6 +431,10 @@ def _names_matrices(path: Path, matrices: str) -> bool:
 
 def load(path: str | os.PathLike) -> Scene | Structure:
     """The mechanism in a TOML file: a structure if it has a table [structure], else a scene.
+
+    **Arguments:**
+
+    - `path`: the TOML file; files that it names are beside it.
 
     **Raises:** as `Scene.load` and `Structure.load`.
     """

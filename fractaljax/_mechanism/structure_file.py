@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from .._base import toml
+from .._base.file_limits import FileLimits
 from .._base.files import read_bounded
 from .._base.numpy_file import read_npz
 from .._base.parts import brief
@@ -20,7 +21,6 @@ from .matrices import MatrixSum, is_sparse
 from .matrix_file import Matrices, read_matrices
 from .mesh import Mesh
 
-_LARGEST_FILE = 2**30
 _MATRICES = ("M", "C", "K")
 _BASES = ("V", "W", "residuals", "touched", "coarse_V", "coarse_W")
 _MESH = "mesh."  # prefix of its arrays in the file of matrices
@@ -99,12 +99,12 @@ class _Source:
         """The mesh in the file `name`, or in the file of matrices."""
         if name is None:
             held = {key.removeprefix(_MESH): x for key, x in self.held.items() if _MESH in key}
-            return Mesh.of_arrays(held, str(self.file)) if held else None
+            return Mesh.from_arrays(held, str(self.file)) if held else None
         if any(key.startswith(_MESH) for key in self.held):
             raise ValueError("[structure] gives mesh twice: in matrices and as mesh")
         if Path(name).suffix.lower() != ".npz":
             raise ValueError(f"[structure] mesh must be {_KEYS['mesh'][1]}, got {brief(name)}")
-        return Mesh.of_arrays(_npz(self.folder / name), name)
+        return Mesh.from_arrays(_npz(self.folder / name), name)
 
     def _read(self, path: Path) -> Matrices:
         model = read_matrices(path)
@@ -136,7 +136,7 @@ def read_structure(document: dict[str, Any], folder: Path) -> dict[str, Any]:
     source = _Source(table, folder)
     matrices: dict[str, Any] = {}
     for name in (*_MATRICES, "F"):
-        if name in table and name in source.held and not _among(table[name], source.held):
+        if name in table and name in source.held and not _is_stored(table[name], source.held):
             raise ValueError(f"[structure] gives {name} twice: in matrices and as {name}")
         if name not in table and (name in source.held or name in source.unread):
             matrices[name] = source.held[name]
@@ -180,7 +180,7 @@ def read_structure(document: dict[str, Any], folder: Path) -> dict[str, Any]:
     return arguments | ({"parameters": parameters} if parameters else {})
 
 
-def _among(value: Any, held: Mapping[str, Any]) -> bool:
+def _is_stored(value: Any, held: Mapping[str, Any]) -> bool:
     """True if the file of matrices contains a matrix, or all of its terms."""
     terms = value if isinstance(value, list) else [{"matrix": value}]
     return all(isinstance(term, dict) and term.get("matrix") in held for term in terms)
@@ -212,8 +212,9 @@ def _dof(key: str, names) -> int | str:
 
 def _npz(path: Path) -> dict[str, Any]:
     """The arrays of a .npz file, sparse ones from the parts "K.data", "K.indices", ..."""
+    most = FileLimits.matrices
     with toml.naming(path.name):
-        arrays: dict[str, Any] = read_npz(read_bounded(path, _LARGEST_FILE), _LARGEST_FILE)
+        arrays: dict[str, Any] = read_npz(read_bounded(path, most), most)
         for name in [key.removesuffix(".data") for key in arrays if key.endswith(".data")]:
             parts = [arrays.pop(f"{name}.{part}", None) for part in _SPARSE]
             arrays[name] = _compressed(name, *parts)
@@ -286,7 +287,7 @@ def npz_bytes(structure: Any) -> bytes:
     """The matrices of a structure as the content of a .npz file."""
     arrays: dict[str, Any] = dict(structure._more_arrays())
     for name, held in structure.sums.items():
-        arrays |= _arrays_of(name, held)
+        arrays |= _matrix_arrays(name, held)
     if structure.F is not None:
         arrays["F"] = np.asarray(structure.F)
     if structure.mesh is not None:
@@ -296,7 +297,7 @@ def npz_bytes(structure: Any) -> bytes:
     return content.getvalue()
 
 
-def _arrays_of(name: str, held: MatrixSum) -> dict[str, np.ndarray]:
+def _matrix_arrays(name: str, held: MatrixSum) -> dict[str, np.ndarray]:
     one = held.coefficients == (None,)
     arrays = {}
     for i, X in enumerate(held.matrices, start=1):

@@ -38,13 +38,6 @@ from .linearise import Pressed, assembled, linearised_at, pressed, with_equilibr
 from .quadratic import solve
 from .quartic import rightmost_root
 
-_FEW, _MANY = 64, 512  # points evaluated at once: bisections have few, a fine lattice has many
-_LINES_MAX = 2000  # of the lattice, whose points grow with the square
-_UNDAMPED = 1e-12  # negative damping over sqrt(a + b) that may be rounding
-_COALESCED = 1e2  # times sqrt(eps): negative damping ratio that may be rounding, in a structure
-_LOST = 1e-5  # damping of two modes at once, where the boundary has a corner
-_MU_M_STEP = 0.3  # where Eq. 19 is discontinuous
-
 Window = tuple[str, float, float]
 
 
@@ -63,12 +56,12 @@ class BoundaryEnd(eqx.Enumeration):
 class BoundaryBranch(Record):
     """One connected piece of a stability boundary, with squeal on its right."""
 
-    x: Float[np.ndarray, " k"]
-    y: Float[np.ndarray, " k"]
+    x: Float[np.ndarray, " k"]  # values of the first quantity
+    y: Float[np.ndarray, " k"]  # values of the second one
     frequency: Float[np.ndarray, " k"]  # of the imaginary pair of eigenvalues [Hz]; 0: divergence
     growth_rate: Float[np.ndarray, " k"]  # [1/s], 0 up to rounding
-    start: BoundaryEnd
-    end: BoundaryEnd
+    start: BoundaryEnd  # what it begins at
+    end: BoundaryEnd  # what it ends at
 
     @property
     def closed(self) -> bool:
@@ -84,11 +77,11 @@ class BoundaryBranch(Record):
 class Boundary(Record):
     """Where the growth rate is 0 in a window of two quantities, as `hopf_boundary` returns it."""
 
-    scene: Mechanism
+    scene: Mechanism  # scene or structure with all other quantities
     x: Window  # name and range
-    y: Window
-    branches: tuple[BoundaryBranch, ...]
-    friction_slope: bool
+    y: Window  # name and range
+    branches: tuple[BoundaryBranch, ...]  # each one connected piece
+    friction_slope: bool  # True if growth rates count the slope of friction
     squeals: bool  # at the corner (low, low) of the window
     untraced: int  # crossings of the lattice that could not be followed
 
@@ -118,21 +111,30 @@ def hopf_boundary(
 ) -> Boundary:
     """Trace where the growth rate is 0 in the window of two quantities of a scene or structure.
 
-    `x` and `y` are (name, low, high): any quantity; for a structure also "left.D"; for a scene also
-    "K_t/K_n" at the scene's K_n (the given stiffness ratio of a fractal contact), "omega_1/omega_2"
-    at the scene's omega_2, and "mu", the friction at the belt velocity, which scales the friction
-    law as a whole. A range over a decade or more is logarithmic. Every point lies on the boundary
-    within 1e-12 of the window, or what the rounding of the scene allows. Branches are found where
-    they cross one of `lines` lines each way, or dip between two of them; a loop within a cell can
-    be missed. Where both directions lose all their damping at once, along a whole line, the Hopf
-    test function does not change sign smoothly: such crossings are counted as `untraced`.
+    Every point lies on the boundary within 1e-12 of the window, or what the rounding of the scene
+    allows. Branches are found where they cross a line of a lattice, or dip between two of them; a
+    loop within a cell can be missed. Where both directions lose all their damping at once, along a
+    whole line, the Hopf test function does not change sign smoothly: such crossings are counted as
+    `untraced`.
 
     For a structure, the boundary is flutter or static divergence (`BoundaryBranch.divergence`). A
     branch ends at a corner, where a second mode loses its damping too; the next branch begins
-    there. Points lie on it within 1e-10 of the window, or eps over the damping ratio. Each
-    takes a full eigenvalue solution: choose fewer `lines` for many degrees of freedom.
+    there. Points lie on it within 1e-10 of the window, or eps over the damping ratio.
 
     Not differentiable, and not for use under `jit`; see `critical_friction` for that.
+
+    **Arguments:**
+
+    - `scene`: a scene or structure of scalars.
+    - `x`, `y`: (name, low, high) of any quantity in SI units; for a structure also "left.D"; for a
+      scene also "K_t/K_n" at the scene's K_n (the given stiffness ratio of a fractal contact),
+      "omega_1/omega_2" at the scene's omega_2, and "mu", the friction at the belt velocity, which
+      scales the friction law as a whole. A range over a decade or more is logarithmic.
+    - `friction_slope`: False leaves the slope of friction out of growth rates.
+    - `lines`: lines of the lattice each way, 49 by default. Each point takes a full eigenvalue
+      solution of a structure: choose fewer for many degrees of freedom.
+
+    **Returns:** a `Boundary`.
 
     **Raises:** `ValueError` for a name that is no quantity of the scene, two names that set the
     same one, a range that is empty, inverted or outside the domain, a scene that holds arrays, and
@@ -141,11 +143,11 @@ def hopf_boundary(
     """
     require_one("scene", scene)
     friction_slope = flag("friction_slope", friction_slope)
-    lines = whole("lines", lines, 2, _LINES_MAX)
-    windows = [_window(scene, which, window) for which, window in (("x", x), ("y", y))]
+    lines = whole("lines", lines, 2, 2000)  # the lattice has the square of them in points
+    windows = [_check_window(scene, which, window) for which, window in (("x", x), ("y", y))]
     names = (windows[0][0], windows[1][0])
     require_independent(scene, names)
-    require_inside(scene, {window[0]: _decisive(scene, *window) for window in windows})
+    require_inside(scene, {window[0]: _decisive_values(scene, *window) for window in windows})
     logarithmic = tuple(is_logarithmic(*window[1:]) for window in windows)
     ends = np.array([window[1:] for window in windows])
     ends[list(logarithmic)] = np.log(ends[list(logarithmic)])
@@ -175,7 +177,7 @@ def hopf_boundary(
     )
 
 
-def _window(scene, which, window) -> Window:
+def _check_window(scene, which, window) -> Window:
     """The validated range, not yet checked against the domain of the scene."""
     if not (isinstance(window, (tuple, list)) and len(window) == 3 and isinstance(window[0], str)):
         raise ValueError(f"{which} must be (name, low, high), got {window!r}")
@@ -187,7 +189,7 @@ def _window(scene, which, window) -> Window:
     return name, low, high
 
 
-def _decisive(scene, name, low, high) -> np.ndarray:
+def _decisive_values(scene, name, low, high) -> np.ndarray:
     """The values of a range that decide if all of it is inside the domain of the scene."""
     quantities = stored_quantities(scene)
     # mu(V), by which "mu" scales the friction law, is least at V = v_m: perhaps between the ends.
@@ -261,7 +263,7 @@ def _rigid(structure: Structure, friction_slope: bool):
 
 
 @jax.jit
-def _at(plane: _Plane, u):
+def _evaluate(plane: _Plane, u):
     """Gradient (2,) of the test function, and the point."""
 
     def both(u):
@@ -274,7 +276,7 @@ def _at(plane: _Plane, u):
 @jax.jit
 def _tests(plane: _Plane, us):
     """Test function (k,), gradient (k, 2) and open joints (k,) at points (k, 2)."""
-    gradients, points = jax.vmap(_at, (None, 0))(plane, us)
+    gradients, points = jax.vmap(_evaluate, (None, 0))(plane, us)
     return points.test, gradients, points.open
 
 
@@ -284,11 +286,13 @@ class _Field:
     def __init__(self, plane: _Plane):
         self.plane, self.dtype, self.entered = plane, plane.low.dtype, False
         eps = float(jnp.finfo(self.dtype).eps)
-        self.tolerance, self.undamped = max(1e-12, 10 * eps), max(_UNDAMPED, (10 * eps) ** 2)
-        if plane.rigid is not None:  # eigenvalues resolve light damping to eps of the frequency
-            self.tolerance, self.undamped = max(1e-10, 1e4 * eps), _COALESCED * eps**0.5
+        # Negative damping that may be rounding: over sqrt(a + b), or the ratio in a structure,
+        # whose eigenvalues resolve light damping to eps of the frequency.
+        self.tolerance, self.undamped = max(1e-12, 10 * eps), max(1e-12, (10 * eps) ** 2)
+        if plane.rigid is not None:
+            self.tolerance, self.undamped = max(1e-10, 1e4 * eps), 1e2 * eps**0.5
         # Each point is evaluated for its zero, its damping and what the result shows.
-        self._at = functools.lru_cache(8)(lambda u: _at(plane, jnp.asarray(u, self.dtype)))
+        self._at = functools.lru_cache(8)(lambda u: _evaluate(plane, jnp.asarray(u, self.dtype)))
 
     def at(self, u) -> _Point:
         return self._at(tuple(u))[1]
@@ -303,7 +307,7 @@ class _Field:
         def program(us):
             return _tests(self.plane, jnp.asarray(us, self.dtype))
 
-        batch = _FEW if len(us) <= _FEW**2 else _MANY
+        batch = 64 if len(us) <= 64**2 else 512  # bisections have few points, a lattice has many
         tests, gradients, lifted = map(np.asarray, in_batches(program, batch, us))
         lost = np.isnan(tests)
         if not self.entered:
@@ -327,14 +331,14 @@ class _Field:
     def quantities(self, u) -> list[float]:
         return [float(x) for x in self.plane.quantities(jnp.asarray(u, self.dtype))]
 
-    def why(self, end: CurveEnd, u, before) -> BoundaryEnd:
+    def reason_of_end(self, end: CurveEnd, u, before) -> BoundaryEnd:
         """Why a branch ends at u, coming from the point `before`."""
         if end in (CurveEnd.edge, CurveEnd.closed):
             return BoundaryEnd.window if end is CurveEnd.edge else BoundaryEnd.closed
         here = self.at(u)
-        if np.abs(here.damping).max() < _LOST:
+        if np.abs(here.damping).max() < 1e-5:  # of two modes at once
             return BoundaryEnd.undamped if self.plane.rigid is None else BoundaryEnd.corner
-        if any(abs(float(mu_m) - _MU_M_STEP) < 1e-6 for mu_m in here.mu_m):
+        if any(abs(float(mu_m) - 0.3) < 1e-6 for mu_m in here.mu_m):
             return BoundaryEnd.friction_correction
         ahead = (u - before) / np.linalg.norm(u - before)
         for reach in 10.0 ** np.arange(-7, -2):
@@ -358,6 +362,6 @@ def _branch(field: _Field, windows, curve: Curve) -> BoundaryBranch:
         y=places[:, 1],
         frequency=np.array([float(point.frequency) for point in points]),
         growth_rate=np.array([float(point.growth_rate) for point in points]),
-        start=field.why(curve.start, *curve.points[:2]),
-        end=field.why(curve.end, *curve.points[:-3:-1]),
+        start=field.reason_of_end(curve.start, *curve.points[:2]),
+        end=field.reason_of_end(curve.end, *curve.points[:-3:-1]),
     )

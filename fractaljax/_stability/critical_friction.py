@@ -33,10 +33,6 @@ from .critical_pair import critical_pair, least_test
 from .linearise import assembled, linearised
 from .quadratic import solve
 
-_FACTORS = 512  # of the friction law, among which the first root is bracketed
-_AT_ONCE = 8  # factors evaluated together, and points that divide the bracket further
-_REFINED = 12  # times, to 9^-12 of it
-
 
 def critical_coupling(lin: Linearised) -> Float[Array, ""]:
     """g_c [1/s^4], the coupling at which a pair of eigenvalues is imaginary.
@@ -74,23 +70,29 @@ def critical_friction(
 ) -> Float[Array, ""]:
     """Friction coefficient mu(V) at which the scene or structure starts to squeal [-], a scalar.
 
-    With a `FixedContact` and friction that has no slope, or `friction_slope=False`, the closed
-    form mu_c = m sqrt(g_c/(K_n K_t)), infinite where K_n or K_t is 0. Otherwise the friction law
-    as a whole is multiplied by a factor, so that mu_s, mu_m and its slope grow together, and the
-    contact follows as in `stiffness`: K_t of a fractal joint depends on mu_s, its critical area on
-    mu_m. The first friction that squeals is searched from 1/1000 to 1000 times that of the scene,
-    up to the limit of Eq. 19 (mu_m <= 0.9): 0 if the least squeals already, infinite if none does,
-    NaN where it cannot be computed, and where a preloaded joint opens first. To hold the stiffness,
+    With a `FixedContact` and friction without a slope, the closed form mu_c = m sqrt(g_c/(K_n
+    K_t)), infinite where K_n or K_t is 0. Otherwise the friction law as a whole is multiplied by a
+    factor, so that mu_s, mu_m and its slope grow together, and the contact follows as in
+    `stiffness`: K_t of a fractal joint depends on mu_s, its critical area on mu_m. The first
+    friction that squeals is searched from 1/1000 to 1000 times that of the scene, up to the limit
+    of Eq. 19 (mu_m <= 0.9): 0 if the least squeals already, infinite if none does, NaN where it
+    cannot be computed, and where a preloaded joint opens first. To hold the stiffness,
     `scene.replace(contact=FixedContact(*stiffness(scene)))`, with its P if it is preloaded.
 
     For a structure, one factor scales the friction of all joints, and the equilibrium follows.
-    The result is mu at the sliding velocity of `joint`, which all joints share unless it is named;
-    the other coefficients keep their proportion to it. Squeal begins by flutter or by static
-    divergence (a real eigenvalue). The factor is the root of the Hopf test function of n degrees
-    of freedom (`critical_pair.py`) between two of 512 factors f, evenly spaced in f/(1 + f): an
-    interval of squeal narrower than that can be missed. Each takes a full eigenvalue solution.
+    Squeal begins by flutter or by static divergence (a real eigenvalue). The factor is the root of
+    the Hopf test function of n degrees of freedom (`critical_pair.py`) between two of 512 factors
+    f, evenly spaced in f/(1 + f): an interval of squeal narrower than that can be missed. Each
+    takes a full eigenvalue solution.
 
     The derivative is that of the root, and 0 where it is 0 or infinite.
+
+    **Arguments:**
+
+    - `scene`: a scene or structure of scalars.
+    - `friction_slope`: False leaves the slope of friction out of growth rates.
+    - `joint`: name of the joint of a structure at whose sliding velocity mu is meant; by default
+      all joints share that mu. The other coefficients keep their proportion to it.
 
     **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`; for a structure without
     joints, a `joint` that it does not have, or none where friction differs between them (NaN under
@@ -104,7 +106,7 @@ def critical_friction(
         return jnp.where(factor == jnp.inf, jnp.inf, coefficient * _finite(factor))
     if joint is not None:
         raise ValueError(f"joint names one of a structure, got {brief(joint)} for a scene")
-    return _of_scene(scene, sloping)
+    return _critical_friction_of_scene(scene, sloping)
 
 
 def _finite(factor):
@@ -142,7 +144,7 @@ def _factor_of_structure(structure, friction_slope):
 
 
 @functools.partial(exported_jit, static_argnames="friction_slope")
-def _of_scene(scene: Scene, friction_slope: bool) -> Float[Array, ""]:
+def _critical_friction_of_scene(scene: Scene, friction_slope: bool) -> Float[Array, ""]:
     sloping = friction_slope and scene.friction.velocity_dependent
     if scene.contact.depends_on_friction or sloping or scene.follows_load_curve:
         factor, _ = _first_factor(scene, friction_slope)
@@ -203,9 +205,9 @@ def _signs(x, factors, friction_slope, rigid):
 
 
 def _lattice(x):
-    """The factors (_FACTORS,) among which the first root is bracketed."""
+    """The factors (512,) among which the first root is bracketed."""
     dtype = jax.tree.leaves(x)[0].dtype
-    share = (jnp.arange(_FACTORS, dtype=dtype) + 0.5) / _FACTORS
+    share = (jnp.arange(512, dtype=dtype) + 0.5) / 512
     factors = share / (1 - share)
     for part in joints_of(x).values():
         if part.contact.yields:
@@ -221,12 +223,14 @@ def _first_factor(x: Any, friction_slope: bool):
 
     Also the number of rigid-body eigenvalues of a structure.
     """
-    groups = _lattice(x).reshape(-1, _AT_ONCE)
-    inner = (jnp.arange(_AT_ONCE, dtype=groups.dtype) + 1) / (_AT_ONCE + 1)
+    # Eight factors are evaluated together; once there is a bracket, eight divide it into nine.
+    groups = _lattice(x).reshape(-1, 8)
+    inner = (jnp.arange(8, dtype=groups.dtype) + 1) / 9
 
     def onward(at):
         bracketed = at.high < jnp.inf
-        return jnp.where(bracketed, at.refined < _REFINED, at.rounds < len(groups))
+        # Twelve divisions leave 9^-12 of the bracket.
+        return jnp.where(bracketed, at.refined < 12, at.rounds < len(groups))
 
     def search(at):
         bracketed = at.high < jnp.inf

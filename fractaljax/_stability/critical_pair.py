@@ -23,10 +23,6 @@ from jaxtyping import Array, Complex, Float, Int
 from .band import in_band
 from .quadratic import Modes, solve
 
-_NODES = 32  # on the circle
-_SEPARATED = 16.0  # times closer than any other mode: the error is 4^-_NODES
-_UNDAMPED = 1e3  # times eps: p over the frequency that may be rounding
-
 
 class CriticalPair(NamedTuple):
     """The mode that decides, and what a boundary shows of it."""
@@ -106,9 +102,9 @@ def _choice(s: Complex[Array, " k"], rigid, conservative, band) -> _Choice:
     distance = jnp.where(counted[None] & (place[None] != place[:, None]), distance, jnp.inf)
     partner = jnp.argmin(distance, axis=1)
     sigma, delta = (s + s[partner]) / 2, ((s - s[partner]) / 2) ** 2
-    eps = jnp.finfo(size.dtype).eps
     # Exactly 0 where C = 0, but for neighbours of which one grows alone.
-    undamped = jnp.abs(sigma.real) <= jnp.where(conservative, eps**0.5, _UNDAMPED * eps) * size
+    coalesced, single = jnp.finfo(size.dtype).eps ** 0.5, _resolution(size.dtype)
+    undamped = jnp.abs(sigma.real) <= jnp.where(conservative, coalesced, single) * size
     alone = (s.imag > 0) & (s[partner] == s.conj()) & ~(undamped & conservative)
     test = jnp.where(alone, _alone(s.real, size), hopf_test(sigma, delta, undamped))
     counted &= in_band(s, band)
@@ -116,9 +112,14 @@ def _choice(s: Complex[Array, " k"], rigid, conservative, band) -> _Choice:
     return _Choice(test, counted, partner, alone, undamped)
 
 
+def _resolution(dtype):
+    """The damping ratio that may be rounding."""
+    return 1e3 * jnp.finfo(dtype).eps
+
+
 def _alone(growth, size):
     """T = u |s| of a mode whose neighbour is its conjugate, above 0 if it may be undamped."""
-    return (_UNDAMPED * jnp.finfo(size.dtype).eps * size - growth) * size
+    return (_resolution(size.dtype) * size - growth) * size
 
 
 def hopf_test(sigma, delta, undamped):
@@ -143,8 +144,9 @@ def _mean_and_spread(M, C, K, s, i, j):
     place, middle = jnp.arange(len(s)), (fixed[i] + fixed[j]) / 2
     half = jnp.abs(fixed[i] - fixed[j]) / 2
     others = jnp.where((place == i) | (place == j), jnp.inf, jnp.abs(fixed - middle)).min()
-    others = jnp.minimum(others, _SEPARATED * (jnp.abs(middle) + half))
-    coalescing = _SEPARATED * half <= others
+    separated = 16.0  # times closer than any other mode: with 32 nodes the error is 4^-32
+    others = jnp.minimum(others, separated * (jnp.abs(middle) + half))
+    coalescing = separated * half <= others
     # Around the first alone where the second is as far as others; `solve` has s = 0 exactly.
     nearest = jnp.where(place == i, jnp.inf, jnp.abs(fixed - fixed[i])).min()
     least = jnp.sqrt(jnp.finfo(half.dtype).eps) * jnp.abs(fixed).max()
@@ -160,9 +162,8 @@ def _moments(M, C, K, centre, radius):
     """Sums of z and of z^2 of the eigenvalues in a circle, z being relative to its centre."""
     unit = jax.lax.stop_gradient(1 / jnp.sqrt(jnp.diagonal(M)))
     M, C, K = (X * unit[:, None] * unit[None] for X in (M, C, K))
-    step = radius * jnp.asarray(
-        np.exp(2j * np.pi * (np.arange(_NODES) + 0.5) / _NODES), centre.dtype
-    )
+    nodes = 32
+    step = radius * jnp.asarray(np.exp(2j * np.pi * (np.arange(nodes) + 0.5) / nodes), centre.dtype)
 
     def traced(z):
         return jnp.trace(jnp.linalg.solve(z**2 * M + z * C + K, 2 * z * M + C))

@@ -10,13 +10,13 @@ from jaxtyping import Array, Float
 from .._base.lapack import solve
 from .._base.parts import concrete, flag
 from .._base.programs import exported_jit
+from .._base.rounding import rounding_error
 from .._contact.load_curve import LoadCurve, loaded_equilibrium
 from .._mechanism.oscillator import Linearised, linearise, static_normal_force
 from .._mechanism.quantities import sliding_friction
 from .._mechanism.scene import Scene, stiffness
 from .._mechanism.structure import Structure, require_single
 
-_ROUNDING = 16.0  # of a sum of n products, in units of eps
 NO_EQUILIBRIUM = (
     "F has no static equilibrium to rounding: a rigid-body mode is left free; hold the structure, "
     "or leave the slope of the friction law out"
@@ -114,13 +114,18 @@ def assemble(
 ) -> tuple[Float[Array, "n n"], Float[Array, "n n"], Float[Array, "n n"]]:
     """(M, C, K), each (n, n), with the joints attached, in the units of the structure.
 
-    With t and n the directions of a joint, Eq. 43 in vectors: K_t t t^T + K_n n n^T
-    - mu K_n t n^T + mu K_t n t^T is added to K. The slope of the friction law adds
-    mu' N_0 t t^T - mu' K_t (t.x_0) n n^T to C, where x_0 is the equilibrium and N_0 = K_n n.x_0.
-    With preload N_0 = P + K_n n.x_0, and the equilibrium is that under F and the friction mu P t;
-    for a load curve N_0 = N(n.x_0), and the tangent at N_0 takes the place of P + K_n n.x.
-    C and K are NaN where such a joint is open, N_0 <= 0, and under `jit` where there is no
-    equilibrium. A joint without normal has N_0 = P and no term with n.
+    With t and n the directions of a joint, Eq. 43 in vectors: K_t t t^T + K_n n n^T - mu K_n t n^T
+    + mu K_t n t^T is added to K. The slope of the friction law adds mu' N_0 t t^T - mu' K_t (t.x_0)
+    n n^T to C, where x_0 is the equilibrium and N_0 = K_n n.x_0. With preload N_0 = P + K_n n.x_0,
+    and the equilibrium is that under F and the friction mu P t; for a load curve N_0 = N(n.x_0),
+    and the tangent at N_0 takes the place of P + K_n n.x. C and K are NaN where such a joint is
+    open, N_0 <= 0, and under `jit` where there is no equilibrium. A joint without normal has N_0 =
+    P and no term with n.
+
+    **Arguments:**
+
+    - `structure`: a `Structure`; `jax.vmap` takes many.
+    - `friction_slope`: False leaves the slope of friction out of C.
 
     **Raises:** `ValueError` for a batch, where a slope needs F and there is none, and if there is
     no equilibrium: a rigid-body mode is free.
@@ -334,7 +339,7 @@ def _equilibrium(F, K, directions) -> tuple[jax.Array, jax.Array, jax.Array]:
     K, x_0, F, size = jax.lax.stop_gradient((K, jnp.abs(x_0), F, jnp.abs(along)))
     eps = jnp.finfo(K.dtype).eps
     through = jnp.abs(solve(K.T, directions.T))
-    errors = _ROUNDING * eps * (jnp.abs(K) @ x_0) @ through
+    errors = rounding_error(K.dtype) * (jnp.abs(K) @ x_0) @ through
     supported = eps * jnp.abs(K).max() * x_0.max() <= 0.01 * jnp.abs(F).max()
     supported |= errors.max() <= 0.01 * size.max()
     return along, errors, supported

@@ -26,7 +26,7 @@ from .quadratic import solve
 def margin(
     scene: Mechanism, shift: ScalarLike = 0.0, friction_slope: bool = True
 ) -> Float[Array, ""]:
-    """Margin of stability [-], a scalar: above 0 exactly where growth_rate < shift [1/s].
+    """Margin of stability [-], a scalar: above 0 exactly where the growth rate is below `shift`.
 
     Its scale is that of a damping ratio. For a scene with lightly damped, well separated modes it
     is 0.5 to 1 times the least decay rate over the rms natural frequency sqrt((a + b)/2) in
@@ -38,7 +38,11 @@ def margin(
     measure of n degrees of freedom takes a Lyapunov equation of size 2n. With a shift the ratios
     are those of the eigenvalues minus the shift. Rigid-body modes do not count without a shift.
 
-    `friction_slope` is as in `growth_rate`; the margin is NaN where the growth rate is.
+    **Arguments:**
+
+    - `scene`: a scene or structure of scalars.
+    - `shift`: growth rate [1/s] at which the margin is 0, a scalar, 0 by default.
+    - `friction_slope`: as in `growth_rate`; the margin is NaN where the growth rate is.
 
     **Raises:** as `growth_rate`; `TypeError` for a `shift` that is no number.
     """

@@ -16,11 +16,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from .._base.lapack import one_by_one
+from .._base.rounding import rounding_error
 from .._mechanism.matrices import mass_normalised
 from .band import in_band
-
-_ROUNDING = 16.0  # of a sum of n products, in units of eps
-_NO_EXPONENT = -2000  # below that of any number
 
 
 class Modes(NamedTuple):
@@ -55,11 +53,12 @@ def solve(
     units = _power_of_two(-_half_exponent(jnp.diagonal(M)), K.dtype)
     M, C, K, C_error = jax.tree.map(lambda X: X * units[:, None] * units[None], (M, C, K, C_error))
     stiffness, damping = _row_sum(K), _row_sum(C)
+    no_exponent = -2000  # below that of any number
     exponent = jnp.maximum(
-        jnp.where(stiffness > 0, _half_exponent(stiffness), _NO_EXPONENT),
-        jnp.where(damping > 0, jnp.frexp(damping)[1], _NO_EXPONENT),
+        jnp.where(stiffness > 0, _half_exponent(stiffness), no_exponent),
+        jnp.where(damping > 0, jnp.frexp(damping)[1], no_exponent),
     )
-    omega = _power_of_two(jnp.where(exponent > _NO_EXPONENT, exponent, 0), K.dtype)
+    omega = _power_of_two(jnp.where(exponent > no_exponent, exponent, 0), K.dtype)
     C_error = None if C_error is None else C_error / omega
     scaled = _modes(M, C / omega, K / omega / omega, C_error)
     s = omega * jnp.where(scaled.rigid, 0, scaled.z)
@@ -129,7 +128,7 @@ class _Vectors(NamedTuple):
 @jax.custom_jvp
 def _modes(M, C, K, C_error) -> _Vectors:
     z, X, Y = _lapack(M, C, K)
-    eps = jnp.finfo(M.dtype).eps
+    eps, rounding = jnp.finfo(M.dtype).eps, rounding_error(M.dtype)
     row, size = z[None], _size(z)[None]
     MX, CX, KX = (A @ X for A in (M, C, K))
     M_size, C_size, K_size = (jnp.abs(A) @ _size(X) for A in (M, C, K))
@@ -140,12 +139,12 @@ def _modes(M, C, K, C_error) -> _Vectors:
     Y = Y / jnp.where(slope == 0, 1, slope)[:, None]
     # The residual between all pairs of modes, and a bound on its rounding error.
     left = -Y @ ((MX * row + CX) * row + KX)
-    off = _size(left) + _ROUNDING * eps * (_size(Y) @ ((M_size * size + C_size) * size + K_size))
+    off = _size(left) + rounding * (_size(Y) @ ((M_size * size + C_size) * size + K_size))
     if C_error is not None:
         off = off + _size(Y) @ (C_error @ _size(X) * size)
     z, error = _pairwise(z, jnp.diagonal(left), _shift(z, off))
     inertia = _size((Y.T * MX).sum(axis=0))
-    stiffness = _ROUNDING * eps * (_size(Y.T) * K_size).sum(axis=0)
+    stiffness = rounding * (_size(Y.T) * K_size).sum(axis=0)
     force = (_size(Y.T) * _size(KX)).sum(axis=0)
     rigid = (size[0] ** 2 * inertia <= stiffness) & (force <= stiffness)
     double = jnp.minimum(jnp.sqrt(stiffness / jnp.where(inertia > 0, inertia, 1)), error)

@@ -12,12 +12,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
+from .._base.rounding import rounding_error
 from .._base.singular import polynomial, positive_sqrt, safe_divide
 from .._mechanism.oscillator import Linearised, dimensionless
 
-_NEWTON_STEPS = 2
-_SMALL = 1e-3  # alpha^2 / p below which the cubic term of the resolvent is left out
-_ROUNDING = 16.0  # of the closed form, in units of eps
 # cos(2/3 arccos x) on [0, 1], highest power first, with an error of at most 2e-7.
 _COSINE_OF_THIRD = [
     -0.00214345,
@@ -69,8 +67,9 @@ def _alpha(p, q, e):
     one = u - safe_divide(P / 3, u, jnp.zeros_like(u))
     closed = jnp.where(discriminant > 0, one, three) - 2 * p / 3
     # The light formula needs p > 0, or a single real root of the cubic.
-    small = (p > 0) & (light <= _SMALL * p)
-    small |= (discriminant > 0) & (2 * root > e) & (light**2 <= _SMALL * e)
+    negligible = 1e-3  # alpha^2 / p below which the cubic term of the resolvent is left out
+    small = (p > 0) & (light <= negligible * p)
+    small |= (discriminant > 0) & (2 * root > e) & (light**2 <= negligible * e)
     square = jnp.maximum(jnp.where(small, light, closed), 0)
     # One Newton step doubles the three digits that either formula has.
     value = ((square + 2 * p) * square + e) * square - q**2
@@ -155,7 +154,7 @@ def _split(lin: Linearised) -> tuple[jax.Array, _Quadratic, _Quadratic]:
         divisor, division
     ) * less_damped_division.resultant(less_damped) ** 2
     divisor, division = _where(better, (less_damped, less_damped_division), (divisor, division))
-    for _ in range(_NEWTON_STEPS):
+    for _ in range(2):  # two Newton steps reach rounding
         divisor, division = _newton_step(lin, divisor, division)
     quotient = _Quadratic(divisor.u + division.difference_1, divisor.v + division.difference_0)
     return omega, divisor, quotient
@@ -250,7 +249,7 @@ def resolutions(lin: Linearised, s: Complex[Array, "4"]) -> Float[Array, "4"]:
     """
     omega, _ = dimensionless(jax.lax.stop_gradient(lin))
     z = jax.lax.stop_gradient(s) / omega
-    error, size = _ROUNDING * float(jnp.finfo(omega.dtype).eps), jnp.abs(z)
+    error, size = rounding_error(omega.dtype), jnp.abs(z)
     x, y, w = (jnp.abs(z - jnp.roll(z, k)) for k in (1, 2, 3))
     nearest = jnp.minimum(jnp.minimum(x, y), w)
     most = jnp.sqrt(error) * size

@@ -11,10 +11,6 @@ from .._mechanism.structure import Structure
 from .band import in_band
 from .snapshots import Snapshot, Snapshots, joint_blocks, joint_directions, plain
 
-_REGULAR = 1e-6  # least singular value of W^T M V
-_PARTNERS = 0.03  # least cosine, of the largest, between right and left directions
-_POWERS = {"M": 2, "C": 1, "K": 0}  # of s
-
 
 def decomposed(vectors: list[np.ndarray], weight: np.ndarray, cut: float) -> np.ndarray:
     """An orthonormal basis (n, r) in the norm of a lumped mass, of vectors (n, k), complex or not.
@@ -66,7 +62,7 @@ class Space:
         Right vectors may begin where left ones are small, and vanish where those are large.
         """
         size = np.linalg.svd(self.mass[:r, :r], compute_uv=False)
-        return not self.oblique or size[-1] > _REGULAR
+        return not self.oblique or size[-1] > 1e-6
 
     def coarse(self, r: int, smaller: int, tol: float) -> CoarseSpace:
         """The `smaller` most important directions, in coordinates of the r most important."""
@@ -96,7 +92,7 @@ def _paired(M: Any, V: np.ndarray, W: np.ndarray) -> tuple[np.ndarray, np.ndarra
     A right direction that all left ones are orthogonal to, in the sense of M, would be lost.
     """
     P, size, Qt = np.linalg.svd(W.T @ (M @ V))
-    alone = size < _PARTNERS * size[0]
+    alone = size < 0.03 * size[0]
     return np.hstack([W @ P[:, alone], V]), np.hstack([V @ Qt.T[:, alone], W])
 
 
@@ -110,7 +106,7 @@ def _in_space(rows: np.ndarray, T: np.ndarray) -> np.ndarray:
 
 def _terms(x: Structure) -> Iterator[tuple[int, Callable | None, Any]]:
     """The power of s, the coefficient and the matrix of every term, always in one order."""
-    for name, power in _POWERS.items():
+    for name, power in (("M", 2), ("C", 1), ("K", 0)):
         held = x.sums[name]
         matrices = held.matrices if held.sparse else map(np.asarray, held.arrays)
         for coefficient, X in zip(held.coefficients, matrices, strict=True):

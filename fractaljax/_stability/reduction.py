@@ -34,22 +34,10 @@ from .._mechanism.reduced import ReducedStructure, Reduction
 from .._mechanism.structure import Structure, require_single
 from .band import in_band
 from .reduced_space import Space, estimated_errors
+from .reduction_search import ReductionSearch
 from .snapshots import Snapshot, Snapshots, joint_numbers, plain, projected
 from .sparse_modes import Factors
 from .stability import stability
-
-_CHECKED = 2  # fresh points at which the eigenvalues are compared at the end
-_CUT = 1e-2  # times sqrt(tol): where the decomposition ends, at first
-_FINER = 0.1  # times that, where it is what limits the error
-_LEAST_CUT = 1e-10
-_STUCK = 0.5  # of an error: a point that leaves more of it shows that the cut limits it
-_SPURIOUS = 0.02  # of |s|: an error beyond which a mode may be none
-_FEW = 8  # candidates at which errors are estimated together, largest ones of before first
-_SIZES = 10  # degrees of freedom less, among which there are none without
-_NEAR = 4  # sizes tried together for the same reason
-_SAFE = 0.2  # of tol: the estimate is of leading order
-_COARSE = 1e-3  # of |s|: to this the coarse space knows the modes
-_WORTH = 40, 0.6  # degrees of freedom from which a coarse space of such a share saves time
 
 
 def reduce(
@@ -61,24 +49,35 @@ def reduce(
     friction_slope: bool = True,
     points: int = 40,
     progress: bool = False,
+    search: ReductionSearch = ReductionSearch(),
 ) -> ReducedStructure:
     """A small structure with the eigenvalues of a large one in a band of frequencies.
 
-    `over` maps named quantities, parameters or those of joints, to ranges (low, high) in which the
-    reduction holds; without any it holds for the quantities as they are. `band` is (low, high) in
-    rad/s. In it, every eigenvalue s is right to `tol` |s| at all candidates, by an estimate, and
-    at two fresh points, by comparison. Candidates are 33 along one quantity, 32 for each of
-    several, 128 at most, besides the corners. Eigenvectors are taken at `points` points at most.
-    Modes with |Re s| > 0.3 |s|, static divergence among them, are not looked for.
+    In the band, every eigenvalue s is right to `tol` |s| at all candidates, by an estimate, and at
+    two fresh points, by comparison. Candidates are 33 along one quantity, 32 for each of several,
+    128 at most, besides the corners; `search` can change these numbers. Modes with |Re s| > 0.3
+    |s|, static divergence among them, are not looked for.
 
-    The result keeps parameters, joints and their directions, and derivatives; `.full(q)` leads
-    back to all degrees of freedom, `.reduction` has the bases, the points and the largest error,
-    and `reduction_errors` estimates that of each eigenvalue. Without joints, and with a mass
-    matrix that does not depend on parameters, the projection is oblique, left vectors against
-    right ones; otherwise one space holds both, so that a joint pulls where it is pulled, and
-    static displacements under F and along the joints' directions as well.
+    The result keeps parameters, joints and their directions, and derivatives; `.full(q)` leads back
+    to all degrees of freedom, `.reduction` has the bases, the points and the largest error, and
+    `reduction_errors` estimates that of each eigenvalue. Without joints, and with a mass matrix
+    that does not depend on parameters, the projection is oblique, left vectors against right ones;
+    otherwise one space holds both, so that a joint pulls where it is pulled, and static
+    displacements under F and along the joints' directions as well.
 
     Not for use under `jit`; what it returns is.
+
+    **Arguments:**
+
+    - `structure`: a `Structure`, also a large and sparse one.
+    - `over`: {name: (low, high)} of quantities, parameters or those of joints, in SI units: the
+      ranges in which the reduction holds. By default it holds for the quantities as they are.
+    - `band`: (low, high) of |Im s| [rad/s], by default all frequencies.
+    - `tol`: largest relative error of an eigenvalue, 1e-8 by default.
+    - `friction_slope`: False leaves the slope of friction out.
+    - `points`: the most points at which eigenvectors are computed, 40 by default.
+    - `progress`: shows a bar; False by default.
+    - `search`: numbers of the search, a `ReductionSearch`.
 
     **Raises:** `ValueError` for a band or a range that is empty or outside the domain, an unknown
     quantity, and if `tol` is not met with so many points.
@@ -96,19 +95,23 @@ def reduce(
         replaced(structure, dict(zip(ranges, ends, strict=True)))
     tol = float(scalar("tol", tol, above=1e-12, at_most=0.1))
     flag("friction_slope", friction_slope)
-    snapshots = Snapshots(
-        with_optional(structure, list(ranges)), ranges, (low, high), friction_slope
-    )
+    require_kind("search", search, ReductionSearch)
+    structure = with_optional(structure, list(ranges))
+    snapshots = Snapshots(structure, ranges, (low, high), friction_slope, search)
     most = whole("points", points, 1)
-    return _Greedy(snapshots, tol, most, flag("progress", progress)).run()
+    return _Greedy(snapshots, tol, most, flag("progress", progress), search).run()
 
 
 def reduction_errors(reduced: ReducedStructure) -> Float[np.ndarray, " 2*r"]:
-    """The approximate error of each eigenvalue of `stability` due to the reduction [1/s].
+    """The approximate error (2r,) of each eigenvalue of `stability` due to the reduction [1/s].
 
-    In the same order; infinite outside the band. It is the product of the residuals of the
-    right and the left vector (see `reduction.py`): an estimate, right to leading order. Not
-    for use under `jit`.
+    In the same order; infinite outside the band. It is the product of the residuals of the right
+    and the left vector (see `reduction.py`): an estimate, right to leading order. Not for use under
+    `jit`.
+
+    **Arguments:**
+
+    - `reduced`: a structure as `reduce` returns it.
     """
     numbers = joint_numbers(reduced, reduced.reduction.friction_slope)
     s, errors = estimated_errors(reduced, reduced.parameters, np.asarray(numbers))
@@ -138,12 +141,19 @@ _Estimate = tuple[np.ndarray, np.ndarray]  # eigenvalues and their errors at a p
 class _Greedy:
     """Points one after the other, where the error is largest, until it is small everywhere."""
 
-    def __init__(self, snapshots: Snapshots, tol: float, most: int, progress: bool):
+    def __init__(
+        self,
+        snapshots: Snapshots,
+        tol: float,
+        most: int,
+        progress: bool,
+        search: ReductionSearch,
+    ):
         from tqdm import tqdm
 
-        self.snapshots, self.tol, self.most = snapshots, tol, most
+        self.snapshots, self.tol, self.most, self.search = snapshots, tol, most, search
         self.bar = tqdm(disable=not progress, unit="point", desc="reduce")
-        self.cut = _CUT * np.sqrt(tol)
+        self.cut = search.cut * np.sqrt(tol)
         self.points: list[np.ndarray] = []
         self.taken: list[Snapshot] = []
         middle = np.full(len(snapshots.ranges), 0.5)
@@ -176,24 +186,25 @@ class _Greedy:
     def run(self) -> ReducedStructure:
         """The smallest reduced structure found that meets the tolerance."""
         before, finer = np.inf, False
+        least_cut = 1e-10
         while True:
             space = Space(self.snapshots, self.taken, self.weight, self.cut, self.factors)
             reduced, estimates = self.sound(space)
             error, at = max((_relative(errors, s), i) for i, (s, errors) in estimates.items())
             self.bar.set_postfix_str(f"error {error:.1e}, {reduced.n} degrees of freedom")
             worst, _ = self.candidates[at]
-            if error > _SAFE * self.tol:
+            if error > self.search.safe * self.tol:
                 # Where the worst point's own vectors are in the space, what was cut off of them is
-                # the error; where one more point hardly reduced the error, it is most of it.
+                # the error; where one more point did not halve the error, it is most of it.
                 sampled = any(np.array_equal(worst, u) for u in self.points)
-                stuck = error > _STUCK * before and not finer and self.cut >= _LEAST_CUT
+                stuck = error > 0.5 * before and not finer and self.cut >= least_cut
                 before, finer = error, sampled or stuck
                 if not finer:
                     self.add(worst)
-                elif self.cut < _LEAST_CUT:
+                elif self.cut < least_cut:
                     raise ValueError(f"tol = {self.tol:g} is below what rounding allows")
                 else:
-                    self.cut *= _FINER
+                    self.cut *= 0.1
                 continue
             targets = {i: s for i, (s, _) in estimates.items()}
             trimmed = self.trimmed(space, targets, self.tol)
@@ -203,20 +214,21 @@ class _Greedy:
                 break
         self.bar.close()
         reduced.reduction.error = max(estimate, compared)
-        least, share = _WORTH
-        if self.tol < _COARSE and reduced.n >= least:
-            coarse = self.trimmed(space, targets, _COARSE)
-            if coarse and coarse[0].n <= share * reduced.n:
-                reduced.reduction.coarse = space.coarse(reduced.n, coarse[0].n, _COARSE)
+        search = self.search
+        if self.tol < search.coarse_tol and reduced.n >= search.coarse_from:
+            coarse = self.trimmed(space, targets, search.coarse_tol)
+            if coarse and coarse[0].n <= search.coarse_share * reduced.n:
+                reduced.reduction.coarse = space.coarse(reduced.n, coarse[0].n, search.coarse_tol)
         return reduced
 
     def sound(self, space: Space) -> tuple[ReducedStructure, dict[int, _Estimate]]:
         """The largest structure without spurious modes in the band, and `estimates` of it.
 
-        A spurious mode has an error of its own size, and comes and goes with the directions kept.
+        A spurious mode has an error of its own size, and comes and goes with the directions kept:
+        five sizes are tried, two degrees of freedom apart.
         """
         best: Any = None
-        for r in range(space.size, max(space.size - _SIZES, 1), -2):
+        for r in range(space.size, max(space.size - 10, 1), -2):
             if best is not None and not space.regular(r):
                 continue
             reduced = self.reduced(space, r)
@@ -224,7 +236,7 @@ class _Greedy:
             largest = _largest(estimates.values()).max()
             if best is None or largest < best[0]:
                 best = largest, reduced, estimates
-            if largest < _SPURIOUS:
+            if largest < 0.02:  # of |s|: all of these are modes
                 break
         return best[1:]
 
@@ -236,8 +248,8 @@ class _Greedy:
         estimates: dict[int, _Estimate] = {}
         for i in map(int, np.argsort(-self.errors, kind="stable")):
             if (
-                len(estimates) % _FEW == 0
-                and max(self.errors[[*estimates]], default=0) > _SAFE * self.tol
+                len(estimates) % self.search.together == 0
+                and max(self.errors[[*estimates]], default=0) > self.search.safe * self.tol
             ):
                 break
             s, errors = estimates[i] = self.estimated(reduced, self.candidates[i])
@@ -252,14 +264,14 @@ class _Greedy:
         None if that is the space itself. Sizes are tried at a few candidates, and every one at
         which the smallest that holds there fails is added to them.
         """
-        hard = {int(i): targets[i] for i in np.argsort(-self.errors)[:_FEW]}
+        hard = {int(i): targets[i] for i in np.argsort(-self.errors)[: self.search.together]}
         # In one degree of freedom the two directions of a joint would be one.
         joints = self.snapshots.structure.joints
         fails, holds = int(any(joint.normal is not None for joint in joints)), space.size
         while True:
             while holds - fails > 1:
                 r = (fails + holds) // 2
-                near = range(r, max(r - _NEAR, fails), -1)  # one may have a spurious mode
+                near = range(r, max(r - 4, fails), -1)  # one may have a spurious mode
                 sound = next((x for x in near if self.holds(space, x, hard, tol)), None)
                 fails, holds = (r, holds) if sound is None else (fails, sound)
             if holds == space.size:
@@ -284,7 +296,7 @@ class _Greedy:
             there, errors = self.estimated(reduced, self.candidates[i])
             # A mode that is lost has no error.
             largest = max(largest, _relative(errors, there), _distance(there, s))
-            if largest > _SAFE * tol:
+            if largest > self.search.safe * tol:
                 return largest, i
         return largest, None
 
@@ -318,7 +330,7 @@ class _Greedy:
         largest = 0.0
         worst = np.argsort(-_largest([self.estimated(reduced, at) for at in self.fresh]))
         low, high = self.snapshots.band
-        for i in worst[: _CHECKED if self.snapshots.ranges else 0]:
+        for i in worst[: self.search.compared if self.snapshots.ranges else 0]:
             u, _ = self.fresh[i]
             values = {name: jnp.asarray(x) for name, x in self.snapshots.values(u).items()}
             # With its own equilibrium.

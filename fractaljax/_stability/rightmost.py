@@ -21,9 +21,6 @@ from . import quadratic
 from .band import MOST_DAMPED, in_band
 
 Matrices = tuple[Float[Array, "n n"], Float[Array, "n n"], Float[Array, "n n"]]
-_STEPS = 6  # of an iteration that triples the digits in each
-_ROUNDING = 64  # units of eps of |s|, where an iteration ends
-_SAME = 1e-9  # of |s|: two modes that converge so near are one, or too near to tell apart
 
 
 class _Mode(NamedTuple):
@@ -44,12 +41,12 @@ def rightmost(
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _mode(band, coarse, M, C, K) -> _Mode:
     if coarse is None:
-        return _of_all(band, M, C, K)
+        return _rightmost_of_all(band, M, C, K)
 
     @one_by_one
     def solution(M, C, K):
         mode, settled = _refined(band, coarse, M, C, K)
-        return jax.lax.cond(settled, lambda: mode, lambda: _of_all(band, M, C, K))
+        return jax.lax.cond(settled, lambda: mode, lambda: _rightmost_of_all(band, M, C, K))
 
     return solution(M, C, K)
 
@@ -63,7 +60,7 @@ def _mode_jvp(band, coarse, primals, tangents):
     rigid = s == 0
     ds = jnp.where(rigid, 0, ds)
     # Q dx + ds Q' x = -dQ x and its transpose. The length of x is free: y Q' dx = 0.
-    Q, slope, dQ = _at(s, *primals), 2 * s * M + C, s**2 * dM + s * dC + dK
+    Q, slope, dQ = _dynamic_stiffness(s, *primals), 2 * s * M + C, s**2 * dM + s * dC + dK
     right, left = slope @ x, y @ slope
     bordered = jnp.block([[Q, right[:, None]], [left[None], jnp.zeros((1, 1), s.dtype)]])
     bordered = jnp.where(rigid, jnp.eye(len(bordered), dtype=s.dtype), bordered)
@@ -73,12 +70,12 @@ def _mode_jvp(band, coarse, primals, tangents):
     return mode, _Mode(ds, dx, dy)
 
 
-def _at(s, M, C, K) -> Complex[Array, "n n"]:
+def _dynamic_stiffness(s, M, C, K) -> Complex[Array, "n n"]:
     """Q(s) = s^2 M + s C + K."""
     return s * (s * M + C) + K
 
 
-def _of_all(band, M, C, K) -> _Mode:
+def _rightmost_of_all(band, M, C, K) -> _Mode:
     modes = quadratic.solve(M, C, K)
     rank = (
         modes.s.real if band is None else jnp.where(in_band(modes.s, band), modes.s.real, -jnp.inf)
@@ -122,7 +119,8 @@ def _refined(band, coarse: CoarseSpace, M, C, K) -> tuple[_Mode, Bool[Array, ""]
         i = jnp.argmax(jnp.where(unsettled(now), z.real, -jnp.inf))
 
         def alone(s, error) -> Bool[Array, ""]:
-            return (jnp.abs(now.s - s) > jnp.maximum(now.error + error, _SAME * size[i])).all()
+            # Two modes that converge within 1e-9 of |s| are one, or too close to tell them apart.
+            return (jnp.abs(now.s - s) > jnp.maximum(now.error + error, 1e-9 * size[i])).all()
 
         def beaten(s, error) -> Bool[Array, ""]:
             return (s.real + error < now.best.s.real) & alone(s, error)
@@ -151,22 +149,23 @@ def _iterated(
     The error is below the last change, since digits triple. An eigenvalue that is `beaten` within
     it needs no more of them.
     """
-    eps = _ROUNDING * jnp.finfo(M.dtype).eps
+    rounding = 64 * jnp.finfo(M.dtype).eps  # what the solutions with Q leave
 
     def settled(s, error):
-        return (error <= eps * jnp.abs(s)) | beaten(s, error)
+        return (error <= rounding * jnp.abs(s)) | beaten(s, error)
 
     def going(now):
         step, mode, error = now
-        return (step < _STEPS) & (error >= 0) & ~settled(mode.s, error)
+        # Digits triple in each step: what has not converged in six does not.
+        return (step < 6) & (error >= 0) & ~settled(mode.s, error)
 
     def improve(now):
         step, (s, x, y), _ = now
         slope = 2 * s * M + C
-        lu, _, order = jax.lax.linalg.lu(_at(s, M, C, K))
+        lu, _, order = jax.lax.linalg.lu(_dynamic_stiffness(s, M, C, K))
         x, y = _inverse(lu, order, slope @ x, y @ slope)
         x, y = x / jnp.linalg.norm(x), y / jnp.linalg.norm(y)
-        change = (y @ (_at(s, M, C, K) @ x)) / (y @ (slope @ x))
+        change = (y @ (_dynamic_stiffness(s, M, C, K) @ x)) / (y @ (slope @ x))
         return step + 1, _Mode(s - change, x, y), jnp.abs(change)
 
     first = 0, mode, jnp.full((), jnp.inf, M.dtype)

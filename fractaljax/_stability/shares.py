@@ -26,15 +26,12 @@ from .._mechanism.structure import Structure
 from .snapshots import joint_numbers
 from .stability import Stability, stability
 
-_ROWS = 8  # of the table, at most, beside the unstable modes
-_ROUNDING = 1e-9  # of |s|: a smaller contribution is none
-
 
 class EnergyShares(Record):
     """Shares of `parts` in k modes, as `energy_shares` returns them; its repr is a table.
 
-    The table shows the unstable modes and some of the least damped ones: which part adds most to
-    the growth rate of each, and which takes most off it.
+    The table shows the unstable modes and the eight least damped of the others: which part adds
+    most to the growth rate of each, and which takes most off it.
     """
 
     parts: tuple[str, ...] = eqx.field(static=True)
@@ -48,10 +45,11 @@ class EnergyShares(Record):
         s: Any = self.eigenvalues
         unstable = np.flatnonzero(s.real > 0)
         others = [i for i in np.argsort(-s.real / np.abs(s)) if i not in unstable]
-        for i in [*unstable, *others[:_ROWS]]:
+        for i in [*unstable, *others[:8]]:
             row, most = self.growth[i], int(self.strain[i].argmax())
+            rounding = 1e-9 * abs(s[i])  # a smaller contribution counts as none
             fed, damped = (
-                f"{self.parts[k]} {row[k]:+.3g}" if sign * row[k] > _ROUNDING * abs(s[i]) else "-"
+                f"{self.parts[k]} {row[k]:+.3g}" if sign * row[k] > rounding else "-"
                 for k, sign in ((int(row.argmax()), 1), (int(row.argmin()), -1))
             )
             share = f"{self.parts[most]} {self.strain[i, most]:.0%}"
@@ -68,15 +66,23 @@ def energy_shares(
 ) -> EnergyShares:
     """Energy and contribution to the growth rate of each part, in each mode that oscillates.
 
-    Parts are the terms of M, C and K, "K" or "K 1", "K 2", ... where it is a sum, or as `names` has
-    them ({"K 2": "pad"}; parts of one name are added up), and the joints by their names. A joint
-    acts through its springs, its friction and, unless `friction_slope` is False, the slope of its
-    friction law. `modes` is `stability(x, friction_slope)`, if already computed.
+    Parts are the terms of M, C and K, "K" or "K 1", "K 2", ... where it is a sum, and the joints by
+    their names. A joint acts through its springs, its friction and the slope of its friction law.
 
     The sum of the contributions is the growth rate, as exactly as shapes are known. Where
     gyroscopic modes coalesce, 2 omega m + Im c passes through 0 and they grow without bound. For a
     structure that `reduce` made obliquely (`Reduction.W` is not `V`), shares are of forms in its
     coordinates, not of energies.
+
+    **Arguments:**
+
+    - `x`: a scene or structure of scalars.
+    - `modes`: `stability(x, friction_slope)`, if already computed.
+    - `friction_slope`: False leaves the slope of friction out.
+    - `names`: {part: other name}, such as {"K 2": "pad"}; parts of one name are added up. By
+      default parts keep their names.
+
+    **Returns:** `EnergyShares`.
 
     **Raises:** `TypeError` for what is neither a scene nor a structure; `ValueError` for a name of
     no part, for modes of another size, and as `stability`.

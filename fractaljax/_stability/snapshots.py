@@ -13,13 +13,8 @@ from .._base.ranges import low_discrepancy, within
 from .._mechanism.quantities import substituted
 from .._mechanism.structure import Joint, ParametricStructure, Structure
 from .linearise import attachments
+from .reduction_search import ReductionSearch
 from .sparse_modes import BandModes, band_modes
-
-_LINE = 33  # candidates along one quantity
-_CANDIDATES = 32  # for each of several quantities, besides the corners
-_MOST = 128  # such candidates, at most
-_CORNERS = 5  # quantities up to which corners are candidates
-_BEYOND = 0.02  # of the band: modes beyond its ends that may enter it
 
 
 class _Directions(NamedTuple):
@@ -89,9 +84,9 @@ class Snapshot(NamedTuple):
 class Snapshots:
     """Eigenvectors of a large structure at points u in [0, 1]^d of its quantities."""
 
-    def __init__(self, structure, ranges, band, friction_slope):
+    def __init__(self, structure, ranges, band, friction_slope, search: ReductionSearch):
         self.structure, self.ranges, self.band = structure, ranges, band
-        self.friction_slope = friction_slope
+        self.friction_slope, self.search = friction_slope, search
         self.directions = joint_directions(structure)
         # A force of friction and one of a spring are along one direction: the projection must be
         # the same for both.
@@ -120,16 +115,21 @@ class Snapshots:
         if d == 0:
             return np.zeros((1, 0))
         if d == 1:
-            return (1 - np.cos(np.linspace(0, np.pi, _LINE)))[:, None] / 2
+            return (1 - np.cos(np.linspace(0, np.pi, self.search.line)))[:, None] / 2
         corners = [np.zeros((0, d))]
-        if d <= _CORNERS:
+        if d <= self.search.corners:
             corners = [np.stack(np.meshgrid(*[[0.0, 1.0]] * d), axis=-1).reshape(-1, d)]
-        return np.concatenate([*corners, low_discrepancy(min(_CANDIDATES * d, _MOST), d)])
+        return np.concatenate([*corners, low_discrepancy(self._count(), d)])
 
     def fresh(self) -> np.ndarray:
         """Points (k, d) that are no candidates."""
         d = len(self.ranges)
-        return low_discrepancy(min(_CANDIDATES * d, _MOST) + 5, d) if d else np.zeros((1, 0))
+        # Another number of points lies elsewhere.
+        return low_discrepancy(self._count() + 5, d) if d else np.zeros((1, 0))
+
+    def _count(self) -> int:
+        """The number of candidates besides the corners."""
+        return min(self.search.candidates * len(self.ranges), self.search.most_candidates)
 
     def springs(self, x: Structure) -> Any:
         """K of a structure with the springs and the friction of its joints, sparse."""
@@ -190,7 +190,7 @@ class Snapshots:
         x = self.at(u)
         right, left = self.statics(x)
         low, high = self.band
-        wider = low * (1 - _BEYOND), high * (1 + _BEYOND)
+        wider = low * (1 - self.search.beyond), high * (1 + self.search.beyond)
         modes = band_modes(self.matrices(x, self.numbers(x, right)({})), wider)
         return Snapshot(modes, right, left)
 

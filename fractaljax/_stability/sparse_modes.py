@@ -14,18 +14,6 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-_NEAREST = 40  # eigenvalues sought about one shift
-_BEYOND = 1.05  # the disc about a shift reaches so far beyond its part of the band
-_NARROWEST = 1e-6  # of the band: there are more eigenvalues in it than can be told apart
-_TOLERANCE = 1e-11
-# The order of rows is that of columns, and pivots are on the diagonal unless they are so small:
-# with the entries where those of a structure are, it fills three fifths and is no less exact.
-_ALMOST_SYMMETRIC: Any = {
-    "permc_spec": "MMD_AT_PLUS_A",
-    "diag_pivot_thresh": 0.1,
-    "options": {"SymmetricMode": True},
-}
-
 
 class BandModes(NamedTuple):
     """Modes with |Im s| in a band, one of each conjugate pair."""
@@ -44,7 +32,14 @@ class Factors:
         M, C, K = matrices
         self.shift = shift
         Q = (shift**2 * M + shift * C + K).tocsc()
-        self._lu = splu(Q, **_ALMOST_SYMMETRIC)
+        # The order of rows is that of columns, and pivots are on the diagonal unless they are so
+        # small: for the entries of a structure this fills two fifths less and is no less exact.
+        self._lu = splu(
+            Q,
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.1,
+            options={"SymmetricMode": True},
+        )
 
     def solve(self, b: np.ndarray, transposed: bool = False) -> np.ndarray:
         """x (n,) or (n, k) for right-hand sides of that shape, complex."""
@@ -73,28 +68,30 @@ def band_modes(matrices: tuple[Any, Any, Any], band: tuple[float, float]) -> Ban
     **Raises:** `ValueError` if more eigenvalues crowd together than can be found.
     """
     low, high = band
-    parts = _within(matrices, low, high, high - low)
+    parts = _modes_by_halving(matrices, low, high, high - low)
     s, right, left = (np.concatenate([each[i] for each in parts], axis=-1) for i in range(3))
     order = np.argsort(np.imag(s))
     return BandModes(s[order], right[:, order], left[:, order])
 
 
-def _within(matrices, low, high, width) -> list[BandModes]:
+def _modes_by_halving(matrices, low, high, width, nearest: int = 40) -> list[BandModes]:
+    """The modes in a band, halved until it has fewer than the `nearest` eigenvalues to a shift."""
     half = (high - low) / 2
     # Not on the axis, where lightly damped eigenvalues are.
     factors = Factors(matrices, half * 1e-3 + 1j * (low + high) / 2)
     n = matrices[0].shape[0]
-    count = min(_NEAREST, 2 * n - 2)
+    count = min(nearest, 2 * n - 2)
     # Side by side, though the left ones are wasted where the band must be halved.
     (s, right), (z, left) = side_by_side(
-        lambda transposed: _nearest(matrices, factors, count, transposed), (False, True)
+        lambda transposed: _solve_nearest(matrices, factors, count, transposed), (False, True)
     )
-    if np.abs(s - factors.shift).max() < _BEYOND * half and count == _NEAREST:
-        if half < _NARROWEST * width:
+    # The disc about the shift must reach a little beyond its part of the band.
+    if np.abs(s - factors.shift).max() < 1.05 * half and count == nearest:
+        if half < 1e-6 * width:
             raise ValueError(f"too many eigenvalues near {high:g} rad/s: choose a narrower band")
         middle = (low + high) / 2
         parts = (low, middle), (middle, high)
-        return [each for part in parts for each in _within(matrices, *part, width)]
+        return [each for part in parts for each in _modes_by_halving(matrices, *part, width)]
     # The low end of a band at 0 has no mode of its own: real eigenvalues do not oscillate.
     inside = (s.imag > low) & (s.imag <= high)
     s, right = s[inside], right[:, inside]
@@ -102,7 +99,7 @@ def _within(matrices, low, high, width) -> list[BandModes]:
     return [BandModes(s, right, left[:, place])]
 
 
-def _nearest(matrices, factors: Factors, count: int, transposed: bool):
+def _solve_nearest(matrices, factors: Factors, count: int, transposed: bool):
     """The eigenvalues (k,) nearest to the shift, and their vectors (n, k)."""
     from scipy.sparse.linalg import LinearOperator, eigs
 
@@ -119,5 +116,5 @@ def _nearest(matrices, factors: Factors, count: int, transposed: bool):
     start = np.random.default_rng(0).standard_normal(2 * n) + 0j
     linear, arpack = cast(Any, LinearOperator), cast(Any, eigs)
     operator = linear((2 * n, 2 * n), inverse, dtype=complex)
-    reciprocals, states = arpack(operator, count, which="LM", v0=start, tol=_TOLERANCE)
+    reciprocals, states = arpack(operator, count, which="LM", v0=start, tol=1e-11)
     return shift + 1 / reciprocals, states[:n]

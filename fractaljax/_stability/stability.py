@@ -140,17 +140,21 @@ class Stability(Record):
 
 
 def growth_rate(scene: Mechanism, friction_slope: bool = True) -> Float[Array, ""]:
-    """Largest real part of the eigenvalues [1/s], a scalar; above 0 the scene squeals.
+    """Largest real part of the eigenvalues of Eq. 43 [1/s], a scalar; above 0 there is squeal.
 
-    `friction_slope=False` leaves out the slope of the friction law, as the source's Eq. 43 does.
     Towards coalescing eigenvalues the derivative grows without bound. Exactly there it is infinite,
-    and some finite number is returned. NaN where the numbers leave the range in which a sign can
-    be told (`dimensionless`), and where a preloaded joint is open at its equilibrium
+    and some finite number is returned. NaN where the numbers leave the range in which a sign can be
+    told (`dimensionless`), and where a preloaded joint is open at its equilibrium
     (`Stability.normal_force`). For a structure also, under `jit` and `vmap`, where there is no
     equilibrium.
 
-    **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`; if a structure without F
-    has friction with a slope; and if one has no equilibrium.
+    **Arguments:**
+
+    - `scene`: a scene or structure of scalars; `jax.vmap` takes many.
+    - `friction_slope`: False leaves out the slope of the friction law, as the source's Eq. 43 does.
+
+    **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`; if a structure without F has
+    friction with a slope; and if one has no equilibrium.
     """
     growth = _growth_rate(scene, friction_slope)
     require_equilibrium(scene, friction_slope, growth)
@@ -166,13 +170,22 @@ def _growth_rate(scene, friction_slope):
 
 
 def stability(scene: Mechanism, friction_slope: bool = True) -> Stability:
-    """Eigenvalues of Eq. 43 and what follows from them; arguments and errors as `growth_rate`."""
+    """Eigenvalues of Eq. 43 and what follows from them.
+
+    **Arguments:**
+
+    - `scene`, `friction_slope`: as in `growth_rate`.
+
+    **Returns:** a `Stability`.
+
+    **Raises:** as `growth_rate`.
+    """
     result = _stability(scene, friction_slope)
     require_equilibrium(scene, friction_slope, result.growth_rate)
     return result
 
 
-def _of_scene(scene, friction_slope):
+def _solve_scene(scene, friction_slope):
     joint = pressed(scene)
     lin, forces = linearised_at(scene, joint, friction_slope), normal_force(scene, joint)
     s, mobility = quartic.roots(lin), sliding_friction(scene) / scene.oscillator.m
@@ -190,7 +203,7 @@ def _stability(scene, friction_slope):
         counted = in_band(s, scene.band)
         margin, names = least_damping_ratio(among(s, scene.band)), scene.names
     else:
-        s, x, error, margin, forces = _of_scene(scene, friction_slope)
+        s, x, error, margin, forces = _solve_scene(scene, friction_slope)
         counted, names = jnp.ones(s.shape, bool), ("x1", "x2")
     largest = jnp.abs(jax.lax.stop_gradient(x)).argmax(axis=1)
     return Stability(

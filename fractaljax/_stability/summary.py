@@ -24,8 +24,6 @@ from .stability import Stability, require_computable, stability
 
 ABSENT = "-"
 _STABLE = "stable against small disturbances"  # all that a growth rate can say
-_ROUNDING = 1e-14  # relative: growth rates and excesses of friction below it say nothing
-_LEAST_DAMPED = 10  # stable modes of a structure that its table lists
 
 
 # Each table is one program: eager operations are slow, and so is every call of JAX's compiler.
@@ -160,7 +158,7 @@ def stiffness_remarks(x: Scene | Structure, which: str = "", **words: str) -> li
 def verdict(modes: Stability, without_joint: bool = False) -> dict[str, str]:
     """The growth rate of a scene as a row, and what it means."""
     growth, margin = float(modes.growth_rate) + 0.0, float(modes.margin)
-    rounding = _ROUNDING * np.abs(np.asarray(modes.eigenvalues)).max()
+    rounding = 1e-14 * np.abs(np.asarray(modes.eigenvalues)).max()
     verdict = "it squeals" if growth > 0 else _STABLE
     if abs(growth) <= rounding or growth * margin > 0:
         # With heavy damping, or without any, rounding can decide the sign of the growth rate. The
@@ -187,7 +185,7 @@ def friction_remark(scene: Scene, speed) -> list[str]:
     shown = np.broadcast_arrays(*map(np.asarray, (speed, mu, mu_s)))
     speeds, mu, static = (values.ravel() for values in shown)
     worst = int((mu / static).argmax())
-    if not mu[worst] > static[worst] * (1 + _ROUNDING):
+    if not mu[worst] > static[worst] * (1 + 1e-14):  # by more than rounding
         return []
     return [
         f"remark: at a sliding speed of {speeds[worst]:.6g} m/s the friction law gives "
@@ -231,11 +229,10 @@ def structure_table(structure: Structure, friction_slope: bool = True) -> str:
         shown = [name for name in joints[0] if any(rows[name] != ABSENT for rows in joints)]
         joints = [{name: rows[name] for name in shown} for rows in joints]
         tables.append(table(list(structure.joint_names), joints))
-    least = modes.least_damped(_LEAST_DAMPED + len(unstable) + len(unresolved))
+    most = 10  # stable modes, and unresolved ones, that are listed
+    least = modes.least_damped(most + len(unstable) + len(unresolved))
     listed = [(mode, "unstable") for mode in unstable]
-    listed += [
-        (mode, f"unresolved to +-{mode.resolution:.1g}") for mode in unresolved[:_LEAST_DAMPED]
-    ]
+    listed += [(mode, f"unresolved to +-{mode.resolution:.1g}") for mode in unresolved[:most]]
     listed += [(mode, "") for mode in least if mode.growth_rate < -mode.resolution]
     if listed:
         columns = ["frequency [Hz]", "growth rate [1/s]", "damping ratio", "moves most", ""]

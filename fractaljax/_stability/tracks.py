@@ -37,14 +37,7 @@ from .band import in_band
 from .linearise import assembled
 from .quadratic import solve
 
-_SURE = 0.8  # a MAC from which on two modes are the same
-_HALVINGS = 12  # of a step, at most
-_NEUTRAL = 1e-9  # growth rate, of |s|, that does not count
-_COALESCED = 1e-7  # growth rate, of |s|, that rounding gives to modes that coalesce
-_PART = 0.48  # of a step, its first "half": a round number would meet the places of coalescence
-_INDEPENDENT = 1e4  # condition of shapes below which they are independent
 _NONE = complex(np.nan, np.nan)
-_TIE = 0.1  # overlaps of two ways to pair modes that differ by less do not decide
 
 
 class ModeCrossing(NamedTuple):
@@ -64,12 +57,13 @@ class ModeTracks(Record):
     for the second of two real eigenvalues where the two are still one conjugate pair.
     """
 
-    name: str = eqx.field(static=True)
-    values: Float[np.ndarray, " p"]
+    name: str = eqx.field(static=True)  # of the quantity
+    values: Float[np.ndarray, " p"]  # of the quantity, in SI units
     eigenvalues: Complex[np.ndarray, "p k"]  # [1/s], in the upper half plane
     shapes: Complex[np.ndarray, "p k n"]  # displacements, the largest of each 1
     mac: Float[np.ndarray, "p-1 k"]  # the least within each step; below 0.8 it is no certain match
     x: Any = eqx.field(repr=False)  # the Scene or Structure
+    # True if the slope of friction counts
     friction_slope: bool = eqx.field(static=True, default=True)
 
     @property
@@ -97,7 +91,8 @@ class ModeTracks(Record):
         from scipy.optimize import brentq
 
         growth = self.growth_rates
-        growth = np.where(np.abs(growth) > _NEUTRAL * np.abs(self.eigenvalues), growth, 0)
+        # A smaller growth rate is one of an undamped mode.
+        growth = np.where(np.abs(growth) > 1e-9 * np.abs(self.eigenvalues), growth, 0)
         at, crossings = _modes_of(self.x, self.name, self.friction_slope), []
         grows, present = growth > 0, np.isfinite(growth)
         changes = (grows[:-1] != grows[1:]) & present[:-1] & present[1:]
@@ -106,7 +101,7 @@ class ModeTracks(Record):
             index = int(np.abs(begin.s - self.eigenvalues[i, k]).argmin())
 
             def eigenvalue(value, begin=begin, index=index):
-                return complex(_step(begin, at(value), at, _HALVINGS)[0].s[index])
+                return complex(_step(begin, at(value), at)[0].s[index])
 
             ends = self.values[i], self.values[i + 1]
             if growth[i, k] * growth[i + 1, k] < 0:
@@ -128,7 +123,7 @@ class ModeTracks(Record):
 
 def _grows(s: complex) -> bool:
     """True where a mode grows by more than the rounding of eigenvalues that coalesce."""
-    return s.real > _COALESCED * abs(s)
+    return s.real > 1e-7 * abs(s)
 
 
 def _bisected(test: Callable[[float], bool], low: float, high: float) -> float:
@@ -148,7 +143,7 @@ def track_modes(
     *,
     friction_slope: bool = True,
 ) -> ModeTracks:
-    """Eigenvalues and shapes of all modes over the values (p,) of a quantity, each mode a column.
+    """Eigenvalues and shapes of all modes over the values of a quantity, each mode a column.
 
     Neighbours are paired by the modal assurance criterion of left and right eigenvectors
     (`tracks.py`), MAC = max(0, 1 - |1 - B|), in the best way for all modes together. A step in
@@ -157,12 +152,21 @@ def track_modes(
     crossing. Equal eigenvalues with independent shapes, as in an exact crossing, get the shapes
     that continue those of the value before.
 
-    Where two modes coalesce exactly, no continuation is better than the other: all MACs are at
-    most 1/2. Then the mode with the higher frequency goes on as the one that grows faster, and that
-    one as the higher frequency where they part. With any difference in damping, modes pass the
+    Where two modes coalesce exactly, no continuation is better than the other: all MACs are at most
+    1/2. Then the mode with the higher frequency goes on as the one that grows faster, and that one
+    as the higher frequency where they part. With any difference in damping, modes pass the
     coalescence at some distance, and their own continuation decides. `mac` tells which it was.
 
     Rigid-body modes, with s = 0, are left out.
+
+    **Arguments:**
+
+    - `x`: a scene or structure of scalars.
+    - `name`: a quantity by its name in `x.replace`.
+    - `values`: (p,), values of the quantity in SI units.
+    - `friction_slope`: False leaves the slope of friction out.
+
+    **Returns:** `ModeTracks`.
 
     **Raises:** `ValueError` for an unknown quantity, values outside its domain or not a list, and a
     structure that is large and sparse; `TypeError` for what is neither a scene nor a structure.
@@ -179,9 +183,9 @@ def track_modes(
             if last is None:
                 current = _aligned(current, current)
             else:
-                current, mac = _step(last, current, at, _HALVINGS)
+                current, mac = _step(last, current, at)
             # Modes that have just coalesced cannot be told apart: the next step passes over.
-            unsure = _shown(current) & (np.asarray(mac) < _SURE)
+            unsure = _shown(current) & _uncertain(mac)
             together = np.triu(_equal(current.s[unsure], 100), 1).any()
             last = last if last is not None and together else current
         modes.append(current)
@@ -244,12 +248,16 @@ class _Modes(NamedTuple):
         return _Modes(self.value, *(each[order] for each in self[1:]))
 
 
-def _step(a: _Modes, b: _Modes, at: Any, halvings: int) -> tuple[_Modes, np.ndarray]:
-    """b in the order of a, and the MAC of each mode, with as many values between as it takes."""
+def _step(a: _Modes, b: _Modes, at: Any, halvings: int = 12) -> tuple[_Modes, np.ndarray]:
+    """b in the order of a, and the MAC of each mode, with as many values between as it takes.
+
+    The step is halved at most `halvings` times.
+    """
     following, mac = _matched(a, b, last=halvings == 0)
     if halvings == 0 or not _doubtful(a, following, mac):
         return following, mac
-    between = at(a.value + _PART * (b.value - a.value))
+    # Not quite one half: a round number would meet the places of coalescence.
+    between = at(a.value + 0.48 * (b.value - a.value))
     if not np.isfinite(between.s).all():
         return _matched(a, b, last=True)
     between, first = _step(a, between, at, halvings - 1)
@@ -260,12 +268,17 @@ def _step(a: _Modes, b: _Modes, at: Any, halvings: int) -> tuple[_Modes, np.ndar
 def _doubtful(a: _Modes, b: _Modes, mac: np.ndarray) -> bool:
     """True if a mode that is shown has no sure partner, or passes another one."""
     shown = _shown(a) | _shown(b)
-    if (mac[shown] < _SURE).any():
+    if _uncertain(mac[shown]).any():
         return True
     before, after = (each.s[shown, None] - each.s[None, shown] for each in (a, b))
     passes = np.real(before.conj() * after) < 0
     # Rounding decides the order of equal eigenvalues.
     return bool((passes & ~_equal(a.s[shown]) & ~_equal(b.s[shown])).any())
+
+
+def _uncertain(mac: Any) -> np.ndarray:
+    """True for a MAC too small for two modes to be surely the same."""
+    return np.asarray(mac) < 0.8
 
 
 def _shown(modes: _Modes) -> np.ndarray:
@@ -293,13 +306,13 @@ def _matched(a: _Modes, b: _Modes, last: bool) -> tuple[_Modes, np.ndarray]:
     mac = np.maximum(0, 1 - np.abs(1 - overlaps))
     if last:
         weight = np.minimum(1, np.abs(overlaps))
-        unsure = np.flatnonzero(np.diagonal(mac) < _SURE)
+        unsure = np.flatnonzero(_uncertain(np.diagonal(mac)))
         # Two modes that coalesce have one real part before and one imaginary part after it, or the
         # other way round: the sum orders both.
         ranks = [each.s.real + each.s.imag for each in (a, b)]
         for i, j in itertools.combinations(unsure, 2):
             here, there = weight[i, i] + weight[j, j], weight[i, j] + weight[j, i]
-            tie = there > _SURE and abs(here - there) < _TIE
+            tie = not _uncertain(there) and abs(here - there) < 0.1
             if tie and (ranks[0][i] > ranks[0][j]) != (ranks[1][i] > ranks[1][j]):
                 order[[i, j]] = order[[j, i]]
     return b.ordered(order), mac[np.arange(len(order)), order]
@@ -318,16 +331,17 @@ def _aligned(a: _Modes, b: _Modes) -> _Modes:
     if not np.triu(equal, 1).any():
         return b
     right, left = b.right.copy(), b.left.copy()
+    dependent = 1e4  # condition number from which on shapes count as dependent
     labels = connected_components(equal)[1]
     for label in np.flatnonzero(np.bincount(labels) > 1):
         (group,) = np.nonzero(labels == label)
         # A defective pair has one shape only.
         length = np.linalg.norm(right[group], axis=1, keepdims=True)
-        if np.linalg.cond(right[group] / length) > _INDEPENDENT:
+        if np.linalg.cond(right[group] / length) > dependent:
             continue
         # LAPACK's left vectors of equal eigenvalues do not belong to its right ones.
         dual = np.linalg.pinv(left[group] @ right[group].T) @ left[group]
         rotation = a.right[group] @ dual.T  # rows: modes of a in the space of the group
-        if np.linalg.cond(rotation) < _INDEPENDENT:
+        if np.linalg.cond(rotation) < dependent:
             right[group], left[group] = rotation @ right[group], np.linalg.inv(rotation).T @ dual
     return b._replace(right=right, left=left)

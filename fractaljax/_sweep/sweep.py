@@ -32,9 +32,6 @@ from .result import Sweep
 from .store import Store, describe, description, leaf_names, zarr
 from .workers import Computed, Job, gathered, require_executor
 
-_POINTS_EACH = 8192  # points in a batch, on every device; fewer for structures:
-_ENTRIES_EACH = 2**21  # entries of one matrix of the eigenvalue problem, at all points together
-
 
 def sweep(
     measure: Callable[[Any], PyTree[ArrayLike]],
@@ -49,31 +46,39 @@ def sweep(
 ) -> Sweep:
     """`measure(x)` at every point of a grid: `sweep(growth_rate, scene, D=Ds, G=Gs)`.
 
-    Each axis is a quantity by its name in `x.replace`, or a ratio as in `**{"K_t/K_n": ratios}`
-    (`quantities.py`), and its values (n,). `measure` gives an array or a pytree of arrays; the
-    result holds it as NumPy arrays (n_1, n_2, ..., *shape of the measure's). `jax.jit` and
-    `jax.grad` act on the measure, not on the sweep. The measure is traced once per sweep, with the
-    values that it captures at that time; equal programs are compiled once.
+    Points are evaluated in batches, which are blocks of the grid. The last digits of a result may
+    depend on the size of a batch, and on nothing else here. `jax.jit` and `jax.grad` act on the
+    measure, not on the sweep.
 
-    Points are evaluated in batches, blocks of the grid of at most `batch_size` points (8192 for
-    every device, fewer for a structure with more than 8 degrees of freedom), split evenly over
-    `devices` (all of this process). The last digits of a result may depend on the size of a batch,
-    and on nothing else here.
+    **Arguments:**
 
-    `out` names a folder for a Zarr store, which `xarray.open_zarr` opens, finished or not: the
-    values of each axis with unit and meaning (K_t/K_n as K_t_over_K_n), each array of the measure,
-    and `computed`, which is 0 where a point is not computed yet. The same sweep called again
-    computes what is missing; batches running when it was killed are lost. Another sweep is
-    refused, and one begun by other versions resumes with a warning. Under `jax.distributed` every
-    process must name the same folder: each computes its share of the batches, and all return the
-    whole. Needs `fractaljax[sweep]`.
+    - `measure`: a function of a scene or structure that gives an array or a pytree of arrays. It is
+      traced once per sweep, with the values that it captures at that time; equal programs are
+      compiled once.
+    - `x`: the scene or structure whose quantities are replaced.
+    - `batch_size`: the most points of a batch, by default 8192 for every device, fewer for a
+      structure with more than 8 degrees of freedom.
+    - `progress`: shows a bar.
+    - `out`: a folder for a Zarr store, by default none, which `xarray.open_zarr` opens, finished or
+      not: the values of each axis with unit and meaning (K_t/K_n as K_t_over_K_n), each array of
+      the measure, and `computed`, which is 0 where a point is not computed yet. The same sweep
+      called again computes what is missing; batches running when it was killed are lost. Another
+      sweep is refused, and one begun by other versions resumes with a warning. Under
+      `jax.distributed` every process must name the same folder: each computes its share of the
+      batches, and all return the whole. Needs `fractaljax[sweep]`.
+    - `executor`: computes the batches: a `ThreadPoolExecutor`, a `ProcessPoolExecutor` that spawns,
+      `client.get_executor()` of Dask, an `MPIPoolExecutor`, or anything like them; by default this
+      thread. It needs several batches for each worker. Unless the workers are threads, measure and
+      x are sent along by cloudpickle (`fractaljax[sweep]`); workers trace and compile them once,
+      with the 64 bits and other settings of the caller, who collects the results and alone writes
+      to `out`. If a batch fails, those that were running are kept in `out` before its error is
+      raised.
+    - `devices`: the devices that share each batch evenly, by default all of this process.
+    - `axes`: each axis is a quantity by its name in `x.replace`, or a ratio as in
+      `**{"K_t/K_n": ratios}` (`quantities.py`), and its values (n,) in SI units.
 
-    `executor` computes the batches: a `ThreadPoolExecutor`, a `ProcessPoolExecutor` that spawns,
-    `client.get_executor()` of Dask, an `MPIPoolExecutor`, or anything like them. It needs several
-    batches for each worker. Measure and x are sent along, a lambda only with `fractaljax[sweep]`;
-    workers trace and compile them once, with the 64 bits and other settings of the caller, who
-    collects the results and alone writes to `out`. If a batch fails, those that were running are
-    kept in `out` before its error is raised.
+    **Returns:** a `Sweep`, which holds each array of the measure as a NumPy array
+    (n_1, n_2, ..., *shape of the measure's).
 
     **Raises:** `ValueError` for no axis, an unknown name, two axes of one quantity, values that are
     not one-dimensional or outside their domain, a batch size that does not divide by the devices, a
@@ -82,13 +87,15 @@ def sweep(
     it, devices beside an executor, or an executor that forks; `TypeError` for what is not numeric,
     no executor, or cannot be sent to a worker; `RuntimeError` if a worker of a pool dies, or traces
     another program; `OSError` if the folder cannot be written; `ImportError` for `out` without
-    Zarr.
+    Zarr, or for workers that are not threads without cloudpickle.
     """
-    grid = _checked(x, axes)
+    grid = _check_axes(x, axes)
     names = tuple(grid)
     whole: Any = with_optional(x, names)  # pyright: ignore[reportArgumentType]
     program = Program(measure, names, whole, list(grid.values()))
-    how: dict[str, Any] = dict(each=_each(x), batch_size=batch_size, progress=progress, out=out)
+    how: dict[str, Any] = dict(
+        each=_points_each(x), batch_size=batch_size, progress=progress, out=out
+    )
     values = run(program, whole, grid, x, measure, **how, devices=devices, executor=executor)
     return Sweep(values, tuple(grid.values()), names, x)
 
@@ -145,13 +152,15 @@ def run(
     kept = store.there() if store else set()
     missing = [k for k in share if k not in kept]
     if executor is None:
-        computed = _in_turn(Batches(program, whole, list(grid.values()), parts, mesh), missing)
+        computed = _compute_in_turn(
+            Batches(program, whole, list(grid.values()), parts, mesh), missing
+        )
     else:
         job = Job(measure, names, whole, list(grid.values()), parts, program)
         hint = f"out {out} keeps what is done" if store else "out would keep what is done"
         computed = gathered(executor, job, missing, f"{hint}, for the next call to resume")
     shown = progress and jax.process_index() == 0
-    with contextlib.closing(computed), _bar(sum(map(parts.size, share)), shown) as bar:
+    with contextlib.closing(computed), _progress_bar(sum(map(parts.size, share)), shown) as bar:
         bar.update(sum(parts.size(k) for k in share if k in kept))
         for k, batch in computed:
             if store:
@@ -168,7 +177,7 @@ def run(
     return jax.tree.unflatten(tree, arrays)
 
 
-def _in_turn(batches: Batches, numbers: Sequence[int]) -> Computed:
+def _compute_in_turn(batches: Batches, numbers: Sequence[int]) -> Computed:
     """Each batch by its number with its leaves, computed while the previous one is stored."""
     begun = None
     for k in numbers:
@@ -179,7 +188,7 @@ def _in_turn(batches: Batches, numbers: Sequence[int]) -> Computed:
         yield begun[0], batches.end(*begun)
 
 
-def _checked(x: Any, axes: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def _check_axes(x: Any, axes: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """The values of every axis, inside their domains jointly with those of the other axes."""
     if isinstance(x, Scene):
         require_scalar(x)
@@ -191,11 +200,14 @@ def _checked(x: Any, axes: Mapping[str, Any]) -> dict[str, np.ndarray]:
     return grid
 
 
-def _each(x: Any) -> int:
+def _points_each(x: Any) -> int:
     """The default number of points of a batch on a device."""
-    if isinstance(x, Structure):  # the memory of its modes grows as the square of their number
-        return max(1, min(_POINTS_EACH, _ENTRIES_EACH // (2 * x.n) ** 2))
-    return _POINTS_EACH
+    points = 8192
+    if not isinstance(x, Structure):
+        return points
+    # The memory of its modes grows as the square of their number: at all points together, a matrix
+    # of the eigenvalue problem has at most 2^21 entries.
+    return max(1, min(points, 2**21 // (2 * x.n) ** 2))
 
 
 def _batch_size(batch_size: int | None, points: int, devices: int, each: int) -> int:
@@ -210,7 +222,7 @@ def _batch_size(batch_size: int | None, points: int, devices: int, each: int) ->
     return batch_size
 
 
-def _bar(points: int, shown: bool):
+def _progress_bar(points: int, shown: bool):
     from tqdm import tqdm
 
     return tqdm(total=points, desc="sweep", unit="point", unit_scale=True, disable=not shown)

@@ -7,7 +7,7 @@ alone stores them: a batch that an executor computes again, because its worker d
 """
 
 import functools
-import pickle
+import os
 import queue
 import secrets
 import threading
@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from .._base import process
 from .._base.parts import brief, one_line
 from .._base.versions import version_text
 from .batches import Batches, mesh_of
@@ -42,6 +43,7 @@ class Job:
         program: Program,
     ):
         self._token = secrets.token_hex(16)
+        self._caller = os.getpid(), process.MARK
         self._settings = settings()
         self._bytes: bytes | None = None
         self._parts = measure, names, scene, grid, blocks, program.digest, version_text()
@@ -54,27 +56,41 @@ class Job:
         return hash(self._token)
 
     def __reduce__(self):
-        return _arrived, (self._token, self._settings, self.pack())
+        return _arrived, (self._token, self._caller, self._settings, self.pack())
 
     def pack(self) -> bytes:
-        """The pickled measure, scene and axes. **Raises:** `TypeError` if they cannot be sent."""
+        """The measure, scene and axes as bytes.
+
+        **Raises:** `TypeError` if they cannot be sent, `ImportError` without cloudpickle.
+        """
         if self._bytes is not None:
             return self._bytes
+        pickler = cloudpickle()
         try:
-            import cloudpickle as pickler
-        except ImportError:
-            pickler = pickle
-        try:
-            self._bytes = pickler.dumps(self._parts)
+            self._bytes = content = pickler.dumps(self._parts)
         except Exception as error:  # whatever the classes in it raise
             raise TypeError(
-                "executor cannot send measure and x to its workers; a function of a module can be"
-                ' sent, others with python -m pip install "fractaljax[sweep]": ' + one_line(error)
+                f"executor cannot send measure and x to its workers: {one_line(error)}"
             ) from None
-        return self._bytes
+        return content
+
+    @property
+    def sent(self) -> bool:
+        """True in a worker, to which the job came as bytes."""
+        return self._batches is None
+
+    def require_no_fork(self) -> None:
+        """Refuse to compute in a fork of the caller, where JAX stops for good."""
+        pid, mark = self._caller
+        if mark == process.MARK and pid != os.getpid():
+            raise ValueError(
+                "executor must not fork, which JAX does not survive:"
+                ' ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn"))'
+            )
 
     def compute(self, k: int) -> list[np.ndarray]:
         """The leaves (*shape of batch k, ...)."""
+        self.require_no_fork()
         with use_settings(self._settings):
             with _lock:
                 batches = self._batches or _prepared(self)
@@ -82,16 +98,29 @@ class Job:
             return batches.end(k, begun)
 
 
-def _arrived(token: str, jax_settings: dict[str, Any], content: bytes) -> Job:
+def _arrived(token: str, caller: tuple, jax_settings: dict[str, Any], content: bytes) -> Job:
     job = Job.__new__(Job)
-    job._token, job._settings, job._bytes, job._batches = token, jax_settings, content, None
+    job._token, job._caller, job._settings = token, caller, jax_settings
+    job._bytes, job._batches = content, None
     return job
+
+
+def cloudpickle() -> Any:
+    """The package that sends functions and arrays. **Raises:** `ImportError` without it."""
+    try:
+        import cloudpickle
+    except ImportError:
+        raise ImportError(
+            "executor needs cloudpickle unless its workers are threads: "
+            'python -m pip install "fractaljax[sweep]"'
+        ) from None
+    return cloudpickle
 
 
 @functools.lru_cache(maxsize=4)
 def _prepared(job: Job) -> Batches:
     # Under the settings of the job: without 64 bits its arrays would be rounded.
-    measure, names, scene, grid, blocks, digest, versions = pickle.loads(job.pack())
+    measure, names, scene, grid, blocks, digest, versions = cloudpickle().loads(job.pack())
     program = Program(measure, names, scene, grid)
     if program.digest != digest:
         raise RuntimeError(
@@ -106,8 +135,11 @@ def _computed(job: Job, k: int) -> list[np.ndarray]:
     try:
         return job.compute(k)
     except Exception as error:
+        if not job.sent:
+            raise
+        pickler = cloudpickle()
         try:
-            pickle.loads(pickle.dumps(error))
+            pickler.loads(pickler.dumps(error))
         except Exception:  # some errors of Equinox: they would end a process pool
             raise RuntimeError(f"batch {k}: {one_line(error)}") from None
         raise
@@ -153,20 +185,13 @@ def gathered(executor: Any, job: Job, batches: Sequence[int], hint: str) -> Comp
 
 
 def require_executor(executor: Any) -> None:
-    """Refuse an object without the interface of `concurrent.futures`, and forked processes.
+    """Refuse an object without the interface of `concurrent.futures`.
 
-    **Raises:** `TypeError` and `ValueError`, respectively.
+    **Raises:** `TypeError`.
     """
     methods = (getattr(executor, name, None) for name in ("submit", "map"))
     if isinstance(executor, type) or not all(map(callable, methods)):
         raise TypeError(
             "executor must have the methods of concurrent.futures.Executor, such as"
             f" ThreadPoolExecutor() has, got {brief(executor)}"
-        )
-    # Python offers no other way to ask, and a fork of JAX stops for good.
-    context = getattr(executor, "_mp_context", None)
-    if context is not None and context.get_start_method() == "fork":
-        raise ValueError(
-            "executor must not fork, which JAX does not survive:"
-            ' ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn"))'
         )

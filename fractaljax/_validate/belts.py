@@ -7,7 +7,7 @@ from scipy.special import i1
 
 import fractaljax as fj
 
-from .case import STATED, Case, Check, Curve, Found, Panel, closed, numerical
+from .case import STATED, Case, CaseResult, Check, Curve, Panel, closed, numerical
 
 
 def _belt(friction: fj.Friction, V: float, m=1.0, c=0.0, k=1.0, P=1.0) -> fj.Structure:
@@ -130,7 +130,7 @@ def _harmonic(drop, v_0, c, sizes):
 # --- the cases ----------------------------------------------------------------------------
 
 
-def _leine() -> Found:
+def _leine() -> CaseResult:
     cycle = fj.limit_cycle(_belt(fj.HyperbolicStribeck(1.0, 3.0), 0.2), [0.0, 0.0])
     theirs = _stick_slip(lambda w: 1 / (1 + 3 * w), 0.2)
     note = (
@@ -139,10 +139,10 @@ def _leine() -> Found:
     printed = Check(
         "largest x, as printed [m]", 1.133944669704, float(cycle.state[0]), 1e-8, STATED, note
     )
-    return Found([printed, *_cycle_checks(cycle, theirs)], [_portrait(cycle, theirs)])
+    return CaseResult([printed, *_cycle_checks(cycle, theirs)], [_portrait(cycle, theirs)])
 
 
-def _thomsen() -> Found:
+def _thomsen() -> CaseResult:
     mu_s, mu_m, v_m, c, V = 0.4, 0.25, 0.5, 0.1, 0.42
     hopf = v_m * np.sqrt(1 - 2 * c * v_m / (3 * (mu_s - mu_m)))
     sticks, size = np.sqrt(4 / 5) * hopf, 2 * np.sqrt(hopf**2 - V**2)
@@ -166,10 +166,10 @@ def _thomsen() -> Found:
     speeds = np.linspace(sticks, hopf, 13)
     pure = Curve(speeds, 2 * np.sqrt(hopf**2 - speeds**2), "Thomsen and Fidlin, pure slip", False)
     ends = Curve([sticks, sticks], [0.15, 0.5], "Thomsen and Fidlin, v_b0", False, True)
-    return Found(checks, [_amplitudes(branch, [pure, ends])])
+    return CaseResult(checks, [_amplitudes(branch, [pure, ends])])
 
 
-def _papangelo() -> Found:
+def _papangelo() -> CaseResult:
     c, v_0, drop = 0.1, 0.5, 0.5
 
     def force(w):
@@ -197,10 +197,10 @@ def _papangelo() -> Found:
         Curve(*balance, "their equation, balance of the first wave", False),
         Curve([hopf, hopf], [0, 2.2], "Hopf point v_0 ln(drop/(v_0 c))", False, True),
     ]
-    return Found(checks, [_portrait(cycle, theirs), _amplitudes(branch, curves)])
+    return CaseResult(checks, [_portrait(cycle, theirs), _amplitudes(branch, curves)])
 
 
-def _veraszto() -> Found:
+def _veraszto() -> CaseResult:
     m, c, k, V = 0.538, 5.746, 6957.0, 0.22  # their Tables 1 and 2
     kinetic, static, c_v, b_s, P = 2.0, 6.0, 10.0, 0.2, 10.0
 
@@ -230,7 +230,7 @@ def _veraszto() -> Found:
         _portrait(cycle, theirs, 1e3, "mm"),
         _amplitudes(branch, curves, omega, "half of peak to peak of omega x [m/s]"),
     ]
-    return Found(checks, panels)
+    return CaseResult(checks, panels)
 
 
 CASES = (

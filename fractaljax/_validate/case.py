@@ -58,7 +58,7 @@ class Panel(NamedTuple):
     options: Mapping[str, Any] = {}
 
 
-class Found(NamedTuple):
+class CaseResult(NamedTuple):
     """The numbers and graphs that a case computes."""
 
     checks: Sequence[Check]
@@ -72,7 +72,7 @@ class Case(NamedTuple):
     title: str
     citation: str
     doi: str | None  # None if it has none, or if it is uncertain
-    run: Callable[[], Found]
+    run: Callable[[], CaseResult]
     missing: Callable[[], str] = lambda: ""
 
 

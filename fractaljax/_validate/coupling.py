@@ -8,7 +8,7 @@ import numpy as np
 
 import fractaljax as fj
 
-from .case import Case, Curve, Found, Panel, closed
+from .case import Case, CaseResult, Curve, Panel, closed
 
 
 def _structure() -> fj.Structure:
@@ -24,7 +24,7 @@ def _published(mu):
     return np.where(s.imag < 0, -s, s)
 
 
-def _hoffmann() -> Found:
+def _hoffmann() -> CaseResult:
     model = _structure()
     mu = np.linspace(0.0125, 1.5, 120)
     eigenvalues = jax.jit(jax.vmap(lambda mu: fj.stability(model.replace(mu=mu)).eigenvalues))
@@ -54,7 +54,7 @@ def _hoffmann() -> Found:
                 Curve(mu, computed[:, k], labels[1], True),
             ]
         panels.append(Panel("friction coefficient mu [-]", name, curves))
-    return Found(checks, panels)
+    return CaseResult(checks, panels)
 
 
 CASES = (

@@ -13,13 +13,10 @@ from scipy.sparse.linalg import splu
 
 import fractaljax as fj
 
-from .case import NUMERICAL, Case, Check, Curve, Found, Panel, numerical
+from .case import NUMERICAL, Case, CaseResult, Check, Curve, Panel, numerical
 
 _VARIABLE = "FRACTALJAX_BRAKE"
 _MATRICES = "BMLL", "BDLL", "BYLL", "BDIWLL", "BHLL", "BKLL", "BKQLL", "BWLL"
-_BAND = 0.0, 20000.0  # rad/s
-# The unstable eigenvalues at Omega = 4 pi, kr = 1, to start SciPy's iteration from.
-_UNSTABLE = 74.8 + 17399.6j, 5.47 + 4932.24j, 1e-4 + 5130.605j
 
 
 def _missing() -> str:
@@ -63,7 +60,7 @@ def _eigenvalue(X, start, kr=1.0, steps=4):
     return s, -(y @ (X["BKQLL"] @ x)) / (y @ ((2 * s * M + C) @ x))
 
 
-def _brake() -> Found:
+def _brake() -> CaseResult:
     X = _matrices(os.environ[_VARIABLE])
     damping = [
         (1, X["BDLL"]),
@@ -74,7 +71,8 @@ def _brake() -> Found:
     stiffness = [(1, X["BKLL"]), ("kr", X["BKQLL"]), ("Omega**2 - 1", X["BWLL"])]
     parameters = {"Omega": 4 * np.pi, "kr": 1.0}
     full = fj.ParametricStructure(X["BMLL"], damping, stiffness, parameters=parameters)
-    reduced = fj.reduce(full, {"kr": (0.9, 1.1)}, _BAND, progress=False)
+    band = 0.0, 20000.0  # rad/s
+    reduced = fj.reduce(full, {"kr": (0.9, 1.1)}, band, progress=False)
 
     def eigenvalues(kr):
         return fj.stability(reduced.replace(kr=kr)).eigenvalues
@@ -82,7 +80,8 @@ def _brake() -> Found:
     kr = np.linspace(0.9, 1.1, 21)
     spectra = np.asarray(jax.jit(jax.vmap(eigenvalues))(jnp.asarray(kr)))
     checks, curves = [], []
-    for start in _UNSTABLE:
+    # The unstable eigenvalues at Omega = 4 pi and kr = 1, to start SciPy's iteration from.
+    for start in (74.8 + 17399.6j, 5.47 + 4932.24j, 1e-4 + 5130.605j):
         exact, slope = _eigenvalue(X, start)
         column: Any = np.array([row[np.abs(row - start).argmin()] for row in spectra])
         name, eigenvalue = f"of the mode at {abs(start) / (2e3 * np.pi):.3f} kHz", column[10]
@@ -108,7 +107,7 @@ def _brake() -> Found:
         curves.append(Curve(at, theirs, f"the full matrices by SciPy, {label}", False))
         curves.append(Curve(kr, column.real, f"fractaljax, {reduced.n} of {full.n}, {label}", True))
     panel = Panel("friction, times that of the model [-]", "growth rate [1/s]", curves)
-    return Found(checks, [panel])
+    return CaseResult(checks, [panel])
 
 
 CASES = (

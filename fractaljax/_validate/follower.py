@@ -6,9 +6,7 @@ import numpy as np
 
 import fractaljax as fj
 
-from .case import Case, Curve, Found, Panel, closed
-
-_UNDAMPED = 7 / 2 - np.sqrt(2)  # P l/c at which the undamped modes coalesce
+from .case import Case, CaseResult, Curve, Panel, closed
 
 
 def _pendulum(b: float) -> fj.ParametricStructure:
@@ -50,17 +48,17 @@ def _undamped() -> float:
     return high
 
 
-def _ziegler() -> Found:
+def _ziegler() -> CaseResult:
     beta = np.concatenate([[1.0, 4 + 5 * np.sqrt(2)], np.geomspace(0.05, 200.0, 41)])
-    b = 0.01
+    b, coalescence = 0.01, 7 / 2 - np.sqrt(2)  # P l/c at which the undamped modes coalesce
     loads, heavy = _critical(_pendulum(b), beta), _critical(_pendulum(0.3), beta[:1])
     checks = [
-        closed("critical load, no damping [c/l]", _UNDAMPED, _undamped(), 1e-8),
+        closed("critical load, no damping [c/l]", coalescence, _undamped(), 1e-8),
         closed("critical load, equal light dampers [c/l]", 41 / 28, loads[0] - b**2 / 2, 1e-9),
         closed("critical load, equal dampers of 0.3 [c/l]", _published(1.0, 0.3), heavy[0], 1e-9),
         closed(
             "critical load, dampers 4 + 5 sqrt(2) to 1 [c/l]",
-            _UNDAMPED + beta[1] * b**2 / 2,
+            coalescence + beta[1] * b**2 / 2,
             loads[1],
             1e-9,
         ),
@@ -68,10 +66,10 @@ def _ziegler() -> Found:
     curves = [
         Curve(beta[2::2], _published(beta[2::2], b), "Herrmann and Jong 1965, damped", False),
         Curve(beta[2:], loads[2:], "fractaljax", True),
-        Curve(beta[2:], np.full(41, _UNDAMPED), "Ziegler 1952, no damping", False, True),
+        Curve(beta[2:], np.full(41, coalescence), "Ziegler 1952, no damping", False, True),
     ]
     axes = "ratio of the dampers, foot to elbow [-]", "critical load P l/c [-]"
-    return Found(checks, [Panel(*axes, curves, {"xscale": "log"})])
+    return CaseResult(checks, [Panel(*axes, curves, {"xscale": "log"})])
 
 
 CASES = (

@@ -1,5 +1,6 @@
 """Rough contacts: exponents, ratios and areas from theory and boundary elements."""
 
+import dataclasses
 import functools
 
 import jax
@@ -10,34 +11,49 @@ from scipy.special import erf
 import fractaljax as fj
 from fractaljax._contact.compare import BOUNDARY_ELEMENTS
 
-from .case import CLOSED, STATED, Case, Check, Curve, Found, Panel, closed
+from .case import CLOSED, STATED, Case, CaseResult, Check, Curve, Panel, closed
 
-_E, _L, _N = 1.154e11, 1e-2, 128
-_MATERIAL = fj.Material(_E, nu=0.3, sigma_y=3.55e8, H=9.94e8)
-_L_S = 4 * _L / _N
-_SQ = 1e-6  # m
-_UNIT = _E * _SQ * _L  # N, the load scale of finite-size laws
-_LOADS = np.geomspace(1e-3, 1.0, 7)  # in _UNIT
-_DIMENSIONS = (2.1, 2.3, 2.5, 2.7, 2.9)
-_SEEDS = 12
+_MATERIAL = fj.brake_scene().contact.material
 
 
-def _surface(D: float) -> fj.Surface:
-    """Surface with the root mean square height Sq."""
-    unit = fj.Surface(D, _L)
-    return fj.Surface(D, _L * (_SQ / float(fj.roughness(unit, _L, _L_S).Sq)) ** (1 / (D - 2)))
+@dataclasses.dataclass(frozen=True)
+class _Patch:
+    """The square patch of rough surfaces that all cases press, with n x n points."""
+
+    L: float = 1e-2  # longest wavelength and side [m]
+    n: int = 128
+    Sq: float = 1e-6  # root mean square height, whatever D [m]
+
+    @property
+    def L_s(self) -> float:
+        return 4 * self.L / self.n
+
+    @property
+    def load_scale(self) -> float:
+        """The load E Sq L [N] by which finite-size laws count."""
+        return float(_MATERIAL.E) * self.Sq * self.L
+
+    @property
+    def loads(self) -> np.ndarray:
+        """The loads [N] of the boundary elements."""
+        return self.load_scale * np.geomspace(1e-3, 1.0, 7)
+
+    def surface(self, D: float) -> fj.Surface:
+        unscaled = fj.roughness(fj.Surface(D, self.L), self.L, self.L_s)
+        return fj.Surface(D, self.L * (self.Sq / float(unscaled.Sq)) ** (1 / (D - 2)))
+
+    def law(self, surface, P, material=_MATERIAL) -> fj.PerssonContact:
+        return fj.PerssonContact(surface, material, P, self.L**2, self.L, self.L_s)
 
 
-def _law(surface, P, nu=0.3, area=_L**2, L_s=_L_S) -> fj.PerssonContact:
-    """Persson's law on a surface; L = 10 mm."""
-    return fj.PerssonContact(surface, fj.Material(_E, nu, 3.55e8, 9.94e8), P, area, _L, L_s)
+_PATCH = _Patch()
 
 
 @functools.cache
-def _pressed(D: float) -> fj.LawComparison:
-    """Boundary elements compared with the laws."""
-    options = {"area": _L**2, "L_s": _L_S, "n": _N, "seeds": _SEEDS, "progress": False}
-    return fj.compare_laws(_surface(D), _MATERIAL, _UNIT * _LOADS, **options)
+def _press(D: float) -> fj.LawComparison:
+    """Boundary elements on twelve surfaces beside the laws; two cases share them."""
+    options = {"area": _PATCH.L**2, "L_s": _PATCH.L_s, "n": _PATCH.n, "progress": False}
+    return fj.compare_laws(_PATCH.surface(D), _MATERIAL, _PATCH.loads, seeds=12, **options)
 
 
 @jax.jit
@@ -45,17 +61,17 @@ def _exponents(surface, loads):
     """d ln K_n/d ln P of Persson's law at loads (n,)."""
 
     def log_stiffness(log_P):
-        return jnp.log(_law(surface, jnp.exp(log_P)).stiffness(0.4, 0.25)[0])
+        return jnp.log(_PATCH.law(surface, jnp.exp(log_P)).stiffness(0.4, 0.25)[0])
 
     return jax.vmap(jax.grad(log_stiffness))(jnp.log(loads))
 
 
-def _pohrt() -> Found:
+def _pohrt() -> CaseResult:
     fitted = 5  # loads, two decades: beyond them K_n rises to full contact
-    x = np.log(_LOADS[:fitted])
+    x, dimensions = np.log(_PATCH.loads[:fitted]), (2.1, 2.3, 2.5, 2.7, 2.9)
     exponents, checks = [], []
-    for D in _DIMENSIONS:
-        K_n = np.asarray(_pressed(D).curves[BOUNDARY_ELEMENTS].K_n)
+    for D in dimensions:
+        K_n = np.asarray(_press(D).curves[BOUNDARY_ELEMENTS].K_n)
         exponents.append(np.polyfit(x, np.log(K_n[:fitted]), 1)[0])
         checks.append(
             Check(
@@ -67,17 +83,17 @@ def _pohrt() -> Found:
     ends = np.array([2.0, 3.0])
     curves = [
         Curve(ends, [0.51, 0.77], "Pohrt and Popov, 0.51 to 0.77 for D = 2 to 3", False, True),
-        Curve(_DIMENSIONS, exponents, "fractaljax, boundary elements", True),
+        Curve(dimensions, exponents, "fractaljax, boundary elements", True),
     ]
     panel = Panel("fractal dimension D [-]", "exponent alpha [-]", curves, {"ylim": (0.4, 0.9)})
-    return Found(checks, [panel])
+    return CaseResult(checks, [panel])
 
 
-def _pastewka() -> Found:
+def _pastewka() -> CaseResult:
     checks, loads = [], np.geomspace(1e-10, 1.0, 41)
     curves = []
     for D in (2.1, 2.5, 2.9):
-        alpha = np.asarray(_exponents(_surface(D), jnp.asarray(_UNIT * loads)))
+        alpha = np.asarray(_exponents(_PATCH.surface(D), jnp.asarray(_PATCH.load_scale * loads)))
         limit = 1 / (1 + 3 - D)
         checks.append(
             closed(f"exponent at small loads, H = {3 - D:.1f} [-]", limit, alpha[0], 1e-3)
@@ -87,14 +103,15 @@ def _pastewka() -> Found:
     built_in = "the law joins this limit to Persson's theory, which leads at larger loads"
     checks[0] = checks[0]._replace(note=built_in)
     axes = "normal load P/(E Sq L) [-]", "d ln K_n/d ln P [-]"
-    return Found(checks, [Panel(*axes, curves, {"xscale": "log", "ylim": (0, 1.6)})])
+    return CaseResult(checks, [Panel(*axes, curves, {"xscale": "log", "ylim": (0, 1.6)})])
 
 
-def _campana() -> Found:
-    nu, surface = np.linspace(0.0, 0.5, 21), _surface(2.4)
+def _campana() -> CaseResult:
+    nu, surface = np.linspace(0.0, 0.5, 21), _PATCH.surface(2.4)
 
     def ratio(nu):
-        K_n, K_t = _law(surface, _UNIT, nu).stiffness(0.4, 0.25)
+        material = fj.Material(_MATERIAL.E, nu, _MATERIAL.sigma_y, _MATERIAL.H)
+        K_n, K_t = _PATCH.law(surface, _PATCH.load_scale, material).stiffness(0.4, 0.25)
         return K_t / K_n
 
     published, ours = (2 - 2 * nu) / (2 - nu), np.asarray(jax.jit(jax.vmap(ratio))(jnp.asarray(nu)))
@@ -106,17 +123,17 @@ def _campana() -> Found:
         Curve(nu[::2], published[::2], "(2 - 2 nu)/(2 - nu)", False),
         Curve(nu, ours, "fractaljax, Persson's law", True),
     ]
-    return Found(checks, [Panel("Poisson's ratio nu [-]", "K_t/K_n [-]", curves)])
+    return CaseResult(checks, [Panel("Poisson's ratio nu [-]", "K_t/K_n [-]", curves)])
 
 
-def _persson() -> Found:
+def _persson() -> CaseResult:
     D = 2.3
-    compared = _pressed(D)
-    Sdq = float(fj.roughness(_surface(D), _L, _L_S).Sdq)
-    strain = _UNIT * _LOADS / _L**2 / (_E * Sdq)  # p/(E Sdq)
+    compared, area = _press(D), _PATCH.L**2
+    Sdq = float(fj.roughness(_PATCH.surface(D), _PATCH.L, _PATCH.L_s).Sdq)
+    strain = _PATCH.loads / area / (float(_MATERIAL.E) * Sdq)  # p/(E Sdq)
     published = erf(np.sqrt(2) * strain)
-    law = np.asarray(compared.curves["Persson"].real_area) / _L**2
-    counted = np.asarray(compared.curves[BOUNDARY_ELEMENTS].real_area) / _L**2
+    law = np.asarray(compared.curves["Persson"].real_area) / area
+    counted = np.asarray(compared.curves[BOUNDARY_ELEMENTS].real_area) / area
     # The law takes Eq. 13's waves as a continuous spectrum, `roughness` as the sum that they are.
     checks = [
         closed("A_r/A at p = 0.045 E Sdq [-]", published[-1], law[-1], 5e-3),
@@ -137,7 +154,7 @@ def _persson() -> Found:
         Curve(strain, counted, "fractaljax, boundary elements", True),
     ]
     axes = "mean pressure p/(E Sdq) [-]", "real over nominal area A_r/A [-]"
-    return Found(checks, [Panel(*axes, curves, {"xscale": "log", "yscale": "log"})])
+    return CaseResult(checks, [Panel(*axes, curves, {"xscale": "log", "yscale": "log"})])
 
 
 CASES = (

@@ -4,26 +4,25 @@ import numpy as np
 
 import fractaljax as fj
 
-from .case import Case, Curve, Found, Panel, closed
+from .case import Case, CaseResult, Curve, Panel, closed
 
-_MATERIAL = fj.Material(E=1.154e11, nu=0.3, sigma_y=3.55e8, H=9.94e8)
+_MATERIAL = fj.brake_scene().contact.material
 _E = float(_MATERIAL.E)
 
-# The images of a periodic cell are a square lattice of equal charges in a uniform background: its
-# energy (Bonsall and Maradudin, Phys. Rev. B 15, 1959, 1977) and its sum of 1/r^3.
-_LATTICE, _LATTICE_CUBED = 3.900264920, 9.0336217
 
-
-def _hertz() -> Found:
+def _hertz() -> CaseResult:
+    # The images of a periodic cell are a square lattice of equal charges in a uniform background:
+    # its energy (Bonsall and Maradudin, Phys. Rev. B 15, 1959, 1977) and its sum of 1/r^3.
+    lattice_energy, lattice_cubed = 3.900264920, 9.0336217
     n, L, R, a = 256, 1e-3, 0.1, 1.2e-4
     P = 4 * _E * a**3 / (3 * R)
     x = (np.arange(n) + 0.5) / n * L - L / 2
     # The images flatten the ball, so it is made rounder to compensate.
-    curvature = 1 / R - P * _LATTICE_CUBED / (2 * np.pi * _E * L**3)
+    curvature = 1 / R - P * lattice_cubed / (2 * np.pi * _E * L**3)
     heights = -np.add.outer(x**2, x**2) / 2 * curvature
     contact = fj.boundary_element(heights, L / n, _MATERIAL, P)
     peak = 3 * P / (2 * np.pi * a**2)
-    images = _LATTICE / (np.pi * _E * L)  # of the compliance
+    images = lattice_energy / (np.pi * _E * L)  # of the compliance
     ring = 2 * L / n / a  # the outline moves by whole points, one at either end of a diameter
     checks = [
         closed("area of contact, pi a^2 [m^2]", np.pi * a**2, contact.area, ring),
@@ -40,10 +39,10 @@ def _hertz() -> Found:
         Curve(r * a * 1e6, peak / 1e6 * np.sqrt(1 - r**2), "Hertz", False),
         Curve(x[near] * 1e6, row[near] / 1e6, "fractaljax", True),
     ]
-    return Found(checks, [Panel("distance from the centre [um]", "pressure [MPa]", curves)])
+    return CaseResult(checks, [Panel("distance from the centre [um]", "pressure [MPa]", curves)])
 
 
-def _westergaard() -> Found:
+def _westergaard() -> CaseResult:
     n, dx = 512, 1e-5
     L, height = n * dx, 1e-3 * n * dx
     closes = np.pi * _E * height / L  # Pa: the mean pressure that closes all gaps
@@ -91,7 +90,7 @@ def _westergaard() -> Found:
             {"yscale": "log"},
         ),
     ]
-    return Found(checks, panels)
+    return CaseResult(checks, panels)
 
 
 CASES = (

@@ -14,9 +14,9 @@ from .case import (
     CORRECTED,
     STATED,
     Case,
+    CaseResult,
     Check,
     Curve,
-    Found,
     Panel,
     closed,
     numerical,
@@ -36,7 +36,7 @@ _MATERIAL = fj.Material(_E, _NU, _SIGMA_Y, _H)
 # --- stiffness ----------------------------------------------------------------------------
 
 
-def _as_printed(D, G, P=_P):
+def _printed_stiffness(D, G, P=_P):
     """(K_n, K_t, Q_e) by Eqs. 21, 26, 30, 33 and 36 as they are printed, with SciPy's a_l."""
     log_gamma, k_mu = np.log(_GAMMA), 1 - 0.228 * _MU_M
     a_e = 2 ** ((3 * D - 11) / (2 - D)) * (33 * k_mu * _SIGMA_Y / _E / 40) ** (2 / (2 - D))
@@ -66,7 +66,7 @@ def _as_printed(D, G, P=_P):
     return K_n, K_t * np.cbrt(max(0.0, 1 - Q_e / (_MU_S * P))), Q_e
 
 
-def _ours(D, G):
+def _computed_stiffness(D, G):
     """(K_n, K_t) at surfaces (n,)."""
 
     def one(D, G):
@@ -77,12 +77,12 @@ def _ours(D, G):
     return [np.asarray(x) for x in jax.jit(jax.vmap(one))(jnp.asarray(D), jnp.asarray(G))]
 
 
-def _stiffness() -> Found:
+def _stiffness() -> CaseResult:
     at = np.array([_D, 2.5, 2.6])
-    K_n, K_t, Q_e = _ours(at, _G)
-    theirs = [_as_printed(D, _G) for D in (_D, 2.5 - 1e-7, 2.6)]
+    K_n, K_t, Q_e = _computed_stiffness(at, _G)
+    theirs = [_printed_stiffness(D, _G) for D in (_D, 2.5 - 1e-7, 2.6)]
     # Eq. 33 has a removable pole at D = 2.5: the mean of both sides is Eq. 34.
-    limit = (theirs[1][2] + _as_printed(2.5 + 1e-7, _G)[2]) / 2
+    limit = (theirs[1][2] + _printed_stiffness(2.5 + 1e-7, _G)[2]) / 2
     lost = "not run: Table 1 (yield strength, friction) is lost. The printed G = 5.1372e-5 m makes "
     lost += "the joint fully plastic whatever it held; G near 5e-10 or 5e-11 m is meant"
     checks = [
@@ -109,8 +109,8 @@ def _stiffness() -> Found:
         ("fractal dimension D [-]", D, (D, _G), {"yscale": "log"}),
         ("fractal roughness G [m]", G, (_D, G), {"yscale": "log", "xscale": "log"}),
     ):
-        printed = np.array([_as_printed(d, g)[:2] for d, g in np.broadcast(*surfaces)])
-        ours = _ours(*surfaces)
+        printed = np.array([_printed_stiffness(d, g)[:2] for d, g in np.broadcast(*surfaces)])
+        ours = _computed_stiffness(*surfaces)
         curves = []
         for k, name in enumerate(("K_n", "K_t")):
             shown = np.where(printed[::4, k] > 0, printed[::4, k], np.nan)
@@ -120,7 +120,7 @@ def _stiffness() -> Found:
                 Curve(x, np.where(ours[k] > 0, ours[k], np.nan), f"{name}, fractaljax", True)
             )
         panels.append(Panel(axis, "stiffness [N/m]", curves, options))
-    return Found(checks, panels)
+    return CaseResult(checks, panels)
 
 
 # --- onset of squeal ----------------------------------------------------------------------
@@ -138,7 +138,7 @@ def _critical(K_n, kappa):
     return np.sqrt(((a_3 * a_2 * a_1 - a_1**2) / a_3**2 - a * b) / (kappa * K_n**2))
 
 
-def _onset() -> Found:
+def _onset() -> CaseResult:
     critical = jax.jit(
         jax.vmap(lambda K_n, K_t: fj.critical_friction(_scene().replace(K_n=K_n, K_t=K_t)))
     )
@@ -170,34 +170,33 @@ def _onset() -> Found:
         Curve([0.15, 0.15], [0, 1.2], "Hopf point as printed", False, True),
     ]
     axes = "stiffness ratio kappa = K_t/K_n [-]", "critical friction mu [-]"
-    return Found(checks, [Panel(*axes, curves, {"ylim": (0, 1.2)})])
+    return CaseResult(checks, [Panel(*axes, curves, {"ylim": (0, 1.2)})])
 
 
 # --- limit cycles -------------------------------------------------------------------------
 
-_V, _V_M, _F = 0.15, 0.5, 5.0
-_SMOOTH = 1e-6  # m/s: sgn(w) is tanh(w/_SMOOTH) for SciPy
 
-
-def _cycle_by_scipy(K_n):
+def _cycle_by_scipy(K_n, smooth=1e-6):
     """Period, share of sticking, peak-to-peak x1 and x2, largest dx2/dt, and the orbit (4, n).
 
-    Eq. 44 is solved by LSODA with a smooth sgn, over 80 periods from near the equilibrium.
+    Eq. 44 is solved by LSODA over 80 periods from near the equilibrium; sgn(w) is tanh(w/smooth),
+    `smooth` in m/s.
     """
     K_t, (w_1, w_2), (xi_1, xi_2) = K_n / 2, (2000 * np.pi, 1600 * np.pi), (0.001, 0.007)
-    drop = (_MU_S - _MU_M) / (2 * _V_M)
+    V, v_m, F = 0.15, 0.5, 5.0
+    drop = (_MU_S - _MU_M) / (2 * v_m)
 
     def mu(w):
-        return _MU_S * np.tanh(w / _SMOOTH) - 3 * drop * w + drop * w**3 / _V_M**2
+        return _MU_S * np.tanh(w / smooth) - 3 * drop * w + drop * w**3 / v_m**2
 
     def rate(_, y):
         x_1, x_2, v_1, v_2 = y
-        a_1 = _F / np.sqrt(2) + mu(_V - v_1) * K_n * x_2 - 2 * xi_1 * w_1 * v_1
-        a_2 = -_F / np.sqrt(2) - mu(_V - v_2) * K_t * x_1 - 2 * xi_2 * w_2 * v_2
+        a_1 = F / np.sqrt(2) + mu(V - v_1) * K_n * x_2 - 2 * xi_1 * w_1 * v_1
+        a_2 = -F / np.sqrt(2) - mu(V - v_2) * K_t * x_1 - 2 * xi_2 * w_2 * v_2
         return [v_1, v_2, a_1 - (w_1**2 + K_t) * x_1, a_2 - (w_2**2 + K_n) * x_2]
 
     def slides(_, y):
-        return abs(_V - y[2]) - 10 * _SMOOTH
+        return abs(V - y[2]) - 10 * smooth
 
     # Extremes of both directions, and sticking, between steps: the steps alone miss them by 4e-4.
     events = [lambda _, y: y[2], lambda _, y: y[3], slides]
@@ -220,9 +219,9 @@ def _cycle_by_scipy(K_n):
     return last - first, share, *sizes, orbit[3].max(), orbit
 
 
-def _cycles() -> Found:
+def _cycles() -> CaseResult:
     scene = fj.brake_scene()
-    stiffnesses = (3e8, 4e8, 5e8)
+    V, stiffnesses = float(scene.oscillator.V), (3e8, 4e8, 5e8)
     cycles = [
         fj.limit_cycle(scene.replace(contact=fj.FixedContact(K_n, K_n / 2))) for K_n in stiffnesses
     ]
@@ -260,8 +259,8 @@ def _cycles() -> Found:
         ),
         Check(
             "largest dx2/dt over V at 4e8 N/m [-]",
-            middle[4] / _V,
-            float(cycle.velocity_max[1]) / _V,
+            middle[4] / V,
+            float(cycle.velocity_max[1]) / V,
             5e-3,
             CORRECTED,
             slides,
@@ -272,15 +271,15 @@ def _cycles() -> Found:
         curves = []
         for K_n, cycle, other in zip(stiffnesses, cycles, theirs, strict=True):
             orbit, states = other[-1], np.asarray(cycle.orbit(512)[1])
-            thinned = _even(orbit[[i, i + 2]], 36)
+            thinned = _thin(orbit[[i, i + 2]], 36)
             label = f"K_n = {K_n:g} N/m"
             curves.append(Curve(thinned[0] * 1e6, thinned[1], f"Eq. 44 by SciPy, {label}", False))
             curves.append(Curve(states[:, i] * 1e6, states[:, i + 2], f"fractaljax, {label}", True))
         panels.append(Panel(f"x{name} [um]", f"dx{i + 1}/dt [m/s]", curves))
-    return Found(checks, panels)
+    return CaseResult(checks, panels)
 
 
-def _even(orbit, count):
+def _thin(orbit, count):
     """`count` points of a closed curve (2, n), evenly along it."""
     scaled = orbit / np.ptp(orbit, axis=1, keepdims=True)
     along = np.append(0, np.cumsum(np.hypot(*np.diff(scaled))))

@@ -21,11 +21,11 @@ _TITLES = ["case", "quantity", "published", "ours", "difference", "tolerance", "
 class ValidatedCase:
     """One published case after its run."""
 
-    name: str
-    title: str
-    citation: str
-    doi: str | None
-    checks: tuple[Check, ...]
+    name: str  # by which `validate` takes it
+    title: str  # what is computed
+    citation: str  # of the article
+    doi: str | None  # of the article
+    checks: tuple[Check, ...]  # each published number beside ours
     panels: tuple[Panel, ...] = dataclasses.field(repr=False)  # the curves of its picture
     reason: str = ""  # why it did not run, or what ended it
     failed: bool = False  # True if an error ended it
@@ -48,7 +48,7 @@ class ValidatedCase:
 class Validation:
     """Published numbers beside ours, as `validate` returns them; printed as a table."""
 
-    cases: dict[str, ValidatedCase]
+    cases: dict[str, ValidatedCase]  # by name
 
     @property
     def agrees(self) -> bool:
@@ -94,15 +94,21 @@ class Validation:
 def validate(*cases: str, progress: bool = True) -> Validation:
     """Compute published results, and compare the numbers in a table.
 
-    `cases` are names of published cases, by default all. Each number has a tolerance, from the
-    digits that were printed or the order of an approximation, and a basis: `stated` in the article,
-    a `closed form` that follows from its equations, the solution of its equations by `SciPy`, or
-    `corrected` where the article is wrong, with a note that says how. SI units unless the
-    quantity names another. A case without its data says so and is not counted. The
-    4669-degree-of-freedom brake needs the folder of its matrices, in the environment variable
-    FRACTALJAX_BRAKE. All cases together take about three minutes.
+    Each number has a tolerance, from the digits that were printed or the order of an approximation,
+    and a basis: `stated` in the article, a `closed form` that follows from its equations, the
+    solution of its equations by `SciPy`, or `corrected` where the article is wrong, with a note
+    that says how. SI units unless the quantity names another. A case without its data says so and
+    is not counted. The 4669-degree-of-freedom brake needs the folder of its matrices, in the
+    environment variable FRACTALJAX_BRAKE. All cases together take about three minutes.
 
     `plot.validation(case)` draws our curves over theirs.
+
+    **Arguments:**
+
+    - `cases`: names of published cases, by default all.
+    - `progress`: shows a bar.
+
+    **Returns:** a `Validation`.
 
     **Raises:** `ValueError` for an unknown case, and without 64 bits (`jax_enable_x64`).
     """

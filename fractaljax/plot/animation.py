@@ -13,7 +13,6 @@ from .axes import Figure
 if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
 
-_LIMIT = 500.0  # MB of frames in a page
 _SIGNS = {  # on matplotlib's buttons, instead of a font from the network
     "minus": "-",
     "fast-backward": "⏮",
@@ -57,7 +56,8 @@ def animation_page(moving: "FuncAnimation", fps: int) -> str:
     """One HTML page with all frames and its buttons inside."""
     import matplotlib as mpl
 
-    with mpl.rc_context({"animation.embed_limit": _LIMIT}):
+    # Frames of a large mesh exceed matplotlib's limit of 20 MB.
+    with mpl.rc_context({"animation.embed_limit": 500.0}):
         body = moving.to_jshtml(fps, embed_frames=True, default_mode="loop")
     body = re.sub(r"<link\b[^>]*>", "", body)
     for name, sign in _SIGNS.items():

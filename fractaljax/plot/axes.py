@@ -22,7 +22,12 @@ DIRECTIONS = "along the belt", "normal to the belt"
 
 
 def new_figure(width: float = 8.4, height: float = 6.4) -> Figure:
-    """A figure outside pyplot to add axes to; a notebook shows it. Sizes are in inches."""
+    """A figure outside pyplot to add axes to; a notebook shows it.
+
+    **Arguments:**
+
+    - `width`, `height`: in inches, 8.4 and 6.4 by default.
+    """
     from .figure import Figure
 
     return Figure((width, height))
@@ -53,7 +58,7 @@ def lines(ax: Axes, x: np.ndarray, rows: Iterable[np.ndarray], names: Sequence[s
     return handles
 
 
-def value_of(x: Any, name: str, value: float) -> str:
+def format_value(x: Any, name: str, value: float) -> str:
     """A quantity with its value, as a legend shows it: G = 1e-10 m."""
     return f"{name} = {value:.3g} {unit(x, name)}".removesuffix(" -")
 

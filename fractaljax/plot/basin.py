@@ -7,16 +7,19 @@ import numpy as np
 from .._dynamics.basin import Basin
 from .axes import Axes, ensure_axes, legend_above
 
-_PIXELS = 400  # along each axis
-_SMALL = 1e-2  # [m]
 _COLOURS = {"equilibrium": "#c6dbef", "diverges": "0.25", "undecided": "#d62728"}
 
 
 def basin(result: Basin, ax: Axes | None = None) -> Axes:
     """The outcomes of a section as areas: each point has the outcome of the nearest start.
 
-    The starts differ in two coordinates only, as in a box with all others fixed.
     Displacements are in um, or in m if one is above 1 cm; velocities are in m/s.
+
+    **Arguments:**
+
+    - `result`: as `basin` returns it, of starts that differ in two coordinates only, as in a box
+      with all others fixed.
+    - `ax`: axes to draw in, by default those of a new figure.
 
     **Raises:** `ValueError` unless exactly two coordinates differ.
     """
@@ -32,14 +35,15 @@ def basin(result: Basin, ax: Axes | None = None) -> Axes:
             f"a picture needs starts that differ in 2 coordinates, got {len(coordinates)}"
         )
     ax, n = ensure_axes(ax), starts.shape[1] // 2
-    small = np.abs(starts[:, :n]).max() < _SMALL
+    small = np.abs(starts[:, :n]).max() < 1e-2  # m
     unit = np.where((coordinates < n) & small, 1e6, 1)
     points = starts[:, coordinates] * unit
     low, high = points.min(axis=0), points.max(axis=0)
-    x, y = (low + (high - low) * ((np.arange(_PIXELS) + 0.5) / _PIXELS)[:, None]).T
+    pixels = 400  # along each axis: about as many as a figure shows
+    x, y = (low + (high - low) * ((np.arange(pixels) + 0.5) / pixels)[:, None]).T
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     nearest = KDTree(points / (high - low)).query(grid / (high - low))[1]
-    shown = result.labels[nearest].reshape(_PIXELS, _PIXELS)
+    shown = result.labels[nearest].reshape(pixels, pixels)
     names = result.outcomes
     cycles = iter(mpl.colormaps["viridis"](np.linspace(0.15, 0.95, max(1, len(names) - 3))))
     colours = [_COLOURS[name] if name in _COLOURS else next(cycles) for name in names]

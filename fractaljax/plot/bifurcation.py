@@ -4,13 +4,13 @@ from typing import Any
 
 import numpy as np
 
+from .._base.parts import whole
 from .._base.ranges import within
 from .._dynamics.bifurcation import BifurcationMap
 from .._stability.stability import growth_rate
 from .._sweep.sweep import sweep
 from .axes import Axes, ensure_axes, legend_above, set_quantity_axis
 
-_POINTS = 160  # per axis
 _STYLES: dict[str, tuple[str, str]] = {
     "fold": ("tab:blue", "solid"),
     "grazing": ("tab:green", "dashed"),
@@ -20,18 +20,26 @@ _STYLES: dict[str, tuple[str, str]] = {
 }
 
 
-def bifurcation_map(result: BifurcationMap, ax: Axes | None = None) -> Axes:
+def bifurcation_map(result: BifurcationMap, ax: Axes | None = None, *, points: int = 160) -> Axes:
     """The curves of a map, with ticks towards the stable cycles; a star is the mechanism.
 
     The region where small disturbances grow is shaded. Elsewhere the mechanism is quiet if there
     are no stable cycles, and the kick decides if there are.
+
+    **Arguments:**
+
+    - `result`: as `bifurcation_map` returns it.
+    - `ax`: axes to draw in, by default those of a new figure.
+    - `points`: values of each quantity at which the growth rate is computed, 160 by default.
+
+    **Raises:** `ValueError` unless points >= 2.
     """
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
     from matplotlib.patheffects import withTickedStroke
 
     ax, windows = ensure_axes(ax), (result.x, result.y)
-    places = np.linspace(0, 1, _POINTS)
+    places = np.linspace(0, 1, whole("points", points, 2))
     x, y = (within(low, high, places) for _, low, high in windows)
     axes: Any = {result.x[0]: x, result.y[0]: y}
     slope = result.boundary.friction_slope

@@ -10,7 +10,13 @@ from .axes import Axes, ensure_axes, legend_above, set_quantity_axis
 
 
 def boundary(result: Boundary, ax: Axes | None = None) -> Axes:
-    """The branches of a boundary, coloured by frequency [kHz], with ticks on the squealing side."""
+    """The branches of a boundary, coloured by frequency [kHz], with ticks on the squealing side.
+
+    **Arguments:**
+
+    - `result`: as `hopf_boundary` returns it.
+    - `ax`: axes to draw in, by default those of a new figure.
+    """
     from matplotlib.collections import LineCollection
     from matplotlib.lines import Line2D
     from matplotlib.patheffects import withTickedStroke

@@ -15,7 +15,6 @@ _MARKERS = {
     "Neimark-Sacker": "v",
     "order of switches": "x",
 }
-_UNITS = (1e6, "µm"), (1e3, "mm"), (1.0, "m")  # the first in which all values are below 1000
 
 
 def branch(
@@ -23,8 +22,14 @@ def branch(
 ) -> Axes:
     """Peak-to-peak amplitude of one degree of freedom over the quantity of a branch.
 
-    Stable cycles are solid, unstable ones dashed; markers are the branch's events. `direction` is
-    the degree of freedom, from 1; `label` names the abscissa.
+    Stable cycles are solid, unstable ones dashed; markers are the branch's events.
+
+    **Arguments:**
+
+    - `result`: as `continue_cycle` returns it.
+    - `ax`: axes to draw in, by default those of a new figure.
+    - `direction`: the degree of freedom, from 1; 1 by default.
+    - `label`: text at the abscissa, by default the name of the quantity with its unit.
 
     **Raises:** `ValueError` for an unknown degree of freedom.
     """
@@ -33,7 +38,8 @@ def branch(
         raise ValueError(f"direction must be from 1 to {n}, got {direction}")
     ax = ensure_axes(ax)
     x, y = result.parameter, result.amplitude[:, direction - 1]
-    factor, unit = next(row for row in _UNITS if y.max() * row[0] < 1e3 or row[1] == "m")
+    units = (1e6, "µm"), (1e3, "mm"), (1.0, "m")
+    factor, unit = next(row for row in units if y.max() * row[0] < 1e3 or row[1] == "m")
     y = y * factor
     handles: list[Any] = []
     # A point where stability changes belongs to both parts.

@@ -10,11 +10,11 @@ from .axes import (
     Axes,
     Figure,
     ensure_axes,
+    format_value,
     legend_above,
     lines,
     new_figure,
     set_quantity_axis,
-    value_of,
 )
 
 _STIFFNESS = {"K_n": "normal stiffness K_n", "K_t": "tangential stiffness K_t"}
@@ -23,9 +23,13 @@ _STIFFNESS = {"K_n": "normal stiffness K_n", "K_t": "tangential stiffness K_t"}
 def curves(result: Sweep, ax: Axes | None = None, *, label: str) -> Axes:
     """A sweep of a scalar over its first quantity, one line for each value of the second.
 
-    `label` names the scalar, with its unit.
+    **Arguments:**
 
-    **Raises:** `ValueError` unless the sweep has one or two axes and one scalar at every point.
+    - `result`: a `Sweep` with one or two axes and one scalar at every point.
+    - `ax`: axes to draw in, by default those of a new figure.
+    - `label`: names the scalar, with its unit.
+
+    **Raises:** `ValueError` for another sweep.
     """
     values = np.asarray(result)
     if values.ndim != len(result.names) or values.ndim > 2:
@@ -45,6 +49,12 @@ def stiffness_curves(
 
     Contact states add circles where the joint becomes fully plastic, and crosses where gross slip
     begins or ends.
+
+    **Arguments:**
+
+    - `result`: a `Sweep` with one or two axes.
+    - `ax`: axes to draw in, by default those of a new figure.
+    - `stiffness`: "K_n", the default, or "K_t".
 
     **Raises:** `ValueError` for a stiffness that is neither "K_n" nor "K_t".
     """
@@ -77,7 +87,12 @@ def stiffness_curves(
 
 
 def stiffness(result: Sweep) -> Figure:
-    """K_n and K_t side by side; returns the figure."""
+    """K_n and K_t side by side; returns the figure.
+
+    **Arguments:**
+
+    - `result`: a `Sweep` as in `stiffness_curves`.
+    """
     figure = new_figure(11.2, 5.2)
     for ax, which in zip(figure.subplots(1, 2), ("K_n", "K_t"), strict=True):
         stiffness_curves(result, ax, stiffness=which)
@@ -87,7 +102,7 @@ def stiffness(result: Sweep) -> Figure:
 def _draw(result, values, ax):
     """Draw values (n,) or (n, m) over the first quantity; the lines."""
     x, *others = result.points
-    names = [value_of(result.scene, result.names[1], y) for y in others[0]] if others else [""]
+    names = [format_value(result.scene, result.names[1], y) for y in others[0]] if others else [""]
     set_quantity_axis(ax, "x", result.scene, result.names[0], x)
     return lines(ax, x, values.reshape(x.size, -1).T, names)
 

@@ -4,11 +4,9 @@ from typing import Any
 
 import numpy as np
 
+from .._base.parts import whole
 from .._dynamics.cycle import CycleResult, LimitCycle
 from .axes import Axes, Figure, coordinate, ensure_axes, legend_above, new_figure
-
-_HARMONICS = 20  # for every return of a period
-_FLOOR = 1e-6  # of the strongest harmonic; weaker ones lie below the axis
 
 
 def phase_portrait(
@@ -16,8 +14,13 @@ def phase_portrait(
 ) -> Axes:
     """The orbit of one displacement [um] against its velocity [m/s], and where it sticks.
 
-    The displacement is that of the degree of freedom `direction`, or t.x of the `joint` of that
-    number; both count from 1.
+    **Arguments:**
+
+    - `cycle`: as `limit_cycle` returns it.
+    - `ax`: axes to draw in, by default those of a new figure.
+    - `direction`: the degree of freedom, from 1; 1 by default.
+    - `joint`: the number of a joint, from 1, whose displacement t.x is shown instead; by default
+      none.
 
     **Raises:** `ValueError` if there is no limit cycle, for a batch, or an unknown direction or
     joint.
@@ -47,19 +50,29 @@ def phase_portrait(
 
 
 def spectrum(
-    cycle: LimitCycle, ax: Axes | None = None, *, direction: int = 1, joint: int | None = None
+    cycle: LimitCycle,
+    ax: Axes | None = None,
+    *,
+    direction: int = 1,
+    joint: int | None = None,
+    harmonics: int = 20,
 ) -> Axes:
     """Peak amplitudes [um] of the harmonics of a displacement over frequency [kHz].
 
-    They begin with the fundamental. The displacement is that of `phase_portrait`.
+    They begin with the fundamental.
 
-    **Raises:** as `phase_portrait`.
+    **Arguments:**
+
+    - `cycle`, `ax`, `direction`, `joint`: as in `phase_portrait`.
+    - `harmonics`: harmonics for every return of the period, 20 by default.
+
+    **Raises:** as `phase_portrait`, and `ValueError` unless harmonics >= 1.
     """
     shown = _coordinate(cycle, direction, joint)
-    ax, most = ensure_axes(ax), _HARMONICS * int(cycle.returns)
+    ax, most = ensure_axes(ax), whole("harmonics", harmonics, 1) * int(cycle.returns)
     frequencies, amplitudes = (np.asarray(x)[:most] for x in cycle.harmonics(shown.row[None]))
     f, a = frequencies / 1e3, amplitudes[:, 0] * 1e6
-    bottom = max(a.min() / 2, a.max() * _FLOOR)
+    bottom = max(a.min() / 2, 1e-6 * a.max())  # rounding errors lie below the axis
     ax.vlines(f, bottom, a, color="tab:blue", lw=1.4)
     words = f"fundamental {f[0]:.4g} kHz"
     handles = ax.plot(f[:1], a[:1], "D", ms=6, mfc="tab:orange", mec="k", label=words, zorder=3)
@@ -75,6 +88,10 @@ def cycle(result: LimitCycle) -> Figure:
     """Phase portraits and spectra; returns the figure.
 
     A row for each direction of a scene, and for t.x of each joint of a structure.
+
+    **Arguments:**
+
+    - `result`: as `limit_cycle` returns it.
 
     **Raises:** `ValueError` if there is no limit cycle, or for a batch.
     """

@@ -10,17 +10,18 @@ from .._dynamics.cycle import LimitCycle
 from .axes import Axes, Figure, ensure_axes, legend_above, new_figure
 from .cycle import phase_portrait, spectrum
 
-_TANGENTS = 6
-_TANGENT = 0.09  # half the length of one, as a share of the axis
-
 
 def cycles(
     results: Mapping[str, LimitCycle], *, direction: int = 1, joint: int | None = None
 ) -> Figure:
     """Phase portrait and spectrum of one displacement, a row for each cycle; returns the figure.
 
-    The keys name the rows, and all rows have the same axes. The displacement is that of
-    `phase_portrait`.
+    All rows have the same axes.
+
+    **Arguments:**
+
+    - `results`: {name of the row: limit cycle}.
+    - `direction`, `joint`: as in `phase_portrait`.
 
     **Raises:** `ValueError` if there are no cycles, and as `phase_portrait`.
     """
@@ -56,9 +57,16 @@ def amplitudes(
 ) -> Axes:
     """Peak-to-peak amplitudes [um] of all directions over a quantity, for a batch of cycles.
 
-    `over` (n,) are the values of the quantity, `label` its name with its unit, and `slopes` (n,)
-    the derivative of the amplitude of direction 1 with respect to it [m per unit], drawn as a few
-    tangents. Gaps are members without a cycle.
+    Gaps are members without a cycle.
+
+    **Arguments:**
+
+    - `results`: a batch (n,) of limit cycles, as `jax.vmap` gives it.
+    - `over`: (n,), values of the quantity.
+    - `ax`: axes to draw in, by default those of a new figure.
+    - `label`: the name of the quantity with its unit.
+    - `slopes`: (n,), the derivative of the amplitude of direction 1 with respect to the quantity [m
+      per unit], drawn as a few tangents; by default none.
 
     **Raises:** `ValueError` for a batch or slopes whose shape is not that of `over` (n,).
     """
@@ -76,8 +84,9 @@ def amplitudes(
         slope = np.asarray(slopes, float) * 1e6
         if slope.shape != x.shape:
             raise ValueError(f"slopes must have shape {x.shape}, got {slope.shape}")
-        reach = _TANGENT * np.ptp(x) * np.array([[-1], [1]])
-        shown = np.unique(np.linspace(0, len(x) - 1, _TANGENTS).astype(int))
+        # Six tangents that do not touch: each is 0.18 of the axis long.
+        reach = 0.09 * np.ptp(x) * np.array([[-1], [1]])
+        shown = np.unique(np.linspace(0, len(x) - 1, 6).astype(int))
         style: dict[str, Any] = {"color": "k", "lw": 1.1, "zorder": 3}
         ends = x[shown] + reach, amplitude[shown, 0] + slope[shown] * reach
         handles += ax.plot(*ends, label="derivative of direction 1", **style)[:1]

@@ -6,6 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from .._base.parts import whole
 from .._base.ranges import within
 from .._contact.contact import Regime
 from .._design.design import Design
@@ -15,11 +16,7 @@ from .._mechanism.structure import Structure
 from .._stability.stability import growth_rate
 from .._sweep.sweep import sweep
 from .axes import Axes, ensure_axes, legend_above, set_quantity_axis
-from .maps import regime_of, shade_regimes, shade_unsteady
-
-_POINTS = 240  # per axis
-_WINDOW = {"D": (2.1, 2.9), "G": (1e-12, 1e-8)}
-_DECADES = 4  # of growth rates, from the largest down
+from .maps import contact_regime, shade_regimes, shade_unsteady
 
 
 def stability_map(
@@ -30,28 +27,38 @@ def stability_map(
     target: float | None = None,
     K_n_min: float | None = None,
     friction_slope: bool = True,
+    points: int = 240,
 ) -> Axes:
-    """Growth rate [1/s] over the first two quantities of `bounds`, by default D and G [m].
+    """Growth rate [1/s] over two quantities, the stability boundary and the regimes of the contact.
 
-    It shows the stability boundary and the regimes of a fractal contact. `target` [1/s] and
-    `K_n_min` [N/m] add the lines of these limits.
+    **Arguments:**
 
-    **Raises:** `ValueError` for a quantity that the scene does not have.
+    - `scene`: a scene or structure of scalars.
+    - `bounds`: {name: (lower, upper)} in SI units, of which the first two are the axes; by default
+      D and G.
+    - `ax`: axes to draw in, by default those of a new figure.
+    - `target`: growth rate [1/s] of which a line is drawn, by default none.
+    - `K_n_min`: normal stiffness [N/m] of which a line is drawn, by default none.
+    - `friction_slope`: False leaves the slope of friction out of growth rates.
+    - `points`: values of each quantity, 240 by default.
+
+    **Raises:** `ValueError` for a quantity that the scene does not have, and unless points >= 2.
     """
     from matplotlib.colors import LogNorm
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     ax, window = ensure_axes(ax), dict(bounds or {})
-    window = window if len(window) > 1 else _WINDOW | window
-    places = np.linspace(0, 1, _POINTS)
+    if len(window) < 2:
+        window = {"D": (2.1, 2.9), "G": (1e-12, 1e-8)} | window  # of most machined surfaces
+    places = np.linspace(0, 1, whole("points", points, 2))
     axes: Any = {name: within(*ends, places) for name, ends in list(window.items())[:2]}
     single = isinstance(scene, Scene)
     fractal = single and scene.contact.fractal
 
     def measure(scene):
         K_n = stiffness(scene)[0] if single else jnp.nan
-        return growth_rate(scene, friction_slope), K_n, regime_of(scene) if fractal else None
+        return growth_rate(scene, friction_slope), K_n, contact_regime(scene) if fractal else None
 
     growth, K_n, regime = sweep(measure, scene, progress=False, **axes).values
     x, y = axes.values()
@@ -63,7 +70,7 @@ def stability_map(
     valid = np.ma.masked_where(inelastic | none, growth)
     if valid.count() and valid.max() > 0:
         top = 10 ** np.ceil(np.log10(valid.max()))
-        norm = LogNorm(top / 10**_DECADES, top)
+        norm = LogNorm(top / 1e4, top)  # four decades; less is as pale as stable
         shown = np.ma.masked_where(inelastic | ~(growth > 0), np.clip(growth, norm.vmin, None))
         mesh = ax.pcolormesh(x, y, shown.T, norm=norm, cmap="YlOrBr", shading="nearest")
         mesh.set_rasterized(True)
@@ -88,7 +95,13 @@ def stability_map(
 
 
 def design(result: Design, ax: Axes | None = None) -> Axes:
-    """The stability map of a design, and the path from the given scene to the designed one."""
+    """The stability map of a design, and the path from the given scene to the designed one.
+
+    **Arguments:**
+
+    - `result`: as `design` returns it.
+    - `ax`: axes to draw in, by default those of a new figure.
+    """
     limits: Any = {key: getattr(result, key) for key in ("target", "K_n_min", "friction_slope")}
     ax = stability_map(result.initial, result.bounds, ax, **limits)
     names = list(result.bounds)[:2]

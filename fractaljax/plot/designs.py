@@ -8,8 +8,6 @@ from .._design.many import DesignMany
 from .._mechanism.quantities import label, require_quantity, stored_quantities
 from .axes import Axes, ensure_axes, legend_above
 
-_DIMENSIONS = 2  # of a grid that is drawn as a map
-
 
 def design_map(
     designs: DesignMany,
@@ -21,9 +19,15 @@ def design_map(
 ) -> Axes:
     """A designed quantity over one or two quantities that differ between the members of a family.
 
-    **Arguments:** `designs` as `design_many` returns them; `x` and `y`, names of quantities of the
-    mechanisms; `quantity`, a designed one, by default the first. Over two quantities it is a map of
-    a grid of members, or points; over one a line. Members without a design are crosses.
+    Over two quantities it is a map of a grid of members, or points; over one a line. Members
+    without a design are crosses.
+
+    **Arguments:**
+
+    - `designs`: as `design_many` returns them.
+    - `x`, `y`: names of quantities of the mechanisms; by default there is no `y`.
+    - `ax`: axes to draw in, by default those of a new figure.
+    - `quantity`: a designed one, by default the first.
 
     **Raises:** `ValueError` for an unknown name.
     """
@@ -48,7 +52,7 @@ def design_map(
         how: dict[str, Any] = {"cmap": "viridis"}
         if scale:
             how["norm"] = "log"
-        if values.ndim == _DIMENSIONS and min(values.shape) > 1:
+        if values.ndim == 2 and min(values.shape) > 1:
             drawn = ax.pcolormesh(*axes, values, shading="nearest", **how)
             drawn.set_rasterized(True)
         else:

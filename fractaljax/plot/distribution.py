@@ -15,10 +15,15 @@ def distribution(
     label: str,
     limit: float | None = None,
 ) -> Axes:
-    """The share [-] of each set of samples (n,) that lies below every value, a line for each.
+    """The share [-] of each set of samples that lies below every value, a line for each.
 
-    `label` names the quantity with its unit, the keys name the sets, and `limit` is a value to
-    mark: for growth rates at 0, one minus the share is the probability of squeal.
+    **Arguments:**
+
+    - `samples`: {name: samples (n,)}, sets of any sizes.
+    - `ax`: axes to draw in, by default those of a new figure.
+    - `label`: names the quantity with its unit.
+    - `limit`: a value to mark, by default none: for growth rates at 0, one minus the share is the
+      probability of squeal.
 
     **Raises:** `ValueError` if there are no sets, for a set that is empty or not of shape (n,), and
     for values that are not finite.

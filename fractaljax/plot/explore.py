@@ -48,17 +48,9 @@ from .._surface.surface import frequency_count
 from .._surface.topography import random_phases
 from .._version import __version__
 from .javascript import javascript
-from .maps import regime_of
+from .maps import contact_regime
 
-_AROUND = {"D": (-0.05, 0.05), "G": (0.5, 2.0), "P": (0.5, 2.0), "mu": (0.5, 1.5)}
-_AROUND |= {"K_n": (0.5, 2.0), "K_t/K_n": (0.5, 1.5)}  # added to D, else factors
-_STOPS = 120  # positions of a slider, or a few more
 WAVELENGTHS = 1e-3, 1e-6  # [m], of Sq; the surface is drawn over the longest
-_PIXELS, _DIRECTIONS = 96, 10  # of the picture of the surface
-_SAMPLES = 96  # of one period of a limit cycle
-_BATCH, _MOST_RETURNS = 32, 500
-_NODES = 13, 5, 3  # of limit cycles over the first quantity, the second, and each of the others
-_MAP, _LONG = (150, 75), 1000  # points of the map per axis, the fewer for a program of more lines
 _SHADES = ["growth_rate", "plastic", "slip"]  # what the map shows, in the order of the leaves
 _CYCLE = ("period", "amplitude_1", "amplitude_2", "stick")
 
@@ -94,22 +86,28 @@ def explore(
 ) -> None:
     """Write a page with a slider for each of `windows`, in one .html file that needs no network.
 
-    `windows` are quantities by name, as the axes of `sweep`, each (low, high), two or more:
-    `D=(2.35, 2.45)`. By default those of D, G, P and mu that the scene has, or K_n, K_t/K_n and mu.
-    The first two span the map of growth rates.
-
     The page shows what `stability` and `stiffness` give at every position of the sliders, to
     rounding: it runs the same program, translated. It also shows the mode in motion, a surface with
-    its D and G, and limit cycles from a small disturbance. These are computed here, where sliding
-    squeals, on a grid of 13 values of the first quantity, 5 of the second and 3 of the others, or
-    as many as `cycles` says by name, and the value of the scene. Where it squeals in between the
-    page shows the nearest and says so. `cycles=False` leaves them out: seconds, not minutes.
+    its D and G, and limit cycles from a small disturbance. Where the mechanism squeals between
+    those that are computed, the page shows the nearest and says so.
+
+    **Arguments:**
+
+    - `scene`: a scene of scalars.
+    - `path`: the .html file.
+    - `cycles`: True, the default, computes limit cycles where sliding squeals, on a grid of 13
+      values of the first quantity, 5 of the second and 3 of the others, and the value of the scene;
+      {name: number of values} chooses the grid; False leaves them out: seconds, not minutes.
+    - `progress`: shows a bar.
+    - `windows`: (low, high) of two or more quantities by name, as the axes of `sweep`:
+      `D=(2.35, 2.45)`. By default those of D, G, P and mu that the scene has, or K_n, K_t/K_n and
+      mu. The first two span the map of growth rates.
 
     **Raises:** `TypeError` for what is not a `Scene`; `ValueError` for a scene that holds arrays,
     one whose program has loops (as of `AsperityContact`, or on a load curve), an unknown quantity,
-    two that are not independent, less than two, a window outside its domain, that is no
-    (low, high) or that leaves out the value of the scene, and a path that does not end in .html;
-    `OSError` if the file cannot be written.
+    two that are not independent, less than two, a window outside its domain, that is no (low, high)
+    or that leaves out the value of the scene, and a path that does not end in .html; `OSError` if
+    the file cannot be written.
     """
     if not os.fspath(path).endswith(".html"):
         raise ValueError(f"path must end in .html, got {os.fspath(path)!r}")
@@ -123,7 +121,7 @@ def page(
     progress: bool = True,
 ) -> str:
     """The text of the page that `explore` writes."""
-    axes, scene = explored(scene, windows, cycles)
+    axes, scene = slider_axes(scene, windows, cycles)
     names = [axis.name for axis in axes]
 
     def numbers(*q):
@@ -135,6 +133,7 @@ def page(
 
     # Before the search for cycles, since it may refuse the law.
     program = javascript(shade, len(axes), "shade")
+    long = program.count("\n") > 1000  # lines: the map has fewer points to stay quick
     programs = javascript(numbers, len(axes), "point") + program
     shown: Any = jax.eval_shape(numbers, *[0.0] * len(axes))
     data = {
@@ -148,7 +147,7 @@ def page(
         ],
         "numbers": sorted(shown),  # as the leaves of a dictionary are
         "shades": _SHADES,
-        "map": _MAP[program.count("\n") > _LONG],
+        "map": 75 if long else 150,
         "colours": {"growth": _colours("YlOrBr", 0.05), "heights": _colours("cividis", 0.0)},
         "surface": _waves(scene) if scene.contact.has_surface else None,
         "cycles": None if cycles is False else _cycles(scene, axes, progress),
@@ -165,7 +164,7 @@ def page(
     return re.sub(r"@(\w+)@", lambda placeholder: text[placeholder[1]], template)
 
 
-def explored(
+def slider_axes(
     scene: Scene, windows: Mapping[str, Any], cycles: bool | Mapping[str, int] = False
 ) -> tuple[list[Axis], Any]:
     """The axes of `windows`, and the scene with a number for each quantity among them.
@@ -180,7 +179,7 @@ def explored(
     for name in windows:
         require_quantity(scene, name)
     require_independent(scene, tuple(windows))
-    counts = dict(zip(windows, [*_NODES, *[_NODES[-1]] * len(windows)], strict=False))
+    counts = dict(zip(windows, [13, 5, *[3] * len(windows)], strict=False))
     counts |= cycles if isinstance(cycles, Mapping) else {}
     if unknown := counts.keys() - windows.keys():
         raise ValueError(f"cycles must name quantities of the sliders, got {', '.join(unknown)}")
@@ -211,7 +210,7 @@ def point(scene: Scene) -> dict[str, Any]:
         "slip": False,
     }
     if scene.contact.fractal:
-        regime = regime_of(scene)
+        regime = contact_regime(scene)
         numbers["plastic"] = regime == Regime.fully_plastic
         numbers["slip"] = regime == Regime.gross_slip
     if scene.contact.has_surface:
@@ -234,11 +233,11 @@ def _default(scene: Scene) -> dict[str, tuple[float, float]]:
         names = [name for name in ("K_n", "K_t/K_n", "mu") if name in quantities]
     windows = {}
     for name in names:
-        value, (low, high) = float(value_of(scene, name)), _AROUND[name]
+        value = float(value_of(scene, name))
         if name == "D":
-            windows[name] = max(2.001, value + low), min(2.999, value + high)
+            windows[name] = max(2.001, value - 0.05), min(2.999, value + 0.05)
         else:
-            windows[name] = value * low, value * high
+            windows[name] = value / 2, value * (1.5 if name in ("mu", "K_t/K_n") else 2.0)
     return windows
 
 
@@ -259,7 +258,8 @@ def _axis(scene: Scene, name: str, window: Any, count: int) -> Axis:
         nodes[k] = value
     else:
         nodes = np.sort(np.append(nodes, value))
-    place, refine = int(np.searchsorted(nodes, value)), math.ceil(_STOPS / (len(nodes) - 1))
+    place = int(np.searchsorted(nodes, value))
+    refine = math.ceil(120 / (len(nodes) - 1))  # a slider has 120 positions, or a few more
     words = label(scene, name).rsplit(" [", 1)[0]
     return Axis(name, words, unit(scene, name), log, nodes, place, refine)
 
@@ -282,22 +282,23 @@ def _base64(values: Any, kind: type) -> str:
 def _waves(scene: Scene) -> dict[str, Any]:
     """The sum of Eq. 13 over directions for each frequency; D and G only weight these sums."""
     surface, (L, L_s) = scene.contact.surface, WAVELENGTHS
-    waves = surface_waves(float(surface.gamma), _PIXELS)
+    n, directions = 96, 10  # enough for a picture; the page holds their sums
+    waves = surface_waves(float(surface.gamma), n, directions)
     return {
-        "n": _PIXELS,
+        "n": n,
         "L": L,
-        "M": _DIRECTIONS,
+        "M": directions,
         "count": len(waves),
         "band": f"wavelengths {1e6 * L_s:g} to {1e6 * L:g} µm",
         "waves": _base64(waves, np.float32),
     }
 
 
-def surface_waves(gamma: float, n: int) -> np.ndarray:
+def surface_waves(gamma: float, n: int, directions: int = 10) -> np.ndarray:
     """(frequencies, n, n): cos(phi) - cos(k.x + phi) summed over directions, with fixed phases."""
     count = int(frequency_count(np.float64(gamma), n / 2, np))
-    phases = 2 * np.pi * np.asarray(random_phases(jax.random.key(0), count, _DIRECTIONS))
-    angles = np.pi * np.arange(1, _DIRECTIONS + 1) / _DIRECTIONS
+    phases = 2 * np.pi * np.asarray(random_phases(jax.random.key(0), count, directions))
+    angles = np.pi * np.arange(1, directions + 1) / directions
     i = np.arange(n) / n
     waves = np.empty((count, n, n))
     for k in range(count):
@@ -310,8 +311,13 @@ def surface_waves(gamma: float, n: int) -> np.ndarray:
 # --- limit cycles ---------------------------------------------------------------------------
 
 
-def _cycles(scene, axes: Sequence[Axis], progress: bool) -> dict[str, Any]:
-    """Limit cycles at the nodes where sliding squeals, and the outcomes at the others in words."""
+def _cycles(
+    scene, axes: Sequence[Axis], progress: bool, batch: int = 32, samples: int = 96
+) -> dict[str, Any]:
+    """Limit cycles at the nodes where sliding squeals, and the outcomes at the others in words.
+
+    They are computed `batch` at once, and their orbits have `samples` points.
+    """
     from tqdm import tqdm
 
     names = tuple(axis.name for axis in axes)
@@ -331,11 +337,10 @@ def _cycles(scene, axes: Sequence[Axis], progress: bool) -> dict[str, Any]:
     orbits: list[Any] = []
     squeals = np.flatnonzero((state == 0) & (growth > 0))
     with tqdm(total=len(squeals), desc="limit cycles", disable=not progress) as bar:
-        for begin in range(0, len(squeals), _BATCH):
-            some = squeals[begin : begin + _BATCH]
+        for begin in range(0, len(squeals), batch):
+            some = squeals[begin : begin + batch]
             # A short batch repeats its nodes: one shape compiles once.
-            batch = nodes[np.resize(some, _BATCH)]
-            result, *arrays = _batch_of_cycles(scene, names, batch)
+            result, *arrays = _find_cycles(scene, names, nodes[np.resize(some, batch)], samples)
             arrays = [np.asarray(array) for array in arrays]
             for i, node in enumerate(some):
                 outcome = CycleResult[jax.tree.map(lambda x, i=i: x[i], result)]
@@ -349,7 +354,7 @@ def _cycles(scene, axes: Sequence[Axis], progress: bool) -> dict[str, Any]:
             bar.update(len(some))
     return {
         "nodes": [axis.nodes.tolist() for axis in axes],
-        "samples": _SAMPLES,
+        "samples": samples,
         "names": _CYCLE,
         "words": words,
         "state": _base64(state, np.int32),
@@ -359,14 +364,15 @@ def _cycles(scene, axes: Sequence[Axis], progress: bool) -> dict[str, Any]:
     }
 
 
-@functools.partial(exported_jit, static_argnames="names")
-def _batch_of_cycles(scene, names, nodes):
+@functools.partial(exported_jit, static_argnames=("names", "samples"))
+def _find_cycles(scene, names, nodes, samples):
     """Results, the numbers of `_CYCLE` and orbits (samples, [x1, v1]) for a batch of nodes."""
 
     def one(q):
         varied = substituted(scene, dict(zip(names, q, strict=True)))
-        cycle = limit_cycle(varied, max_returns=_MOST_RETURNS, throw=False)
-        _, states = cycle.orbit(_SAMPLES)
+        # Most settle long before; the page says which have not.
+        cycle = limit_cycle(varied, max_returns=500, throw=False)
+        _, states = cycle.orbit(samples)
         numbers = cycle.period, *cycle.amplitude, cycle.stick_fraction[0]
         return cycle.result, jnp.stack(numbers), states[:, jnp.array([0, 2])]
 

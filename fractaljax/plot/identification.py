@@ -11,7 +11,13 @@ from .axes import Axes, ensure_axes, legend_above
 
 
 def power_spectrum(result: Identification, ax: Axes | None = None) -> Axes:
-    """The measured one-sided spectrum over frequency, for a map over |(f_x, f_y)|."""
+    """The measured one-sided spectrum over frequency, for a map over |(f_x, f_y)|.
+
+    **Arguments:**
+
+    - `result`: as `identify` returns it.
+    - `ax`: axes to draw in, by default those of a new figure.
+    """
     ax, spectrum = ensure_axes(ax), result.spectrum
     ax.loglog(spectrum.f, spectrum.power, "-", color="0.72", lw=0.9, label="measured", zorder=1)
     ax.set_xlabel("frequency f [1/m]")
@@ -25,6 +31,11 @@ def identification(result: Identification, ax: Axes | None = None) -> Axes:
 
     The fit uses the white band only. A dashed line is the power law of the structure function, a
     dotted one the limit of the instrument.
+
+    **Arguments:**
+
+    - `result`: as `identify` returns it.
+    - `ax`: axes to draw in, by default those of a new figure.
     """
     ax = power_spectrum(result, ax)
     law, (low, high) = result.law, result.band

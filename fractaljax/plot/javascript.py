@@ -33,7 +33,6 @@ _MOVES = (
     "transpose",
     "rev",
 )
-_MOST = 20_000  # lines: beyond them a browser is too slow
 # A sum of positive terms, so that no digit is lost.
 _ERF = """const erf=x=>{
 if(!(Math.abs(x)<6))return x!==x?x:Math.sign(x);
@@ -45,7 +44,9 @@ return 2/Math.sqrt(Math.PI)*x*Math.exp(-x*x)*sum;
 _INSIDE = ("jaxpr", "call_jaxpr", "fun_jaxpr")  # parameters that hold a program in the program
 
 
-def javascript(function: Callable[..., Any], count: int, name: str) -> str:
+def javascript(
+    function: Callable[..., Any], count: int, name: str, *, max_lines: int = 20_000
+) -> str:
     """`function name(q)` that returns the numbers of `function(*q)`, a list of `count` numbers.
 
     `function` gives a pytree of real numbers; JavaScript gets them as a list, in the order of its
@@ -53,10 +54,10 @@ def javascript(function: Callable[..., Any], count: int, name: str) -> str:
     are written once.
 
     **Raises:** `ValueError` for a program with loops, with an operation without a counterpart, or
-    of more than 20000 lines.
+    of more than `max_lines`, for which a browser would be too slow.
     """
     closed = jax.make_jaxpr(function)(*[jnp.zeros(())] * count)
-    program = _Program()
+    program = _Program(max_lines)
     inputs = [f"q[{i}]" for i in range(count)]
     results = program.run(closed.jaxpr, [_literal(x) for x in closed.consts], inputs)
     body = "".join(f"const {key}={text};\n" for key, text in program.needed(results))
@@ -67,7 +68,8 @@ def javascript(function: Callable[..., Any], count: int, name: str) -> str:
 class _Program:
     """Lines, each a name for an expression of the names before it."""
 
-    def __init__(self):
+    def __init__(self, max_lines: int):
+        self.max_lines = max_lines
         self.names: dict[str, str] = {}  # by expression
         self.lines: dict[str, tuple[str, Sequence[str]]] = {}  # expression and what it needs
 
@@ -113,7 +115,7 @@ class _Program:
             raise ValueError(f"no JavaScript for the operation {kind} of complex numbers")
         arrays = [np.asarray(value, object) for value in values]
         if kind in _MOVES:
-            return [_plain(_moved(eqn, arrays))]
+            return [_plain(_rearrange(eqn, arrays))]
         if kind == "unstack":
             return [_plain(part) for part in np.moveaxis(arrays[0], params["axis"], 0)]
         if kind == "iota":
@@ -139,8 +141,8 @@ class _Program:
             if out.dtype == jnp.float32:
                 text = f"Math.fround({text})"
             names[place] = text if text in needs else self.name(text, needs)
-        if len(self.lines) > _MOST:
-            raise ValueError(f"no JavaScript for a program of more than {_MOST} lines")
+        if len(self.lines) > self.max_lines:
+            raise ValueError(f"no JavaScript for a program of more than {self.max_lines} lines")
         return _plain(names)
 
 
@@ -149,7 +151,7 @@ def _refusal(eqn: Any) -> ValueError:
     return ValueError(f"no JavaScript for the operation {eqn.primitive.name}, which gives {out}")
 
 
-def _moved(eqn: Any, arrays: list[np.ndarray]) -> np.ndarray:
+def _rearrange(eqn: Any, arrays: list[np.ndarray]) -> np.ndarray:
     """The numbers of arrays in their new places, from the same operation on their indices."""
     ends = np.cumsum([0, *(array.size for array in arrays)])
     indices = [

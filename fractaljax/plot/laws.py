@@ -18,8 +18,12 @@ _PANELS = {
 def law_curves(result: LawComparison, ax: Axes | None = None, *, show: str = "K_n") -> Axes:
     """One quantity of every law over the load; boundary elements as points with their scatter.
 
-    `show` is "K_n", "alpha" (d ln K_n/d ln P, with published values), "ratio" (K_t/K_n) or "share"
-    (real over nominal area).
+    **Arguments:**
+
+    - `result`: as `compare_laws` returns it.
+    - `ax`: axes to draw in, by default those of a new figure.
+    - `show`: "K_n", the default, "alpha" (d ln K_n/d ln P, with published values), "ratio"
+      (K_t/K_n) or "share" (real over nominal area).
 
     **Raises:** `ValueError` for any other `show`.
     """
@@ -61,7 +65,12 @@ def law_curves(result: LawComparison, ax: Axes | None = None, *, show: str = "K_
 
 
 def laws(result: LawComparison) -> Figure:
-    """K_n, its exponent, K_t/K_n and the real area by every law; returns the figure."""
+    """K_n, its exponent, K_t/K_n and the real area by every law; returns the figure.
+
+    **Arguments:**
+
+    - `result`: as `compare_laws` returns it.
+    """
     figure = new_figure(11.2, 8.4)
     for ax, show in zip(figure.subplots(2, 2).ravel(), _PANELS, strict=True):
         law_curves(result, ax, show=show)

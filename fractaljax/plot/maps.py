@@ -19,9 +19,14 @@ _SHADES = {
 def growth_map(result: Sweep, ax: Axes | None = None) -> Axes:
     """Growth rate [1/s] as labelled contours: filled where it squeals, dashed where it does not.
 
-    The sweep is of `stability` or of `growth_rate`. Hatched where a fractal contact is not
-    elastic-plastic: there the growth rate belongs to another mechanism; and, with another hatch,
-    where it is NaN, for example where a preloaded joint has no closed equilibrium.
+    Hatched where a fractal contact is not elastic-plastic: there the growth rate belongs to another
+    mechanism; and, with another hatch, where it is NaN, for example where a preloaded joint has no
+    closed equilibrium.
+
+    **Arguments:**
+
+    - `result`: a `Sweep` of `stability` or of `growth_rate` over two quantities.
+    - `ax`: axes to draw in, by default those of a new figure.
 
     **Raises:** `ValueError` unless the sweep has two axes, each with two values or more.
     """
@@ -37,9 +42,15 @@ def growth_map(result: Sweep, ax: Axes | None = None) -> Axes:
 
 
 def frequency_map(result: Sweep, ax: Axes | None = None, *, mode: int = 1) -> Axes:
-    """Frequency [kHz] of a mode of a sweep of `stability`, and the stability boundary.
+    """Frequency [kHz] of a mode over two quantities, and the stability boundary.
 
-    Mode 1 has the lowest frequency. Hatches are as in `growth_map`.
+    Hatches are as in `growth_map`.
+
+    **Arguments:**
+
+    - `result`: a `Sweep` of `stability` over two quantities.
+    - `ax`: axes to draw in, by default those of a new figure.
+    - `mode`: number of the mode, from 1, the default, which has the lowest frequency.
 
     **Raises:** `ValueError` for an unknown mode, and as `growth_map`.
     """
@@ -57,12 +68,17 @@ def frequency_map(result: Sweep, ax: Axes | None = None, *, mode: int = 1) -> Ax
 
 
 def stability_chart(result: Sweep, ax: Axes | None = None) -> Axes:
-    """The number of unstable modes over one or two quantities, from a sweep of `stability`.
+    """The number of unstable modes over one or two quantities.
 
     Over two, it has labelled contours of the growth rate [1/s] and the stability boundary, as in
-    `growth_map`; over one, the growth rate and its zero. A real part within rounding of 0 is
-    not unstable. The measure of the sweep may be any object with the `growth_rate`, `eigenvalues`,
-    `resolutions` and `counted` of a `Stability`.
+    `growth_map`; over one, the growth rate and its zero. A real part within rounding of 0 is not
+    unstable.
+
+    **Arguments:**
+
+    - `result`: a `Sweep` of `stability`, or of a measure that returns any object with the
+      `growth_rate`, `eigenvalues`, `resolutions` and `counted` of a `Stability`.
+    - `ax`: axes to draw in, by default those of a new figure.
 
     **Raises:** `ValueError` for a sweep of anything else, and unless it has one or two axes, each
     with two values or more.
@@ -138,7 +154,7 @@ def _shade(ax, x, y, inside, words: str, grey: str, hatch: str) -> list[Artist]:
     return [Patch(facecolor=grey, hatch=hatch, edgecolor="0.3", label=words)]
 
 
-def regime_of(scene: Scene) -> Regime:
+def contact_regime(scene: Scene) -> Regime:
     """The regime of a fractal contact."""
     return scene.contact.state(scene.friction.mu_s, scene.friction.mu_m).regime
 
@@ -158,7 +174,7 @@ def _start(result, ax):
     if not (isinstance(result.scene, Scene) and result.scene.contact.fractal):
         return ax, growth, shade_unsteady(ax, x, y, none)
     axes: Any = result.axes
-    regime = sweep(regime_of, result.scene, progress=False, **axes).values
+    regime = sweep(contact_regime, result.scene, progress=False, **axes).values
     inelastic = np.asarray(regime != Regime.elastic_plastic)
     if not inelastic.all():
         growth = np.ma.masked_where(inelastic, growth)

@@ -9,12 +9,10 @@ from jaxtyping import Float
 from .._mechanism.mesh import Mesh
 from .axes import new_figure
 
-_SHARE = 0.03  # largest displacement as drawn, over the size of the mesh
 
-
-def scale_of(mesh: Mesh, largest: float) -> float:
+def mesh_scale(mesh: Mesh, largest: float) -> float:
     """The factor that draws the largest displacement as 3 % of the size of the mesh."""
-    return _SHARE * float(np.linalg.norm(np.ptp(mesh.points, axis=0))) / largest
+    return 0.03 * float(np.linalg.norm(np.ptp(mesh.points, axis=0))) / largest
 
 
 def draw_mesh(

@@ -11,11 +11,11 @@ from .axes import (
     Axes,
     Figure,
     ensure_axes,
+    format_value,
     legend_above,
     lines,
     new_figure,
     set_quantity_axis,
-    value_of,
 )
 from .maps import frequency_map, growth_map, vibration_modes
 
@@ -30,9 +30,16 @@ def mode_lines(
     quantity: Literal["real", "frequency"] = "real",
     at: Sequence[float] | None = None,
 ) -> Axes:
-    """Real part or frequency of all modes over y, a colour for each of the values `at` of x.
+    """Real part or frequency of all modes over y, a colour for each of some values of x.
 
-    Without `at`, four of them. The nearest values of the sweep are shown, without interpolation.
+    The nearest values of the sweep are shown, without interpolation.
+
+    **Arguments:**
+
+    - `result`: a `Sweep` of `stability` over two quantities, x and y.
+    - `ax`: axes to draw in, by default those of a new figure.
+    - `quantity`: "real", the default, or "frequency".
+    - `at`: values of x, by default four of them.
 
     **Raises:** `ValueError` for a quantity that is neither "real" nor "frequency".
     """
@@ -42,7 +49,7 @@ def mode_lines(
     rows = [int(np.abs(x - value).argmin()) for value in at]
     if quantity == "real":
         ax.axhline(0, color="k", lw=0.8)
-    names = [value_of(result.scene, result.names[0], x[i]) for i in rows]
+    names = [format_value(result.scene, result.names[0], x[i]) for i in rows]
     handles = lines(ax, y, layers[rows], names)
     set_quantity_axis(ax, "x", result.scene, result.names[1], y)
     ax.set_ylabel(f"{_LABELS[quantity]} of all modes")
@@ -53,7 +60,12 @@ def mode_lines(
 def mode_surfaces(
     result: Sweep, ax: Any = None, *, quantity: Literal["real", "frequency"] = "real"
 ) -> Any:
-    """Real part or frequency of each mode as a surface over x and y; `ax` has to be 3D.
+    """Real part or frequency of each mode as a surface over x and y.
+
+    **Arguments:**
+
+    - `result`, `quantity`: as in `mode_lines`.
+    - `ax`: 3D axes to draw in, by default those of a new figure.
 
     **Raises:** `ValueError` for a quantity that is neither "real" nor "frequency".
     """
@@ -86,7 +98,12 @@ def mode_surfaces(
 
 
 def modes(result: Sweep) -> Figure:
-    """Growth rate, real parts, and the frequencies of modes 1 and 2; returns the figure."""
+    """Growth rate, real parts, and the frequencies of modes 1 and 2; returns the figure.
+
+    **Arguments:**
+
+    - `result`: a `Sweep` of `stability` over two quantities.
+    """
     figure = new_figure(11.2, 9.2)
     upper, lower = figure.subplots(2, 2)
     growth_map(result, upper[0])

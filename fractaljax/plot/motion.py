@@ -8,26 +8,17 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from .._base.parts import require_kind, scalar, whole
-from .._dynamics.cycle import STATE_NAMES, CycleResult, LimitCycle
-from .._dynamics.hybrid import OPEN
+from .._dynamics.contact_state import STATES, find_state
+from .._dynamics.cycle import CycleResult, LimitCycle
 from .._mechanism.mesh import Mesh
 from .._mechanism.reduced import ReducedStructure
 from .._mechanism.structure import Structure
 from .animation import animated, animation_path
 from .axes import Axes, Figure, frequency_unit, legend_above, new_figure
-from .mesh import draw_mesh, mesh_height, projection, scale_of
+from .mesh import draw_mesh, mesh_height, mesh_scale, projection
 
 if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
-
-_SAMPLES = 256  # of a period, at least
-_NAMED = 24  # joints with a name at their lane
-_STATES = {  # value in `contact_states`: colour, and words
-    1: ("tab:blue", "slips, t.dx/dt < V"),
-    -1: ("tab:cyan", "slips, t.dx/dt > V"),
-    0: ("tab:orange", "sticks"),
-    OPEN: ("tab:red", "open"),
-}
 
 
 def cycle_motion(
@@ -42,12 +33,17 @@ def cycle_motion(
 ) -> Figure:
     """A limit cycle at one time: the deformed mesh, and what each joint does over the period.
 
-    `structure` is the one of the cycle; for a reduced one, the mesh of the full one is drawn.
-    `points`, `dofs` and `cells` are as in `complex_mode`, by default from the structure's mesh.
-    `at` is the time as a share of the period, from `state` on. Displacements are from the mean over
-    the period, times `scale`, which by default draws the largest as 3 % of the size of the mesh;
-    the colour is the largest displacement of each node over the period. A mark on the mesh is at
+    The colour is the largest displacement of each node over the period. A mark on the mesh is at
     the mean place of the nodes that a joint's directions touch, in the colour of its contact state.
+
+    **Arguments:**
+
+    - `cycle`: as `limit_cycle` returns it.
+    - `structure`: the one of the cycle; for a reduced one, the mesh of the full one is drawn.
+    - `points`, `dofs`, `cells`: as in `complex_mode`, by default from the structure's mesh.
+    - `at`: the time as a share of the period, from `state` on; 0 by default.
+    - `scale`: factor of the displacements from their mean over the period, which by default draws
+      the largest as 3 % of the size of the mesh.
 
     **Raises:** `ValueError` if there is no limit cycle, for a batch, a regularised cycle, the cycle
     of another structure and a mesh that does not fit.
@@ -72,11 +68,18 @@ def animate_cycle(
 ) -> "FuncAnimation":
     """One period of a limit cycle in motion on its mesh, as matplotlib's animation.
 
-    Frame j is the picture of `cycle_motion` at j/frames of the period. `path` ends in .gif for a
-    picture, or in .html for one page with its frames and buttons inside, which needs no network.
-    Other arguments and errors are as for `cycle_motion`.
+    Frame j is the picture of `cycle_motion` at j/frames of the period.
 
-    **Raises:** `ValueError` for another ending; `OSError` if the file cannot be written.
+    **Arguments:**
+
+    - `cycle`, `structure`, `points`, `dofs`, `cells`, `scale`: as in `cycle_motion`.
+    - `frames`: number of pictures in the period, 24 by default.
+    - `fps`: frames per second, 12 by default.
+    - `path`: a file, by default none: it ends in .gif for a picture, or in .html for one page with
+      its frames and buttons inside, which needs no network.
+
+    **Raises:** as `cycle_motion`; `ValueError` for another ending; `OSError` if the file cannot be
+    written.
     """
     frames, fps, path = whole("frames", frames, 2), whole("fps", fps, 1), animation_path(path)
     motion = _motion(cycle, structure, points, dofs, cells, frames)
@@ -126,8 +129,8 @@ def _motion(
     elif (mesh := structure.mesh) is None:
         raise ValueError("structure has no mesh: give points, dofs and cells")
     mesh.require(n if reduced is None else len(reduced.V))
-    # The mean and the largest displacements need more times than are shown.
-    count = frames * -(-_SAMPLES // frames)
+    # The mean and the largest displacements need more times than are shown: 256 or a few more.
+    count = frames * -(-256 // frames)
     x = np.asarray(cycle.orbit(count)[1])[:, :n]
     x = x - x.mean(axis=0)
     x = x if reduced is None else x @ reduced.V.T
@@ -158,7 +161,7 @@ def _places(mesh: Mesh, touched: np.ndarray) -> np.ndarray:
 
 def _spans(cycle: LimitCycle, face: int, start: float) -> Iterator[tuple[float, float, int]]:
     """Yield begin [s], duration [s] and contact state, one after the other over a period."""
-    values = {name: value for value, name in STATE_NAMES.items()}
+    values = {state.name: state.code for state in STATES}
     begin, state = 0.0, int(start)
     for switch in cycle.switches():
         if switch.direction == face + 1:
@@ -175,7 +178,7 @@ def _picture(motion: _Motion, scale: float | None) -> tuple[Figure, Callable[[fl
     mesh, count = motion.mesh, len(motion.names)
     amplitudes = np.linalg.norm(motion.displacements, axis=2).max(axis=0)
     largest = float(amplitudes.max()) or 1.0
-    factor = scale_of(mesh, largest) if scale is None else float(scalar("scale", scale, above=0))
+    factor = mesh_scale(mesh, largest) if scale is None else float(scalar("scale", scale, above=0))
     heights = mesh_height(mesh), 1.1 + min(0.26 * count, 4.0)
     figure = new_figure(8.4, sum(heights))
     grid = figure.add_gridspec(2, 1, height_ratios=heights)
@@ -201,7 +204,7 @@ def _picture(motion: _Motion, scale: float | None) -> tuple[Figure, Callable[[fl
                 marks._offsets3d = tuple(at.T)
             else:
                 marks.set_offsets(at)
-            marks.set_facecolor([_STATES[int(state)][0] for state in motion.states[k]])
+            marks.set_facecolor([find_state(state).colour for state in motion.states[k]])
         return [cells, marks, cursor]
 
     return figure, draw
@@ -213,14 +216,16 @@ def _lanes(ax: Axes, motion: _Motion) -> Any:
 
     for i, spans in enumerate(motion.spans):
         bars = [(begin / motion.period, duration / motion.period) for begin, duration, _ in spans]
-        colours = [_STATES[state][0] for _, _, state in spans]
+        colours = [find_state(state).colour for _, _, state in spans]
         ax.broken_barh(bars, (i - 0.4, 0.8), facecolors=colours)
     passed = {state for spans in motion.spans for _, _, state in spans}
     shown = [
-        Patch(color=colour, label=words) for s, (colour, words) in _STATES.items() if s in passed
+        Patch(color=state.colour, label=state.description.format(velocity="t.dx/dt"))
+        for state in STATES
+        if state.code in passed
     ]
     legend_above(ax, shown)
-    few = len(motion.names) <= _NAMED
+    few = len(motion.names) <= 24  # more names would overlap
     ax.set_yticks(range(len(motion.names)) if few else [], motion.names if few else [])
     ax.set(xlim=(0, 1), ylim=(len(motion.names) - 0.5, -0.5))
     ax.set_xlabel("share of the period [-]")

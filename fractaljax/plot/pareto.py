@@ -9,7 +9,13 @@ from .axes import Axes, ensure_axes, legend_above
 
 
 def pareto(front: Front, ax: Axes | None = None) -> Axes:
-    """First against second objective, in their own units, coloured by the fractal dimension."""
+    """First against second objective, in their own units, coloured by the fractal dimension.
+
+    **Arguments:**
+
+    - `front`: as `pareto` returns it.
+    - `ax`: axes to draw in, by default those of a new figure.
+    """
     ax = ensure_axes(ax)
     handles: list[Any] = ax.plot(front.first, front.second, color="0.6", lw=1.1, label="front")
     order = np.argsort(front.D)

@@ -12,12 +12,10 @@ from .._mechanism.mesh import Mesh
 from .._stability.stability import Stability
 from .animation import animated, animation_path
 from .axes import Axes, ensure_axes, frequency_unit
-from .mesh import draw_mesh, scale_of
+from .mesh import draw_mesh, mesh_scale
 
 if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
-
-_NAMED = 24  # degrees of freedom named below their bars
 
 
 def complex_mode(
@@ -33,16 +31,23 @@ def complex_mode(
 ) -> Axes:
     """The displacement Re(shape exp(i phase)) of a mode: a deformed mesh coloured by amplitude.
 
-    `mode` is a shape (n,), or a `Stability` whose shape `index` is taken; for a reduced structure,
-    `reduced.full(modes.shapes[index])`. `points` (nodes, 2) or (nodes, 3) [m] are the places of the
-    nodes, `dofs`, of the same shape, the degree of freedom of each displacement, -1 where it is
-    held, and `cells` (cells, 3) or (cells, 4) the nodes of triangles or quadrilaterals, the outer
-    ones of a solid. For a solid, `ax` has to be 3D. `scale` is the factor of the displacements; by
-    default the largest amplitude is drawn as 3 % of the size of the mesh. The colour is the
-    greatest displacement of each node over a period, divided by the largest of all.
+    The colour is the greatest displacement of each node over a period, divided by the largest of
+    all. Without `points` there is a bar for each degree of freedom, coloured by its phase, within a
+    pale one that shows its amplitude.
 
-    Without `points` there is a bar for each degree of freedom, coloured by its phase, within a pale
-    one that shows its amplitude.
+    **Arguments:**
+
+    - `mode`: a shape (n,), or a `Stability`; for a reduced structure,
+      `reduced.full(modes.shapes[index])`.
+    - `index`: which shape of a `Stability` is drawn, from 0, the default.
+    - `ax`: axes to draw in, by default those of a new figure; for a solid they have to be 3D.
+    - `points`: (nodes, 2) or (nodes, 3), places of the nodes [m]; by default there is no mesh.
+    - `dofs`: of the same shape, the degree of freedom of each displacement, -1 where it is held.
+    - `cells`: (cells, 3) or (cells, 4), the nodes of triangles or quadrilaterals, the outer ones of
+      a solid.
+    - `phase`: [rad], 0 by default.
+    - `scale`: factor of the displacements; by default the largest amplitude is drawn as 3 % of the
+      size of the mesh.
 
     **Raises:** `ValueError` for a batch, an unknown index, and a mesh that does not fit.
     """
@@ -65,11 +70,15 @@ def animate_mode(
 ) -> "FuncAnimation":
     """One period of a mode in motion, Re(shape exp(i omega t)), as matplotlib's animation.
 
-    Frame j has the phase omega t = 2 pi j/frames; growth is left out. Other arguments and errors
-    are as for `complex_mode`. `path` ends in .gif for a picture, or in .html for one page with its
-    frames and buttons inside, which needs no network.
+    Frame j has the phase omega t = 2 pi j/frames; growth is left out.
 
-    **Raises:** `ValueError` for another ending; `OSError` if the file cannot be written.
+    **Arguments:**
+
+    - `mode`, `index`, `points`, `dofs`, `cells`, `scale`: as in `complex_mode`.
+    - `frames`, `fps`, `path`: as in `animate_cycle`.
+
+    **Raises:** as `complex_mode`; `ValueError` for another ending; `OSError` if the file cannot be
+    written.
     """
     frames, fps, path = whole("frames", frames, 2), whole("fps", fps, 1), animation_path(path)
     ax, draw = _picture(mode, index, None, points, dofs, cells, scale)
@@ -89,7 +98,7 @@ def _picture(
     mode: Any, index: int, ax: Any, points: Any, dofs: Any, cells: Any, scale: float | None
 ) -> tuple[Any, Callable[[float], Any]]:
     """The axes, and a function that draws a phase on them."""
-    shape, words, names = _shape_of(mode, index)
+    shape, words, names = _read_shape(mode, index)
     if points is None:
         ax, move = _bars(shape, names, ensure_axes(ax))
     else:
@@ -106,7 +115,7 @@ def _picture(
     return ax, draw
 
 
-def _shape_of(mode: Any, index: int) -> tuple[np.ndarray, list[str], Any]:
+def _read_shape(mode: Any, index: int) -> tuple[np.ndarray, list[str], Any]:
     """A shape (n,), the numbers of its mode, and the names of its degrees of freedom."""
     if not isinstance(mode, Stability):
         shape = np.asarray(mode)
@@ -129,7 +138,7 @@ def _deformed(
     motion = mesh.displacements(shape)
     amplitudes = _amplitudes(motion)
     largest = float(amplitudes.max()) or 1.0
-    factor = scale_of(mesh, largest) if scale is None else scale
+    factor = mesh_scale(mesh, largest) if scale is None else scale
     ax, drawn, move = draw_mesh(mesh, ax, factor * largest, amplitudes / largest, 1.0)
     bar = ax.figure.colorbar(drawn, ax=ax, location="bottom", shrink=0.6, aspect=40)
     bar.set_label("amplitude, of the largest [-]")
@@ -147,7 +156,7 @@ def _bars(shape: Any, names: Any, ax: Axes) -> tuple[Axes, Callable[[complex], A
     bars = ax.bar(x, unit.real, 0.5, color=colours.to_rgba(np.angle(unit, deg=True)))
     ax.axhline(0, color="k", lw=0.8)
     ax.set(ylim=(-1.1, 1.1), xlabel="degree of freedom", ylabel="displacement, of the largest [-]")
-    if len(x) <= _NAMED:
+    if len(x) <= 24:  # more names would overlap
         ax.set_xticks(x, names or [str(i) for i in x], rotation=0 if names is None else 90)
     bar = ax.figure.colorbar(colours, ax=ax, pad=0.02, ticks=range(-180, 181, 90))
     bar.set_label("phase of the shape [°]")

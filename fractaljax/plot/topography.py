@@ -13,9 +13,14 @@ from .axes import Axes, Figure, ensure_axes, new_figure
 def topography(
     z: Float[ArrayLike, "n m"], dx: float, ax: Axes | None = None, *, dy: float | None = None
 ) -> Axes:
-    """Heights [um] of a map z (n, m) [m] about their mean; x [um] along its first axis.
+    """Heights [um] of a map about their mean; x [um] along its first axis.
 
-    Points are dx [m] apart, and dy (dx, if not given) along the second axis; NaN is left white.
+    **Arguments:**
+
+    - `z`: heights (n, m) [m]; NaN is left white.
+    - `dx`: distance of points along the first axis [m].
+    - `ax`: axes to draw in, by default those of a new figure.
+    - `dy`: distance of points along the second axis [m], by default dx.
 
     **Raises:** `ValueError` for a z that is no map or holds no height, and unless dx, dy > 0.
     """
@@ -25,7 +30,7 @@ def topography(
     steps = dx, dx if dy is None else dy
     if not all(np.isfinite(step) and step > 0 for step in steps):
         raise ValueError(f"dx and dy must be above 0, got {steps[0]!r} and {steps[1]!r}")
-    ax, heights = ensure_axes(ax), _about_mean(z)
+    ax, heights = ensure_axes(ax), _subtract_mean(z)
     image = _draw(ax, heights, steps, np.nanmin(heights), np.nanmax(heights))
     ax.figure.colorbar(image, ax=ax, pad=0.02).set_label("height about the mean [µm]")
     return ax
@@ -34,14 +39,17 @@ def topography(
 def topographies(design: Design, **options: Any) -> Figure:
     """The given and the designed surface side by side, at one colour scale; returns the figure.
 
-    `options` are those of `Design.topographies`.
+    **Arguments:**
+
+    - `design`: as `design` returns it.
+    - `options`: those of `Design.topographies`.
     """
     return drawn_topographies(design, design.topographies(**options))
 
 
 def drawn_topographies(design: Design, surfaces: Topographies) -> Figure:
     """As `topographies`, of surfaces that are computed already."""
-    heights = [_about_mean(z) for z in (surfaces.before, surfaces.after)]
+    heights = [_subtract_mean(z) for z in (surfaces.before, surfaces.after)]
     low, high = min(z.min() for z in heights), max(z.max() for z in heights)
     figure = new_figure(11.2, 5.4)
     figure.set_layout_engine("constrained", wspace=0.06)
@@ -57,7 +65,7 @@ def drawn_topographies(design: Design, surfaces: Topographies) -> Figure:
     return figure
 
 
-def _about_mean(z):
+def _subtract_mean(z):
     return (z - np.nanmean(z)) * 1e6
 
 

@@ -5,19 +5,22 @@ import numpy as np
 from .._stability.tracks import ModeTracks
 from .axes import Figure, frequency_unit, legend_above, lines, new_figure, set_quantity_axis
 
-_ROUNDING = 1e-9  # of |s|: a smaller growth rate has no sign
-_NAMED = 9  # modes in the legend
 
-
-def mode_tracks(tracks: ModeTracks) -> Figure:
+def mode_tracks(tracks: ModeTracks, *, most: int = 9) -> Figure:
     """Growth rate [1/s] and frequency of all modes over the quantity; returns the figure.
 
-    A mode is drawn thick where it is unstable. If there are more than nine, only modes that are
+    A mode is drawn thick where it is unstable. If there are more than `most`, only modes that are
     unstable somewhere have a colour, and the axes show their range; the others are grey.
+
+    **Arguments:**
+
+    - `tracks`: as `track_modes` returns them.
+    - `most`: modes that have a colour and a name in the legend, 9 by default.
     """
     x, growth = tracks.values, tracks.growth_rates
-    unstable = growth > _ROUNDING * np.abs(tracks.eigenvalues)
-    chosen = np.flatnonzero(unstable.any(axis=0) | (len(growth.T) <= _NAMED))
+    # The growth rate of an undamped mode is a rounding error of |s|.
+    unstable = growth > 1e-9 * np.abs(tracks.eigenvalues)
+    chosen = np.flatnonzero(unstable.any(axis=0) | (len(growth.T) <= most))
     factor, hertz = frequency_unit(tracks.frequencies)
     figure = new_figure(8.4, 8.0)
     panels = figure.subplots(2, 1, sharex=True)
@@ -38,6 +41,6 @@ def mode_tracks(tracks: ModeTracks) -> Figure:
     panels[0].axhline(0, color="k", lw=0.8)
     panels[0].set_xlabel("")
     if handles:
-        legend_above(panels[0], handles[:_NAMED])
+        legend_above(panels[0], handles[:most])
     figure.align_ylabels()
     return figure

@@ -19,6 +19,10 @@ _STYLES = "solid", "dashed", "dashdot", "dotted"
 def validation(case: ValidatedCase) -> Figure:
     """The curves of a published case: theirs as marks or dashed, ours as lines; the figure.
 
+    **Arguments:**
+
+    - `case`: a member of `Validation.cases`.
+
     **Raises:** `ValueError` for a case that did not run.
     """
     import matplotlib as mpl

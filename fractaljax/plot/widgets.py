@@ -19,20 +19,22 @@ from .._surface.topography import topography
 from .axes import new_figure
 from .cycle import cycle as draw_cycle
 from .design import stability_map
-from .explore import WAVELENGTHS, Axis, explored
-from .maps import regime_of
+from .explore import WAVELENGTHS, Axis, slider_axes
+from .maps import contact_regime
 from .shapes import complex_mode
 from .topography import topography as draw_topography
-
-_POINTS = 128  # of a side of the surface
 
 
 def explore(scene: Scene, **windows: tuple[float, float]) -> Any:
     """Sliders over the quantities of a scene, for a notebook: a widget to end a cell with.
 
-    `windows` are as for `plot.explore`, which writes a page for those without Python. Beside the
-    sliders are the numbers of `stability` and `stiffness`, the map of the first two quantities with
-    the point on it, the surface and the mode. A button finds the limit cycle.
+    Beside the sliders are the numbers of `stability` and `stiffness`, the map of the first two
+    quantities with the point on it, the surface and the mode. A button finds the limit cycle.
+
+    **Arguments:**
+
+    - `scene`: a scene of scalars.
+    - `windows`: as for `plot.explore`, which writes a page for those without Python.
 
     **Raises:** `ImportError` unless ipywidgets is installed; else as `plot.explore`, except that
     any contact law is accepted.
@@ -41,7 +43,7 @@ def explore(scene: Scene, **windows: tuple[float, float]) -> Any:
         import ipywidgets
     except ImportError:
         raise ImportError("explore needs ipywidgets: python -m pip install ipywidgets") from None
-    axes, scene = explored(scene, windows)
+    axes, scene = slider_axes(scene, windows)
     sliders = {axis.name: _slider(ipywidgets, axis) for axis in axes}
     numbers, words = ipywidgets.HTML(), ipywidgets.HTML()
     pictures = {name: ipywidgets.Image(format="png") for name in ("map", "surface", "mode")}
@@ -102,7 +104,7 @@ def _table(scene: Scene) -> str:
     if scene.contact.has_surface:
         rows["Sq"] = f"{roughness(scene.contact.surface, *WAVELENGTHS).Sq:.5g} m"
     if scene.contact.fractal:
-        rows["regime"] = Regime[regime_of(scene)]
+        rows["regime"] = Regime[contact_regime(scene)]
     cells = (f"<tr><td>{name}</td><td>{html.escape(text)}</td></tr>" for name, text in rows.items())
     return f"<table>{''.join(cells)}</table>"
 
@@ -128,9 +130,9 @@ class _Map:
 
 
 def _surface(scene: Scene) -> bytes:
-    L = WAVELENGTHS[0]
-    z = topography(scene.contact.surface, L, _POINTS, key=jax.random.key(0))
-    return _png(draw_topography(z, L / _POINTS, new_figure(5.6, 4.8).add_subplot()).figure)
+    L, n = WAVELENGTHS[0], 128  # points on a side: a surface is drawn in a moment
+    z = topography(scene.contact.surface, L, n, key=jax.random.key(0))
+    return _png(draw_topography(z, L / n, new_figure(5.6, 4.8).add_subplot()).figure)
 
 
 def _mode(scene: Scene) -> bytes:

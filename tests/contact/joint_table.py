@@ -48,8 +48,8 @@ def _everything(x):
     names = [name for name in vars(state) if name != "regime"]
 
     def numbers(move):
-        moved = vars(_state(jnp.where(ABSOLUTE, x + move, x * jnp.exp(move))))
-        return jnp.stack([moved[name] for name in names])
+        values = vars(_state(jnp.where(ABSOLUTE, x + move, x * jnp.exp(move))))
+        return jnp.stack([values[name] for name in names])
 
     _, *slopes = both_modes(numbers, jnp.zeros_like(x))
     return state, *(dict(zip(names, slope, strict=True)) for slope in slopes)
@@ -61,8 +61,8 @@ def everything(x, dtype: Any = np.float64):
     Derivatives are by each input, or by its logarithm. All calls share one compiled program.
     """
     padded = np.pad(x, ((0, len(ROWS) - len(x)), (0, 0)), mode="edge")
-    found = _everything(jnp.asarray(padded, dtype))
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[: len(x)], found)
+    computed = _everything(jnp.asarray(padded, dtype))
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[: len(x)], computed)
 
 
 def reference_joints(**changes):

@@ -125,14 +125,14 @@ def test_area_and_stiffness_are_the_quadrature(point):
 @pytest.mark.parametrize("point", POINTS[:5:4], ids=str)
 def test_slopes_under_a_fixed_load_are_those_of_the_quadrature(point):
     D, G, L_s, _ = point
-    given = [D, *map(math.log, (G, L_s, E, SIGMA_Y, H))]
+    parameters = [D, *map(math.log, (G, L_s, E, SIGMA_Y, H))]
     log_P = oracle(point)[1]
-    _, *found = slopes_of_log_K_n(jnp.asarray(given), log_P)
+    _, *both_slopes = slopes_of_log_K_n(jnp.asarray(parameters), log_P)
     with mpmath.workdps(40):
         row, h = exact_row(point), mpf("1e-9")
 
         def slope(i):
-            """Of ln P and ln K_n by the ith of ln b, D, ln G, ..."""
+            """Slopes of ln P and ln K_n by the ith of ln b, D, ln G, ..."""
             ends = [exact(*row[:i], row[i] + x, *row[i + 1 :])[1:] for x in (-h, h)]
             return [(mp.log(b) - mp.log(a)) / (2 * h) for a, b in zip(*ends, strict=True)]
 
@@ -140,7 +140,7 @@ def test_slopes_under_a_fixed_load_are_those_of_the_quadrature(point):
         for i in range(len(NAMES)):
             load, stiffness = slope(i + 1)
             expected = float(stiffness - of_stiffness * load / of_load)
-            for slopes in found:
+            for slopes in both_slopes:
                 assert float(slopes[i]) == pytest.approx(expected, rel=1e-9, abs=1e-11), NAMES[i]
 
 
@@ -194,14 +194,14 @@ def test_the_mean_over_depths_has_zhao_s_asperity_as_its_slope(log_y):
 
 @pytest.mark.parametrize("D", [2.1, 2.4, 2.8])
 def test_small_loads_touch_the_smallest_bases_only(D):
-    found = alpha(D, math.log(1e-10), math.log(1e-8), LOG_L_S)
-    assert float(found) == pytest.approx(1, abs=1e-6)
+    exponent = alpha(D, math.log(1e-10), math.log(1e-8), LOG_L_S)
+    assert float(exponent) == pytest.approx(1, abs=1e-6)
 
 
 @pytest.mark.parametrize("D", [2.1, 2.3])
 def test_elastic_joints_follow_the_power_law_of_the_largest_base(D):
-    found = alpha(D, math.log(1e-25), 0.0, math.log(1e-9))
-    assert float(found) == pytest.approx((D - 1) / (4 - D), abs=0.03)
+    exponent = alpha(D, math.log(1e-25), 0.0, math.log(1e-9))
+    assert float(exponent) == pytest.approx((D - 1) / (4 - D), abs=0.03)
 
 
 @functools.cache
@@ -216,8 +216,8 @@ def _batch():
 def test_finite_and_positive_from_1_newton_to_1e6_with_gradients_of_three_orders():
     exact, slopes = jax.jit(jax.vmap(jax.value_and_grad(log_K_n, (0, 1, 2, 3))))(*_batch())
     bend = jax.jit(jax.vmap(jax.grad(jax.grad(jax.grad(log_K_n, 2), 2), 2)))(*_batch())
-    for found in (exact, *slopes, bend):
-        assert np.isfinite(found).all()
+    for numbers in (exact, *slopes, bend):
+        assert np.isfinite(numbers).all()
     assert (np.asarray(slopes[2]) > 0).all() and (np.asarray(slopes[2]) < 1.1).all()
     with jax.enable_x64(False):
         single = [jnp.asarray(x, jnp.float32) for x in _batch()]
@@ -245,8 +245,8 @@ def test_domain_extension_solves_its_equation(D):
             return (grown - rest) / ((3 - exact) / (exact - 1)) - 1
 
         expected = float(mp.log(mp.findroot(excess, 2)))
-    found = asperity.log_domain_extension(jnp.asarray(float(D)))
-    assert float(found) == pytest.approx(expected, rel=1e-13)
+    log_psi = asperity.log_domain_extension(jnp.asarray(float(D)))
+    assert float(log_psi) == pytest.approx(expected, rel=1e-13)
 
 
 def test_domain_extension_shares_the_load_and_has_known_ends():
@@ -281,11 +281,11 @@ def test_scene_comes_back_from_its_file_and_has_gradients():
 
     x, h = jnp.array([2.4, math.log(1.342e-10)]), 1e-5
     program = jax.jit(lambda x: both_modes(growth, x))
-    value, *found = program(x)
+    value, *both_slopes = program(x)
     assert float(value) == pytest.approx(float(fj.growth_rate(scene)), rel=1e-9)
     for i, step in enumerate(h * np.eye(2)):
         slope = (program(x + step)[0] - program(x - step)[0]) / (2 * h)
-        for slopes in found:
+        for slopes in both_slopes:
             assert float(slopes[i]) == pytest.approx(float(slope), rel=1e-6)
 
 
@@ -304,6 +304,6 @@ def test_boundary_elements_are_softer_and_as_sensitive():
     ).curves
     ratio = compared["asperity"].K_n / compared["boundary elements"].K_n
     assert (np.asarray(ratio) > 1).all() and (np.asarray(ratio) < 3).all()
-    given = (2.4, math.log(1.342e-10), math.log(1907.3), math.log(1e-4))
-    slopes = jax.grad(log_K_n, (0, 1))(*given)
+    parameters = (2.4, math.log(1.342e-10), math.log(1907.3), math.log(1e-4))
+    slopes = jax.grad(log_K_n, (0, 1))(*parameters)
     assert 12 < float(slopes[0]) < 14 and -0.4 < float(slopes[1]) < -0.25

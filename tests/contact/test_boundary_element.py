@@ -38,15 +38,15 @@ def hertz_errors(n):
     x = (np.arange(n) + 0.5) / n * L - L / 2
     P, images = 4 * E * a**3 / (3 * R), 3.900264920 / np.pi / (E * L)
     h = -np.add.outer(x**2, x**2) / 2 * (1 / R - P * 9.0336217 / (2 * np.pi * E * L**3))
-    wanted = {
+    expected = {
         "area": np.pi * a**2,
         "peak": 3 * P / (2 * np.pi * a**2),
         "K_n": 1 / (1 / (2 * E * a) - images),
         "mean_gap": -h.mean() - a**2 / R + images * P,
     }
     s = fj.boundary_element(h, L / n, MATERIAL, P)
-    found = {"area": s.area, "peak": s.pressure.max(), "K_n": s.K_n, "mean_gap": s.mean_gap}
-    return {name: abs(float(found[name]) / wanted[name] - 1) for name in wanted}
+    computed = {"area": s.area, "peak": s.pressure.max(), "K_n": s.K_n, "mean_gap": s.mean_gap}
+    return {name: abs(float(computed[name]) / expected[name] - 1) for name in expected}
 
 
 def test_hertz():
@@ -115,8 +115,8 @@ def bordered(S, inside, right, total):
     """(p, g) of S p + g = right inside, of the sum `total` inside."""
     k = inside.sum()
     A = np.block([[S[np.ix_(inside, inside)] * E / DX, np.ones((k, 1))], [np.ones(k), 0]])
-    found = np.linalg.solve(A, np.append(right[inside], total * DX / E))
-    return found[:-1] * E / DX, found[-1]
+    solution = np.linalg.solve(A, np.append(right[inside], total * DX / E))
+    return solution[:-1] * E / DX, solution[-1]
 
 
 def by_active_set(S, h, total):
@@ -167,7 +167,7 @@ def test_plastic_beside_a_quadratic_program(fraction):
     S, P = dense(shape) * E / DX, load(h, fraction)
     flat, mean, limit = (h - h.mean()).ravel() / DX, fraction * H / E, H / E
     scale = np.abs(flat).max()
-    found = minimize(
+    optimum = minimize(
         lambda p: ((p @ S @ p / 2 - flat @ p) / scale**2, (S @ p - flat) / scale**2),
         np.full(h.size, mean),
         jac=True,
@@ -180,8 +180,8 @@ def test_plastic_beside_a_quadratic_program(fraction):
         method="SLSQP",
         options={"ftol": 1e-15, "maxiter": 1000},
     )
-    yields = found.x > limit * (1 - 1e-5)
-    inside = (found.x > limit * 1e-5) & ~yields
+    yields = optimum.x > limit * (1 - 1e-5)
+    inside = (optimum.x > limit * 1e-5) & ~yields
     p = np.where(yields, limit, 0.0)
     right, total = (flat - S @ p) * DX, P / DX**2 - H * yields.sum()
     p[inside], g = bordered(S * DX / E, inside, right, total)
@@ -189,9 +189,9 @@ def test_plastic_beside_a_quadratic_program(fraction):
     s = tight(h, DX, MATERIAL, P, plastic=True)
     assert yields.any() and inside.any()
     np.testing.assert_allclose(s.pressure.ravel() / E, p, rtol=1e-9, atol=1e-9 * limit)
-    apart = S @ p + g / DX - flat
-    assert (apart[p == 0] >= 0).all() and (apart[yields] <= 0).all()
-    assert float(s.mean_gap) == pytest.approx(np.maximum(apart, 0).mean() * DX, rel=1e-8)
+    gap = S @ p + g / DX - flat
+    assert (gap[p == 0] >= 0).all() and (gap[yields] <= 0).all()
+    assert float(s.mean_gap) == pytest.approx(np.maximum(gap, 0).mean() * DX, rel=1e-8)
     assert float(s.area) == pytest.approx((p > 0).sum() * DX**2)
     assert float(s.pressure.sum()) * DX**2 == pytest.approx(P, rel=1e-12)
     assert float(s.pressure.max()) <= H * (1 + 1e-15) and (s.gap >= 0).all()
@@ -265,11 +265,11 @@ def test_derivatives_of_pressure_gap_and_stiffness():
         heights = h * jnp.exp(log_height)
         return jnp.log(fj.boundary_element(heights, DX, material, P * jnp.exp(log_P)).K_n)
 
-    wanted = 1 / np.log(1 / 0.3)
+    expected = 1 / np.log(1 / 0.3)
     _, *slopes = jax.jit(lambda x: both_modes(log_K_n, x))(jnp.zeros(3))
     for by_height, by_P, by_E in slopes:
-        assert float(by_P) == pytest.approx(wanted, rel=0.04)
-        assert float(by_height) == pytest.approx(-wanted, rel=0.04)
+        assert float(by_P) == pytest.approx(expected, rel=0.04)
+        assert float(by_height) == pytest.approx(-expected, rel=0.04)
         assert float(by_P + by_E) == pytest.approx(1, rel=1e-9)  # K_n/E depends on P/E alone
 
 
@@ -278,20 +278,20 @@ def test_derivatives_of_a_surface_and_many_seeds():
     """d mean gap and d ln K_n to D and ln G; `vmap` over seeds equals one by one."""
     L, n = 1e-3, 16
 
-    def found(x, key):
+    def solve(x, key):
         surface = fj.Surface(x[0], jnp.exp(x[1]), 1.5)
         s = tight(fj.topography(surface, L, n, key=key), L / n, MATERIAL, 5.0)
         return jnp.stack([s.mean_gap * 1e6, jnp.log(s.K_n)])
 
     # Two contacts in the last: by symmetry their first guess leaves nothing but rounding.
     x, keys = jnp.array([2.4, np.log(1e-9)]), jax.random.split(jax.random.key(3), 3)
-    value, slope = (jax.jit(jax.vmap(f, (None, 0))) for f in (found, jax.jacrev(found)))
+    value, slope = (jax.jit(jax.vmap(f, (None, 0))) for f in (solve, jax.jacrev(solve)))
     many = slope(x, keys)
     for i, step in enumerate(1e-5 * np.eye(2)):
         up, down = value(x + step, keys), value(x - step, keys)
         np.testing.assert_allclose(many[:, 0, i], (up - down)[:, 0] / 2e-5, rtol=1e-6)
     assert np.isfinite(many).all()
-    np.testing.assert_allclose(value(x, keys)[2], jax.jit(found)(x, keys[2]), rtol=1e-10)
+    np.testing.assert_allclose(value(x, keys)[2], jax.jit(solve)(x, keys[2]), rtol=1e-10)
     K_n = np.exp(value(x, keys)[:, 1])
     assert (K_n < 2e7).all() and np.ptp(K_n) > 1e6
 
@@ -347,11 +347,11 @@ def test_float32():
     for plastic in (False, True):
         s = fj.boundary_element(ROUGH, DX, MATERIAL, P, plastic=plastic)
         half = [jnp.float32(x) for x in (ROUGH, DX, P)]
-        found = fj.boundary_element(half[0], half[1], material, half[2], plastic=plastic)
-        assert found.K_n.dtype == found.pressure.dtype == jnp.float32
-        np.testing.assert_allclose(found.pressure, s.pressure, atol=1e-4 * float(s.pressure.max()))
-        assert float(found.K_n) == pytest.approx(float(s.K_n), rel=1e-4)
-        assert float(found.mean_gap) == pytest.approx(float(s.mean_gap), rel=1e-4)
+        single = fj.boundary_element(half[0], half[1], material, half[2], plastic=plastic)
+        assert single.K_n.dtype == single.pressure.dtype == jnp.float32
+        np.testing.assert_allclose(single.pressure, s.pressure, atol=1e-4 * float(s.pressure.max()))
+        assert float(single.K_n) == pytest.approx(float(s.K_n), rel=1e-4)
+        assert float(single.mean_gap) == pytest.approx(float(s.mean_gap), rel=1e-4)
 
     mixed = fj.boundary_element(half[0], DX, MATERIAL, half[2])  # the wider of two precisions
     assert mixed.pressure.dtype == mixed.K_n.dtype == jnp.float64
@@ -361,6 +361,7 @@ def test_float32():
 def test_what_does_not_converge_says_so(plastic):
     call = partial(fj.boundary_element, ROUGH, DX, MATERIAL, load(ROUGH, 0.3), plastic=plastic)
     assert call(rtol=1e-30, throw=False).result == KINDS.not_converged
+    assert call(max_steps=2, throw=False).result == KINDS.not_converged
     with pytest.raises(RuntimeError, match=r"^boundary elements did not converge: rtol may be too"):
         call(rtol=1e-30)
 
@@ -373,6 +374,7 @@ test_refusals = refusals(
         ({"P": -1.0}, r"^P must be above 0, got -1\.0$"),
         ({"P": np.ones(2)}, r"^P must be a single number, got shape \(2,\)$"),
         ({"rtol": 0}, r"^rtol must be above 0 and below 1, got 0\.0$"),
+        ({"max_steps": 0}, r"^max_steps must be a whole number of at least 1, got 0$"),
         ({"plastic": 1}, "^plastic must be True or False, got 1$"),
     ],
     lambda change: fj.boundary_element(
@@ -392,10 +394,10 @@ def test_many_points(plastic):
     q = 2 * np.pi / L * np.hypot(*np.meshgrid(*[np.fft.fftfreq(n) * n] * 2))
     S = np.divide(2 / E, q, out=np.zeros_like(q), where=q > 0)
     p = np.asarray(s.pressure)
-    apart = np.real(np.fft.ifft2(S * np.fft.fft2(p))) - h + h.mean()
+    gap = np.real(np.fft.ifft2(S * np.fft.fft2(p))) - h + h.mean()
     free = (p > 0) & (p < H * (1 - 1e-12) if plastic else True)
-    apart -= apart[free].mean()
+    gap -= gap[free].mean()
     rms = float(h.std())
-    assert np.abs(apart[free]).max() < 2e-9 * rms and apart[p == 0].min() > -2e-9 * rms
+    assert np.abs(gap[free]).max() < 2e-9 * rms and gap[p == 0].min() > -2e-9 * rms
     assert p.mean() * L**2 == pytest.approx(50, rel=1e-12)
-    assert not plastic or apart[p >= H * (1 - 1e-12)].max() < 2e-9 * rms
+    assert not plastic or gap[p >= H * (1 - 1e-12)].max() < 2e-9 * rms

@@ -28,17 +28,17 @@ def test_the_same_contact(shape, mean, name, tolerance):
     """Pressure, gap, area, mean gap, and K_n, the peer's by differences within one outline."""
     import_or_skip(half_spaces.PEERS[name][0])
     heights, total = rough(shape), shape[0] * shape[1] * DX**2
-    found = fj.boundary_element(heights, DX, MATERIAL, mean * total, rtol=1e-12)
+    ours = fj.boundary_element(heights, DX, MATERIAL, mean * total, rtol=1e-12)
     pressure, gap = pressed(name, heights, DX, E, mean, tolerance)
-    np.testing.assert_allclose(found.pressure, pressure, rtol=0, atol=1e-9 * pressure.max())
-    np.testing.assert_allclose(found.gap, gap, rtol=0, atol=1e-9 * heights.std())
-    assert float(found.mean_gap) == pytest.approx(gap.mean(), rel=1e-9)
-    assert float(found.area) == pytest.approx((pressure > 0).mean() * total, rel=1e-12)
+    np.testing.assert_allclose(ours.pressure, pressure, rtol=0, atol=1e-9 * pressure.max())
+    np.testing.assert_allclose(ours.gap, gap, rtol=0, atol=1e-9 * heights.std())
+    assert float(ours.mean_gap) == pytest.approx(gap.mean(), rel=1e-9)
+    assert float(ours.area) == pytest.approx((pressure > 0).mean() * total, rel=1e-12)
     step = 1e-6
     ends = [pressed(name, heights, DX, E, mean * (1 + s * step), tolerance) for s in (1, -1)]
     assert all(((p > 0) == (pressure > 0)).all() for p, _ in ends)
     K_n = 2 * step * mean * total / (ends[1][1].mean() - ends[0][1].mean())
-    assert float(found.K_n) == pytest.approx(K_n, rel=1e-6)
+    assert float(ours.K_n) == pytest.approx(K_n, rel=1e-6)
 
 
 @pytest.mark.parametrize("shape", [(32, 48), (48, 64)])
@@ -48,12 +48,12 @@ def test_the_same_yielding_contact(shape, fraction):
     import_or_skip("tamaas")
     heights, mean = rough(shape), fraction * H
     total = heights.size * DX**2
-    found = fj.boundary_element(heights, DX, MATERIAL, mean * total, plastic=True, rtol=1e-11)
+    ours = fj.boundary_element(heights, DX, MATERIAL, mean * total, plastic=True, rtol=1e-11)
     pressure, gap = half_spaces.tamaas_saturated(heights, DX, E, mean, 1e-12, H)
     yields, free = pressure > H * (1 - 1e-9), pressure > 0
     assert yields.any() and (free & ~yields).any()
-    np.testing.assert_allclose(found.pressure, pressure, rtol=0, atol=1e-8 * H)
+    np.testing.assert_allclose(ours.pressure, pressure, rtol=0, atol=1e-8 * H)
     gap -= gap[free & ~yields].mean()
-    np.testing.assert_allclose(found.gap, np.maximum(gap, 0), rtol=0, atol=1e-8 * heights.std())
-    assert float(found.area) == pytest.approx(free.mean() * total, rel=1e-12)
-    assert float(found.mean_gap) == pytest.approx(np.maximum(gap, 0).mean(), rel=1e-7)
+    np.testing.assert_allclose(ours.gap, np.maximum(gap, 0), rtol=0, atol=1e-8 * heights.std())
+    assert float(ours.area) == pytest.approx(free.mean() * total, rel=1e-12)
+    assert float(ours.mean_gap) == pytest.approx(np.maximum(gap, 0).mean(), rel=1e-7)

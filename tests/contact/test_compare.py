@@ -22,9 +22,9 @@ MEASURED = fj.MeasuredContact((100.0, 1e4), (1e8, 1e10), 1.0, 0.7)
 
 @pytest.fixture(scope="module")
 def compared():
-    asked: dict[str, Any] = {"n": 64, "seeds": 3, "key": jax.random.key(5), "progress": False}
-    given = {"measured": MEASURED}
-    return fj.compare_laws(SURFACE, MATERIAL, LOADS, **SIZES, laws=given, **asked)
+    options: dict[str, Any] = {"n": 64, "seeds": 3, "key": jax.random.key(5), "progress": False}
+    laws = {"measured": MEASURED}
+    return fj.compare_laws(SURFACE, MATERIAL, LOADS, **SIZES, laws=laws, **options)
 
 
 @pytest.mark.slow
@@ -33,14 +33,14 @@ def test_every_law_is_as_by_itself_and_over_the_seeds(compared):
     assert list(compared.curves) == names
     for i, P in enumerate(LOADS):
         state = fj.contact_state(SURFACE, MATERIAL, P, mu_s=0.4, mu_m=0.25)
-        found = compared.curves["fractal"]
+        curve = compared.curves["fractal"]
         for name, alone in (("K_n", state.K_n), ("K_t", state.K_t), ("real_area", state.A_r)):
-            assert float(getattr(found, name)[i]) == pytest.approx(float(alone), rel=1e-12)
+            assert float(getattr(curve, name)[i]) == pytest.approx(float(alone), rel=1e-12)
         law = fj.PerssonContact(SURFACE, MATERIAL, P, 4e-4, 1e-2, 1e-3)
-        found = compared.curves["Persson"]
-        for given, alone in zip((found.K_n, found.K_t), law.stiffness(0.4, 0.25), strict=True):
-            assert float(given[i]) == pytest.approx(float(alone), rel=1e-12)
-        assert float(found.real_area[i]) == pytest.approx(float(law.real_area(0.25)), rel=1e-12)
+        curve = compared.curves["Persson"]
+        for stiffness, alone in zip((curve.K_n, curve.K_t), law.stiffness(0.4, 0.25), strict=True):
+            assert float(stiffness[i]) == pytest.approx(float(alone), rel=1e-12)
+        assert float(curve.real_area[i]) == pytest.approx(float(law.real_area(0.25)), rel=1e-12)
     h = 1e-5
     low, high = (
         fj.compare_laws(SURFACE, MATERIAL, LOADS * x, **SIZES, seeds=0, progress=False).curves
@@ -58,13 +58,13 @@ def test_every_law_is_as_by_itself_and_over_the_seeds(compared):
         pressed = [fj.boundary_element(z, 1e-2 / 64, MATERIAL, P / 4) for P in LOADS]
         stiff.append([float(4 * one.K_n) for one in pressed])
         touching.append([float(4 * one.area) for one in pressed])
-    found = compared.curves["boundary elements"]
-    np.testing.assert_allclose(found.K_n, np.exp(np.log(stiff).mean(0)), rtol=1e-12)
-    np.testing.assert_allclose(found.scatter, np.log(stiff).std(0, ddof=1), rtol=1e-10)
-    np.testing.assert_allclose(found.real_area, np.mean(touching, 0), rtol=1e-12)
-    slope = np.log(found.K_n[2] / found.K_n[1]) / np.log(LOADS[2] / LOADS[1])
-    assert float(found.alpha[2]) == pytest.approx(slope, rel=1e-12)
-    assert found.K_t is None
+    curve = compared.curves["boundary elements"]
+    np.testing.assert_allclose(curve.K_n, np.exp(np.log(stiff).mean(0)), rtol=1e-12)
+    np.testing.assert_allclose(curve.scatter, np.log(stiff).std(0, ddof=1), rtol=1e-10)
+    np.testing.assert_allclose(curve.real_area, np.mean(touching, 0), rtol=1e-12)
+    slope = np.log(curve.K_n[2] / curve.K_n[1]) / np.log(LOADS[2] / LOADS[1])
+    assert float(curve.alpha[2]) == pytest.approx(slope, rel=1e-12)
+    assert curve.K_t is None
 
 
 @pytest.mark.slow
@@ -93,12 +93,12 @@ def test_table_and_picture(compared):
 
 def test_full_contact_is_infinitely_stiff():
     smooth, loads = fj.Surface(2.9, 1e-12), [4e6, 4e7, 4e8]
-    found = fj.compare_laws(smooth, MATERIAL, loads, **SIZES, n=64, seeds=3, progress=False)
-    judge: Any = found.curves["boundary elements"]
+    comparison = fj.compare_laws(smooth, MATERIAL, loads, **SIZES, n=64, seeds=3, progress=False)
+    judge: Any = comparison.curves["boundary elements"]
     assert np.isinf(judge.K_n).all() and np.isnan(judge.alpha).all()
     assert np.isnan(judge.scatter).all()
     np.testing.assert_allclose(judge.real_area, 4e-4, rtol=1e-12)
-    assert found.rows()[1][3][2:6] == ["inf", "-", "-", "-"]
+    assert comparison.rows()[1][3][2:6] == ["inf", "-", "-", "-"]
 
 
 @pytest.mark.slow
@@ -110,15 +110,15 @@ def test_persson_s_law_is_near_boundary_elements(D, waves):
     loads = np.geomspace(1.0, 3e4, 10)
     one = float(fj.roughness(fj.Surface(D, side), side, side / waves).Sq)
     surface = fj.Surface(D, side * (0.5e-6 / one) ** (1 / (D - 2)))
-    found = fj.compare_laws(
+    curves = fj.compare_laws(
         surface, MATERIAL, loads, area=side**2, L_s=side / waves, n=n, seeds=6, progress=False
     ).curves
-    judge = found["boundary elements"]
+    judge = curves["boundary elements"]
     share = np.asarray(judge.real_area) / side**2
-    ratio = np.asarray(found["Persson"].K_n / judge.K_n)
+    ratio = np.asarray(curves["Persson"].K_n / judge.K_n)
     # Below twice a shortest wavelength squared a single summit carries, as Hertz has it.
-    seen = share * waves**2 > 2
-    low, high = seen & (share < 0.5), seen & (share >= 0.5) & (share < 0.95)
+    touching = share * waves**2 > 2
+    low, high = touching & (share < 0.5), touching & (share >= 0.5) & (share < 0.95)
     assert low.sum() >= 4
     assert np.abs(np.log(ratio[low])).max() < np.log(1.35)
     assert np.abs(np.log(ratio[high])).max(initial=0) < np.log(2)
@@ -199,5 +199,7 @@ def test_a_law_of_its_own_scene_is_differentiable():
             return 1e7 * jnp.cbrt(self.P), 5e6 * jnp.cbrt(self.P)
 
     laws = {"Hertz": Hertz(jnp.array(1.0))}
-    found = fj.compare_laws(SURFACE, MATERIAL, LOADS, area=1e-4, laws=laws, seeds=0, progress=False)
-    np.testing.assert_allclose(found.curves["Hertz"].alpha, 1 / 3, rtol=1e-12)
+    comparison = fj.compare_laws(
+        SURFACE, MATERIAL, LOADS, area=1e-4, laws=laws, seeds=0, progress=False
+    )
+    np.testing.assert_allclose(comparison.curves["Hertz"].alpha, 1 / 3, rtol=1e-12)

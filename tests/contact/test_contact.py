@@ -68,11 +68,11 @@ def case(dtype):
         full, slopes, _ = everything(x)
         truth = vars(full)
         log_slopes = {name: log_slope(truth[name], slopes[name]) for name in LOG_SLOPE}
-    found = {"state": state, "forward": forward, "reverse": reverse}
+    computed = {"state": state, "forward": forward, "reverse": reverse}
     # Not in the table. Only their size matters, and the values test what they rest on.
     rest = ("A_r", "Q_e", "plastic_share", "slip_ratio")
     sizes = {name: log_slope(truth[name], slopes[name]) for name in rest} | log_slopes
-    return found, truth, sizes, x[:, 0]
+    return computed, truth, sizes, x[:, 0]
 
 
 def log_slope(value, slope):
@@ -101,24 +101,24 @@ def assert_within(error, allowed, rows=None):
 @DTYPES
 def test_regimes(dtype):
     """Exact up to 1e-6 beside the boundaries; float32 can tell from 1e-4 on."""
-    found, truth, *_ = case(dtype)
+    computed, truth, *_ = case(dtype)
     clear = np.ones(len(ROWS), bool)
     if dtype == "float32":
         clear = np.abs(truth["log_area_ratio"]) > 1e-4
         clear &= np.abs(truth["slip_ratio"] - 1) > 1e-4
         assert clear.mean() > 0.96
     for name in make_contact.REGIMES:
-        mine = np.asarray(found["state"].regime == getattr(fj.Regime, name))
+        mine = np.asarray(computed["state"].regime == getattr(fj.Regime, name))
         np.testing.assert_array_equal(mine[clear], np.equal(REGIME, name)[clear])
 
 
 @DTYPES
 def test_values(dtype):
     """Areas, stiffnesses, load and shares to 1e-13 (16 roundings of float32) of their condition."""
-    found, truth, slopes, D = case(dtype)
+    computed, truth, slopes, D = case(dtype)
     tolerance = 1e-13 if dtype == "float64" else 16 * EPS32
     for name, by_input in slopes.items():
-        value, rows = getattr(found["state"], name), truth[name] != 0
+        value, rows = getattr(computed["state"], name), truth[name] != 0
         assert value.dtype == dtype
         extra = slip_condition(truth["slip_ratio"]) if name == "K_t" else 0
         error = np.abs(value / np.where(rows, truth[name], 1) - 1)
@@ -129,7 +129,7 @@ def test_values(dtype):
 @MODES
 def test_derivatives(dtype, mode):
     """dln a_l, dln K_n, dln K_t by D, ln G, ln P in both modes."""
-    found, truth, slopes, D = case(dtype)
+    computed, truth, slopes, D = case(dtype)
     tolerance = 1e-13 if dtype == "float64" else 64 * EPS32
     # A derivative that is large because a_l is near a_e is as ill-conditioned as it is large.
     by_a_l, by_K_n, by_K_t = (slopes[name] for name in LOG_SLOPE)
@@ -146,8 +146,8 @@ def test_derivatives(dtype, mode):
     edge |= np.abs(1 - VALUE["slip_ratio"]) < 1e-4
     for name, bound in allowed.items():
         rows = truth[name] != 0
-        assert found[mode][name].dtype == dtype
-        slope = log_slope(getattr(found["state"], name).astype(float), found[mode][name])
+        assert computed[mode][name].dtype == dtype
+        slope = log_slope(getattr(computed["state"], name).astype(float), computed[mode][name])
         error = np.abs(slope - slopes[name])
         for i in range(3):
             assert_within(error[:, i], tolerance * bound[:, i], rows)
@@ -159,8 +159,8 @@ def test_derivatives(dtype, mode):
 @MODES
 def test_zeros_are_exact(dtype, mode):
     """K_n, K_t, Q_e and slip are 0.0 where the regime says so, and so is every derivative."""
-    found, *_ = case(dtype)
-    state, slopes = found["state"], found[mode]
+    computed, *_ = case(dtype)
+    state, slopes = computed["state"], computed[mode]
     plastic = np.asarray(state.regime == fj.Regime.fully_plastic)
     sticks = np.asarray(state.regime == fj.Regime.elastic_plastic)
     for name, rows in {
@@ -179,8 +179,8 @@ def test_zeros_are_exact(dtype, mode):
 @MODES
 def test_finite(dtype, mode):
     """No NaN or infinity but in a_e as D -> 2, and only where its true derivative overflows."""
-    found, *_ = case(dtype)
-    state, slopes = found["state"], found[mode]
+    computed, *_ = case(dtype)
+    state, slopes = computed["state"], computed[mode]
     # dD brings (D-2)^-2, dG brings 1/G.
     divisor = np.minimum(2 * np.log(INPUT[:, 0] - 2), np.log(INPUT[:, 1]))
     largest = VALUE["ln_a_e"] - divisor
@@ -206,11 +206,11 @@ def test_log_areas_and_their_loads():
     A_r = (D - 1) / (3 - D) * VALUE["a_l"]
     slopes[:, 0] += 1 / (D - 1) + 1 / (3 - D)
     P, forward, reverse = loads(INPUT, A_r)
-    wanted = np.stack([-slopes[:, 0], -slopes[:, 1], np.ones_like(D)], axis=1) / slopes[:, 2:]
-    scale = condition(D, wanted)
+    expected = np.stack([-slopes[:, 0], -slopes[:, 1], np.ones_like(D)], axis=1) / slopes[:, 2:]
+    scale = condition(D, expected)
     assert_within(np.abs(P / INPUT[:, 7] - 1), 1e-14 * scale * (1 + np.abs(VALUE["ln_a_l"])))
     np.testing.assert_allclose(forward, reverse, rtol=1e-11, atol=1e-11)
-    assert_within(np.abs(forward - wanted).max(axis=1), 1e-11 * scale)
+    assert_within(np.abs(forward - expected).max(axis=1), 1e-11 * scale)
 
 
 @pytest.mark.parametrize("nominal", [1.0, 0.037])
@@ -240,8 +240,8 @@ def loads(x, A_r):
         surface = substitute(BRAKE.surface, {"D": D, "G": G, "gamma": x[2]})
         return jnp.log(fj.contact_load(surface, material, A, mu_m=x[9]))
 
-    found, *slopes = both_modes(log_P, jnp.zeros(3, x.dtype))
-    return jnp.exp(found), *slopes
+    computed, *slopes = both_modes(log_P, jnp.zeros(3, x.dtype))
+    return jnp.exp(computed), *slopes
 
 
 # --- a domain far beyond any brake's ----------------------------------------------------------
@@ -284,20 +284,20 @@ def test_wide_domain(seeds):
     for seed in seeds:
         x = wide_joints(seed)
         state, forward, reverse = everything(x)
-        found = {name: value for name, value in vars(state).items() if name != "regime"}
+        computed = {name: value for name, value in vars(state).items() if name != "regime"}
         # In range; only a_e overflows, as D -> 2.
-        for name, values in found.items():
+        for name, values in computed.items():
             assert np.isfinite(values).all() or name == "a_e", name
         for name in ("K_n", "K_t", "a_l", "A_r", "a_e", "plastic_share"):
-            assert (found[name] >= 0).all(), name
-        assert (state.plastic_share <= 1).all() and found["plastic_share"][0] < 1e-7
+            assert (computed[name] >= 0).all(), name
+        assert (state.plastic_share <= 1).all() and computed["plastic_share"][0] < 1e-7
         plastic, slips = state.log_area_ratio <= 0, state.slip_ratio >= 1
         np.testing.assert_array_equal(state.K_n == 0, plastic)
         np.testing.assert_array_equal(state.K_t == 0, plastic | slips)
         slipping = np.asarray(state.regime == fj.Regime.gross_slip)
         np.testing.assert_array_equal(slipping, ~plastic & slips)
         # Its load is that of its area.
-        P = np.asarray(loads(x, found["A_r"])[0])
+        P = np.asarray(loads(x, computed["A_r"])[0])
         assert_within(np.abs(P / x[:, 7] - 1), 4 * lost(x))
         # More load, more stiffness.
         slope = forward["K_n"][:, INPUTS.index("P")]
@@ -309,7 +309,7 @@ def test_wide_domain(seeds):
         for name in ("a_l", "A_r", "K_n", "K_t", "Q_e", "plastic_share"):
             a, b = (np.where(ABSOLUTE, x, 1) * slopes[name] for slopes in (forward, reverse))
             assert np.isfinite(a).all() and np.isfinite(b).all(), name
-            size = np.abs(found[name]) + np.abs(a).max(axis=1)
+            size = np.abs(computed[name]) + np.abs(a).max(axis=1)
             assert_within(np.abs(a - b).max(axis=1), rounding * np.where(size == 0, 1, size))
 
 
@@ -415,7 +415,7 @@ def test_hessians(D, P):
 # --- the root, and what is traced -------------------------------------------------------------
 
 
-def worst_residual():
+def worst_residual(**options):
     """Largest |s(t) - s|, in roundings of 1 + s, over the whole domain of the root."""
     rng = np.random.default_rng(5)
     n = 100_000
@@ -425,16 +425,15 @@ def worst_residual():
     beta = np.exp(rng.uniform(np.log(0.02), np.log(1.1), n))
 
     def residual(s, D, beta):
-        t = load_balance.log_area_ratio(s, D, beta)
+        t = load_balance.log_area_ratio(s, D, beta, **options)
         return jnp.max(jnp.abs(load_balance.log_load(t, D, beta) - s) / (1 + s))
 
     return float(jax.jit(residual)(s, D, beta)) / EPS
 
 
-def test_halley_steps_are_the_fewest_that_work(monkeypatch):
+def test_halley_steps_are_the_fewest_that_work():
     assert worst_residual() < 4
-    monkeypatch.setattr(load_balance, "_HALLEY_STEPS", load_balance._HALLEY_STEPS - 1)
-    assert worst_residual() > 1000
+    assert worst_residual(steps=2) > 1000
 
 
 def test_only_what_is_needed_is_traced():
@@ -445,9 +444,9 @@ def test_only_what_is_needed_is_traced():
         return primitives(jax.make_jaxpr(f)(contact).jaxpr)
 
     whole = traced(BRAKE)
-    given = traced(fj.FractalContact(BRAKE.surface, MATERIAL, 1907.3, stiffness_ratio=0.5))
-    assert "cbrt" in whole and "cbrt" not in given
-    assert given.total() < 0.9 * whole.total()
+    fixed_ratio = traced(fj.FractalContact(BRAKE.surface, MATERIAL, 1907.3, stiffness_ratio=0.5))
+    assert "cbrt" in whole and "cbrt" not in fixed_ratio
+    assert fixed_ratio.total() < 0.9 * whole.total()
     assert not traced(fj.FixedContact(4e8, 2e8))
     assert not {"while", "scan"} & set(whole + traced(BRAKE, jax.grad))
 
@@ -524,7 +523,7 @@ def test_gross_slip_of_a_joint():
     np.testing.assert_allclose(root, before.K_t / np.cbrt(1 - before.slip_ratio), rtol=1e-13)
     for by_input in both_modes:
         np.testing.assert_array_equal(by_input["K_t"][4:], 0)
-        # Of (1 - slip)^(1/3): each thousandth of the distance, a hundredfold slope.
+        # The factor (1 - slip)^(1/3): each thousandth of the distance, a hundredfold slope.
         slope = np.abs(by_input["K_t"][:4, 1])
         np.testing.assert_allclose(slope[1:] / slope[:-1], 100, rtol=0.02)
 

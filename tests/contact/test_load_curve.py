@@ -53,12 +53,12 @@ def test_powers(alpha):
     loads = P * np.array([1e-4, 1e-2, 0.1, 0.5, 1.0, 2.0, 10.0, 30.0])
     u = opening * ((loads / P) ** (1 - alpha) - 1)
     beyond = -opening * np.array([1.0000001, 1.5, 10.0])
-    found, opened = np.split(np.asarray(_load(law, np.concatenate([u, beyond]))), [len(u)])
-    np.testing.assert_allclose(found, loads, rtol=1e-9)
+    computed, opened = np.split(np.asarray(_load(law, np.concatenate([u, beyond]))), [len(u)])
+    np.testing.assert_allclose(computed, loads, rtol=1e-9)
     slopes = _slopes(law, u)
     np.testing.assert_allclose(slopes, K_N * (loads / P) ** alpha, rtol=1e-7)
     np.testing.assert_array_equal(opened, 0.0)
-    assert found[u == 0] == pytest.approx(P, rel=1e-14)
+    assert computed[u == 0] == pytest.approx(P, rel=1e-14)
 
 
 @pytest.mark.parametrize(
@@ -93,14 +93,14 @@ def _table_and_curve(curve, share):
 def test_table(law):
     """What motions look up: within 1e-11 of P or N, its slope within 1e-8, up to full contact."""
     curve = law.load_curve(0.4, 0.3)
-    found, wanted = _table_and_curve(curve, jnp.linspace(-1.2, 1.1, 4001))
-    np.testing.assert_allclose(found[0], wanted[0], rtol=1e-11, atol=1e-11)
-    np.testing.assert_allclose(found[1], wanted[1], rtol=1e-8, atol=1e-8)
+    computed, expected = _table_and_curve(curve, jnp.linspace(-1.2, 1.1, 4001))
+    np.testing.assert_allclose(computed[0], expected[0], rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(computed[1], expected[1], rtol=1e-8, atol=1e-8)
 
 
 @jax.jit
 @jax.vmap
-def _of_persson(D, load):
+def _persson_lanes(D, load):
     """Curve and table at rest, and beside each other from the opening to far above P."""
     law = fj.PerssonContact(fj.Surface(D, 1.342e-10), MATERIAL, load, 1e-4, 1e-2, 1e-4)
     curve = law.load_curve(0.4, 0.3)
@@ -114,14 +114,14 @@ def _of_persson(D, load):
 def test_nothing_moves_at_rest():
     """N = P without approach, from the lightest loads to full contact of surfaces of any D."""
     D, load = np.meshgrid(np.linspace(2.02, 2.98, 9), 10.0 ** np.arange(7))
-    found, tabled, e = map(np.asarray, _of_persson(D.ravel(), load.ravel()))
-    np.testing.assert_array_equal(found[:, 0], 1)
+    computed, tabled, e = map(np.asarray, _persson_lanes(D.ravel(), load.ravel()))
+    np.testing.assert_array_equal(computed[:, 0], 1)
     np.testing.assert_allclose(tabled[:, 0], 1, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(tabled, found, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(tabled, computed, rtol=1e-9, atol=1e-9)
     # N never falls with the approach, and is 0 where the joint opens.
-    rising = np.take_along_axis(found, np.argsort(e, axis=1), axis=1)
+    rising = np.take_along_axis(computed, np.argsort(e, axis=1), axis=1)
     assert (rising[:, 1:] >= rising[:, :-1]).all()
-    assert (found[:, 200] == 0).all()
+    assert (computed[:, 200] == 0).all()
 
 
 @pytest.mark.parametrize("D", [2.05, 2.5, 2.8, 2.97])
@@ -143,11 +143,11 @@ def test_measured_table_and_laws_without_a_curve():
         u = np.linspace(-1, 3, 9) * load / float(law.stiffness(0.4, 0.3)[0])
 
         for side in (u[u < 0][::-1], u[u > 0]):
-            found = solve_ivp(
+            computed = solve_ivp(
                 lambda u, N, law=law: [float(_at(law, N[0]))], (0.0, side[-1]), [load], "DOP853",
                 t_eval=side, rtol=1e-11, atol=1e-10 * load, max_step=abs(side[-1]) / 100,
             )  # fmt: skip
-            np.testing.assert_allclose(_load(law, found.t), found.y[0], rtol=1e-6)
+            np.testing.assert_allclose(_load(law, computed.t), computed.y[0], rtol=1e-6)
     # The source's law, whose K_n ends above P = 0, and a table too steep to open.
     scene = fj.brake_scene()
     for law in (scene.contact, power_law(1.2), fj.FixedContact(K_N, K_N, P)):
@@ -172,8 +172,8 @@ def test_derivatives():
     np.testing.assert_allclose(forward, reverse, rtol=1e-9)
     for i, step in enumerate(steps):
         ends = [float(program(x.at[i].add(sign * step))[0][0]) for sign in (1, -1)]
-        wanted = (ends[0] - ends[1]) / (2 * step)
-        np.testing.assert_allclose(forward[0, i], wanted, rtol=1e-6)
+        expected = (ends[0] - ends[1]) / (2 * step)
+        np.testing.assert_allclose(forward[0, i], expected, rtol=1e-6)
 
 
 @pytest.mark.slow

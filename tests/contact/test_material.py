@@ -26,12 +26,12 @@ def test_equation_2(mode):
     E = float(material.E)
     assert float(abs(mpf(E) / truth - 1)) < 4e-16
     assert (material.nu, material.sigma_y, material.H) == ((nu1 + nu2) / 2, 3.55e8, 9.94e8)
-    found = mode(lambda x: fj.Material.pair(x[0], x[1], x[2], x[3], 3.55e8, 9.94e8).E)(
+    slopes = mode(lambda x: fj.Material.pair(x[0], x[1], x[2], x[3], 3.55e8, 9.94e8).E)(
         jnp.array([E1, nu1, E2, nu2])
     )
     by_1 = [(1 - nu1**2) * (E / E1) ** 2, 2 * nu1 * E**2 / E1]
     by_2 = [(1 - nu2**2) * (E / E2) ** 2, 2 * nu2 * E**2 / E2]
-    np.testing.assert_allclose(found, by_1 + by_2, rtol=2e-15)
+    np.testing.assert_allclose(slopes, by_1 + by_2, rtol=2e-15)
 
 
 def test_the_domain_and_beyond_it_under_jit():

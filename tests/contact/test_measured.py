@@ -33,8 +33,8 @@ def test_is_scipy_s_monotone_cubic_of_the_logarithms_or_a_power_law():
         np.testing.assert_allclose(slopes, curve.derivative()(x[4:]), rtol=1e-10, atol=1e-12)
     assert (np.diff(value[4:]) > 0).all()
     P = np.array([1.0, 50.0, 100.0, 150.0, 400.0, 9e4])
-    found = jax.jit(jax.vmap(lambda P: K_n(P, (100.0, 400.0), (1e7, 2e7))))(P)
-    np.testing.assert_allclose(found, 1e7 * (P / 100) ** 0.5, rtol=1e-13)
+    K_n_at = jax.jit(jax.vmap(lambda P: K_n(P, (100.0, 400.0), (1e7, 2e7))))(P)
+    np.testing.assert_allclose(K_n_at, 1e7 * (P / 100) ** 0.5, rtol=1e-13)
 
 
 @pytest.mark.parametrize("P", [1e-3, 99.0, 2001.0, 1e7])

@@ -91,23 +91,23 @@ def test_the_example_does_what_a_joint_of_that_stiffness_does(Hertz):
     """Growth rate, stability, critical friction, sweep, limit cycle, a structure."""
     law = Hertz(**NUMBERS)
     scene, fixed = (COULOMB.replace(contact=c) for c in (law, fj.FixedContact(4e8, 2e8, 1900.0)))
-    for of in (fj.growth_rate, fj.critical_friction, lambda x: fj.stability(x).eigenvalues):
-        np.testing.assert_allclose(of(scene), of(fixed), rtol=1e-12)
+    for measure in (fj.growth_rate, fj.critical_friction, lambda x: fj.stability(x).eigenvalues):
+        np.testing.assert_allclose(measure(scene), measure(fixed), rtol=1e-12)
     loads = np.array([500.0, 1900.0, 4000.0])
     swept = fj.sweep(fj.growth_rate, scene, progress=False, P=loads)
     stiff = 4e8 * np.cbrt(loads / 1900)
-    own = [fj.growth_rate(fixed.replace(K_n=K, K_t=K / 2)) for K in stiff]
-    np.testing.assert_allclose(swept.values, own, rtol=1e-10)
-    moved = replaced(scene, {"K_t/K_n": 0.4})
-    assert float(moved.contact.stiffness_ratio) == pytest.approx(0.4)
+    rates = [fj.growth_rate(fixed.replace(K_n=K, K_t=K / 2)) for K in stiff]
+    np.testing.assert_allclose(swept.values, rates, rtol=1e-10)
+    replaced_scene = replaced(scene, {"K_t/K_n": 0.4})
+    assert float(replaced_scene.contact.stiffness_ratio) == pytest.approx(0.4)
 
 
 def test_with_an_opening_exponent_it_has_its_load_curve(Hertz):
     """Hertz's, N = P (1 + 2 K_n u/(3 P))^(3/2), 0 where it is open."""
     law = type("Opening", (Hertz,), {"opening_exponent": 1 / 3})(**NUMBERS)
     u = np.array([-1e-5, -5e-6, 0.0, 2e-6])
-    wanted = 1900 * np.maximum(0, 1 + 2 * 4e8 * u / (3 * 1900)) ** 1.5
-    np.testing.assert_allclose(law.load(u), wanted, rtol=1e-9)
+    expected = 1900 * np.maximum(0, 1 + 2 * 4e8 * u / (3 * 1900)) ** 1.5
+    np.testing.assert_allclose(law.load(u), expected, rtol=1e-9)
     with pytest.raises(ValueError, match="load needs a contact law with a load curve, got Hertz"):
         Hertz(**NUMBERS).load(u)
 
@@ -115,10 +115,10 @@ def test_with_an_opening_exponent_it_has_its_load_curve(Hertz):
 @pytest.mark.slow
 def test_its_limit_cycle_is_that_of_a_joint_of_that_stiffness(Hertz):
     scene = BRAKE.replace(contact=Hertz(**NUMBERS))
-    found = fj.limit_cycle(scene)
-    wanted = fj.limit_cycle(BRAKE.replace(contact=fj.FixedContact(4e8, 2e8)))
-    assert found.result == fj.CycleResult.converged
-    np.testing.assert_allclose(found.amplitude, wanted.amplitude, rtol=1e-8)
+    computed = fj.limit_cycle(scene)
+    expected = fj.limit_cycle(BRAKE.replace(contact=fj.FixedContact(4e8, 2e8)))
+    assert computed.result == fj.CycleResult.converged
+    np.testing.assert_allclose(computed.amplitude, expected.amplitude, rtol=1e-8)
 
 
 def test_designed_over_its_load(Hertz):
@@ -144,11 +144,11 @@ def test_derivatives_in_both_modes_under_jit_and_vmap(Hertz):
         return fj.growth_rate(COULOMB.replace(contact=fj.FixedContact(K[0], K[1])))
 
     by_K = jax.grad(fixed)(jnp.array([4e8, 2e8]))
-    wanted = {"k": by_K[0] + by_K[1] / 2, "stiffness_ratio": by_K[1] * 4e8}
-    wanted |= {"P": wanted["k"] * 4e8 / 5700, "P_0": -wanted["k"] * 4e8 / 5700}
-    for found in both_gradients(rate, numbers):
-        for name in wanted:
-            assert float(found[name]) == pytest.approx(float(wanted[name]), rel=1e-9)
+    expected = {"k": by_K[0] + by_K[1] / 2, "stiffness_ratio": by_K[1] * 4e8}
+    expected |= {"P": expected["k"] * 4e8 / 5700, "P_0": -expected["k"] * 4e8 / 5700}
+    for computed in both_gradients(rate, numbers):
+        for name in expected:
+            assert float(computed[name]) == pytest.approx(float(expected[name]), rel=1e-9)
     loads = jnp.array([500.0, 1900.0, -1.0])
     many = jax.jit(jax.vmap(lambda P: rate(numbers | {"P": P})))(loads)
     np.testing.assert_allclose(many[:2], [rate(numbers | {"P": P}) for P in loads[:2]], rtol=1e-12)
@@ -166,9 +166,9 @@ def test_files_hold_it(Hertz, tmp_path):
     )
     joint.save(tmp_path / "joint.toml")
     pairs = [(fj.Scene.from_toml(text), scene), (fj.Structure.load(tmp_path / "joint.toml"), joint)]
-    for found, wanted in pairs:
-        assert jax.tree.structure(found) == jax.tree.structure(wanted)
-        assert all(map(np.array_equal, jax.tree.leaves(found), jax.tree.leaves(wanted)))
+    for computed, expected in pairs:
+        assert jax.tree.structure(computed) == jax.tree.structure(expected)
+        assert all(map(np.array_equal, jax.tree.leaves(computed), jax.tree.leaves(expected)))
     with pytest.raises(ValueError, match=r"\[contact\] P of Hertz must be above 0, got -5"):
         fj.Scene.from_toml(text.replace("P = 1900.0", "P = -5.0"))
     with pytest.raises(ValueError, match=r"a file holds as contact one of Fractal.*got Softened"):

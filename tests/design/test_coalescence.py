@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import brentq, minimize_scalar
 
 import fractaljax as fj
-from fractaljax._design.coalescence import neighbour_residuals, of_scene
+from fractaljax._design.coalescence import neighbour_residuals, scene_residuals
 from fractaljax._stability.quadratic import leading
 
 W = 100.0  # square of the mean frequency
@@ -63,7 +63,7 @@ def test_residuals_have_the_signs_of_growth_rates():
     def of_scenes(values, target):
         x = scene.replace(friction=fj.Coulomb(0.3)).replace(**values)
         growth = fj.growth_rate(x)
-        found = of_scene(x, True, growth, target, jnp.array(10.0))
+        found = scene_residuals(x, True, growth, target, jnp.array(10.0))
         return growth - target, jnp.stack(found)
 
     above, residuals = map(np.asarray, of_scenes(moved, targets))

@@ -1,5 +1,6 @@
 """`design` refuses what it cannot mean, by name and in one line, before it searches."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ DESIGN = {
     "lattice": [0, 200_000, 10**30, np.nan],
     "seed": [-1, 0.5, 10**20, 2**63, True, None],
     "quiet_within": [0, -1.0, np.nan, "2", True, {}, [], [1.0], [1, 1, 1, 0], [[1.0] * 4] * 2],
+    "search": [None, 1, "thorough", {}, {"renewals": 2}],
     "progress": ["no", None],
 }
 
@@ -44,3 +46,14 @@ def test_a_design_is_refused_before_its_search(argument, monkeypatch):
         words = (argument, "scene", "FractalContact", "D bound", "bound", "envelope", "tolerance")
         assert any(word in message for word in words), (bad, message)
         assert len(message) < 250 and "\n" not in message, message
+
+
+@pytest.mark.parametrize("bad", [0, -1, 1.5, True, None, "2", np.nan, [1], (0,), ()])
+def test_a_search_is_refused_where_it_is_made(bad):
+    """Every field of a search by its name."""
+    for field in dataclasses.fields(fj.DesignSearch):
+        if bad == [1] and field.name == "kick_starts":
+            continue
+        with pytest.raises((TypeError, ValueError), match=f"^{field.name} must be "):
+            fj.DesignSearch(**{field.name: bad})
+    assert fj.DesignSearch(kick_starts=[8, 16]) == fj.DesignSearch(kick_starts=(8, 16))

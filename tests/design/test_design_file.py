@@ -36,6 +36,7 @@ def robust():
         tolerance={"D": 0.002, "ln G": 0.02},
         quantile=0.9,
         seed=3,
+        search=fj.DesignSearch(exchange_rounds=11, kick_starts=(64, 512)),
         **SMALL,
     )
 
@@ -152,6 +153,8 @@ EDITS = [
     ('kind = "Roughness"', 'kind = "Colour"', "there is no constraint 'Colour'"),
     ("P = [1800.0, 2000.0]", "P = [2000.0, 1800.0]", "must be (lower, upper), got (2000, 1800)"),
     ("D = 2.4 ", "D = 2.0 ", "[contact.surface] D must be above 2 and below 3, got 2.0"),
+    ("renewals = 12", "renewals = 0", "renewals must be a whole number of at least 1, got 0"),
+    ("renewals = 12", "renewal = 12", "[options.search] has the unknown key 'renewal'"),
     ("[options]", "[options", "run.toml: "),
 ]
 
@@ -166,6 +169,19 @@ def test_bad_files(robust, tmp_path, old, new, message):
     with pytest.raises(ValueError) as caught:
         read_design(tmp_path / "run.toml", {"coarse": coarse})
     assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_search_is_in_the_file_and_may_be_left_out(robust, tmp_path):
+    """Files from before it had options lack it."""
+    robust.save(tmp_path / "run.toml")
+    _, options = read_design(tmp_path / "run.toml", {"coarse": coarse})
+    assert options["search"] == robust.options["search"] != fj.DesignSearch()
+    text = (tmp_path / "run.toml").read_text()
+    first = text.index("[options.search]")
+    older = text[:first] + text[text.index("[result]", first) :]
+    (tmp_path / "older.toml").write_text(older)
+    _, options = read_design(tmp_path / "older.toml", {"coarse": coarse})
+    assert "search" not in options and options["seed"] == 3
 
 
 def test_functions_that_are_not_in_the_file(robust, tmp_path):

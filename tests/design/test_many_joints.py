@@ -8,13 +8,13 @@ import pytest
 import scipy.linalg
 
 import fractaljax as fj
-from fractaljax._design.design import screened, solver_of
-from fractaljax._design.few_modes import in_few_modes
+from fractaljax._design.design import default_solver, designs_to_screen
+from fractaljax._design.few_modes import project_on_modes
 from fractaljax._design.joint_limits import make_joint_limits
-from fractaljax._design.joints import state_of, states_of
+from fractaljax._design.joints import joint_state, joint_states
 from fractaljax._design.rows import evaluate, linearise
 from fractaljax._design.solvers import slsqp
-from fractaljax._design.starts import screened_designs
+from fractaljax._design.starts import spread_designs
 from random_brakes import random_brake
 from structures import two_joints
 
@@ -50,10 +50,10 @@ def test_states_of_joints_that_share_a_law_are_those_of_each():
     parts = dict(zip(x.joint_names, x.joints, strict=True))
     # One has a stiffness ratio, which is another law.
     parts["odd"] = several_joints(1).replace(**{"j0.stiffness_ratio": 0.5}).joints[0]
-    found = states_of(parts)
+    found = joint_states(parts)
     assert list(found) == list(parts)
     for name, part in parts.items():
-        wanted = state_of(part)
+        wanted = joint_state(part)
         for key in ("K_n", "K_t", "log_area_ratio", "slip_ratio"):
             one, other = getattr(found[name], key), getattr(wanted, key)
             if other is None:
@@ -67,11 +67,11 @@ def test_designs_that_are_screened_are_inside_the_limits_of_all_joints():
     """Of those of an even spread nearly none is; two joints, as before, take those as they are."""
     x = several_joints(4)
     problem = fj.DesignProblem(x, bounds_of(x), **STATED)
-    drawn = screened_designs(12, 8)
+    drawn = spread_designs(12, 8)
     nothing = np.zeros((len(drawn), 0))  # of an envelope
     residuals, slopes = make_joint_limits(problem)(drawn, nothing)
     assert (residuals.max(axis=1) <= 0).mean() < 0.1
-    _, moved = screened(problem, 8, 12)
+    _, moved = designs_to_screen(problem, 8, 12)
     assert ((moved >= 0) & (moved <= 1)).all()
     within = make_joint_limits(problem)(moved, nothing[: len(moved)])[0]
     assert (within.max(axis=1) <= 0).mean() > 0.7
@@ -88,12 +88,12 @@ def test_designs_that_are_screened_are_inside_the_limits_of_all_joints():
     k = problem.model_residuals
     np.testing.assert_allclose(residuals[0, :k], row[0, 1 : 1 + k], rtol=1e-12)
     np.testing.assert_allclose(slopes[0, :k], jacobian[0, 1 : 1 + k], rtol=1e-9, atol=1e-12)
-    assert solver_of(problem) is None
+    assert default_solver(problem) is None
 
     few = several_joints(2)
     problem = fj.DesignProblem(few, bounds_of(few), **STATED)
-    np.testing.assert_array_equal(screened(problem, 8, 12)[1], screened_designs(12, 4))
-    assert solver_of(problem) is slsqp
+    np.testing.assert_array_equal(designs_to_screen(problem, 8, 12)[1], spread_designs(12, 4))
+    assert default_solver(problem) is slsqp
 
 
 @pytest.mark.slow
@@ -209,7 +209,7 @@ def test_a_brake_in_few_modes_has_nearly_its_growth_rates():
     _, problem = parametric_brake()
     start = np.asarray(problem.start)
     us = np.clip(start + 0.1 * np.random.default_rng(0).uniform(-1, 1, (13, len(start))), 0, 1)
-    rough = in_few_modes(problem, us[:12])
+    rough = project_on_modes(problem, us[:12])
     assert rough is not None and rough.x.n < 100
     both = [
         linearise(each, us[[3, 12]], np.zeros((2, 0)))[0][:, each.growth_columns]
@@ -223,7 +223,7 @@ def test_a_brake_in_few_modes_has_nearly_its_growth_rates():
     def objective(x):
         return x.joints[0].contact.P
 
-    assert in_few_modes(problem.with_fields(objective=objective), us) is None
+    assert project_on_modes(problem.with_fields(objective=objective), us) is None
     few_joints = several_joints(4)
     small = fj.DesignProblem(few_joints, bounds_of(few_joints), **STATED)
-    assert in_few_modes(small, np.asarray(small.start)[None]) is None
+    assert project_on_modes(small, np.asarray(small.start)[None]) is None

@@ -12,10 +12,10 @@ import fractaljax as fj
 from fractaljax._design import search as searches, starts as starting
 from fractaljax._design.evaluator import averaged, expected_shortfall
 from fractaljax._design.functions import Functions
-from fractaljax._design.lockstep import in_lockstep
+from fractaljax._design.lockstep import run_in_lockstep
 from fractaljax._design.search import Search
 from fractaljax._design.solvers import slsqp
-from fractaljax._design.starts import choose_starts, designs_near, screened_designs
+from fractaljax._design.starts import choose_starts, renew_starts, spread_designs
 from minima import MINIMA
 from tools import reference_scene
 
@@ -64,22 +64,22 @@ def test_tasks_in_lockstep_are_answered_together_and_in_this_thread():
         odd = {i: n for i, n in questions.items() if n % 2} or questions
         return {i: 10 * n for i, n in odd.items()}
 
-    assert in_lockstep([task(count) for count in (3, 1, 2)], answer) == [90, 10, 40]
+    assert run_in_lockstep([task(count) for count in (3, 1, 2)], answer) == [90, 10, 40]
     assert asked == [{0: 3, 1: 1, 2: 2}, {0: 3, 2: 2}, {0: 3, 2: 2}, {2: 2}, {2: 2}]
 
     def interrupt(questions):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        in_lockstep([task(2), task(3)], interrupt)
+        run_in_lockstep([task(2), task(3)], interrupt)
     with pytest.raises(ZeroDivisionError):
-        in_lockstep([task(2), lambda ask: 1 / 0], answer)
+        run_in_lockstep([task(2), lambda ask: 1 / 0], answer)
 
 
 @pytest.mark.parametrize("variables", [1, 2, 3, 5])
 def test_screened_designs_fill_the_bounds(variables):
     """Every half of every variable holds half of them, every quadrant a quarter."""
-    designs = screened_designs(16, variables)
+    designs = spread_designs(16, variables)
     assert designs.shape == (16 if variables == 1 else 256, variables)
     upper = designs > 0.5
     np.testing.assert_allclose(upper.mean(axis=0), 0.5, atol=0.01)
@@ -89,7 +89,7 @@ def test_screened_designs_fill_the_bounds(variables):
 
 
 def test_starts_are_those_given_and_one_in_every_basin():
-    designs = screened_designs(24, 2)
+    designs = spread_designs(24, 2)
     deep, shallow = np.array([0.2, 0.3]), np.array([0.8, 0.7])
     values = np.minimum(
         *(((designs - at) ** 2).sum(axis=1) + level for at, level in ((deep, 0), (shallow, 0.01)))
@@ -109,14 +109,14 @@ def test_new_starts_are_near_the_best_and_every_other_round_on_the_way_back(monk
     own, best = np.full(18, 0.5), np.full(18, 0.5) + 0.1 * np.cos(np.arange(18.0))
     stated: Any = SimpleNamespace(objective=None, start=own, nominal_condition=np.zeros(0))
     distance = np.linalg.norm(best - own)
-    near, back = (designs_near(stated, best, 12, again) for again in (2, 3))
+    near, back = (renew_starts(stated, best, 12, again) for again in (2, 3))
     assert (np.abs(near - best).max(axis=1) <= 8 * [0.06] + 4 * [0.15]).all()
     along = (back - own) @ (best - own) / distance**2
     np.testing.assert_allclose(along, [0.8, 0.6, 0.4] * 4, atol=0.2)
     assert (np.linalg.norm(back - own, axis=1) < distance).all()
     assert len(np.unique(np.concatenate([near, back]), axis=0)) == 24
     stated.objective = len
-    assert (np.abs(designs_near(stated, best, 12, 3) - best).max(axis=1) <= 0.15).all()
+    assert (np.abs(renew_starts(stated, best, 12, 3) - best).max(axis=1) <= 0.15).all()
 
 
 @pytest.mark.parametrize(
@@ -137,7 +137,7 @@ def test_rounds_near_the_best_end_when_they_cease_to_gain(monkeypatch, rounds, c
     asked = []
 
     class Scripted(Search):
-        def _land(self, paths, *_, **__):
+        def _minimise(self, paths, *_, **__):
             asked.append(paths)
             ends = rounds[len(asked) - 1]
             return [np.append(path, [[z]], axis=0) for path, z in zip(paths, ends, strict=False)]
@@ -146,13 +146,17 @@ def test_rounds_near_the_best_end_when_they_cease_to_gain(monkeypatch, rounds, c
         met = np.isfinite(us[:, 0])
         return SimpleNamespace(worst=np.where(met, -1.0, 1.0), values=np.where(met, us[:, 0], 9.0))
 
-    monkeypatch.setattr(searches, "designs_near", lambda problem, best, *_: np.tile(best, (12, 1)))
+    monkeypatch.setattr(searches, "renew_starts", lambda problem, best, *_: np.tile(best, (12, 1)))
     evaluator: Any = SimpleNamespace(problem=None, evaluate=evaluate)
-    found = Scripted(evaluator, None)._near(np.array([7.0]))
+    found = Scripted(evaluator, None)._renew(np.array([7.0]))
     assert len(asked) == count and found[0] == [end] and len(found) <= 2
     assert asked[0][0] == [[7.0]] and len(asked[0]) == 13 and len(asked[1]) == 12
     ended = [min(ends) for ends in rounds[: count - 1]]
     assert asked[-1][0] == [[min([7.0, *ended]) if np.isfinite(ended).all() else 7.0]]
+    # No more rounds than the options say.
+    asked.clear()
+    Scripted(evaluator, None, options=fj.DesignSearch(renewals=2))._renew(np.array([7.0]))
+    assert len(asked) == 2
 
 
 @pytest.mark.parametrize(("count", "alpha"), [(10, 0.9), (10, 0.85), (7, 0.0), (4, 0.99)])

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from fractaljax._design.trust_region import FINE, ROUGH, SETTLED, Local, in_trust_region
+from fractaljax._design.trust_region import Local, Stages, minimise_in_trust_region
+
+ROUGH, SETTLED, FINE = Stages.rough, Stages.settled, Stages.fine
 
 
 def by_complex_step(f):
@@ -68,11 +70,11 @@ def test_known_solutions(f, c, solution, as_limits):
         if as_limits:
             at, seen = asked(f, lambda u: -1 + 0 * u[0])
             start = start if (c(start) < 0).all() else np.array([0.59, 0.9])
-            u = in_trust_region(at, by_complex_step(c), start, 0.0, FINE, 10.0)
+            u = minimise_in_trust_region(at, by_complex_step(c), start, 0.0, FINE, 10.0)
             assert all((c(v) <= 0).all() for v in seen)
         else:
             at, seen = asked(f, c)
-            u = in_trust_region(at, free, start, 0.0, FINE, 10.0, 1e-9)
+            u = minimise_in_trust_region(at, free, start, 0.0, FINE, 10.0, 1e-9)
         assert len(seen) < 100
         if (c(u) <= 1e-9).all():
             ends.append((f(u), *u))
@@ -87,7 +89,7 @@ def test_the_largest_of_several_is_minimised_where_they_meet():
         lambda u: -1 + 0 * u[0],
         lambda u: np.stack([((u - corner) ** 2).sum() for corner in corners]),
     )
-    u = in_trust_region(at, free, np.array([0.2, 0.7]), 0.0, FINE, 10.0)
+    u = minimise_in_trust_region(at, free, np.array([0.2, 0.7]), 0.0, FINE, 10.0)
     # Of a circle through all three.
     height = (0.7**2 - 0.4**2) / (2 * 0.7)
     np.testing.assert_allclose(u, [0.5, 0.1 + height], atol=1e-4)
@@ -101,7 +103,7 @@ def test_it_comes_back_from_a_cliff_without_a_slope():
         return 0.5 + 0 * u[0] if beyond else u[0] ** 4 - 0.6**4
 
     at, _ = asked(lambda u: -10 * u[0] + u[1] ** 2, c)
-    u = in_trust_region(at, free, np.array([0.05, 0.5]), 0.0, FINE, 10.0, 1e-9)
+    u = minimise_in_trust_region(at, free, np.array([0.05, 0.5]), 0.0, FINE, 10.0, 1e-9)
     np.testing.assert_allclose(u, [0.6, 0.0], atol=1e-4)
 
 
@@ -112,7 +114,7 @@ def test_along_a_sharply_bent_edge():
         return 3e4 * ((u - 0.5) @ (u - 0.5) - 0.16)
 
     at, _ = asked(lambda u: u[0] + 0.05 * u[1], c)
-    u = in_trust_region(at, free, np.array([0.7, 0.8]), 0.0, FINE, 10.0, 1e-9)
+    u = minimise_in_trust_region(at, free, np.array([0.7, 0.8]), 0.0, FINE, 10.0, 1e-9)
     down = np.array([1, 0.05]) / np.hypot(1, 0.05)
     np.testing.assert_allclose(u, 0.5 - 0.4 * down, atol=1e-4)
 
@@ -127,7 +129,7 @@ def test_a_rough_way_takes_fewer_steps_and_ends_near():
     steps = {}
     for accuracy in (ROUGH, SETTLED, FINE):
         at, seen = asked(f, lambda u: -1 + 0 * u[0])
-        u = in_trust_region(at, free, np.array([0.1, 0.8]), 0.0, accuracy, 10.0)
+        u = minimise_in_trust_region(at, free, np.array([0.1, 0.8]), 0.0, accuracy, 10.0)
         near = {ROUGH: 0.1, SETTLED: 0.02, FINE: 1e-3}[accuracy]
         np.testing.assert_allclose(u, [0.75, 0.75], atol=near)
         steps[accuracy] = len(seen)
@@ -138,5 +140,5 @@ def test_a_rough_way_takes_fewer_steps_and_ends_near():
 def test_a_settled_way_meets_what_a_rough_one_leaves_unmet(accuracy):
     """The first penalty is too small."""
     at, _ = asked(lambda u: 100 * u[0] + (u[1] - 0.5) ** 2, lambda u: 0.5 - u[0])
-    u = in_trust_region(at, free, np.array([0.6, 0.2]), 0.0, accuracy, 10.0)
+    u = minimise_in_trust_region(at, free, np.array([0.6, 0.2]), 0.0, accuracy, 10.0)
     assert (abs(u[0] - 0.5) < 1e-6) == (accuracy is SETTLED)

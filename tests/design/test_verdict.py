@@ -32,17 +32,17 @@ def growth(scene):
 @pytest.mark.slow
 def test_every_question_and_what_it_rests_on(found):
     as_is, loaded, revised, law, ratio, scatter = found.questions
-    assert float(as_is.found) == pytest.approx(growth(DESIGNED), rel=1e-5) and as_is.quiet
+    assert float(as_is.answer) == pytest.approx(growth(DESIGNED), rel=1e-5) and as_is.quiet
     preloaded = fj.Scene(DESIGNED.contact, DESIGNED.friction, DESIGNED.oscillator, preload=True)
-    assert float(loaded.found) == pytest.approx(growth(preloaded), rel=1e-5)
+    assert float(loaded.answer) == pytest.approx(growth(preloaded), rel=1e-5)
     assert loaded.name == "friction on P + K_n x2" and not loaded.quiet
     surface = DESIGNED.contact.surface
     contact = fj.PerssonContact(surface, DESIGNED.contact.material, 1907.3, 1e-4, 1e-2, 1e-4)
-    assert float(law.found) == pytest.approx(growth(DESIGNED.replace(contact=contact)), rel=1e-5)
+    assert float(law.answer) == pytest.approx(growth(DESIGNED.replace(contact=contact)), rel=1e-5)
     assert law.name == "by PerssonContact" and not law.quiet
     contact = fj.AsperityContact(surface, DESIGNED.contact.material, 1907.3, 1e-4)
     expected = growth(DESIGNED.replace(contact=contact))
-    assert float(revised.found) == pytest.approx(expected, rel=1e-5)
+    assert float(revised.answer) == pytest.approx(expected, rel=1e-5)
     assert revised.name == "by AsperityContact" and not revised.quiet
     # The worst of the stiffness ratios between the scene's own and Mindlin's.
     K_n, K_t = fj.stiffness(DESIGNED)
@@ -51,9 +51,9 @@ def test_every_question_and_what_it_rests_on(found):
         for share in np.linspace(float(K_t / K_n), 1.4 / 1.7, 65)[[0, 32, 64]]
     ]
     assert rates == sorted(rates)
-    assert float(ratio.found.split()[0]) == pytest.approx(rates[-1], rel=1e-5)
+    assert float(ratio.answer.split()[0]) == pytest.approx(rates[-1], rel=1e-5)
     probability = fj.squeal_probability(DESIGNED, {"D": 0.01, "ln G": 0.1})
-    assert f"probability {probability.value:.3g}" in scatter.found
+    assert f"probability {probability.value:.3g}" in scatter.answer
     assert not found.quiet and not found.incurable
     assert found.rests_on[2:] == ("K_t/K_n = 0.355", "D and ln G without scatter")
     assert found.rests_on[:2] == ("friction on K_n x2", "FractalContact")
@@ -238,7 +238,7 @@ def test_verdict_of_a_structure_changes_all_its_joints():
 
     for question, change in ((1, loaded), (3, persson_of)):
         wanted = growth(with_joints(change))
-        assert float(found.questions[question].found) == pytest.approx(wanted, rel=1e-5)
+        assert float(found.questions[question].answer) == pytest.approx(wanted, rel=1e-5)
     share = np.linspace(0, 1, 17)[:, None]
     stiff = np.array([[float(k) for k in joint.stiffness()] for joint in x.joints])
     own, mindlin = stiff[:, 1] / stiff[:, 0], 2 * (1 - 0.3) / (2 - 0.3)
@@ -252,6 +252,6 @@ def test_verdict_of_a_structure_changes_all_its_joints():
         )
 
     worst = max(growth(with_joints(fixed(row))) for row in low + share * (high - low))
-    assert float(found.questions[4].found.split()[0]) == pytest.approx(worst, rel=1e-5)
+    assert float(found.questions[4].answer.split()[0]) == pytest.approx(worst, rel=1e-5)
     with pytest.raises(ValueError, match="area must be of the joints left, right, got left"):
         fj.verdict(x, area={"left": 1e-4})

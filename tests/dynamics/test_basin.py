@@ -81,6 +81,15 @@ def test_belt_comes_to_rest_or_not():
     assert found.shares["equilibrium"] + found.shares["cycle 1"] == pytest.approx(1)
 
 
+def test_without_full_searches_no_start_ends_in_a_cycle():
+    coarse = {"max_returns": 100, "search": fj.BasinSearch(failures=0)}
+    result = fj.basin(of_problem(BELT), *BOX, 8, progress=False, **coarse)
+    assert result.outcomes == ("equilibrium", "diverges", "undecided")
+    assert result.shares["equilibrium"] > 0 and result.shares["undecided"] > 0
+    with pytest.raises(TypeError, match="search must be a BasinSearch"):
+        fj.basin(of_problem(BELT), *BOX, search=0.1)  # type: ignore[arg-type]
+
+
 @pytest.mark.slow
 def test_starts_on_and_beside_the_belt():
     """Within the friction limits it sticks, beyond them it slips; w = 0 to rounding is no trap."""

@@ -11,8 +11,10 @@ import pytest
 from numpy.polynomial import Polynomial
 
 from fractaljax._dynamics.events import Cubic, first_root, step, without_start
-from fractaljax._dynamics.hybrid import NONE, SECTION, HybridSystem
+from fractaljax._dynamics.guard import NONE, SECTION
+from fractaljax._dynamics.hybrid import HybridSystem
 from fractaljax._dynamics.scaled import hybrid_system
+from fractaljax._dynamics.transition import first_contact_state
 from hybrid_truth import Mechanism, phases
 from mechanisms import PLAIN, source_form
 from tools import reference_scene
@@ -20,7 +22,7 @@ from tools import reference_scene
 EPS = np.finfo(float).eps
 KINDS = pytest.mark.parametrize("kind", ["any", "guards"])
 equilibrium, field = jax.jit(HybridSystem.equilibrium), jax.jit(HybridSystem.field)
-contact_state = jax.jit(HybridSystem.contact_state)
+contact_state = jax.jit(first_contact_state)
 found_root = jax.jit(lambda *ends: first_root(Cubic.through(*ends)))
 
 
@@ -190,7 +192,7 @@ def _stepped(system, y, h):
         y, s_new, dt, guard, *_ = step(system, y, s, last, h)
         return (y, s_new, guard, t + dt), (y, s_new, t + dt, dt, guard)
 
-    start = y, system.contact_state(y), jnp.array(NONE), jnp.zeros(())
+    start = y, first_contact_state(system, y), jnp.array(NONE), jnp.zeros(())
     return jax.lax.scan(body, start, length=1600)[1]
 
 

@@ -7,7 +7,7 @@ import pytest
 
 import fractaljax as fj
 from fractaljax._dynamics.extremes import extreme_values
-from fractaljax._dynamics.hybrid import NONE, SECTION, UNUSED
+from fractaljax._dynamics.guard import NONE, SECTION, UNUSED
 from fractaljax._dynamics.scaled import hybrid_system
 from fractaljax._dynamics.segments import Segments
 

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
-from fractaljax._dynamics.hybrid import NONE, SECTION, HybridSystem
+from fractaljax._dynamics import step_length as step_lengths, transition
+from fractaljax._dynamics.guard import NONE, SECTION
+from fractaljax._dynamics.hybrid import HybridSystem
 from fractaljax._dynamics.scaled import check_rtol, hybrid_system, start_state
 from tools import both_modes, primitives, reference_scene
 
@@ -19,9 +21,9 @@ NAMES = ("m", "omega_1", "omega_2", "xi_1", "xi_2", "F", "V", "K_n", "K_t", "mu_
 
 field = jax.jit(HybridSystem.field)
 guards = jax.jit(HybridSystem.guards)
-switch = jax.jit(HybridSystem.switch)
-first_state = jax.jit(HybridSystem.contact_state)
-step_length = jax.jit(HybridSystem.step_length)
+switch = jax.jit(transition.switch)
+first_state = jax.jit(transition.first_contact_state)
+step_length = jax.jit(step_lengths.step_length)
 closures = jax.jit(HybridSystem.closures)
 equilibrium = jax.jit(HybridSystem.equilibrium)
 scaled = jax.jit(hybrid_system)
@@ -157,7 +159,7 @@ def test_steps_are_bounded_by_the_slope_of_friction():
             slopes.append((ends[0] - ends[1]) / 2e-6 / (omega * x["V"]))
         system, s, longest = scaled(scene_of(x)), np.array([[1.0], [-1.0]]), np.full(200, 1e-3)
         s = np.broadcast_to(s, (2, 200))
-        # Of so short a step nothing but the slope here counts.
+        # In so short a step only the slope here counts.
         step = step_length(system, y, s, field(system, y, s), longest, 1e-6 * longest)
         assert (step < longest).all()
         found = np.maximum(5e-10 / np.asarray(step) - 5e-7, 0)
@@ -214,14 +216,14 @@ def test_laws_go_on_below_zero_and_are_bounded():
         system = hybrid_system(reference_scene().replace(friction=law))
         assert system.scales is not None and float(system.scales.below[0]) > 0
         far = [
-            float(system._by_laws(jnp.full((2, 1), w), signs, signs)[0, 0])
+            float(system.friction(jnp.full((2, 1), w), signs, signs)[0, 0])
             for w in (-1e-12, -1e-3, -1.0, -1e3)
         ]
         assert min(far) >= 0 and max(far) <= 0.8 * (1 + 1e-12), law
         assert far[2] == far[3]
         # As smooth as the law.
         steps = 1e-3 * float(system.scales.below[0]) * jnp.arange(-2, 3)
-        values = [float(system._by_laws(jnp.full((2, 1), w), signs, signs)[0, 0]) for w in steps]
+        values = [float(system.friction(jnp.full((2, 1), w), signs, signs)[0, 0]) for w in steps]
         known = law.mu(float(system.speed) * steps)
         np.testing.assert_allclose(values, known, rtol=1e-12)
 

@@ -13,11 +13,11 @@ import pytest
 import fractaljax as fj
 import hybrid_truth
 from fractaljax._base.parts import substitute
-from fractaljax._dynamics import search
 from fractaljax._dynamics.acceptance import growth_of
 from fractaljax._dynamics.cycle import repels
-from fractaljax._dynamics.hybrid import NONE
+from fractaljax._dynamics.guard import NONE
 from fractaljax._dynamics.orbit import solve_periodic_orbits
+from fractaljax._dynamics.search import find_attractor
 from fractaljax._dynamics.segments import flow
 from mechanisms import PLAIN, source_form
 from tools import (
@@ -455,8 +455,10 @@ test_refusals = refusals(
 def test_another_contact_law_needs_no_other_program(monkeypatch):
     """The search knows stiffnesses and loads alone, so that users do not wait for it twice."""
     reference_cycle()
-    traced, find = [], search.find
-    monkeypatch.setattr(search, "find", lambda *given: traced.append(given) or find(*given))
+    traced, place = [], "fractaljax._dynamics.limit_cycle.find_attractor"
+    monkeypatch.setattr(
+        place, lambda *arguments: traced.append(arguments) or find_attractor(*arguments)
+    )
     fj.limit_cycle(reference_scene().replace(contact=fj.brake_scene().contact))
     assert not traced
     jax.make_jaxpr(lambda x: fj.limit_cycle(x, segments=47))(reference_scene())

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
-from fractaljax._dynamics.hybrid import NONE, UNUSED
+from fractaljax._dynamics.guard import NONE, UNUSED
 from fractaljax._dynamics.lanes import together
-from fractaljax._dynamics.maps import _maps, coarse_maps, exact_maps, in_blocks, unmoved
+from fractaljax._dynamics.maps import _maps, coarse_maps, exact_maps, identity_maps, in_blocks
 from fractaljax._dynamics.scaled import hybrid_system
 from fractaljax._dynamics.segments import Segments
 
@@ -46,7 +46,7 @@ def test_segments_in_blocks(size):
     system, segments = problem(2)
 
     def solved(size):
-        return in_blocks(lambda some: _maps(system, some), unmoved, size, segments)
+        return in_blocks(lambda some: _maps(system, some), identity_maps, size, segments)
 
     found, wanted = jax.jit(lambda: (solved(size), solved(LENGTH)))()
     ends, A, b = found

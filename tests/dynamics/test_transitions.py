@@ -7,7 +7,8 @@ import jax
 import numpy as np
 
 import hybrid_truth
-from fractaljax._dynamics.hybrid import OPEN
+from fractaljax._dynamics import transition
+from fractaljax._dynamics.contact_state import OPEN
 from fractaljax._dynamics.scaled import hybrid_system
 from mechanisms import PROBLEMS
 from structures import of_problem
@@ -66,7 +67,7 @@ def case(seed):
 def test_transitions():
     """Of 3000 events; in two of three the switch releases a face that stuck."""
     system = jax.jit(hybrid_system)(of_problem(PROBLEM))
-    switch = jax.jit(lambda y, s, guard: system.switch(y, s, guard)[1])
+    switch = jax.jit(lambda y, s, guard: transition.switch(system, y, s, guard)[1])
     units = np.asarray(system.units)
     cases = [made for seed in range(3000) if (made := case(seed))]
     compared = released = 0

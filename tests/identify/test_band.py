@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from fractaljax._identify.band import check_band, chosen_band, noise_model
-from fractaljax._identify.spectrum import Spectrum
+from fractaljax._identify.band import check_band, choose_band, noise_model
+from fractaljax._identify.spectrum import PowerSpectrum
 from fractaljax._identify.stylus import tip_limit
 
 LENGTH, NYQUIST, RATIO = 2e-3, 5e5, 1.5
@@ -18,7 +18,7 @@ CHANCE = np.random.default_rng(3).gamma(3, 1 / 3, F.size)  # three tapers
 def spectrum(factor: ArrayLike = 1.0, floor=0.0, chance: ArrayLike = CHANCE, p=2.0):
     one = np.ones_like(F)
     power = (1e-20 * (F / 1e5) ** -p * np.asarray(factor) + floor) * np.asarray(chance)
-    return Spectrum(F, power, 3 * one, 1 / F, 0 * one, "profile", NYQUIST)
+    return PowerSpectrum(F, power, 3 * one, 1 / F, 0 * one, "profile", NYQUIST)
 
 
 @pytest.mark.parametrize(
@@ -35,7 +35,7 @@ def spectrum(factor: ArrayLike = 1.0, floor=0.0, chance: ArrayLike = CHANCE, p=2
 )
 def test_chosen_band(measured, top, low, high, warning):
     """From five periods in the length to half of Nyquist, less what is not a power law."""
-    found = chosen_band(measured, LENGTH, RATIO, top)
+    found = choose_band(measured, LENGTH, RATIO, top)
     assert low[0] <= found.low <= low[1] and high[0] <= found.high <= high[1]
     assert [line[: len(warning or "")] for line in found.warnings] == [warning] * bool(warning)
     if warning is None:
@@ -58,9 +58,9 @@ def test_a_given_band_is_kept():
     assert (found.low, found.high) == (3e3, 2e5)
     assert found.warnings == ("the band goes beyond the instrument's limit of 1e+05 1/m",)
     with pytest.raises(ValueError, match="the instrument's limit of 3000 1/m leaves no band"):
-        chosen_band(spectrum(), LENGTH, RATIO, 3e3)
+        choose_band(spectrum(), LENGTH, RATIO, 3e3)
     noise = noise_model(spectrum(np.where(F < 0.85 * NYQUIST, 1, 1e-3)), (2.5e3, NYQUIST), RATIO)
-    assert noise.flat_mean == pytest.approx(-0.5, abs=0.05) and not noise.aliased
+    assert noise.flat_prior.mean == pytest.approx(-0.5, abs=0.05) and not noise.aliased
 
 
 @pytest.mark.parametrize("p", [1.6, 2.2])

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.special import zeta
 
-from fractaljax._identify.fit import Bins, bin_edges, curvature, fit, shape
-from fractaljax._identify.spectrum import Spectrum
+from fractaljax._identify.fit import Bins, FlatPrior, bin_edges, curvature, fit, shape
+from fractaljax._identify.spectrum import PowerSpectrum
 
 NYQUIST, BAND, RATIO = 5e5, (5e3, 2.5e5), 1.5
 F = np.arange(1e3, NYQUIST, 1e3)
@@ -16,7 +16,7 @@ F = np.arange(1e3, NYQUIST, 1e3)
 def spectrum(power, kind="profile", spread=0.0):
     """Ordinates a thousand 1/m apart."""
     one = np.ones_like(F)
-    return Spectrum(F, power, one, 1 / F, spread * one, kind, NYQUIST)
+    return PowerSpectrum(F, power, one, 1 / F, spread * one, kind, NYQUIST)
 
 
 def law(p, aliased=False):
@@ -47,9 +47,16 @@ EXACT = [  # (power by p, p, flat, kind, spread, options)
     (aliased_law, 1.8, 0, "profile", 0, {"aliased": True}),
     (lambda p: law(p) * (1 + p * (p + 1) / 2 * SPREAD / F**2), 2.5, 0, "profile", SPREAD, {}),
     (lambda p: law(p) * (1 + (p + 1) ** 2 / 2 * SPREAD / F**2), 2.5, 0, "map", SPREAD, {}),
-    (lambda p: law(p) + 3e-20, 2.4, 3.0, "profile", 0, {"flat_deviation": 1e6}),
-    (lambda p: law(p) + 3e-20 * F / NYQUIST, 2.4, 3.0, "map", 0, {"flat_deviation": 1e6}),
-    (lambda p: law(p) - 3e-21, 2.0, -0.3, "profile", 0, {"flat_mean": -0.3}),
+    (lambda p: law(p) + 3e-20, 2.4, 3.0, "profile", 0, {"flat_prior": FlatPrior(deviation=1e6)}),
+    (
+        lambda p: law(p) + 3e-20 * F / NYQUIST,
+        2.4,
+        3.0,
+        "map",
+        0,
+        {"flat_prior": FlatPrior(deviation=1e6)},
+    ),
+    (lambda p: law(p) - 3e-21, 2.0, -0.3, "profile", 0, {"flat_prior": FlatPrior(-0.3)}),
     (lambda p: law(p) * np.exp(plateau(F)[1] * p), 2.2, 0, "profile", 0, {"factor": plateau}),
     (lambda p: law(p) / (1 + F / 1e5), 2.0, 0, "profile", 0, {"factor": damped}),
 ]
@@ -108,9 +115,11 @@ def test_errors_and_a_bend_are_measured():
         assert values.mean() == pytest.approx(truth, abs=4 * values.std() / math.sqrt(300))
         assert values.std() < 1.1 * error < 1.7 * values.std()
     bent = law(2.0) * np.exp(-0.05 * np.log(F / 5e4) ** 2)
-    c, _ = curvature(fit(spectrum(bent), BAND, RATIO, flat_deviation=1e-3))
+    c, _ = curvature(fit(spectrum(bent), BAND, RATIO, flat_prior=FlatPrior(deviation=1e-3)))
     assert c == pytest.approx(-0.05, abs=0.005)
-    straight, error = curvature(fit(spectrum(law(2.0)), BAND, RATIO, flat_deviation=1e-3))
+    straight, error = curvature(
+        fit(spectrum(law(2.0)), BAND, RATIO, flat_prior=FlatPrior(deviation=1e-3))
+    )
     assert abs(straight) < 1e-3 < error
 
 

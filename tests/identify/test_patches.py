@@ -9,7 +9,7 @@ import pytest
 import fractaljax as fj
 from fractaljax._identify import identify as module
 from fractaljax._identify.fit import Bins, bin_edges, fit
-from fractaljax._identify.patches import between_patches
+from fractaljax._identify.patches import patch_covariance
 from fractaljax._identify.spectrum import map_spectra
 from synthetic import DX, gaussian_map, surface
 
@@ -25,10 +25,10 @@ def test_one_patch_at_many_heights_and_its_influence():
     law = fit(spectrum, BAND, RATIO)
     bins = Bins(map_spectra(patch, DX, DX)[0], BAND, RATIO)
     chance = np.linalg.inv(law.influence[:2] * bins.variance @ law.influence[:2].T)
-    found = between_patches(z, DX, DX, spectrum, law, BAND, RATIO)
+    found = patch_covariance(z, DX, DX, spectrum, law, BAND, RATIO)
     expected = np.var(height**2, ddof=1) / np.mean(height**2) ** 2 - 1.3 / chance[0, 0]
     np.testing.assert_allclose(found, [[expected, 0], [0, 0]], rtol=1e-9, atol=1e-12 * expected)
-    alike = between_patches(np.tile(patch, (4, 4)), DX, DX, spectrum, law, BAND, RATIO)
+    alike = patch_covariance(np.tile(patch, (4, 4)), DX, DX, spectrum, law, BAND, RATIO)
     np.testing.assert_array_equal(alike, np.zeros((2, 2)))
     # ln A, p and the flat share against differences by the power of one bin.
     spectrum = map_spectra(gaussian_map(np.random.default_rng(1)), DX, DX)[0]
@@ -95,7 +95,7 @@ def test_a_quadrant_predicts_the_others(make, monkeypatch):
     apart = quadrants_apart(make, maps)
     assert np.sqrt(np.mean(apart[:, 0] ** 2)) < 1.3
     assert np.all(np.mean(np.abs(apart) < 2, axis=0) > least)
-    monkeypatch.setattr(module, "between_patches", lambda *_: np.zeros((2, 2)))
+    monkeypatch.setattr(module, "patch_covariance", lambda *_: np.zeros((2, 2)))
     apart = quadrants_apart(make, maps)
     assert np.sqrt(np.mean(apart[:, 0] ** 2)) > 1.4
 
@@ -115,7 +115,7 @@ def test_stationary_maps_keep_their_errors(make, monkeypatch):
         ).T
 
     error, stated = errors()
-    monkeypatch.setattr(module, "between_patches", lambda *_: np.zeros((2, 2)))
+    monkeypatch.setattr(module, "patch_covariance", lambda *_: np.zeros((2, 2)))
     wider = stated / errors()[1]
     assert np.median(wider) < 1.05 and wider.mean() < 1.1
     covered = np.mean(np.abs(error) < stated)

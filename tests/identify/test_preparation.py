@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fractaljax._identify.preparation import checked, prepared, spacing
+from fractaljax._identify.preparation import check_heights, prepare_heights, spacing
 from tools import refusals
 
 NAN = np.nan
@@ -30,7 +30,7 @@ def holed(n, *gaps):
 )
 def test_long_gaps_divide(z, sizes, missing, unused):
     """Short gaps are interpolated, segments too short to be of use are counted."""
-    heights = prepared(z)
+    heights = prepare_heights(z)
     assert [segment.size for segment in heights.segments] == sizes
     assert (heights.missing, heights.outliers, heights.unused) == (missing, 0, unused)
     first = heights.segments[0]
@@ -42,7 +42,7 @@ def test_long_gaps_divide(z, sizes, missing, unused):
 def test_spikes_become_gaps_and_a_spacing_is_one_number():
     z = rough(400)
     z[[50, 200, 300]] += [60.0, -80.0, 90.0]
-    heights = prepared(z)
+    heights = prepare_heights(z)
     assert heights.outliers == 3 and heights.missing == 0
     np.testing.assert_allclose(heights.segments[0][50], (z[49] + z[51]) / 2)
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(heights.despiked)), [50, 200, 300])
@@ -58,14 +58,14 @@ def test_kinks_are_no_spikes():
     """The cusps between arcs of a tip stay; spikes of one point and of two do not."""
     x = np.arange(2000.0)
     arcs = -((x % 96.7 - 48.35) ** 2) / 4000 + 1e-4 * np.random.default_rng(0).normal(size=x.size)
-    assert prepared(arcs).outliers == 0
+    assert prepare_heights(arcs).outliers == 0
     spikes = [300, 707, 1400, 1401]
     arcs[spikes] += [0.1, -0.2, 0.3, 0.3]
-    found = prepared(arcs)
+    found = prepare_heights(arcs)
     assert set(spikes) <= set(np.flatnonzero(np.isnan(found.despiked))) and found.outliers < 6
     both = np.add.outer(arcs[1500:1600], 0.5 * arcs[1550:1650])
     both[40, 50] += 0.5
-    assert prepared(both).outliers == 1
+    assert prepare_heights(both).outliers == 1
 
 
 def test_gaps_of_a_map_and_masked_heights():
@@ -75,12 +75,12 @@ def test_gaps_of_a_map_and_masked_heights():
     z[20:40] = plane[20:40]
     holes = z.copy()
     holes[25:28, 30:33] = holes[35] = NAN
-    heights = prepared(holes)
+    heights = prepare_heights(holes)
     assert heights.missing == 9 + 80
     np.testing.assert_allclose(heights.segments[0][22:38], z[22:38], atol=1e-12)
     z = np.ma.masked_greater(rough(200), 1e9)
     z[3] = np.ma.masked
-    assert np.isnan(checked(z)).sum() == 1
+    assert np.isnan(check_heights(z)).sum() == 1
 
 
 Z = np.sin(np.arange(500.0) ** 1.5) * 1e-8
@@ -101,4 +101,4 @@ REFUSED = [
 ]
 
 
-test_refused = refusals(REFUSED, lambda z: prepared(checked(z)))
+test_refused = refusals(REFUSED, lambda z: prepare_heights(check_heights(z)))

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import fractaljax as fj
 import instrument_files as files
 from fractaljax._identify.files import read_measurement
 from fractaljax._identify.grid import equal_steps, map_on_grid
@@ -169,6 +170,7 @@ REFUSED = [
     ("long.csv", "1\n" * 2**20, {}, "it is too large: at most 1 MiB are read"),
     ("long.sur", "1\n" * 2**20, {}, "it is too large: at most 1 MiB are read"),
     ("bomb.x3p", npz(z=npy(np.zeros(2**22))), {}, "it unpacks to 33554"),
+    ("map.x3p", X3P, {"limits": fj.FileLimits(heights=19)}, "it holds 20 heights, at most 19 are"),
     ("noise.x3p", NOISE, {}, "unknown to SurfaceTopography .*, or damaged"),
     ("square", bytes(2 * 64**2), {}, "no known format"),
     ("cut.x3p", X3P[:500], {}, "unknown to SurfaceTopography .*, or damaged"),
@@ -177,12 +179,10 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("name", "content", "given", "message"), REFUSED, ids=without_bytes)
-def test_refused(tmp_path, monkeypatch, capsys, name, content, given, message):
+def test_refused(tmp_path, capsys, name, content, given, message):
     """One line that says what to do, no memory taken for what a file only claims to hold."""
     if "1 MiB" in message or "unpacks" in message:
-        for limit in ("files._MOST_TEXT", "files._MOST_ARRAYS", "files._MOST"):
-            monkeypatch.setattr(f"fractaljax._identify.{limit}", 2**20)
-        monkeypatch.setattr("fractaljax._identify.instrument_file._MOST_UNPACKED", 2**20)
+        given = {**given, "limits": fj.FileLimits(text=2**20, arrays=2**20, instrument=2**20)}
     assert_refused(tmp_path / name, content, message, **given)
     assert capsys.readouterr() == ("", "")
 

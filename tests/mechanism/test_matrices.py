@@ -8,7 +8,7 @@ import scipy.linalg
 import scipy.sparse
 
 import fractaljax as fj
-from fractaljax._mechanism.matrices import array_of, fitting, mass_matrix, mass_normalised, square
+from fractaljax._mechanism.matrices import as_array, fitting, mass_matrix, mass_normalised, square
 from structures import beam, matrices, state_matrix
 from tools import refusals
 
@@ -21,19 +21,19 @@ RATIOS = np.array([0.03, 0.01, 0.02, 0.0, 0.05])
     "convert", [np.ndarray.tolist, scipy.sparse.csr_matrix, jnp.asarray, np.float32]
 )
 def test_arrays_of_every_kind(convert):
-    found = array_of("K", convert(np.eye(3)))
+    found = as_array("K", convert(np.eye(3)))
     np.testing.assert_array_equal(found, np.eye(3))
     assert found.dtype == (np.float32 if convert is np.float32 else np.float64)
-    traced = jax.jit(lambda x: array_of("F", [x, 2 * x]))(3)
+    traced = jax.jit(lambda x: as_array("F", [x, 2 * x]))(3)
     np.testing.assert_array_equal(traced, [3.0, 6.0])
 
 
 @pytest.mark.parametrize(
     "value", ["K", None, [[1.0, "2"]], [[1.0], [2.0, 3.0]], [[True, 1]], 1j * K, [10**400]]
 )
-def test_what_is_no_array_of_real_numbers(value):
+def test_what_is_no_as_array_real_numbers(value):
     with pytest.raises(TypeError, match="K must be an array of real numbers, got"):
-        array_of("K", value)
+        as_array("K", value)
 
 
 test_refusals = refusals(

@@ -252,6 +252,15 @@ def test_what_is_written_is_read(tmp_path, case, kind):
 
 
 @pytest.mark.parametrize("case", CASES)
+def test_no_matrix_is_larger_than_the_limit(tmp_path, case):
+    name, write, *_ = CASES[case]
+    write(tmp_path / name, K)
+    assert fj.read_matrices(tmp_path / name, fj.FileLimits(dofs=len(K))).matrices
+    with pytest.raises(ValueError, match=rf"\b{len(K) - 1}\b"):
+        fj.read_matrices(tmp_path / name, fj.FileLimits(dofs=len(K) - 1))
+
+
+@pytest.mark.parametrize("case", CASES)
 def test_damage_gives_one_line_or_a_matrix(tmp_path, case):
     name, write, *_ = CASES[case]
     path = tmp_path / name
@@ -445,8 +454,8 @@ def test_too_many_rows_and_a_skew_matrix(tmp_path):
     np.testing.assert_array_equal(found, [[0, -1.5, 2.5], [1.5, 0, 0], [-2.5, 0, 0]])
 
 
-def test_what_unpacks_to_too_much_and_room_that_is_not_used(tmp_path, monkeypatch):
-    monkeypatch.setattr("fractaljax._mechanism.matrix_file._MOST", 10**6)
+def test_what_unpacks_to_too_much_and_room_that_is_not_used(tmp_path):
+    limits = fj.FileLimits(matrices=10**6)
     zeros = np.zeros((1000, 1000))
     scipy.io.savemat(tmp_path / "x.mat", {"K": zeros}, do_compression=True)
     np.savez_compressed(tmp_path / "x.npz", K=zeros)
@@ -454,9 +463,9 @@ def test_what_unpacks_to_too_much_and_room_that_is_not_used(tmp_path, monkeypatc
     (tmp_path / "x.mtx").write_bytes(b"\n" * 2 * 10**6)
     for name, message in {"x.npz": "unpacks", "x.mat": "unpacks", "x.mtx.gz": "unpacks"}.items():
         with pytest.raises(ValueError, match=f"^{name}: .*{message} to "):
-            fj.read_matrices(tmp_path / name)
+            fj.read_matrices(tmp_path / name, limits)
     with pytest.raises(ValueError, match=r"^x\.mtx: the file is larger than 1 MB"):
-        fj.read_matrices(tmp_path / "x.mtx")
+        fj.read_matrices(tmp_path / "x.mtx", limits)
     # MATLAB keeps it after entries were removed; what is there means nothing.
     full = scipy.sparse.csc_matrix(K)
     spare = np.array([9, 9]), np.array([np.nan, 7])

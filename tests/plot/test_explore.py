@@ -14,7 +14,7 @@ from scipy.special import erf
 import fractaljax as fj
 from browser import chromium, complaints
 from fractaljax._mechanism.quantities import replaced, substituted, with_optional
-from fractaljax.plot.explore import explored, page, point, points_at, surface_waves
+from fractaljax.plot.explore import page, point, points_at, slider_axes, surface_waves
 from fractaljax.plot.javascript import javascript
 from tools import refused_command, run_command as run
 
@@ -61,21 +61,21 @@ def test_the_translated_program_gives_what_python_gives(scene, windows):
     names, ends = tuple(windows), np.array(list(windows.values()))
     at = ends[:, 0] * (ends[:, 1] / ends[:, 0]) ** np.random.default_rng(1).random((200, len(ends)))
     whole = with_optional(scene, names)
-    wanted = points_at(whole, names, at)
+    expected = points_at(whole, names, at)
 
     def numbers(*q):
         return point(substituted(whole, dict(zip(names, q, strict=True))))
 
-    found = in_node(javascript(numbers, len(names), "f"), [f"f({q})" for q in at.tolist()])
-    assert len(found[0]) == len(wanted)
-    for name, column in zip(sorted(wanted), zip(*found, strict=True), strict=True):
-        got, want = np.array(column, float), np.asarray(wanted[name], float)
+    computed = in_node(javascript(numbers, len(names), "f"), [f"f({q})" for q in at.tolist()])
+    assert len(computed[0]) == len(expected)
+    for name, column in zip(sorted(expected), zip(*computed, strict=True), strict=True):
+        got, want = np.array(column, float), np.asarray(expected[name], float)
         size = np.nanmax(np.abs(want), initial=0.0) if "first" in name else np.abs(want)
         error = np.abs(got - want) / np.where(size > 0, size, 1)
         assert (np.isnan(got) == np.isnan(want)).all() and np.nanmax(error, initial=0) < 1e-9, name
     if scene is SCENE:
-        assert 0.1 < np.mean(wanted["plastic"]) < 0.9 and np.any(wanted["slip"])
-        assert np.any(np.asarray(wanted["growth_rate"]) > 0)
+        assert 0.1 < np.mean(expected["plastic"]) < 0.9 and np.any(expected["slip"])
+        assert np.any(np.asarray(expected["growth_rate"]) > 0)
 
 
 def test_operations_the_error_function_and_equal_lines():
@@ -88,15 +88,15 @@ def test_operations_the_error_function_and_equal_lines():
         return [z.imag, z.real, single, chosen, jnp.cbrt(-x), x**-3, jnp.sign(y) / 0.0, jnp.abs(y)]
 
     places = [(0.3, 0.2), (-0.7, 3.0), (1.0, 2.0), (1e-3, 1.0)]
-    found = in_node(javascript(function, 2, "f"), [f"f([{x},{y}])" for x, y in places])
-    for (x, y), row in zip(places, found, strict=True):
-        wanted = [float(value) for value in function(jnp.array(x), jnp.array(y))]
-        np.testing.assert_allclose(np.array(row), np.array(wanted), rtol=1e-15)
+    computed = in_node(javascript(function, 2, "f"), [f"f([{x},{y}])" for x, y in places])
+    for (x, y), row in zip(places, computed, strict=True):
+        expected = [float(value) for value in function(jnp.array(x), jnp.array(y))]
+        np.testing.assert_allclose(np.array(row), np.array(expected), rtol=1e-15)
     program = javascript(jax.scipy.special.erf, 1, "f")
     places = [0.0, 1e-300, -1e-9, 0.3, -1.0, 1.9, 2.1, -3.5, 5.9, 5.999, 6.0, -40.0, np.inf, np.nan]
     calls = [f"f([{str(x).replace('inf', 'Infinity').replace('nan', 'NaN')}])" for x in places]
-    found = [row[0] for row in in_node(program, calls)]
-    np.testing.assert_allclose(np.array(found, float), erf(places), rtol=4e-15)
+    computed = [row[0] for row in in_node(program, calls)]
+    np.testing.assert_allclose(np.array(computed, float), erf(places), rtol=4e-15)
 
     def twice(x):
         jnp.sin(x)
@@ -129,8 +129,8 @@ def test_waves_sum_to_the_topography():
     k = np.arange(len(waves))
     weights = L * (surface.G / L) ** (surface.D - 2) * np.sqrt(np.log(surface.gamma) / 10)
     z = np.tensordot(weights * surface.gamma ** ((surface.D - 3) * k), waves, 1)
-    wanted = fj.topography(surface, L, n, key=jax.random.key(0))
-    np.testing.assert_allclose(z, wanted, atol=1e-12 * np.abs(wanted).max())
+    expected = fj.topography(surface, L, n, key=jax.random.key(0))
+    np.testing.assert_allclose(z, expected, atol=1e-12 * np.abs(expected).max())
 
 
 def test_page_is_small_and_whole(tmp_path, capsys):
@@ -158,12 +158,12 @@ def test_command_refuses_in_one_line(over, said, capsys, tmp_path):
 
 def test_stops_hold_the_nodes_and_the_scene():
     """Every `refine`-th stop is a node; the value of the scene is one, to the last bit."""
-    axes, _ = explored(SCENE, dict(D=(2.31, 2.42), G=(1e-10, 1e-9)), dict(G=4))
-    for axis, own in zip(axes, (2.4, 1.342e-10), strict=True):
+    axes, _ = slider_axes(SCENE, dict(D=(2.31, 2.42), G=(1e-10, 1e-9)), dict(G=4))
+    for axis, nominal in zip(axes, (2.4, 1.342e-10), strict=True):
         stops = axis.stops
         assert (np.diff(stops) > 0).all() and len(stops) > 100
         assert (stops[:: axis.refine] == axis.nodes).all()
-        assert stops[axis.start * axis.refine] == own
+        assert stops[axis.start * axis.refine] == nominal
     assert len(axes[1].nodes) == 5 and axes[1].nodes[[0, -1]].tolist() == [1e-10, 1e-9]
 
 
@@ -217,14 +217,14 @@ def test_a_slider_moved_on_the_page_of_persson_s_law(tmp_path):
     with chromium() as browser:
         browser.get(path.as_uri())
         for D, P in ((20, 100), (90, 30)):
-            moved = {"D": D, "P": P}
-            at = {name: move(browser, name, k) for name, k in moved.items()}
+            positions = {"D": D, "P": P}
+            at = {name: move(browser, name, k) for name, k in positions.items()}
             scene = replaced(BY_PERSSON, at)
-            for name, wanted in [
+            for name, expected in [
                 ("growth_rate", fj.growth_rate(scene)),
                 ("K_n", fj.stiffness(scene)[0]),
             ]:
-                assert number_in(cell(browser, name)) == float(f"{float(wanted):.5g}")
+                assert number_in(cell(browser, name)) == float(f"{float(expected):.5g}")
         assert browser.execute_script("return shadeMap().kinds.size") == 1
         assert not complaints(browser)
 
@@ -239,19 +239,19 @@ def test_a_slider_moved_changes_the_numbers_to_what_python_says(tmp_path):
         browser.get(path.as_uri())
         assert number_in(cell(browser, "growth_rate")) == 22.080
         assert cell(browser, "verdict") == "squeals"
-        own = fj.limit_cycle(SCENE)
-        assert cell(browser, "amplitude") == f"{own.amplitude[0]:.4e} m".replace("e-0", "e-")
+        cycle = fj.limit_cycle(SCENE)
+        assert cell(browser, "amplitude") == f"{cycle.amplitude[0]:.4e} m".replace("e-0", "e-")
         assert "Computed at this point" in cell(browser, "cycle-note")
         verdicts = set()
         places = [(70, 60, 60, 60), (3, 9, 100, 31), (90, 60, 60, 60), (44, 80, 5, 110)]
         for D, G, P, mu in places:
-            moved = {"D": D, "G": G, "P": P, "mu": mu}
-            scene = replaced(SCENE, {name: move(browser, name, k) for name, k in moved.items()})
+            positions = {"D": D, "G": G, "P": P, "mu": mu}
+            scene = replaced(SCENE, {name: move(browser, name, k) for name, k in positions.items()})
             modes, (K_n, K_t) = fj.stability(scene), fj.stiffness(scene)
             verdict, cycle = cell(browser, "verdict"), cell(browser, "cycle-result")
             verdicts.add(verdict)
             assert verdict == "squeals" or cycle == verdict
-            for name, wanted in [
+            for name, expected in [
                 ("growth_rate", modes.growth_rate),
                 ("frequency", modes.frequency),
                 ("K_n", K_n),
@@ -259,14 +259,14 @@ def test_a_slider_moved_changes_the_numbers_to_what_python_says(tmp_path):
                 ("Sq", fj.roughness(scene.contact.surface, 1e-3, 1e-6).Sq),
             ]:
                 shown = cell(browser, name)
-                wanted = float(wanted)
-                assert np.isnan(wanted) == (shown.split()[0] == DASH)
-                if not np.isnan(wanted):
-                    assert number_in(shown) == float(f"{wanted:.5g}"), (name, moved)
+                expected = float(expected)
+                assert np.isnan(expected) == (shown.split()[0] == DASH)
+                if not np.isnan(expected):
+                    assert number_in(shown) == float(f"{expected:.5g}"), (name, positions)
         assert {"squeals", "quiet"} <= verdicts
         z = browser.execute_script("return Array.from(document.getElementById('surface').heights)")
-        wanted = fj.topography(scene.contact.surface, 1e-3, 96, key=jax.random.key(0))
-        np.testing.assert_allclose(z, np.ravel(wanted), atol=1e-6 * np.abs(wanted).max())
+        expected = fj.topography(scene.contact.surface, 1e-3, 96, key=jax.random.key(0))
+        np.testing.assert_allclose(z, np.ravel(expected), atol=1e-6 * np.abs(expected).max())
         # Between nodes the page says so; the scene squeals there.
         browser.find_element("id", "reset").click()
         move(browser, "D", 61)
@@ -281,8 +281,8 @@ def test_a_slider_moved_changes_the_numbers_to_what_python_says(tmp_path):
         ActionChains(browser).move_to_element(browser.find_element("id", "map")).click().perform()
         at = browser.execute_script("return values()")
         assert at[:2] != [2.4, 1.342e-10] and at[2] == 1907.3
-        wanted = float(fj.growth_rate(SCENE.replace(D=at[0], G=at[1])))
-        assert number_in(cell(browser, "growth_rate")) == float(f"{wanted:.5g}")
+        expected = float(fj.growth_rate(SCENE.replace(D=at[0], G=at[1])))
+        assert number_in(cell(browser, "growth_rate")) == float(f"{expected:.5g}")
         assert complaints(browser) == []
 
 
@@ -323,8 +323,8 @@ def test_widget_says_what_python_says():
     assert "+22.08 1/s" in numbers.value and "elastic-plastic" in numbers.value
     before = [picture.value for picture in pictures]
     D.index = 100
-    wanted = fj.growth_rate(SCENE.replace(D=D.value))
-    assert D.value > 2.4 and f"{wanted:+.5g} 1/s" in numbers.value
+    expected = fj.growth_rate(SCENE.replace(D=D.value))
+    assert D.value > 2.4 and f"{expected:+.5g} 1/s" in numbers.value
     assert all(bytes(new.value).startswith(b"\x89PNG") for new in pictures)
     assert all(new.value != old for new, old in zip(pictures, before, strict=True))
     assert motion.layout.display == "none" and button.description == "Limit cycle"

@@ -47,9 +47,9 @@ def chart(**axes):
     """A sweep of what a chart needs."""
 
     def measure(x):
-        found = fj.stability(x)
+        modes_at = fj.stability(x)
         names = "growth_rate", "eigenvalues", "resolutions", "counted"
-        return SimpleNamespace(**{name: getattr(found, name) for name in names})
+        return SimpleNamespace(**{name: getattr(modes_at, name) for name in names})
 
     values = {name: np.linspace(*ends) for name, ends in axes.items()}
     return fj.sweep(measure, two_joints(4), progress=False, **values)
@@ -79,13 +79,13 @@ class Recorder(matplotlib.animation.AbstractMovieWriter):
 
     def __init__(self, look):
         super().__init__()
-        self.look, self.seen = look, []
+        self.look, self.frames = look, []
 
     def setup(self, fig, outfile, dpi=None):
         self.fig = fig
 
     def grab_frame(self, **_):
-        self.seen.append(self.look(self.fig))
+        self.frames.append(self.look(self.fig))
 
     def finish(self):
         pass
@@ -94,7 +94,7 @@ class Recorder(matplotlib.animation.AbstractMovieWriter):
 def recorded(moving, look):
     writer = Recorder(look)
     moving.save("nowhere", writer)
-    return writer.seen
+    return writer.frames
 
 
 def corners(ax):
@@ -130,8 +130,8 @@ def test_charts_over_one_and_two_quantities():
     assert_whole(ax.figure)
     expected = np.zeros((5, 4), int)
     for place in np.ndindex(5, 4):
-        moved = {name: v[i] for (name, v), i in zip(result.axes.items(), place, strict=True)}
-        expected[place] = len(fj.stability(two_joints(4).replace(**moved)).unstable())
+        varied = {name: v[i] for (name, v), i in zip(result.axes.items(), place, strict=True)}
+        expected[place] = len(fj.stability(two_joints(4).replace(**varied)).unstable())
     shown = ax.collections[0].get_array().reshape(4, 5)
     np.testing.assert_array_equal(shown, expected.T)
     assert len(np.unique(expected)) > 2
@@ -150,8 +150,8 @@ def test_deformed_mesh():
     """Re(shape exp(i phase)) at the corners; amplitudes are those of ellipses."""
     ax = plot.complex_mode(SHAPE, phase=0.7, **STRIP)
     assert_whole(ax.figure)
-    moved = NODES + 0.02 * np.stack([0 * SHAPE.real, (SHAPE * np.exp(0.7j)).real], axis=1)
-    np.testing.assert_allclose(corners(ax), moved[CELLS], atol=1e-12)
+    deformed = NODES + 0.02 * np.stack([0 * SHAPE.real, (SHAPE * np.exp(0.7j)).real], axis=1)
+    np.testing.assert_allclose(corners(ax), deformed[CELLS], atol=1e-12)
     np.testing.assert_allclose(ax.collections[-1].get_array(), 1)
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("x [m]", "y [m]")
     both = np.arange(84).reshape(42, 2)
@@ -170,13 +170,13 @@ def test_solid_and_bars():
     ax = plot.complex_mode(np.arange(24) * 1j, phase=np.pi / 2, **SOLID)
     assert_whole(ax.figure)
     assert (ax.name, ax.get_zlabel()) == ("3d", "z [m]")
-    given = plot.new_figure().add_subplot()
-    assert plot.complex_mode(modes(), 0, given, phase=0.4) is given
-    assert_whole(given.figure)
+    ax = plot.new_figure().add_subplot()
+    assert plot.complex_mode(modes(), 0, ax, phase=0.4) is ax
+    assert_whole(ax.figure)
     s, shape = complex(modes().eigenvalues[0]), np.asarray(modes().shapes[0])
     words = f"{abs(s.imag) / 2e3 / np.pi:.4g} kHz, growth rate {s.real:.3g} 1/s, phase 23°"
-    assert given.get_title(loc="left") == words
-    heights = [bar.get_height() for bar in given.patches]
+    assert ax.get_title(loc="left") == words
+    heights = [bar.get_height() for bar in ax.patches]
     np.testing.assert_allclose(heights[:4], 2 * np.abs(shape), rtol=1e-12)
     np.testing.assert_allclose(heights[4:], (shape * np.exp(0.4j)).real, rtol=1e-12)
     named = fj.stability(fj.Structure.from_scene(fj.brake_scene()))
@@ -212,13 +212,13 @@ def test_files(tmp_path):
         for i in range(4):
             gif.seek(i)
             shown.append(np.asarray(gif.convert("L"), float))
-    apart = [np.abs(shown[0] - other).mean() for other in shown]
-    assert apart[0] == 0 and min(apart[1:]) > 0.1
+    differences = [np.abs(shown[0] - other).mean() for other in shown]
+    assert differences[0] == 0 and min(differences[1:]) > 0.1
     plot.animate_mode(SHAPE, frames=3, path=tmp_path / "wave.html", **STRIP)
     page = (tmp_path / "wave.html").read_text(encoding="utf-8")
-    found = re.findall(r'data:image/png;base64,([^"]*)"', page)
-    assert len(found) == 3
-    frame = matplotlib.image.imread(io.BytesIO(base64.b64decode(found[1].replace("\\\n", ""))))
+    images = re.findall(r'data:image/png;base64,([^"]*)"', page)
+    assert len(images) == 3
+    frame = matplotlib.image.imread(io.BytesIO(base64.b64decode(images[1].replace("\\\n", ""))))
     assert frame.shape[1] == 840
     rest = re.sub(r'base64,[^"]*"', '"', page)
     assert not re.search(r"https?:|//[a-z]|<link|fa-|src=", rest) and "⏸" in rest

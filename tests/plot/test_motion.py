@@ -19,7 +19,7 @@ BLOCK: dict[str, Any] = {  # moves along x, with a held edge
 COLOURS = {1: "tab:blue", -1: "tab:cyan", 0: "tab:orange", 2: "tab:red"}
 
 
-def moved(cycle, share, samples=256):
+def displaced(cycle, share, samples=256):
     """The displacements at a share of the period from their mean."""
     x = np.asarray(cycle.orbit(samples)[1])[:, : len(cycle.amplitude)]
     return x[round(share * samples) % samples] - x.mean(axis=0)
@@ -31,7 +31,7 @@ def test_places_marks_and_lanes(at):
     structure, cycle = belt_cycle()
     figure: Any = plot.cycle_motion(cycle, structure, at=at, scale=0.5, **BLOCK)
     top, lanes = figure.axes[0], next(ax for ax in figure.axes if "period" in ax.get_xlabel())
-    x = 0.5 * moved(cycle, at)[0]
+    x = 0.5 * displaced(cycle, at)[0]
     outline, drawn, marks = top.collections
     points = np.array(BLOCK["points"])
     np.testing.assert_allclose(outline.get_paths()[0].vertices[:4], points)
@@ -105,7 +105,7 @@ def test_a_reduced_structure_moves_the_whole_mesh():
     mesh: dict[str, Any] = {"points": points, "dofs": dofs, "cells": cells}
     figure: Any = plot.cycle_motion(cycle, reduced, at=0.25, scale=0.2, **mesh)
     _, drawn, marks = figure.axes[0].collections
-    x = 0.2 * np.asarray(reduced.full(moved(cycle, 0.25)))
+    x = 0.2 * np.asarray(reduced.full(displaced(cycle, 0.25)))
     shifted = points + x[dofs]
     corner = drawn.get_paths()[-1].vertices[1]
     np.testing.assert_allclose(corner, shifted[N - 1], rtol=1e-12)

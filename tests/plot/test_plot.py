@@ -42,13 +42,13 @@ MU, KAPPA = np.linspace(0.02, 1, 41), np.linspace(0.0, 1.4, 30)
 
 def test_a_png_and_a_notebook_are_given_the_picture():
     figure, other = (plot.topography(Z, 1e-6).figure for _ in range(2))  # layouts move on
-    found, expected, dpi = io.BytesIO(figure.png(60)), io.BytesIO(), figure.dpi
+    ours, expected, dpi = io.BytesIO(figure.png(60)), io.BytesIO(), figure.dpi
     other.savefig(expected, format="png", dpi=60)
     assert dpi == other.dpi != 60
     expected.seek(0)
-    pixels = matplotlib.image.imread(found)
+    pixels = matplotlib.image.imread(ours)
     np.testing.assert_array_equal(pixels, matplotlib.image.imread(expected))
-    # Of the size asked for, with what was drawn, again after more is drawn, also unpickled.
+    # The size is as asked, and what is drawn is there: after more is drawn, also unpickled.
     ax = plot.new_figure().add_subplot()
     ax.set_axis_off()
     blank = picture(ax.figure)
@@ -72,7 +72,7 @@ def family():
 
 
 @functools.cache
-def nothing():
+def no_cycle():
     return fj.limit_cycle(motionless_scene(), throw=False)
 
 
@@ -85,7 +85,7 @@ def both_stick():
 @functools.cache
 def batch():
     """Three cycles, the middle one without a result."""
-    return jax.tree.map(lambda *x: jnp.stack(x), reference_cycle(), nothing(), both_stick())
+    return jax.tree.map(lambda *x: jnp.stack(x), reference_cycle(), no_cycle(), both_stick())
 
 
 @functools.cache
@@ -232,9 +232,14 @@ test_refusals = refusals(
     [
         (lambda: plot.phase_portrait(reference_cycle(), direction=3), "direction must be 1 or 2"),
         (lambda: plot.spectrum(batch()), "index the batch first"),
-        (lambda: plot.spectrum(nothing()), "no limit cycle to draw: the motion dies out"),
+        (lambda: plot.spectrum(reference_cycle(), harmonics=0), "harmonics must be a whole number"),
+        (lambda: plot.spectrum(no_cycle()), "no limit cycle to draw: the motion dies out"),
         (lambda: plot.cycles({}), "at least one limit cycle"),
         (lambda: plot.trajectory(motion(), direction=0), "direction must be 1 or 2"),
+        (
+            lambda: plot.trajectory(motion(), samples=1),
+            "samples must be a whole number of at least",
+        ),
         (lambda: plot.trajectory(jax.tree.map(lambda x: x[None], motion())), "index the batch"),
         (lambda: plot.amplitudes(batch(), [1, 2], label="x"), r"got \(2,\) and \(3,\)"),
         (
@@ -262,6 +267,10 @@ test_refusals = refusals(
         (lambda: plot.curves(cube(), label="x"), "curves need scalars over one or two axes"),
         (lambda: plot.growth_map(cube()), "a map needs two axes of two values or more"),
         (lambda: plot.stability_map(reference_scene()), "scene has no quantity 'D'"),
+        (
+            lambda: plot.stability_map(BRAKE, points=1),
+            "points must be a whole number of at least 2",
+        ),
         (lambda: plot.basin(section(1.0, 21)), "starts that differ in 2 coordinates, got 1"),
     ]
 )
@@ -282,7 +291,7 @@ def test_design_shows_its_path_and_whether_it_is_one():
 
 @pytest.mark.slow
 def test_boundary_is_where_the_growth_rate_changes_sign():
-    for ax, moved, aside in (
+    for ax, vary, aside in (
         (plot.stability_map(BRAKE), lambda p: BRAKE.replace(D=p[0], G=p[1]), [0.004, 0]),
         (
             plot.growth_map(modes()),
@@ -293,7 +302,7 @@ def test_boundary_is_where_the_growth_rate_changes_sign():
         (zero,) = (c for c in ax.collections if list(getattr(c, "levels", ())) == [0.0])
         points = np.concatenate([path.vertices for path in zero.get_paths()])
         points = points[points[:, 1] < 0.9][5:-5:7]
-        growth = jax.vmap(lambda p, moved=moved: fj.growth_rate(moved(p)))
+        growth = jax.vmap(lambda p, vary=vary: fj.growth_rate(vary(p)))
         sides = growth(points - np.array([aside])), growth(points + np.array([aside]))
         assert (sides[0] * sides[1] < 0).mean() > 0.95
 
@@ -348,12 +357,12 @@ def test_all_that_is_a_number_is_drawn(draw):
     lacking = draw(eqx.tree_at(changed, whole, values))
     words = [text.get_text() for text in lacking.get_legend().get_texts()]
     assert "no steady sliding" in words
-    (filled,), (own, *_) = (
+    (filled,), (hatch, *_) = (
         [x for x in ax.collections if isinstance(x, ContourSet) and x.filled and not any(x.hatches)]
         for ax in (draw(whole), lacking)
     )
-    np.testing.assert_array_equal(own.levels, filled.levels)
-    areas = [sum(np.shape(path.vertices)[0] for path in x.get_paths()) for x in (own, filled)]
+    np.testing.assert_array_equal(hatch.levels, filled.levels)
+    areas = [sum(np.shape(path.vertices)[0] for path in x.get_paths()) for x in (hatch, filled)]
     assert areas[0] > 0.8 * areas[1]
 
 
@@ -375,8 +384,10 @@ def test_map_without_a_boundary():
     ax = plot.growth_map(rates())
     assert labels(ax) == ["stability boundary", "fully plastic", "gross slip"]
     assert ax.get_yscale() == "log" and ax.get_ylim() == pytest.approx((1e-12, 1e-8))
-    given = plot.stability_map(BRAKE.replace(stiffness_ratio=0.5), {"D": (2.3, 2.5)})
-    assert given.get_xlim() == (2.3, 2.5) and "gross slip" not in labels(given)
+    ax = plot.stability_map(BRAKE.replace(stiffness_ratio=0.5), {"D": (2.3, 2.5)})
+    assert ax.get_xlim() == (2.3, 2.5) and "gross slip" not in labels(ax)
+    coarse = plot.stability_map(BRAKE, points=30)
+    assert coarse.collections[0].get_array().size == 30**2
 
 
 def test_curves_of_stiffness_and_their_marks():
@@ -446,15 +457,16 @@ def test_spectrum_and_cycles_side_by_side():
     stems = np.array(ax.collections[0].get_segments())
     np.testing.assert_array_equal(stems[:, 1].T, [f, a])
     assert ax.get_ylim()[0] == stems[0, 0, 1] < a.min() and a.max() < ax.get_ylim()[1]
+    assert drawn(plot.spectrum(cycle, harmonics=5), "harmonics")[0].shape == (2, 4)
     # A period of two returns has twice as many lines.
     twice = eqx.tree_at(lambda cycle: cycle.returns, cycle, jnp.array(2))
     assert drawn(plot.spectrum(twice), "harmonics")[0].shape == (2, 39)
     # Orbits and lines as they are alone, a named row each, stems on the common axis.
-    given = {"soft": reference_cycle(), "hard": both_stick()}
-    figure = plot.cycles(given, direction=2)
+    shown = {"soft": reference_cycle(), "hard": both_stick()}
+    figure = plot.cycles(shown, direction=2)
     assert [part.get_suptitle() for part in figure.subfigs] == ["soft", "hard"]
     rows = [part.axes for part in figure.subfigs]
-    for (portrait, spectrum), cycle in zip(rows, given.values(), strict=True):
+    for (portrait, spectrum), cycle in zip(rows, shown.values(), strict=True):
         alone = plot.phase_portrait(cycle, direction=2)
         np.testing.assert_array_equal(drawn(portrait, "limit cycle"), drawn(alone, "limit cycle"))
         stems = np.array(spectrum.collections[0].get_segments())
@@ -487,8 +499,8 @@ def test_cycle_of_a_structure():
     lever = eqx.tree_at(lambda system: system.T, cycle._system, jnp.array([[-2.0]]))
     shown = [coordinate(lever, 1, joint, cycle.period, batch=0) for joint in (1, None)]
     assert [(*c.row, c.face) for c in shown] == [(-2.0, 0), (1.0, None)]
-    moved = fj.simulate(belt, cycle.state, 10.0)
-    for ax in (plot.trajectory(moved, joint=1), plot.trajectory(moved)):
+    simulated = fj.simulate(belt, cycle.state, 10.0)
+    for ax in (plot.trajectory(simulated, joint=1), plot.trajectory(simulated)):
         assert drawn(ax, "sticks")
     with pytest.raises(ValueError, match="joint must be 1, got 2"):
         plot.phase_portrait(cycle, joint=2)
@@ -525,6 +537,8 @@ def test_motion_is_drawn_as_it_is(direction):
     assert (x[0], x[-1]) == pytest.approx(ends)
     at_steps = np.interp(1e3 * motion().times, t, x)
     np.testing.assert_allclose(at_steps, 1e6 * motion().states[:, i], atol=1e-6)
+    ((few, _),) = drawn(plot.trajectory(motion(), samples=2), "motion")
+    assert len(few) == len(motion().times) + 2
     if direction == 2:
         slides = fj.simulate(motionless_scene(), [1e-8, 0, 0, 0], TIME)
         return np.testing.assert_equal(labels(plot.trajectory(slides)), ["motion"])
@@ -533,8 +547,8 @@ def test_motion_is_drawn_as_it_is(direction):
     sticks = np.diff(motion().times)[np.asarray(motion().contact_states)[:-1, 0] == 0].sum()
     # The last sample before its end is not drawn: one of some 180.
     assert sticks > 0 and np.diff(t)[inside].sum() == pytest.approx(1e3 * sticks, rel=0.03)
-    moved = np.diff(x)[inside].sum() / np.diff(t)[inside].sum()
-    assert moved == pytest.approx(1e3 * 0.15, rel=1e-6)  # um/ms
+    speed = np.diff(x)[inside].sum() / np.diff(t)[inside].sum()
+    assert speed == pytest.approx(1e3 * 0.15, rel=1e-6)  # um/ms
 
 
 # --- surfaces and samples -----------------------------------------------------------------
@@ -548,13 +562,13 @@ def test_distribution_and_identification():
         np.testing.assert_allclose(y[1:], [(np.asarray(values) <= at).mean() for at in x[1:]])
         np.testing.assert_array_equal(np.sort(values), x[1:])
     assert (drawn(ax, "limit 0")[0][0] == 0).all()
-    found = spectrum_of_profile()
-    ax = plot.identification(found)
+    result = spectrum_of_profile()
+    ax = plot.identification(result)
     assert "limit of the instrument 6.25e+04 1/m" in labels(ax)
-    np.testing.assert_array_equal(ax.lines[0].get_ydata(), found.spectrum.power)
-    ((f, power),) = drawn(ax, f"D = {found.D:.3f} ± ")
-    np.testing.assert_allclose(f[[0, -1]], found.band)
-    np.testing.assert_allclose(power, found.law(f))
+    np.testing.assert_array_equal(ax.lines[0].get_ydata(), result.spectrum.power)
+    ((f, power),) = drawn(ax, f"D = {result.D:.3f} ± ")
+    np.testing.assert_allclose(f[[0, -1]], result.band)
+    np.testing.assert_allclose(power, result.law(f))
     of_map = fj.identify(gaussian_map(np.random.default_rng(0), shape=(64, 64)), DX)
     assert "of the map" in plot.power_spectrum(of_map).get_ylabel()
 

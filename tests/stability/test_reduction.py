@@ -206,6 +206,8 @@ def test_refused(message):
         fj.reduce(full_structure("no joints"), **(dict(over={}, band=BAND) | REFUSED[message]))
     with pytest.raises(TypeError, match="structure must be a Structure"):
         fj.reduce(fj.brake_scene(), {}, BAND)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="search must be a ReductionSearch"):
+        fj.reduce(full_structure("no joints"), {}, BAND, search=8)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("columns", [0, 1, 5, 70])

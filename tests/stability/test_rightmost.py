@@ -11,7 +11,6 @@ import scipy.linalg
 
 import fractaljax as fj
 from fractaljax._mechanism.reduced import CoarseSpace
-from fractaljax._stability import reduction
 from fractaljax._stability.quadratic import solve
 from fractaljax._stability.rightmost import _refined, rightmost
 from structures import state_matrix
@@ -177,14 +176,14 @@ def test_derivatives_of_every_order_are_those_of_all_modes(orders):
 
 
 @pytest.mark.slow
-def test_a_reduced_structure_keeps_its_coarse_space(monkeypatch, tmp_path):
+def test_a_reduced_structure_keeps_its_coarse_space(tmp_path):
     """On disk too; growth rates and slopes are those of all its modes."""
-    monkeypatch.setattr(reduction, "_WORTH", (10, 1.0))
     M, C, K = problem()
     skew = [("kr", C - C.T)]
     joint = fj.Joint(fj.FixedContact(0.5, 0.2), fj.Coulomb(0.4), 1, 2)
     full = fj.ParametricStructure(M, C, [(1, (K + K.T) / 2), *skew], joint, {"kr": 0.1})
-    reduced = fj.reduce(full, {"kr": (0.0, 0.2), "mu": (0.2, 0.6)}, BAND, 1e-7)
+    search = fj.ReductionSearch(coarse_from=10, coarse_share=1.0)
+    reduced = fj.reduce(full, {"kr": (0.0, 0.2), "mu": (0.2, 0.6)}, BAND, 1e-7, search=search)
     coarse = reduced.coarse
     assert coarse is not None and coarse.V.shape[1] < reduced.n < N
     reduced.save(tmp_path / "x.toml")

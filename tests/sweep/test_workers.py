@@ -149,11 +149,17 @@ def test_what_cannot_be_sent_and_what_is_no_executor(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_without_cloudpickle_functions_of_a_module_travel(monkeypatch):
+def test_without_cloudpickle_threads_alone_compute(monkeypatch, tmp_path):
+    """Also a measure that fails there has its error."""
     monkeypatch.setitem(sys.modules, "cloudpickle", None)
-    assert_same(swept(executor=Posted()), swept())
-    with pytest.raises(TypeError, match=r'others with .* install "fractaljax\[sweep\]": .*lambda'):
-        swept(lambda scene: fj.growth_rate(scene), executor=Posted())
+    with pytest.raises(
+        ImportError, match=r"^executor needs cloudpickle unless .*threads: [^\n]*p\]"
+    ):
+        swept(executor=Posted())
+    with ThreadPoolExecutor(1) as executor:
+        assert_same(swept(executor=executor), swept())
+        with pytest.raises(Exception, match="D is too large here"):
+            swept(limited, executor=executor)
 
 
 def limited(scene):
@@ -187,7 +193,7 @@ class Dying(Posted):
         return result
 
 
-def test_a_pool_that_dies_or_forks(tmp_path):
+def test_a_pool_that_dies(tmp_path):
     with pytest.raises(RuntimeError, match=r"^a worker of executor died; out would keep what is d"):
         swept(executor=Dying())
     with pytest.raises(RuntimeError, match=r"^a worker .* died; out .*run\.zarr keeps what is don"):
@@ -195,12 +201,24 @@ def test_a_pool_that_dies_or_forks(tmp_path):
     executor = Posted()
     assert_same(swept(executor=executor, out=tmp_path / "run.zarr"), swept())
     assert executor.calls == 4
-    if "fork" in multiprocessing.get_all_start_methods():
-        forking = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("fork"))
-        with pytest.raises(ValueError, match="executor must not fork, which JAX does not survive"):
-            swept(executor=forking)
     with pytest.raises(ValueError, match="devices are those of this process"):
         swept(executor=Posted(), devices=jax.devices())
+
+
+@pytest.mark.skipif(
+    "fork" not in multiprocessing.get_all_start_methods(), reason="this system does not fork"
+)
+@pytest.mark.filterwarnings("ignore:.*fork")  # of Python and of JAX
+@pytest.mark.parametrize("running", [False, True])
+def test_forks_refuse_to_compute(running, tmp_path):
+    """Also processes that the pool forked before the sweep was called."""
+    context = multiprocessing.get_context("fork")
+    with ProcessPoolExecutor(1, mp_context=context) as executor:
+        if running:
+            assert executor.submit(os.getppid).result() == os.getpid()
+        with pytest.raises(ValueError, match="executor must not fork, which JAX does not survive"):
+            swept(executor=executor, out=tmp_path / "run.zarr")
+    assert not list((tmp_path / "run.zarr" / "computed").glob("c.*"))
 
 
 def test_threads_share_what_is_compiled(monkeypatch):

@@ -12,7 +12,7 @@ import pytest
 
 import fractaljax as fj
 from fractaljax._validate import validate as module
-from fractaljax._validate.case import Case, Check, Curve, Found, Panel, closed, stated
+from fractaljax._validate.case import Case, CaseResult, Check, Curve, Panel, closed, stated
 from tools import (
     DOCS,
     assert_same_picture,
@@ -33,7 +33,7 @@ def script():
 
 
 @functools.cache
-def found(*names):
+def validated(*names):
     """All cases where none is named."""
     return fj.validate(*names, progress=False)
 
@@ -46,7 +46,9 @@ def fake(ours=1.0, missing="", error=None):
             raise error
         x = np.array([0.0, 1.0])
         curves = [Curve(x, x, "theirs", False), Curve(x, ours * x, "fractaljax", True)]
-        return Found([stated("length [m]", 1.0, ours, 0.01)], [Panel("x [m]", "y [m]", curves)])
+        return CaseResult(
+            [stated("length [m]", 1.0, ours, 0.01)], [Panel("x [m]", "y [m]", curves)]
+        )
 
     return Case("fake", "A fake", "Nobody, J. Null 1, 1 (1900)", "10.0/0", compute, lambda: missing)
 
@@ -83,7 +85,7 @@ def test_a_number_agrees_within_its_tolerance(published, ours, tolerance, differ
 
 def test_two_cases_and_their_table():
     """Critical friction over K_t/K_n, and Mindlin's ratio."""
-    both = found("source_onset", "campana")
+    both = validated("source_onset", "campana")
     assert both.agrees and list(both.cases) == ["source_onset", "campana"]
     text = repr(both)
     titles = ["case", "published", "ours", "difference", "tolerance", "basis", "result"]
@@ -184,18 +186,18 @@ def test_command_ends_with_1_where_one_differs(capsys, only, case):
 
 
 def test_every_case_names_its_source_and_is_on_the_page():
-    known = module.case_names()
+    cases = module.case_names()
     modules = [sys.modules[f"fractaljax._validate.{name}"] for name in module._MODULES]
-    assert len(known) == sum(len(each.CASES) for each in modules)
-    for name, case in known.items():
+    assert len(cases) == sum(len(each.CASES) for each in modules)
+    for name, case in cases.items():
         assert case.doi is None or re.fullmatch(r"10\.\d{4,}/\S+", case.doi)
         assert case.citation in PAGE and f"## {case.title}\n\n`{name}`: " in PAGE
         assert case.doi is None or f"(https://doi.org/{case.doi})" in PAGE
         picture = script().picture_of(name)
         assert f"]({picture.name})" in PAGE
         assert picture.read_bytes().startswith(b"\x89PNG") and picture.stat().st_size < 60_000
-    assert {name for name, case in known.items() if case.doi is None} == {"papangelo"}
-    assert rows_as_on_the_page(found("source_onset", "campana")) == 7
+    assert {name for name, case in cases.items() if case.doi is None} == {"papangelo"}
+    assert rows_as_on_the_page(validated("source_onset", "campana")) == 7
 
 
 def cells(text):
@@ -232,7 +234,7 @@ def rows_as_on_the_page(validation) -> int:
 @pytest.mark.slow
 def test_all_agree_with_numbers_and_pictures_of_the_page(tmp_path):
     """One test: two workers would compute all cases twice."""
-    everything = found()
+    everything = validated()
     assert everything.agrees, repr(everything)
     assert len(everything.cases) == 16
     for name, case in everything.cases.items():

@@ -1,0 +1,36 @@
+"""Options of the spectrum of measured heights, and of the band in which its law is fitted."""
+
+import dataclasses
+
+from .._base.options import require_number
+from .._base.parts import whole
+
+
+@dataclasses.dataclass(frozen=True)
+class SpectralAnalysis:
+    """How `identify` estimates a spectrum and chooses its band; the defaults suit most surfaces.
+
+    **Fields:**
+
+    - `tapers`: number of sine tapers of a profile, at least 1; more of them scatter less and
+      resolve less. Three have two thirds of the variance of Hann's window.
+    - `fewest_periods`: periods of the longest wave of the band in the length, at least 1. From
+      longer waves tilt has been taken out, and the window is too wide for them.
+    - `resolutions`: the shortest wavelength of the band in units of the lateral resolution, at
+      least 1. A Gaussian filter leaves 96 percent of the height of a wave of 4 cut-off wavelengths.
+    - `sigmas`: standard errors, at least 0, at which a bend or a noise floor is credible: the
+      deviance must fall by their square.
+
+    **Raises:** `ValueError` or `TypeError` for an option that is no number or outside its domain.
+    """
+
+    tapers: int = 3
+    fewest_periods: float = 5.0
+    resolutions: float = 4.0
+    sigmas: float = 3.0
+
+    def __post_init__(self):
+        whole("tapers", self.tapers, 1)
+        require_number("fewest_periods", self.fewest_periods, 1)
+        require_number("resolutions", self.resolutions, 1)
+        require_number("sigmas", self.sigmas, 0)
