@@ -17,6 +17,7 @@ import equinox as eqx
 import numpy as np
 
 from .preparation import fill_gaps
+from .spectrum import PowerSpectrum
 
 
 def correct_for_gaps(

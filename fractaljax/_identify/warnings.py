@@ -12,6 +12,7 @@ from .band import Band
 from .fit import PowerLaw, curvature, fit
 from .preparation import Heights
 from .quantisation import QuantisationTest, differences, rounding
+from .spectrum import PowerSpectrum
 from .structure_function import StructureFunction
 
 DISQUALIFYING = ("not fractal", "too few levels")  # of warnings that void D and G
