@@ -194,7 +194,14 @@ def one_line(error: Exception) -> str:
 # --- parts ---------------------------------------------------------------------------------
 
 
-def quantity(unit: str, meaning: str, *, log: bool = False, name: str | None = None) -> Any:
+def quantity(
+    unit: str,
+    meaning: str,
+    *,
+    log: bool = False,
+    name: str | None = None,
+    argument: str | None = None,
+) -> Any:
     """A numeric field of a part, with its unit and its meaning for files and tables.
 
     **Arguments:**
@@ -204,14 +211,22 @@ def quantity(unit: str, meaning: str, *, log: bool = False, name: str | None = N
     - `log`: True for a scale, which is designed and swept on a logarithmic axis; False by default.
     - `name`: name of the quantity and of the argument of `__init__`, by default that of the
       attribute.
+    - `argument`: name of the argument of `__init__` if the quantity needs another, because some
+      other part of a scene has one of that name.
     """
-    named = {} if name is None else {"name": name}
+    named = {"name": name, "argument": argument}
+    named = {key: value for key, value in named.items() if value is not None}
     return eqx.field(metadata={"unit": unit, "meaning": meaning, "log": log, **named})
 
 
 def quantity_name(field: dataclasses.Field) -> str:
     """The name of a field of a part in files, tables and `replace`."""
     return field.metadata.get("name", field.name)
+
+
+def argument_name(field: dataclasses.Field) -> str:
+    """The name of the argument of `__init__` that sets a field of a part."""
+    return field.metadata.get("argument", quantity_name(field))
 
 
 class Record(eqx.Module):
@@ -227,7 +242,7 @@ class Record(eqx.Module):
             value = getattr(self, field.name)
             if isinstance(value, jax.Array) and not isinstance(value, Tracer):
                 value = value.item() if value.ndim == 0 else np.asarray(value)
-            yield f"{quantity_name(field)}={value!r}"
+            yield f"{argument_name(field)}={value!r}"
 
 
 class Part(Record):
@@ -262,7 +277,7 @@ def rebuild(part: _PartT, changes: Mapping[str, Any]) -> _PartT:
         if isinstance(new, Part):
             new = rebuild(new, {other: x for other, x in changes.items() if other != name})
         changed |= new is not old
-        arguments[name] = new
+        arguments[argument_name(field)] = new
     return type(part)(**arguments) if changed else part
 
 

@@ -9,7 +9,7 @@ import tomllib
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any, NamedTuple, cast
 
-from .parts import Part, brief, quantity_name
+from .parts import Part, argument_name, brief, quantity_name
 
 Laws = Mapping[str, Mapping[str, type[Part]]]  # by field, then by the name of the law
 
@@ -158,10 +158,12 @@ def read_part(kind: type[Part], table: Mapping[str, Any], laws: Laws, name: str 
                 arguments[key] = read_law(key, below, laws, f"{inside}{key}")
             else:
                 arguments[key] = read_part(cast(type[Part], inner), below, laws, f"{inside}{key}")
-        elif key not in table and parameters[key].default is inspect.Parameter.empty:
+        elif (
+            key not in table and parameters[argument_name(field)].default is inspect.Parameter.empty
+        ):
             raise ValueError(f"{where} lacks the key {key!r}")
     try:
-        return kind(**arguments)
+        return kind(**{argument_name(fields[key]): value for key, value in arguments.items()})
     except (ValueError, TypeError) as error:
         raise type(error)(f"{where} {error}" if name else str(error)) from None
 

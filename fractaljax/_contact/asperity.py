@@ -32,8 +32,7 @@ from .._base.singular import boxcox
 from .._surface.surface import Surface
 from .contact import Contact
 from .fractal import critical_pressure_ratio, friction_correction, log_critical_area
-from .material import Material
-from .persson import mindlin_ratio
+from .material import Material, mindlin_ratio
 
 _LOG_PLASTIC = math.log(54)  # ln y from which all is plastic
 

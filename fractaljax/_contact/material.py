@@ -50,3 +50,8 @@ class Material(Part):
         nu1 = number("nu1", nu1, at_least=0, at_most=0.5)
         nu2 = number("nu2", nu2, at_least=0, at_most=0.5)
         return cls(1 / ((1 - nu1**2) / E1 + (1 - nu2**2) / E2), (nu1 + nu2) / 2, sigma_y, H)
+
+
+def mindlin_ratio(nu: Numbers) -> Numbers:
+    """K_t/K_n = (2 - 2 nu)/(2 - nu) of a contact without slip."""
+    return (2 - 2 * nu) / (2 - nu)

@@ -6,10 +6,12 @@ from typing import final
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike
+from jaxtyping import ArrayLike, Float, ScalarLike
 
-from .._base.parts import Numbers, concrete, number, quantity
+from .._base.parts import Numbers, concrete, number, quantity, scalar
+from .boundary_element import boundary_element
 from .contact import Contact
+from .material import Material, mindlin_ratio
 
 
 @final
@@ -49,6 +51,59 @@ class MeasuredContact(Contact):
             raise ValueError(f"loads must rise, got {self.loads}")
         self.P = number("P", P, above=0)
         self.stiffness_ratio = number("stiffness_ratio", stiffness_ratio, at_least=0)
+
+    @classmethod
+    def from_heights(
+        cls,
+        heights: Float[ArrayLike, "nx ny"],
+        dx: ScalarLike,
+        material: Material,
+        P: ArrayLike,
+        area: ScalarLike,
+        stiffness_ratio: ArrayLike | None = None,
+        *,
+        pressures: Sequence[float] | None = None,
+        plastic: bool = False,
+    ) -> "MeasuredContact":
+        """The law of a measured map, pressed on a flat by boundary elements.
+
+        It needs no statistics, so that surfaces with plateaus or deep grooves are right too, as far
+        as the map is large enough: its highest hill carries the smallest loads. On a larger area
+        the map is repeated side by side.
+
+        **Arguments:**
+
+        - `heights`: (nx, ny) [m], level and without gaps; opposite edges are taken to meet.
+        - `dx`: grid spacing [m], the same in x and y.
+        - `material`: of the pair; E alone counts unless `plastic`.
+        - `P`: normal load of the joint [N].
+        - `area`: nominal area of the joint [m^2].
+        - `stiffness_ratio`: K_t/K_n, by default Mindlin's (2 - 2 nu)/(2 - nu).
+        - `pressures`: rising nominal pressures [Pa] of the table; by default 12 from 1e-3 to .5
+          E Sdq, less if all of the map touches before.
+        - `plastic`: True lets no pressure exceed the hardness; False by default.
+
+        **Raises:** as `boundary_element`; `ValueError` unless area > 0, and for pressures of which
+        fewer than two leave gaps.
+        """
+        heights, dx = number("heights", heights), scalar("dx", dx, above=0)
+        area = scalar("area", area, above=0)
+        nominal = float(dx) ** 2 * heights.size
+        if pressures is None:
+            slopes = (np.diff(heights, axis=axis) / float(dx) for axis in (0, 1))
+            Sdq = float(np.sqrt(sum(np.mean(slope**2) for slope in slopes)))
+            pressures = list(np.geomspace(1e-3, 0.5, 12) * float(material.E) * Sdq)
+        loads, stiffnesses = [], []
+        for pressure in pressures:
+            pressed = boundary_element(heights, dx, material, pressure * nominal, plastic=plastic)
+            if not np.isfinite(pressed.K_n):
+                break
+            loads.append(pressure * float(area))
+            stiffnesses.append(float(pressed.K_n) * float(area) / nominal)
+        if len(loads) < 2:
+            raise ValueError("pressures must be two or more that leave gaps between the surfaces")
+        ratio = mindlin_ratio(material.nu) if stiffness_ratio is None else stiffness_ratio
+        return cls(loads, stiffnesses, P, ratio)
 
     @property
     def opening_exponent(self):

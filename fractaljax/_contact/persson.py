@@ -30,7 +30,7 @@ from .._surface.roughness import root_mean_square, wavelengths_of
 from .._surface.spectrum import Pieces, Spectrum
 from .._surface.surface import Surface
 from .contact import Contact, partial_slip
-from .material import Material
+from .material import Material, mindlin_ratio
 
 # Factors of the elastic energy in the middle range and of the finite-size law, the exponent that
 # joins the two, and the correction towards full contact: fitted to boundary elements, D = 2.1 to
@@ -43,11 +43,6 @@ _CLOSING = 0.5
 _LAYER = 3e-10  # m: no joint is stiffer than one layer of atoms of its own bulk
 _NODES = np.polynomial.legendre.leggauss(64)
 _NEGLIGIBLE = 40.0  # e^-40 is below rounding
-
-
-def mindlin_ratio(nu: Numbers) -> Numbers:
-    """K_t/K_n = (2 - 2 nu)/(2 - nu) of a contact without slip."""
-    return (2 - 2 * nu) / (2 - nu)
 
 
 @final

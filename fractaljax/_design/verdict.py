@@ -17,7 +17,8 @@ from .._contact.asperity import AsperityContact
 from .._contact.contact import Contact
 from .._contact.fixed import FixedContact
 from .._contact.fractal import FractalContact
-from .._contact.persson import PerssonContact, mindlin_ratio
+from .._contact.material import mindlin_ratio
+from .._contact.persson import PerssonContact
 from .._mechanism.joint import Joint
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import joints_of, quantity_names, require_one, unit, value_of

@@ -27,7 +27,8 @@ class SelfAffine(Spectrum):
     **Arguments:**
 
     - `Sq`: root mean square height [m].
-    - `H`: Hurst exponent, above 0 and at most 1; smaller is finer.
+    - `H`: Hurst exponent, above 0 and at most 1; smaller is finer. In files, `replace`, sweeps and
+      bounds it is `hurst`, since H is the hardness.
     - `rolloff`: wavelength [m], across the lay, above which the power spectrum is flat.
     - `shortest`: wavelength [m] at which the spectrum ends.
     - `longest`: wavelength [m] at which it begins; None (default) for a flat spectrum without end.
@@ -38,7 +39,10 @@ class SelfAffine(Spectrum):
     """
 
     Sq: Numbers = quantity("m", "root mean square height", log=True)
-    H: Numbers = quantity("-", "Hurst exponent, above 0 and at most 1; smaller is finer")
+    # The hardness of the material is the H of a scene.
+    H: Numbers = quantity(
+        "-", "Hurst exponent, above 0 and at most 1; smaller is finer", name="hurst", argument="H"
+    )
     rolloff: Numbers = quantity("m", "roll-off wavelength", log=True)
     shortest: Numbers = quantity("m", "shortest wavelength", log=True)
     longest: Numbers | None = quantity("m", "longest wavelength, if the spectrum has one", log=True)

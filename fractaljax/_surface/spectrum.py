@@ -138,8 +138,8 @@ class Spectrum(Part):
     def roll_off(self) -> tuple[Numbers, Numbers]:
         """The wavelength [m] at which m is greatest, and the Hurst exponent of shorter waves.
 
-        By default both are read off 64 points, the exponent as the mean slope of ln m, from .01
-        to 1.
+        By default both are read off 64 points, the exponent as the slope of ln m weighted by m,
+        from .01 to .99.
         """
         longest, shortest = self._ends()
         q = 2 * math.pi / longest * jnp.exp(jnp.linspace(0, 1, 64) * jnp.log(longest / shortest))
@@ -147,14 +147,17 @@ class Spectrum(Part):
 
 
 def fit_roll_off(q: Float[Array, " k"], m: Float[Array, " k"]) -> tuple[Numbers, Numbers]:
-    """The wavelength [m] where m is greatest; -1/2 of the slope of ln m beyond, .01 to 1."""
+    """The wavelength [m] where m is greatest; -1/2 of the slope of ln m beyond, .01 to .99."""
     peak = jnp.argmax(m)
     beyond = (jnp.arange(len(q)) > peak) & (m > 0)
     falls = jnp.log(jnp.where(beyond, m / m[peak], 1))
     distances = jnp.log(jnp.where(beyond, q / q[peak], 1))
+    # By the waves that are high: the end of a table may fall off otherwise.
+    weight = jnp.where(beyond, m / m[peak], 0)
+    squares = jnp.sum(weight * distances**2)
     # With the greatest m at the last point there is no slope.
-    H = -jnp.sum(falls * distances) / jnp.where(jnp.any(beyond), jnp.sum(distances**2), 1) / 2
-    return 2 * math.pi / q[peak], jnp.clip(H, 0.01, 1.0)
+    H = -jnp.sum(weight * falls * distances) / jnp.where(squares > 0, squares, 1) / 2
+    return 2 * math.pi / q[peak], jnp.clip(H, 0.01, 0.99)
 
 
 def through_gradients(q: Float[Array, " k+1"], gradients: Float[Array, " k"]) -> Pieces:
