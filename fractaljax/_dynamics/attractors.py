@@ -35,7 +35,7 @@ def attractors(
     - `mechanism`: as in `limit_cycle`.
     - `starts`: (k, 2n), [x, v] in m and m/s; by default 32 spread about the equilibrium, up to
       velocities of 2 V.
-    - `excitation`, `rtol`, `max_returns`: as in `limit_cycle`.
+    - `excitation`, `rtol`, `max_returns`, `search`: as in `limit_cycle`.
 
     **Raises:** `ValueError` for starts of another shape, and what `limit_cycle` raises.
     """

@@ -94,6 +94,7 @@ def read_matrices(path: str | os.PathLike, limits: FileLimits = FileLimits()) ->
     **Arguments:**
 
     - `path`: the file, whose ending tells its format.
+    - `limits`: how much is read, a `FileLimits`.
 
     **Returns:** `Matrices`, in the units of the file.
 

@@ -43,15 +43,20 @@ def areal_parameters(
     cutoff: ScalarLike | None = None,
     shortest: ScalarLike | None = None,
 ) -> ArealParameters:
-    """Roughness parameters of a map of heights z [m]; x is along the first axis.
+    """Roughness parameters of a map, as ISO 25178-2 defines them; x is along the first axis.
 
-    Points are dx [m] apart along the first axis and dy, by default dx, along the second. The
-    Gaussian filters of ISO 16610-61 take out waves shorter than `shortest` (S-filter [m]) and
-    longer than `cutoff` (L-filter [m]), and half a cutoff is dropped at all edges. A warning says
-    if what is left is smaller than a square with the cutoff as its side (ISO 25178-3).
+    The Gaussian filters of ISO 16610-61 take out waves shorter than `shortest` and longer than
+    `cutoff`, and half a cutoff is dropped at all edges. A warning says if what is left is smaller
+    than a square with the cutoff as its side (ISO 25178-3).
 
-    Without `shortest` no short waves are taken out. Without `cutoff`, z is roughness already: only
-    its mean is subtracted, no tilt, and of the map half of `shortest` is dropped at all edges.
+    **Arguments:**
+
+    - `z`: (n, m), heights [m].
+    - `dx`: distance of the points along the first axis [m].
+    - `dy`: distance of the points along the second axis [m], by default dx.
+    - `cutoff`: nesting index of the L-filter [m]. By default none: z is roughness already, only its
+      mean is subtracted, no tilt, and half of `shortest` is dropped at all edges.
+    - `shortest`: nesting index of the S-filter [m]. By default no short waves are taken out.
 
     Sdr is the mean of (1 + (dz/dx)^2 + (dz/dy)^2)^(1/2) - 1. Sal and Str take the map as one period
     of the surface, with s = 0.2; a lag ends at half the map, and so does Str of a surface with a
@@ -60,6 +65,8 @@ def areal_parameters(
     Differentiable in z and, without filters, in dx and dy; works under `jit` and `vmap` with grid
     and filters known at trace time. Sal and Str have first derivatives; extremes and what is sorted
     have derivatives piecewise. Flat heights have no Ssk, Sku, Sal and Str (NaN).
+
+    **Returns:** `ArealParameters`.
 
     **Raises:** `ValueError` unless z is (n, m), both >= 8, finite, dx > 0, dy > 0,
     2 max(dx, dy) <= shortest <= cutoff, and z is longer than the cutoff.

@@ -43,16 +43,21 @@ def profile_parameters(
     shortest: ScalarLike | None = None,
     sections: int | None = None,
 ) -> ProfileParameters:
-    """Roughness parameters of a profile of heights z [m] at points dx [m] apart.
+    """Roughness parameters of a profile, as ISO 21920-2 defines them.
 
-    The Gaussian filters of ISO 16610-21 take out waves shorter than `shortest` (lambda_s [m]) and
-    longer than `cutoff` (lambda_c [m]), and half a cutoff is dropped at both ends, as run-up and
-    overrun. The evaluation length, in the middle, is made of `sections` (sampling lengths) as long
-    as the cutoff: five, or as many as z holds, with a warning.
+    The Gaussian filters of ISO 16610-21 take out waves shorter than `shortest` and longer than
+    `cutoff`, and half a cutoff is dropped at both ends, as run-up and overrun. The evaluation
+    length, in the middle, is made of sections (sampling lengths) as long as the cutoff.
 
-    Without `shortest` no short waves are taken out. Without `cutoff`, z is roughness already: only
-    its mean is subtracted, no tilt, and the whole profile (less half of `shortest` at both ends) is
-    one section, or is divided into so many `sections`.
+    **Arguments:**
+
+    - `z`: (n,), heights [m].
+    - `dx`: distance of the points [m].
+    - `cutoff`: lambda_c [m]. By default none: z is roughness already, only its mean is subtracted,
+      no tilt, and all of it (less half of `shortest` at both ends) is one section.
+    - `shortest`: lambda_s [m]. By default no short waves are taken out.
+    - `sections`: how many sections, by default five, or as many as z holds, with a warning; without
+      `cutoff` the profile is divided into so many.
 
     Hills and valleys below a tenth of Rz, or narrower than a hundredth of a section, are no profile
     elements. RSm is NaN where no element is complete. Rk, Rpk and Rvk are those of the same
@@ -61,6 +66,8 @@ def profile_parameters(
     Differentiable in z and, without filters, in dx; works under `jit` and `vmap`, with filters and
     then dx known at trace time. Extremes, RSm and what is sorted have derivatives piecewise. Flat
     heights have no Rsk and Rku (NaN).
+
+    **Returns:** `ProfileParameters`.
 
     **Raises:** `ValueError` unless z is (n,), n >= 8, finite, dx > 0,
     2 dx <= shortest <= cutoff, and z holds the sections.
