@@ -80,7 +80,7 @@ class SelfAffine(Spectrum):
         q = jnp.asarray(q)
         if self.lay is None:
             return self._isotropic(q)
-        stretch = self._stretches(self.lay)
+        stretch = self._stretches(self.lay).reshape((1,) * q.ndim + (-1,))
         return jnp.mean(self.lay / stretch**2 * self._isotropic(q[..., None] * stretch), axis=-1)
 
     def C_at(self, q_x, q_y):
@@ -125,11 +125,13 @@ class SelfAffine(Spectrum):
         if self.lay is None:
             return waves
         # Waves of one direction, up to q: those without lay up to q' = q s, times lay/s^4.
-        low, high = waves.q[0] / jnp.maximum(self.lay, 1), waves.q[-1] / jnp.minimum(self.lay, 1)
+        # Beyond the waves of all directions, so that without a lay no edge is at their very end.
+        low = waves.q[0] / jnp.maximum(self.lay, 1) * (1 - 1e-6)
+        high = waves.q[-1] / jnp.minimum(self.lay, 1) * (1 + 1e-6)
         q = low * jnp.exp(jnp.arange(count + 1) * jnp.log(high / low) / count)
         stretch = self._stretches(self.lay)
         below = waves.gradient(q[:, None] * stretch[None])
-        total = jnp.mean(self.lay / stretch**4 * below, axis=1)
+        total = jnp.mean((self.lay / stretch**4)[None] * below, axis=1)
         return through_gradients(q, jnp.diff(total))
 
     def _two_pieces(self, longest) -> Pieces:

@@ -40,8 +40,11 @@ class Pieces(NamedTuple):
 
     def gradient(self, q: Numbers) -> Numbers:
         """The mean square gradient of the waves up to the wavenumbers q [rad/m]; any shape."""
-        x = jnp.log(jnp.clip(q[..., None] / self.q[:-1], 1, self.q[1:] / self.q[:-1]))
-        return jnp.sum(self.m * self.q[:-1] ** 2 * boxcox(x, self.r), axis=-1)
+        low, high, m, r = (
+            x.reshape((1,) * q.ndim + (-1,)) for x in (self.q[:-1], self.q[1:], self.m, self.r)
+        )
+        x = jnp.log(jnp.clip(q[..., None] / low, 1, high / low))
+        return jnp.sum(m * low**2 * boxcox(x, r), axis=-1)
 
 
 class Spectrum(Part):

@@ -77,3 +77,47 @@ test_refuses_what_is_no_measurement = refusals(
 def test_refuses_a_traced_table():
     with pytest.raises(TypeError, match="loads must be known when a program is traced"):
         jax.jit(lambda x: K_n(500.0, (x, 2 * x)))(1.0)
+
+
+# --- of a map -------------------------------------------------------------------------------------
+
+MATERIAL = fj.Material(E=1.154e11, nu=0.3, sigma_y=3.55e8, H=9.94e8)
+
+
+@pytest.fixture(scope="module")
+def heights():
+    surface = fj.SelfAffine(1e-6, 0.8, 2.5e-4, 5e-5)
+    return fj.topography(surface, 1e-3, 64, key=jax.random.key(1), periodic=True)
+
+
+def test_law_of_a_map_is_that_of_boundary_elements(heights):
+    """Also with a plateau; a joint of four times the area is four maps side by side."""
+    dx = 1e-3 / 64
+    z = np.minimum(np.asarray(heights), 5e-7)
+    law = fj.MeasuredContact.from_heights(z, dx, MATERIAL, 2e3, 4e-6)
+    for P in (law.loads[0], law.loads[5], 1e3):
+        K_n, K_t = law_at(law, P)
+        pressed = fj.boundary_element(z, dx, MATERIAL, P / 4)
+        rel = 1e-7 if P in law.loads else 0.03  # between two loads of the table
+        assert float(K_n) == pytest.approx(4 * float(pressed.K_n), rel=rel)
+        assert float(K_t / K_n) == pytest.approx(1.4 / 1.7, rel=1e-12)
+    scene = fj.brake_scene().replace(contact=law)
+    assert np.isfinite(fj.growth_rate(scene)) and fj.Scene.from_toml(scene.to_toml()) is not None
+
+
+def law_at(law, P):
+    return fj.MeasuredContact(law.loads, law.stiffnesses, P, law.stiffness_ratio).stiffness(
+        0.4, 0.2
+    )
+
+
+def test_loads_of_a_map_end_before_it_is_flat(heights):
+    pressures = [1e8, 1e9, 1e12, 1e13]
+    law = fj.MeasuredContact.from_heights(
+        heights, 1e-3 / 64, MATERIAL, 1e3, 1e-6, 0.7, pressures=pressures
+    )
+    assert law.loads == pytest.approx((1e2, 1e3)) and float(law.stiffness_ratio) == 0.7
+    with pytest.raises(ValueError, match="pressures must be two or more that leave gaps"):
+        fj.MeasuredContact.from_heights(
+            heights, 1e-3 / 64, MATERIAL, 1e3, 1e-6, pressures=pressures[1:]
+        )

@@ -339,7 +339,7 @@ test_refusals = refusals(
         ({"M": 2**50}, "4 x 1125899906842624 waves would take"),
         ({"surface": fj.Surface(D, G, 1 + 3e-16)}, " x 10 waves would take"),
         ({"surface": jax.tree.map(lambda x: jnp.stack([x, x]), SURFACE)}, "D must be a scalar"),
-        ({"surface": "rough"}, "surface must be a Surface, got 'rough'"),
+        ({"surface": "rough"}, "surface must be a Spectrum, got 'rough'"),
     ],
     lambda change: topography(**({"surface": SURFACE, "L": L, "n": 8, "key": KEY}) | change),
     kind=(ValueError, TypeError),
