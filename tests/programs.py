@@ -47,6 +47,10 @@ def slope(measure: Callable[[Any], Any], x: Any = BRAKE, slow: bool = False) -> 
     return Program(lambda D: (jax.jacfwd(function)(D), jax.jacrev(function)(D)), 2.4, 3.5, slow)
 
 
+def _ground(Sq):
+    return fj.SelfAffine(Sq, 0.8, 1e-4, 1e-5, lay=3.0)
+
+
 def _joint(law):
     return lambda P: fj.stiffness(BRAKE.replace(contact=law, P=P))
 
@@ -101,6 +105,15 @@ PROGRAMS: dict[str, Program] = {
     "Structure.from_scene": of(fj.Structure.from_scene),
     **{f"stiffness, {name}": Program(_joint(law), 1907.3, -1.0) for name, law in LAWS.items()},
     "stiffness, fixed": Program(lambda K_n: fj.stiffness(FIXED.replace(K_n=K_n)), 4e8, -1.0),
+    "stiffness, spectrum with a lay": Program(
+        lambda Sq: fj.PerssonContact(_ground(Sq), MATERIAL, 1e3, 1e-6).stiffness(0.4, 0.25),
+        1e-6,
+        -1.0,
+    ),
+    "spectral_moments": Program(lambda Sq: fj.spectral_moments(_ground(Sq)), 1e-6, -1.0),
+    "topography of a spectrum": Program(
+        lambda Sq: fj.topography(_ground(Sq), 1e-3, 16, key=jax.random.key(0)), 1e-6, -1.0
+    ),
     "contact_state": of(
         lambda x: fj.contact_state(x.contact.surface, MATERIAL, 1907.3, mu_s=0.4, mu_m=0.25)
     ),

@@ -108,13 +108,11 @@ def test_a_scene_is_asked_for_by_name(function, bad):
         function(bad)
 
 
-REWRITTEN = {"roughness", "topography"}  # with their package, by another change
 FUNCTIONS = [
     function
     for module in (fj, fj.plot)
     for name in module.__all__
     if inspect.isroutine(function := inspect.unwrap(getattr(module, name)))
-    and (module is fj.plot or name not in REWRITTEN)
 ]
 
 

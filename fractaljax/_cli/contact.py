@@ -45,6 +45,11 @@ def _run(arguments) -> int:
     scene = load_mechanism(arguments.scene)
     law, friction = scene.contact, scene.friction
     if not law.has_surface:
+        if hasattr(law, "surface"):
+            kind = type(law.surface).__name__
+            raise ValueError(
+                f"{arguments.scene}: laws are compared on a fractal surface, not a {kind}"
+            )
         raise ValueError(f"{arguments.scene}: the law of its contact takes no surface")
     options: dict[str, Any] = {}
     for name in ("area", "L", "L_s"):

@@ -16,6 +16,7 @@ from .._mechanism.quantities import sliding_friction
 from .._mechanism.scene import Scene, stiffness
 from .._mechanism.structure import Joint, Structure
 from .._surface.roughness import roughness
+from .._surface.spectrum import Spectrum
 from .critical_friction import critical_friction
 from .linearise import Assembled, linearised_at, normal_force, pressed, with_equilibrium
 from .margin import damping_ratios
@@ -77,6 +78,8 @@ def _rows(scene: Scene, mode: _Critical | Stability, K, state, rough=None) -> di
     contact, surface, after = scene.contact, {}, {}
     if contact.has_surface:
         surface = {"D": f"{contact.surface.D:.6g}", "G [m]": f"{contact.surface.G:.6g}"}
+    elif isinstance(other := getattr(contact, "surface", None), Spectrum):
+        rough = roughness(other)
     if rough is not None:
         surface |= {"Sq [m]": f"{rough.Sq:.6g}", "Sdq": f"{rough.Sdq:.6g}"}
     if state is not None:

@@ -66,10 +66,18 @@ def _roughness(surface, L, L_s):
 def spectral_moments(
     surface: Spectrum, L: ArrayLike | None = None, L_s: ArrayLike | None = None
 ) -> SpectralMoments:
-    """m0, m2, m4 and Nayak's alpha of a surface; arguments and errors as `roughness`.
+    """The moments of a surface's spectrum, and Nayak's parameter.
 
     m0 = int m dln q, m2 = 1/2 int m q^2 dln q, m4 = 3/8 int m q^4 dln q (Nayak, J. Lubr. Technol.
     93, 398, 1971, doi:10.1115/1.3451608), with the mean over directions m of the spectrum.
+
+    **Arguments:**
+
+    - `surface`, `L`, `L_s`: as in `roughness`.
+
+    **Returns:** `SpectralMoments`.
+
+    **Raises:** as `roughness`.
     """
     return _moments(surface, *wavelengths_of(surface, L, L_s))
 

@@ -44,9 +44,16 @@ def test_scene_with_a_nominal_area(capsys):
         (("--area", 1e-4, "--loads", "2:1"), "--loads must be LOW:HIGH with 0 < LOW < HIGH"),
         (("--area", 1e-4, "--points", 1), "--points must be at least 2, got 1"),
         (("fixed.toml", "--area", 1e-4), "fixed.toml: the law of its contact takes no surface"),
+        (
+            ("ground.toml", "--area", 1e-4),
+            "laws are compared on a fractal surface, not a SelfAffine",
+        ),
     ],
 )
 def test_refuses(capsys, arguments, said):
     fj.brake_scene().replace(contact=fj.FixedContact(1e8, 1e8)).save("fixed.toml")
+    ground = fj.SelfAffine(1e-6, 0.8, 1e-4, 1e-5)
+    law = fj.PerssonContact(ground, fj.brake_scene().contact.material, 1e3, 1e-4)
+    fj.brake_scene().replace(contact=law).save("ground.toml")
     assert said in refused_command(capsys, "contact", *arguments, "--quiet")
     assert not Path("fractaljax-contact").exists()
