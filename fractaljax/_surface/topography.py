@@ -27,6 +27,7 @@ from .._base.parts import (
     whole,
 )
 from .._base.programs import exported_jit
+from .._base.singular import positive_sqrt
 from .spectrum import Spectrum
 from .surface import Surface, frequency_count
 
@@ -163,11 +164,10 @@ def _random_phases(spectrum: Spectrum, L, key, n: int, periodic: bool):
     phases = waves / jnp.where(size > 0, size, 1)
     q_x, q_y = 2 * np.pi * np.fft.fftfreq(points), 2 * np.pi * np.fft.rfftfreq(points)
     step = points / period
-    constant = (q_x[:, None] == 0) & (q_y[None] == 0)
-    C = spectrum.C_at(
-        jnp.asarray(np.where(constant, 1, q_x[:, None])) * step, jnp.asarray(q_y[None]) * step
-    )
-    amplitude = jnp.where(constant | (C <= 0), 0, jnp.sqrt(jnp.where(C > 0, C, 1)) / period)
+    at_mean = (q_x[:, None] == 0) & (q_y[None] == 0)
+    waves_x = jnp.asarray(np.where(at_mean, 1, q_x[:, None])) * step
+    C = spectrum.C_at(waves_x, jnp.asarray(q_y)[None] * step)
+    amplitude = jnp.where(at_mean, 0, positive_sqrt(C)) / period
     return jnp.fft.irfft2(phases * amplitude, s=(points, points))[:n, :n] * points**2
 
 
