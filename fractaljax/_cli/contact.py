@@ -1,9 +1,10 @@
 """`fractaljax contact`: the stiffness of a joint by every contact law."""
 
+from pathlib import Path
 from typing import Any
 
 from .output import csv_text, output, picture
-from .parsing import add_out, add_scene_file, load_mechanism, numbers
+from .parsing import add_out, load_mechanism, numbers
 
 _OPTIONS: dict[str, dict[str, Any]] = {
     "--area": {"type": float, "help": "nominal area of the joint [m^2], if not in the scene"},
@@ -16,6 +17,16 @@ _OPTIONS: dict[str, dict[str, Any]] = {
     "--L-s": {"type": float, "help": "shortest wavelength [m]; default 4 L/n"},
     "--n": {"type": int, "help": "points of a boundary-element surface along a side; default 128"},
     "--seeds": {"type": int, "help": "how many such surfaces, 0 for none; default 4"},
+    "--scene": {
+        "type": Path,
+        "dest": "joint",
+        "metavar": "FILE",
+        "help": "scene with the material and the load of a map; default the reference brake",
+    },
+    "--dx": {"type": float, "help": "step between heights of a map [m], if not in the file"},
+    "--dy": {"type": float, "help": "step across the map [m], if not in the file; default dx"},
+    "--unit": {"help": "unit of the heights, if not in the file: m, mm, um, nm"},
+    "--channel": {"help": "name or number of one of several in the file"},
 }
 
 
@@ -24,7 +35,13 @@ def add_contact(commands) -> None:
     parser = commands.add_parser(
         "contact", help="compare contact laws with boundary elements", description=_run.__doc__
     )
-    add_scene_file(parser)
+    parser.add_argument(
+        "scene",
+        nargs="?",
+        type=Path,
+        help="a scene file, or a measured map: CSV, NPY or an instrument's own format; else the"
+        " reference brake",
+    )
     for name, options in _OPTIONS.items():
         parser.add_argument(name, **options)
     add_out(parser, "fractaljax-contact")
@@ -36,7 +53,13 @@ def _run(arguments) -> int:
     """K_n, K_t, d ln K_n/d ln P and the real area of a scene's joint by every contact law.
 
     Beside them boundary elements on surfaces of the same D and G. Writes contact.png, contact.csv.
+    With a measured map: its stiffness by boundary elements, and by its spectrum. Writes scene.toml,
+    a scene with the measured law, and contact.csv.
     """
+    if arguments.scene is not None and arguments.scene.suffix != ".toml":
+        from .contact_map import run_map
+
+        return run_map(arguments)
     import numpy as np
 
     from .. import plot

@@ -1,0 +1,57 @@
+"""`fractaljax contact MAP`: the contact law of a measured map, pressed by boundary elements."""
+
+import warnings
+
+import numpy as np
+
+from .output import csv_text, output
+from .parsing import load_mechanism
+
+
+def run_map(arguments) -> int:
+    """Press a map by boundary elements; write scene.toml with its law, and contact.csv."""
+    from .._base.parts import rebuild
+    from .._base.table import aligned
+    from .._contact.measured import MeasuredContact
+    from .._contact.persson import PerssonContact
+    from .._identify.files import read_measurement
+    from .._identify.preparation import prepare_heights
+    from .._identify.spectrum import remove_plane
+    from .._identify.spectrum_of import spectrum_of
+
+    scene = load_mechanism(arguments.joint)
+    contact, friction = scene.contact, scene.friction
+    material, P = getattr(contact, "material", None), getattr(contact, "P", None)
+    if material is None or P is None:
+        raise ValueError(f"{arguments.joint}: a map needs the material and the load of its contact")
+    area = getattr(contact, "area", None) if arguments.area is None else arguments.area
+    if area is None:
+        raise ValueError("--area must be given: the law of the scene knows no nominal area")
+    names = ("dx", "dy", "unit", "channel")
+    read = read_measurement(arguments.scene, **{name: getattr(arguments, name) for name in names})
+    if read.dy is None:
+        raise ValueError(f"{arguments.scene}: a profile cannot be pressed, a map is needed")
+    if abs(read.dy / read.dx - 1) > 1e-3:
+        raise ValueError(
+            f"{arguments.scene}: dx and dy must agree, got {read.dx:g} and {read.dy:g} m: resample"
+        )
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        spectrum = spectrum_of(read)
+    heights = remove_plane(prepare_heights(read.z).segments[0])
+    with output(arguments.out) as write:
+        law = MeasuredContact.from_heights(heights, read.dx, material, P, area)
+        persson = PerssonContact(spectrum, material, P, area)
+        loads = np.asarray(law.loads)
+        by_spectrum = [
+            float(rebuild(persson, {"P": load}).stiffness(friction.mu_s, friction.mu_m)[0])
+            for load in loads
+        ]
+        titles = ["load [N]", "K_n [N/m]", "by its spectrum [N/m]", "ratio"]
+        numbers = zip(loads, law.stiffnesses, by_spectrum, strict=True)
+        rows = [[f"{P:.4g}", f"{K:.4g}", f"{S:.4g}", f"{S / K:.2f}"] for P, K, S in numbers]
+        files = {"scene.toml": scene.replace(contact=law).to_toml().encode()}
+        written = write(files | {"contact.csv": csv_text(titles, rows).encode()})
+    lines = [f"warning: {each.message}" for each in caught]
+    print("\n".join([read.source, read.description, "", aligned([titles, *rows]), *lines, written]))
+    return 0
