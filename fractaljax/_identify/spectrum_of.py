@@ -40,7 +40,7 @@ def spectrum_of(
     - `shortest`: wavelength [m] at which the spectrum ends, by default two steps: waves that the
       instrument does not resolve, and noise, are below.
     - `largest_skewness`, `largest_kurtosis`: beyond |Ssk| of 1 or Sku of 8 there is a warning that
-      the heights are not Gaussian: laws that need no more than a spectrum can then be off by four
+      the heights are not Gaussian: laws that need no more than a spectrum can then be off by several
       times, and `MeasuredContact.from_heights` is the way.
 
     **Raises:** `ValueError` for a profile, for heights and steps as `identify` does, and for a
@@ -77,6 +77,6 @@ def _warn_unless_gaussian(z: np.ndarray, largest_skewness: float, largest_kurtos
     if abs(Ssk) > largest_skewness or Sku > largest_kurtosis:
         warnings.warn(
             f"heights are far from Gaussian (Ssk {Ssk:.2g}, Sku {Sku:.2g}): a law that has only"
-            " their spectrum can be off by four times; use MeasuredContact.from_heights",
+            " their spectrum can be off by several times; use MeasuredContact.from_heights",
             stacklevel=3,
         )
