@@ -113,7 +113,7 @@ class Design(Record):
     def wavelengths(self) -> tuple[float, float]:
         """Longest and shortest [m] that roughness counts.
 
-        Of a limit on Sq, or of the contact law, or 1 mm and 1 um.
+        They are those of a limit on Sq, or of the contact law, or 1 mm and 1 um.
         """
         for constraint in self.options["constraints"]:
             if isinstance(constraint, limits.Roughness):

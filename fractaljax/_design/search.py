@@ -75,7 +75,7 @@ class Search:
     def best(self, starts: np.ndarray, progress: bool):
         """The path (s, v) to the best end, its evaluation, and how many starts (n, v) failed.
 
-        Of paths whose ends are equally good it is the first, for the given design leads the starts.
+        Where ends are equally good the first path is taken: the initial design leads the starts.
         The last result is that of `least_growth`, if all failed.
         """
         problem, lowest = self.evaluator.problem, None

@@ -1,7 +1,7 @@
 """The material ratio curve and its parameters (ISO 21920-2 and ISO 25178-2; before, ISO 13565-2).
 
-The curve c(p) is the height that a share p of all points exceeds. Of n sorted heights, the i-th
-highest is taken at p = (i - 1/2)/n.
+The curve c(p) is the height that a share p of all points exceeds. The i-th highest of n heights is
+taken at p = (i - 1/2)/n.
 """
 
 from typing import NamedTuple
