@@ -40,8 +40,8 @@ def spectrum_of(
     - `shortest`: wavelength [m] at which the spectrum ends, by default two steps: waves that the
       instrument does not resolve, and noise, are below.
     - `largest_skewness`, `largest_kurtosis`: beyond |Ssk| of 1 or Sku of 8 there is a warning that
-      the heights are not Gaussian: laws that need no more than a spectrum can then be off by several
-      times, and `MeasuredContact.from_heights` is the way.
+      the heights are not Gaussian: laws that need no more than a spectrum can then be off by
+      several times, and `MeasuredContact.from_heights` is the way.
 
     **Raises:** `ValueError` for a profile, for heights and steps as `identify` does, and for a
     `shortest` that leaves fewer than two points.
