@@ -26,6 +26,7 @@ from ._contact.fractal import (
 from ._contact.material import Material as Material
 from ._contact.measured import MeasuredContact as MeasuredContact
 from ._contact.persson import PerssonContact as PerssonContact
+from ._contact.run_in import WornSurface as WornSurface, run_in as run_in
 from ._design import constraints as constraints
 from ._design.design import (
     Design as Design,

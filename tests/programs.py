@@ -85,6 +85,11 @@ def _pressed(**options):
     return lambda D: fj.boundary_element(_heights(D), 1e-3 / 16, MATERIAL, 50.0, **options)
 
 
+def _worn(D):
+    worn = fj.run_in(_heights(D), 1e-3 / 16, MATERIAL, 5e7, 1e-8, steps=2)
+    return worn.heights, worn.pressure
+
+
 def _cycle(**options):
     return lambda x: fj.limit_cycle(x, **options)
 
@@ -129,6 +134,8 @@ PROGRAMS: dict[str, Program] = {
     "boundary_element": Program(_pressed(), 2.4, 3.5),
     "boundary_element, plastic": Program(_pressed(plastic=True), 2.4, 3.5),
     "boundary_element, slope": Program(jax.jacrev(lambda D: _pressed()(D).mean_gap), 2.4, 3.5),
+    "run_in": Program(_worn, 2.4, 3.5),
+    "run_in, slope": Program(jax.jacrev(lambda D: _worn(D)[0].std()), 2.4, 3.5),
     "growth_rate": of(fj.growth_rate),
     "growth_rate of a structure": of(fj.growth_rate, STRUCTURE),
     "growth_rate, pressed": of(fj.growth_rate, PRESSED, slow=True),

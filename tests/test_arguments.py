@@ -39,6 +39,10 @@ CALLS = {
         partial(fj.boundary_element, material=MATERIAL),
         dict(heights=np.eye(3), dx=1e-6, P=1.0, rtol=1e-6),
     ),
+    "run-in": (
+        partial(fj.run_in, material=MATERIAL),
+        dict(z=np.eye(3), dx=1e-6, pressure=1e6, depth=1e-7, steps=2, rtol=1e-6),
+    ),
     "profile": (
         partial(fj.profile_parameters, np.sin(np.arange(100.0))),
         dict(dx=1e-6, cutoff=1e-5, shortest=2e-6, sections=5),

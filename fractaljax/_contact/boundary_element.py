@@ -47,11 +47,18 @@ class BoundaryElement(Record):
 
 
 @dataclasses.dataclass(frozen=True)
-class _Convergence:
+class Convergence:
     """When an iteration ends."""
 
     rtol: float
     max_steps: int
+
+    @classmethod
+    def checked(cls, rtol: float | None, max_steps: int, dtype) -> "Convergence":
+        if rtol is None:
+            rtol = 1e-9 if dtype == jnp.float64 else 1e-5
+        rtol = float(scalar("rtol", rtol, above=0, below=1))
+        return cls(rtol, whole("max_steps", max_steps, 1))
 
     def continues(self, residual, count) -> Array:
         return (residual > self.rtol) & (count < self.max_steps)
@@ -106,19 +113,21 @@ def boundary_element(
     max_steps >= 1; `RuntimeError` if `throw` and the solution has not converged. Under a trace
     (`jit`, `vmap`) everything is NaN instead.
     """
-    heights = number("heights", heights)
-    if heights.ndim != 2 or min(heights.shape) < 2:
-        raise ValueError(f"heights must have shape (nx, ny), got {heights.shape}")
-    require_kind("material", material, Material)
     dx, P = scalar("dx", dx, above=0), scalar("P", P, above=0)
-    heights = heights.astype(jnp.result_type(heights, dx, P, material.E, material.H))
-    if rtol is None:
-        rtol = 1e-9 if heights.dtype == jnp.float64 else 1e-5
-    rtol = float(scalar("rtol", rtol, above=0, below=1))
+    heights = check_map("heights", heights, material, dx, P)
+    convergence = Convergence.checked(rtol, max_steps, heights.dtype)
     plastic, throw = flag("plastic", plastic), flag("throw", throw)
-    convergence = _Convergence(rtol, whole("max_steps", max_steps, 1))
     solution = _boundary_element(heights, dx, material, P, plastic, convergence)
     return raise_unless(BoundaryElementResult.converged, solution) if throw else solution
+
+
+def check_map(name: str, heights, material: Material, *others: Array) -> Array:
+    """Heights (nx, ny) in the widest of all precisions."""
+    heights = number(name, heights)
+    if heights.ndim != 2 or min(heights.shape) < 2:
+        raise ValueError(f"{name} must have shape (nx, ny), got {heights.shape}")
+    require_kind("material", material, Material)
+    return heights.astype(jnp.result_type(heights, *others, material.E, material.H))
 
 
 @functools.partial(jax.jit, static_argnums=(4, 5))
@@ -165,40 +174,48 @@ def _filtered(field, factor):
     return jnp.fft.irfft2(jnp.asarray(factor, field.dtype) * jnp.fft.rfft2(field), s=field.shape)
 
 
-def _displacement(pressure):
-    """S p: 2/|q| times each wave, and 0 for the mean, which the mean gap represents."""
+def _displacement(pressure, local=None):
+    """S p: 2/|q| times each wave, and 0 for the mean, which the mean gap represents.
+
+    A `local` compliance, of a layer on the half-space, adds to that of each wave.
+    """
     q = _wavenumbers(pressure.shape)
-    return _filtered(pressure, np.divide(2, q, out=np.zeros_like(q), where=q > 0))
+    S = np.divide(2, q, out=np.zeros_like(q), where=q > 0)
+    return _filtered(pressure, S if local is None else S + local * (q > 0))
 
 
-def _precondition(residual):
+def _precondition(residual, local=None):
     q = _wavenumbers(residual.shape)
-    return _filtered(residual, np.maximum(q, np.min(q[q > 0])) / 2)
+    stiffness = np.maximum(q, np.min(q[q > 0])) / 2
+    return _filtered(residual, stiffness if local is None else 1 / (1 / stiffness + local))
 
 
 def _mean(field, where):
     return jnp.sum(jnp.where(where, field, 0)) / jnp.maximum(jnp.sum(where), 1)
 
 
-def _rms(h):
-    rms = jnp.std(h)
-    return jnp.where(rms > 0, rms, jnp.inf)  # a flat surface has no residual
+def rms(h):
+    root = jnp.std(h)
+    return jnp.where(root > 0, root, jnp.inf)  # a flat surface has no residual
 
 
 # --- solvers -------------------------------------------------------------------------------
 
 
-def _solve(h, mean, convergence, start=None) -> _Solution:
+def _solve(h, mean, convergence, start=None, local=None, scale=None) -> _Solution:
     """Constrained conjugate gradients."""
+    displacement = functools.partial(_displacement, local=local)
+    precondition = functools.partial(_precondition, local=local)
 
-    def conditions(pressure, displacement):
-        """(gap, points in contact, points that overlap, mean gap, residual) for a pressure."""
+    def conditions(pressure, u):
+        """(gap, points in contact, points that overlap, mean gap, residual) of pressure and u."""
         free = pressure > 0
-        gap = displacement - h
+        gap = u - h
         mean_gap = -_mean(gap, free)
         gap = gap + mean_gap
         wrong = (gap < 0) & ~free
-        residual = jnp.max(jnp.where(free | wrong, jnp.abs(gap), 0)) / _rms(h)
+        largest = jnp.max(jnp.where(free | wrong, jnp.abs(gap), 0))
+        residual = largest / (rms(h) if scale is None else scale)
         return gap, free, wrong, mean_gap, residual
 
     def projected(field, free):  # onto steps that keep the load
@@ -212,12 +229,12 @@ def _solve(h, mean, convergence, start=None) -> _Solution:
         pressure, u, direction, old, product, before, count = state
         gap, free, wrong, *_ = conditions(pressure, u)
         gradient = jnp.where(free, gap, 0)
-        step = projected(_precondition(gradient), free)
+        step = projected(precondition(gradient), free)
         new = jnp.sum(gradient * step)
         # Polak and Ribiere's factor; 0 at the first step, and after the contact has grown.
         beta = jnp.maximum((new - jnp.sum(old * step)) / product, 0)
         direction = projected(step + beta * direction, free)
-        response = _displacement(direction)
+        response = displacement(direction)
         curvature = jnp.sum(direction * response)
         # A single point in contact has no direction, but others must still join it.
         length = jnp.where(curvature > 0, jnp.sum(gradient * direction) / curvature, 1)
@@ -225,19 +242,19 @@ def _solve(h, mean, convergence, start=None) -> _Solution:
         grown = jnp.any(wrong)
         pull = jax.lax.cond(
             grown,
-            lambda: length * jnp.where(wrong, _precondition(jnp.where(wrong, gap, 0)), 0),
+            lambda: length * jnp.where(wrong, precondition(jnp.where(wrong, gap, 0)), 0),
             lambda: jnp.zeros_like(gap),
         )
         clipped = jnp.maximum(trial - pull, 0)
         changed = grown | jnp.any(trial < 0)
         following = jnp.where(changed, clipped * (mean / jnp.mean(clipped)), trial)
-        u = jax.lax.cond(changed, lambda: _displacement(following), lambda: u - length * response)
+        u = jax.lax.cond(changed, lambda: displacement(following), lambda: u - length * response)
         residual = conditions(following, u)[-1]
         product = jnp.where(grown & (residual > before), jnp.inf, new)
         return following, u, direction, gradient, product, residual, count + 1
 
     start = jnp.full_like(h, mean) if start is None else start * (mean / jnp.mean(start))
-    u, zeros = _displacement(start), jnp.zeros_like(h)
+    u, zeros = displacement(start), jnp.zeros_like(h)
     infinite = jnp.full_like(mean, jnp.inf)
     state = start, u, zeros, zeros, infinite, conditions(start, u)[-1], 0
     pressure, u, *_, residual, _ = jax.lax.while_loop(go_on, iterate, state)
@@ -274,7 +291,7 @@ def _solve_plastic(h, mean, limit, convergence) -> _Solution:
         mean_gap = jnp.where(jnp.any(free), -_mean(gap, free), mean_gap)
         gap = gap + mean_gap
         wrong = jnp.maximum(jnp.where(pressure < limit, -gap, gap), 0)
-        return mean_gap, jnp.max(jnp.where(free, jnp.abs(gap), wrong)) / _rms(h)
+        return mean_gap, jnp.max(jnp.where(free, jnp.abs(gap), wrong)) / rms(h)
 
     def go_on(state):
         *_, residual, count = state
@@ -298,7 +315,7 @@ def _solve_plastic(h, mean, limit, convergence) -> _Solution:
     return _Solution(pressure, mean_gap, residual)
 
 
-def _conjugate_gradients(right, load, contact, convergence):
+def _conjugate_gradients(right, load, contact, convergence, local=None):
     """p with S p + g = right in contact for some g, p = 0 outside, and the sum `load`."""
 
     def go_on(state):
@@ -307,10 +324,10 @@ def _conjugate_gradients(right, load, contact, convergence):
 
     def iterate(state):
         p, residual, direction, product, count = state
-        response = _projected(_displacement(direction))
+        response = _projected(_displacement(direction, local))
         length = product / _positive(jnp.sum(direction * response))
         p, residual = p + length * direction, residual - length * response
-        step = _projected(_precondition(residual))
+        step = _projected(_precondition(residual, local))
         new = jnp.sum(residual * step)
         direction = step + new / _positive(product) * direction
         return p, residual, direction, new, count + 1
@@ -322,31 +339,37 @@ def _conjugate_gradients(right, load, contact, convergence):
         return jnp.where(x > 0, x, 1)
 
     p = jnp.where(contact, load / jnp.maximum(jnp.sum(contact), 1), 0)
-    whole = jnp.where(contact, right - _displacement(p), 0)
+    whole = jnp.where(contact, right - _displacement(p, local), 0)
     residual = _projected(whole)
-    step = _projected(_precondition(residual))
+    step = _projected(_precondition(residual, local))
     # Not relative to the first residual, which may be pure rounding error.
     tolerance = max(convergence.rtol, 4 * float(jnp.finfo(p.dtype).eps))
-    enough = tolerance**2 * (jnp.sum(whole * _precondition(whole)) + jnp.sum(p**2))
+    enough = tolerance**2 * (jnp.sum(whole * _precondition(whole, local)) + jnp.sum(p**2))
     state = p, residual, step, jnp.sum(residual * step), 0
     return jax.lax.while_loop(go_on, iterate, state)[0]
 
 
-def _solve_contact(right, load, contact, convergence) -> Any:
+def _solve_contact(right, load, contact, convergence, local=None) -> Any:
     """(p, g) with S p + g = right in contact, p = right outside, and the sum `load` inside."""
 
+    def split(x):
+        return x[:-1].reshape(contact.shape), x[-1]
+
     def operator(solution):
-        p, g = solution
+        p, g = split(solution)
         inside = jnp.where(contact, p, 0)
-        return jnp.where(contact, _displacement(inside) + g, p), jnp.sum(inside)
+        balance = jnp.where(contact, _displacement(inside, local) + g, p)
+        return jnp.append(balance, jnp.sum(inside))
 
     def solve(_, sides):
-        right, load = sides
-        p = _conjugate_gradients(right, load, contact, convergence)
-        g = _mean(right - _displacement(p), contact)
-        return jnp.where(contact, p, right), g
+        right, load = split(sides)
+        p = _conjugate_gradients(right, load, contact, convergence, local)
+        g = _mean(right - _displacement(p, local), contact)
+        return jnp.append(jnp.where(contact, p, right), g)
 
-    return jax.lax.custom_linear_solve(operator, (right, load), solve, symmetric=True)
+    # One vector: JAX transposes no system of which one right side depends on the input and one not.
+    sides = jnp.append(right, load)
+    return split(jax.lax.custom_linear_solve(operator, sides, solve, symmetric=True))
 
 
 def _flat_punch(contact, convergence, dtype):
@@ -394,6 +417,23 @@ def _contact_jvp(convergence, primals, tangents):
     dcompliance = (jnp.mean((w_less - w_more) * dh) + (c_more - c_less) * dmean) / width
     primals = pressure, mean_gap, compliance, residual
     return primals, (dpressure, dmean_gap, dcompliance, jnp.zeros_like(residual))
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(4,))
+def press_layered(h, mean, local, scale, convergence):
+    """(p, residual over `scale`) with a layer of the compliance `local` on the half-space."""
+    solution = _solve(h, mean, convergence, local=local, scale=scale)
+    return solution.pressure, solution.residual
+
+
+@press_layered.defjvp
+def _press_layered_jvp(convergence, primals, tangents):
+    (h, mean, local, scale), (dh, dmean, dlocal, _) = _first_only(primals), tangents
+    p, residual = press_layered(h, mean, local, scale, convergence)
+    contact = p > 0
+    right, load = jnp.where(contact, dh - dlocal * p, 0), dmean * h.size
+    dp, _ = _solve_contact(right, load, contact, convergence, local)
+    return (p, residual), (dp, jnp.zeros_like(residual))
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(3,))

@@ -273,6 +273,17 @@ def test_derivatives_of_pressure_gap_and_stiffness():
         assert float(by_P + by_E) == pytest.approx(1, rel=1e-9)  # K_n/E depends on P/E alone
 
 
+@pytest.mark.parametrize("argument", [0, 1])
+def test_derivative_of_the_pressure_by_one_argument_alone(argument):
+    def highest(heights, P):
+        return tight(heights, DX, MATERIAL, P).pressure.max() / H
+
+    x = jnp.asarray(ROUGH), jnp.asarray(load(ROUGH, 0.3))
+    reverse, forward = (mode(highest, argument)(*x) for mode in (jax.grad, jax.jacfwd))
+    assert reverse.any()
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-9 * abs(forward).max())
+
+
 @pytest.mark.slow
 def test_derivatives_of_a_surface_and_many_seeds():
     """d mean gap and d ln K_n to D and ln G; `vmap` over seeds equals one by one."""
