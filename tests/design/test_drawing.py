@@ -1,5 +1,6 @@
 """Designs held to what a drawing says of their surface."""
 
+import dataclasses
 import math
 from typing import Any
 
@@ -92,6 +93,27 @@ def test_file(best, tmp_path):
     assert repr(again) == repr(best)
     for one, other in zip(best.options["constraints"], again.options["constraints"], strict=True):
         assert type(one) is type(other) and vars(one) == vars(other)
+
+
+def test_drawing(best):
+    """Both surfaces behind the filters that are stated, also in print."""
+    drawing = best.drawing()
+    surfaces = best.initial.contact.surface, best.scene.contact.surface
+    for i, surface in enumerate(surfaces):
+        p, s = fj.profile_parameters(surface, **FILTERS), fj.areal_parameters(surface, **FILTERS)
+        row = [drawing.Ra[i], drawing.Rz[i], drawing.Sq[i], drawing.Sdq[i]]
+        assert row == [p.Ra, p.Rz, s.Sq, s.Sdq]
+    assert repr(drawing) in repr(best)
+    words = [line.split() for line in repr(drawing).splitlines()]
+    assert ["Ra", "[m]", f"{drawing.Ra[0]:.6g}", "4e-07"] in words
+    assert best.drawing(cutoff=2.5e-4).Ra[0] < drawing.Ra[0]
+    fractal = dataclasses.replace(best, scene=fj.brake_scene(), initial=fj.brake_scene())
+    surface = fj.brake_scene().contact.surface
+    p = fj.profile_parameters(surface, L=1e-3, L_s=1e-6, **FILTERS)
+    assert fractal.drawing().Rz == (p.Rz, p.Rz)
+    fixed = fj.brake_scene().replace(contact=fj.FixedContact(1e8, 1e8))
+    with pytest.raises(ValueError, match="a drawing needs"):
+        dataclasses.replace(best, scene=fixed).drawing()
 
 
 test_refusals = refusals(
