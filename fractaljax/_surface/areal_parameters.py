@@ -57,7 +57,7 @@ def areal_parameters(
     and filters known at trace time. Sal and Str have first derivatives; extremes and what is sorted
     have derivatives piecewise. Flat heights have no Ssk, Sku, Sal and Str (NaN).
 
-    Of a spectrum they are those of Gaussian heights on a large area, smooth functions of all its
+    For a spectrum they are those of Gaussian heights on a large area, smooth functions of all its
     numbers and of the filters, which may be traced. Sdr is that of small slopes, Sdq^2/2. Sz, Sp,
     Sv, Sal and Str are NaN: the extremes depend on the area, and the lengths on the lay.
 

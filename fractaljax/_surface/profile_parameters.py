@@ -57,7 +57,7 @@ def profile_parameters(
     then dx known at trace time. Extremes, RSm and what is sorted have derivatives piecewise. Flat
     heights have no Rsk and Rku (NaN).
 
-    Of a spectrum they are those of a profile with Gaussian heights in a random direction, smooth
+    For a spectrum they are those of a profile with Gaussian heights in a random direction, smooth
     functions of all its numbers and of the filters, which may be traced. Rz and its kin are up to
     12 % above the mean of measured ones; they need a cutoff longer than RSm (else NaN). RSm counts
     every crossing of the mean line, with no hill left out, and is less than a measured one. A sum
