@@ -118,15 +118,13 @@ from ._stability.tracks import (
     ModeTracks as ModeTracks,
     track_modes as track_modes,
 )
-from ._surface.areal_parameters import (
+from ._surface.areal_parameters import areal_parameters as areal_parameters
+from ._surface.drawing_parameters import (
     ArealParameters as ArealParameters,
-    areal_parameters as areal_parameters,
+    ProfileParameters as ProfileParameters,
 )
 from ._surface.measured_spectrum import MeasuredSpectrum as MeasuredSpectrum
-from ._surface.profile_parameters import (
-    ProfileParameters as ProfileParameters,
-    profile_parameters as profile_parameters,
-)
+from ._surface.profile_parameters import profile_parameters as profile_parameters
 from ._surface.roughness import (
     Roughness as Roughness,
     SpectralMoments as SpectralMoments,

@@ -116,6 +116,14 @@ PROGRAMS: dict[str, Program] = {
         -1.0,
     ),
     "spectral_moments": Program(lambda Sq: fj.spectral_moments(_ground(Sq)), 1e-6, -1.0),
+    "profile_parameters of a spectrum": Program(
+        lambda Sq: fj.profile_parameters(_ground(Sq), cutoff=8e-4, shortest=2e-5), 1e-6, -1.0
+    ),
+    "areal_parameters of a surface": Program(
+        lambda D: fj.areal_parameters(fj.Surface(D, 1e-10), cutoff=8e-4, L=1e-3, L_s=1e-6),
+        2.4,
+        3.5,
+    ),
     "topography of a spectrum": Program(
         lambda Sq: fj.topography(_ground(Sq), 1e-3, 16, key=jax.random.key(0)), 1e-6, -1.0
     ),

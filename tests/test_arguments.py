@@ -56,6 +56,7 @@ CALLS = {
     "equilibrium": (partial(fj.equilibrium, SCENE.oscillator), dict(K_n=1e8, K_t=1e8, mu=0.3)),
     "replace": (SCENE.replace, dict(D=2.4, P=1e3, surface=SURFACE)),
     "roughness": (fj.constraints.Roughness, LIMITS | dict(L=1e-3, L_s=1e-6)),
+    "Ra": (fj.constraints.Ra, LIMITS | dict(cutoff=8e-4, shortest=2.5e-6, L=1e-3, L_s=1e-6)),
     "frequency": (fj.constraints.Frequency, LIMITS | dict(friction_slope=True)),
     "damping": (fj.constraints.DampingRatio, dict(at_least=0.1, friction_slope=True)),
     "amplitude": (fj.constraints.CycleAmplitude, dict(at_most=1e-6)),

@@ -14,7 +14,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from .._base.parts import Record, flag, is_traced, scalar, whole
+from .._base.parts import Record, flag, is_traced, ordered, scalar, whole
 from .._contact.contact import ContactState
 from .._dynamics.cycle import VELOCITY_REFERENCE, CycleResult
 from .._dynamics.limit_cycle import limit_cycle
@@ -22,7 +22,10 @@ from .._mechanism.mechanism import Mechanism
 from .._mechanism.scene import Scene, stiffness
 from .._stability.margin import least_damping_ratio
 from .._stability.stability import stability
+from .._surface.areal_parameters import areal_parameters
+from .._surface.profile_parameters import profile_parameters
 from .._surface.roughness import root_mean_square
+from .._surface.spectrum import Spectrum
 from .._surface.surface import Surface
 
 Limit = Any  # a scalar, or None where there is none
@@ -211,6 +214,119 @@ class Roughness(_LogConstraint):
 
     def measure(self, scene):
         return root_mean_square(_surface(scene, self.symbol), self.L, self.L_s)
+
+
+class _DrawingLimit(_LogConstraint):
+    """A roughness parameter to expect of the surface of a contact, a `Spectrum`, within limits.
+
+    Gaussian filters leave the waves from `shortest` to `cutoff` [m], as in `profile_parameters`.
+    """
+
+    cutoff: Limit  # longest wavelength that the filter leaves [m], or None
+    shortest: Limit  # shortest wavelength that the filter leaves [m], or None
+    L: Float[Array, ""]  # longest wavelength of a `Surface` [m]
+    L_s: Float[Array, ""]  # shortest wavelength of a `Surface` [m]
+
+    unit: ClassVar[str] = "m"
+
+    def __init__(
+        self,
+        at_least: ArrayLike | None,
+        at_most: ArrayLike | None,
+        cutoff: ArrayLike | None,
+        shortest: ArrayLike | None,
+        L: ArrayLike,
+        L_s: ArrayLike,
+    ):
+        super().__init__(at_least, at_most)
+        self.shortest = None if shortest is None else scalar("shortest", shortest, above=0)
+        self.cutoff = None if cutoff is None else scalar("cutoff", cutoff, above=0)
+        if self.cutoff is not None and self.shortest is not None:
+            ordered("cutoff", self.cutoff, "shortest", self.shortest)
+        self.L_s = scalar("L_s", L_s, above=0)
+        self.L = ordered("L", scalar("L", L, above=0), "L_s", self.L_s)
+
+    def expected(self, scene: Mechanism, parameters: Callable[..., Any]) -> Any:
+        """The `profile_parameters` or `areal_parameters` of the surface behind the filters."""
+        surface = getattr(scene.contact, "surface", None) if isinstance(scene, Scene) else None
+        if not isinstance(surface, Spectrum):
+            raise ValueError(f"{self.symbol} needs a scene whose contact has a surface")
+        band = dict(L=self.L, L_s=self.L_s) if isinstance(surface, Surface) else {}
+        return parameters(surface, cutoff=self.cutoff, shortest=self.shortest, **band)
+
+
+class Ra(_DrawingLimit):
+    """Arithmetic mean height Ra [m] of the profile within limits; see `profile_parameters`.
+
+    `cutoff` and `shortest` are the lengths of its filters [m]; L and L_s count for a `Surface`.
+    """
+
+    symbol: ClassVar[str] = "Ra"
+
+    def __init__(
+        self,
+        at_least: ArrayLike | None = None,
+        at_most: ArrayLike | None = None,
+        *,
+        cutoff: ArrayLike,
+        shortest: ArrayLike | None = None,
+        L: ArrayLike = 1e-3,
+        L_s: ArrayLike = 1e-6,
+    ):
+        super().__init__(at_least, at_most, cutoff, shortest, L, L_s)
+
+    def measure(self, scene):
+        return self.expected(scene, profile_parameters).Ra
+
+
+class Rz(_DrawingLimit):
+    """Maximum height Rz [m] of the profile within limits; see `profile_parameters`.
+
+    `cutoff`, the length of a section, and `shortest` are the lengths of its filters [m]; L and L_s
+    count for a `Surface`. The limit is on an Rz up to 12 % above the mean of measured ones.
+    """
+
+    symbol: ClassVar[str] = "Rz"
+
+    def __init__(
+        self,
+        at_least: ArrayLike | None = None,
+        at_most: ArrayLike | None = None,
+        *,
+        cutoff: ArrayLike,
+        shortest: ArrayLike | None = None,
+        L: ArrayLike = 1e-3,
+        L_s: ArrayLike = 1e-6,
+    ):
+        super().__init__(at_least, at_most, cutoff, shortest, L, L_s)
+
+    def measure(self, scene):
+        return self.expected(scene, profile_parameters).Rz
+
+
+class Sq(_DrawingLimit):
+    """Root mean square height Sq [m] of the map within limits; see `areal_parameters`.
+
+    `cutoff` and `shortest` are the lengths of its filters [m], None for none; L and L_s count for a
+    `Surface`.
+    """
+
+    symbol: ClassVar[str] = "Sq"
+
+    def __init__(
+        self,
+        at_least: ArrayLike | None = None,
+        at_most: ArrayLike | None = None,
+        *,
+        cutoff: ArrayLike | None = None,
+        shortest: ArrayLike | None = None,
+        L: ArrayLike = 1e-3,
+        L_s: ArrayLike = 1e-6,
+    ):
+        super().__init__(at_least, at_most, cutoff, shortest, L, L_s)
+
+    def measure(self, scene):
+        return self.expected(scene, areal_parameters).Sq
 
 
 class DampingRatio(Constraint):

@@ -27,11 +27,13 @@ from .._mechanism.scene import Scene
 from .._stability.stability import growth_rate, require_computable
 from .._stability.summary import stiffness_remarks
 from .._surface.roughness import Roughness, roughness
+from .._surface.spectrum import Spectrum
 from .._surface.topography import Topographies, topography
 from . import constraints as limits
 from .descent import descend, select_distinct
 from .design_file import STATED, design_files, read_design
 from .design_search import DesignSearch
+from .drawing import Drawing, compare_drawings
 from .envelope import Envelope, condition_text
 from .evaluator import Evaluation, make_evaluator
 from .few_modes import project_on_modes
@@ -138,6 +140,23 @@ class Design(Record):
         before, after = (roughness(surface, *band) for surface in self._surfaces())
         return before, after
 
+    def drawing(self, cutoff: ScalarLike = 8e-4, shortest: ScalarLike = 2.5e-6) -> Drawing:
+        """Ra, Rz [m] of a profile, Sq [m] and Sdq of a map, of both surfaces behind the filters.
+
+        They are those to expect of the spectrum, as `profile_parameters` says, and printed are a
+        table. The waves of a `Surface` are those of `wavelengths`.
+
+        **Arguments:**
+
+        - `cutoff`, `shortest`: nesting indices of the filters [m], 0.8 mm and 2.5 um by default.
+
+        **Raises:** as `profile_parameters`; `ValueError` without a surface.
+        """
+        spectra = self._spectra()
+        if spectra is None:
+            raise ValueError("a drawing needs a scene whose contact has a surface")
+        return compare_drawings(*spectra, cutoff, shortest, self.wavelengths)
+
     def topographies(self, n: int = 1024, *, L=None, L_s=None, M=10, key=None) -> Topographies:
         """Both surfaces on a grid of n x n points with the same phases, to see the difference.
 
@@ -161,6 +180,13 @@ class Design(Record):
             for surface in self._surfaces()
         )
         return Topographies(before, after, float(L) / n)
+
+    def _spectra(self) -> tuple[Spectrum, Spectrum] | None:
+        contacts = (getattr(x, "contact", None) for x in (self.initial, self.scene))
+        before, after = (getattr(contact, "surface", None) for contact in contacts)
+        if isinstance(before, Spectrum) and isinstance(after, Spectrum):
+            return before, after
+        return None
 
     def _surfaces(self):
         if not self.has_surface:
@@ -187,6 +213,8 @@ class Design(Record):
         if self.has_surface:
             L, L_s = self.wavelengths
             lines.append(f"Sq and Sdq: wavelengths from {L:g} to {L_s:g} m")
+        elif self._spectra() is not None:
+            lines += ["", *repr(self.drawing()).splitlines(), ""]
         for name, (before, after) in (self.cycles or {}).items():
             lines.append(f"{name}: {before:.6g}, then {after:.6g}")
         lines += self._condition_lines() + self._kick_lines()

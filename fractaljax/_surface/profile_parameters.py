@@ -5,45 +5,34 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, ScalarLike
+from jaxtyping import ArrayLike, Float, ScalarLike
 
-from .._base.parts import Record, scalar
+from .._base.parts import scalar
+from .drawing_parameters import ProfileParameters
 from .evaluation import section_bounds
 from .gaussian_filter import band_pass, check_nesting_indices
 from .heights import check_heights, extremes, height_statistics, remove_mean, slope
 from .material_ratio import material_ratio
 from .profile_elements import mean_element_width
-
-
-class ProfileParameters(Record):
-    """Roughness parameters of a profile by ISO 21920-2 (before, ISO 4287 and ISO 13565-2)."""
-
-    Ra: Float[Array, "..."]  # arithmetic mean height [m]
-    Rq: Float[Array, "..."]  # root mean square height [m]
-    Rz: Float[Array, "..."]  # maximum height, mean over the sections [m]
-    Rp: Float[Array, "..."]  # peak height, mean over the sections [m]
-    Rv: Float[Array, "..."]  # pit depth, mean over the sections [m]
-    Rt: Float[Array, "..."]  # total height, over the whole evaluation length [m]
-    Rsk: Float[Array, "..."]  # skewness [-]
-    Rku: Float[Array, "..."]  # kurtosis [-]
-    Rdq: Float[Array, "..."]  # root mean square gradient, rise over run [-]
-    RSm: Float[Array, "..."]  # mean width of the profile elements [m]
-    Rk: Float[Array, "..."]  # core height [m]
-    Rpk: Float[Array, "..."]  # reduced peak height [m]
-    Rvk: Float[Array, "..."]  # reduced pit depth [m]
-    Mr1: Float[Array, "..."]  # material ratio of the peaks [%]
-    Mr2: Float[Array, "..."]  # material ratio above the pits [%]
+from .spectral_parameters import (
+    refuse_grid,
+    require_step,
+    spectral_profile_parameters,
+)
+from .spectrum import Spectrum
 
 
 def profile_parameters(
-    z: Float[ArrayLike, " n"],
-    dx: ScalarLike,
+    z: Float[ArrayLike, " n"] | Spectrum,
+    dx: ScalarLike | None = None,
     *,
     cutoff: ScalarLike | None = None,
     shortest: ScalarLike | None = None,
     sections: int | None = None,
+    L: ScalarLike | None = None,
+    L_s: ScalarLike | None = None,
 ) -> ProfileParameters:
-    """Roughness parameters of a profile, as ISO 21920-2 defines them.
+    """Roughness parameters of a profile, as ISO 21920-2 defines them, or expected of a spectrum.
 
     The Gaussian filters of ISO 16610-21 take out waves shorter than `shortest` and longer than
     `cutoff`, and half a cutoff is dropped at both ends, as run-up and overrun. The evaluation
@@ -51,13 +40,14 @@ def profile_parameters(
 
     **Arguments:**
 
-    - `z`: (n,), heights [m].
-    - `dx`: distance of the points [m].
+    - `z`: (n,), heights [m]; or a `Spectrum`, for the parameters to expect of it.
+    - `dx`: distance of the points [m]; None (default) for a spectrum.
     - `cutoff`: lambda_c [m]. By default none: z is roughness already, only its mean is subtracted,
       no tilt, and all of it (less half of `shortest` at both ends) is one section.
     - `shortest`: lambda_s [m]. By default no short waves are taken out.
     - `sections`: how many sections, by default five, or as many as z holds, with a warning; without
       `cutoff` the profile is divided into so many.
+    - `L`, `L_s`: longest and shortest wavelength [m] of a `Surface`; None (default) for all else.
 
     Hills and valleys below a tenth of Rz, or narrower than a hundredth of a section, are no profile
     elements. RSm is NaN where no element is complete. Rk, Rpk and Rvk are those of the same
@@ -67,11 +57,22 @@ def profile_parameters(
     then dx known at trace time. Extremes, RSm and what is sorted have derivatives piecewise. Flat
     heights have no Rsk and Rku (NaN).
 
+    For a spectrum they are those of a profile with Gaussian heights in a random direction, smooth
+    functions of all its numbers and of the filters, which may be traced. Rz and its kin are up to
+    12 % above the mean of measured ones; they need a cutoff longer than RSm (else NaN). RSm counts
+    every crossing of the mean line, with no hill left out, and is less than a measured one. A sum
+    of few waves per ln q, as `topography` makes of a `Surface`, is not quite its spectrum.
+
     **Returns:** `ProfileParameters`.
 
     **Raises:** `ValueError` unless z is (n,), n >= 8, finite, dx > 0,
-    2 dx <= shortest <= cutoff, and z holds the sections.
+    2 dx <= shortest <= cutoff, and z holds the sections; for a spectrum with `dx`, for heights with
+    `L` or `L_s`, and as `roughness`.
     """
+    if isinstance(z, Spectrum):
+        refuse_grid(dx)
+        return spectral_profile_parameters(z, cutoff, shortest, L, L_s, sections)
+    dx = require_step(dx, L, L_s)
     z, dx = check_heights(z, "n"), scalar("dx", dx, above=0)
     cutoff, shortest = check_nesting_indices(cutoff, shortest, (dx,))
     bounds = section_bounds(z.size, dx, cutoff, shortest, sections)

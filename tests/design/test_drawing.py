@@ -1,0 +1,129 @@
+"""Designs held to what a drawing says of their surface."""
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fractaljax as fj
+from fractaljax._design.constraints import Ra, Rz, Sq
+from tools import both_gradients, refusals
+
+FILTERS: Any = dict(cutoff=8e-4, shortest=2.5e-6)
+GROUND = fj.SelfAffine(1e-6, 0.8, 1e-4, 2e-6)
+MEASURES = {
+    Ra: lambda surface, **filters: fj.profile_parameters(surface, **filters).Ra,
+    Rz: lambda surface, **filters: fj.profile_parameters(surface, **filters).Rz,
+    Sq: lambda surface, **filters: fj.areal_parameters(surface, **filters).Sq,
+}
+
+
+def pressed(surface=GROUND):
+    """The brake with this surface under Persson's law."""
+    brake = fj.brake_scene()
+    law = fj.PerssonContact(surface, brake.contact.material, P=1907.3, area=1e-3)
+    return fj.Scene(law, brake.friction, brake.oscillator)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return pressed()
+
+
+@pytest.mark.parametrize("kind", MEASURES)
+def test_residuals(kind, scene):
+    """ln(value/limit), with its slopes in both modes: 1 by ln Sq, and differences by ln rolloff."""
+    limit = kind(at_most=5e-7, **FILTERS)
+    value = float(MEASURES[kind](GROUND, **FILTERS))
+    assert float(limit(scene)) == pytest.approx(math.log(value / 5e-7), rel=1e-12)
+    assert float(kind(at_least=5e-7, **FILTERS)(scene)) == pytest.approx(-float(limit(scene)))
+    assert limit.name == f"{kind.__name__} <= 5e-07 m"
+
+    def residual(x):
+        return limit(scene.replace(Sq=jnp.exp(x[0]), rolloff=jnp.exp(x[1])))
+
+    x = jnp.log(jnp.array([1e-6, 1e-4]))
+    step = jnp.array([0, 1e-5])
+    difference = jax.jit(lambda x: (residual(x + step) - residual(x - step)) / 2e-5)(x)
+    for slope in jax.jit(lambda x: both_gradients(residual, x))(x):
+        np.testing.assert_allclose(slope, [1, difference], rtol=1e-7)
+
+
+@pytest.mark.parametrize("kind", MEASURES)
+def test_fractal_surfaces(kind):
+    """L and L_s are 1 mm and 1 um unless stated."""
+    brake = fj.brake_scene()
+    for band in ({}, dict(L=2e-3, L_s=1e-5)):
+        expected = MEASURES[kind](
+            brake.contact.surface, **{"L": 1e-3, "L_s": 1e-6} | band, **FILTERS
+        )
+        assert kind(at_most=1.0, **FILTERS, **band).measure(brake) == expected
+
+
+@pytest.fixture(scope="module")
+def best(scene):
+    """Ra to 0.4 um, from 0.74 um."""
+    return fj.design(
+        scene,
+        {"Sq": (1e-7, 2e-6), "rolloff": (2e-5, 3e-4)},
+        constraints=[Ra(at_most=4e-7, **FILTERS), Sq(at_most=1e-6)],
+        target=1e6,
+        starts=2,
+        lattice=4,
+        progress=False,
+    )
+
+
+def test_design_ends_at_the_limit(best):
+    """The nearest surface that the drawing allows has all of its Ra."""
+    assert best.result != fj.DesignResult.infeasible, best
+    assert "Ra <= 4e-07 m" in best.active
+    p = fj.profile_parameters(best.scene.contact.surface, **FILTERS)
+    assert float(p.Ra) == pytest.approx(4e-7, rel=1e-5) and p.Ra <= 4e-7 * (1 + 1e-9)
+
+
+def test_file(best, tmp_path):
+    """The limits come back from a file, and the run with them."""
+    best.save(tmp_path / "run.toml")
+    again = fj.repeat_design(tmp_path / "run.toml", progress=False)
+    assert repr(again) == repr(best)
+    for one, other in zip(best.options["constraints"], again.options["constraints"], strict=True):
+        assert type(one) is type(other) and vars(one) == vars(other)
+
+
+def test_drawing(best):
+    """Both surfaces behind the filters that are stated, also in print."""
+    drawing = best.drawing()
+    surfaces = best.initial.contact.surface, best.scene.contact.surface
+    for i, surface in enumerate(surfaces):
+        p, s = fj.profile_parameters(surface, **FILTERS), fj.areal_parameters(surface, **FILTERS)
+        row = [drawing.Ra[i], drawing.Rz[i], drawing.Sq[i], drawing.Sdq[i]]
+        assert row == [p.Ra, p.Rz, s.Sq, s.Sdq]
+    assert repr(drawing) in repr(best)
+    words = [line.split() for line in repr(drawing).splitlines()]
+    assert ["Ra", "[m]", f"{drawing.Ra[0]:.6g}", "4e-07"] in words
+    assert best.drawing(cutoff=2.5e-4).Ra[0] < drawing.Ra[0]
+    fractal = dataclasses.replace(best, scene=fj.brake_scene(), initial=fj.brake_scene())
+    surface = fj.brake_scene().contact.surface
+    p = fj.profile_parameters(surface, L=1e-3, L_s=1e-6, **FILTERS)
+    assert fractal.drawing().Rz == (p.Rz, p.Rz)
+    fixed = fj.brake_scene().replace(contact=fj.FixedContact(1e8, 1e8))
+    with pytest.raises(ValueError, match="a drawing needs"):
+        dataclasses.replace(best, scene=fixed).drawing()
+
+
+test_refusals = refusals(
+    [
+        (lambda: Ra(**FILTERS), "Ra needs at_least or at_most"),
+        (lambda: Ra(at_most=1e-6, cutoff=1e-6, shortest=1e-3), "cutoff must be at least shortest"),
+        (lambda: Sq(at_most=1e-6, L=1e-6, L_s=1e-3), "L must be at least L_s"),
+        (
+            lambda: Sq(at_most=1.0)(fj.brake_scene().replace(contact=fj.FixedContact(1e8, 1e8))),
+            "Sq needs a scene whose contact has a surface",
+        ),
+    ]
+)
