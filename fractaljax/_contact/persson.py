@@ -193,7 +193,8 @@ class PerssonContact(Contact):
         density = pieces.m * pieces.q[:-1] ** 2  # mean square gradient per ln q at the lower edges
         gradients = density * boxcox(pieces.widths, pieces.r)
         total = jnp.sum(gradients)
-        below = jnp.concatenate([jnp.zeros_like(total)[None], jnp.cumsum(gradients)[:-1]])
+        earlier = np.tri(len(pieces.m), k=-1, dtype=bool)
+        below = jnp.sum(jnp.where(earlier, gradients[None], 0), axis=1)
         # Where e^-s^2 is so small: x - x_i = ln(1 + r y)/r, at least that with a small r > 0.
         first = strain**2 / (_NEGLIGIBLE + strain**2) * total
         y, r = jnp.clip(first - below, 0, gradients) / density, jnp.maximum(pieces.r, 1e-3)
