@@ -115,9 +115,9 @@ DRIVERS = {
         ["linearised"],
         lambda: fj.design(BRAKE, {"D": (2.39, 2.41)}, starts=1, progress=False),
     ),
-    "basin": (basin, ["_first", "_run"], lambda: fj.basin(BRAKE, **KICKS)),
+    "basin": (basin, ["_start_lanes", "_run"], lambda: fj.basin(BRAKE, **KICKS)),
     "track_modes": (tracks, ["_states"], lambda: fj.track_modes(STRUCTURE, "D", [2.4, 2.41])),
-    "hopf_boundary": (boundary, ["_at", "_tests"], lambda: fj.hopf_boundary(BRAKE, **WINDOW)),
+    "hopf_boundary": (boundary, ["_evaluate", "_tests"], lambda: fj.hopf_boundary(BRAKE, **WINDOW)),
     "continue_cycle": (
         itinerary,
         ["condensed", "lowest"],
