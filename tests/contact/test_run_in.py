@@ -197,7 +197,7 @@ def test_no_second_derivatives():
         return fj.run_in(ROUGH, DX, MATERIAL, PRESSURE, depth, steps=1).Sq
 
     with pytest.raises(TypeError, match="first derivatives only"):
-        jax.grad(jax.grad(Sq))(0.1 * SQ)
+        jax.jacfwd(jax.jacfwd(Sq))(0.1 * SQ)
 
 
 # --- extremes ------------------------------------------------------------------------------
