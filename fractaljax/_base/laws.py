@@ -22,6 +22,11 @@ def register(law: str, kind: type[Part], laws: dict[str, Any]) -> None:
     laws[law] = kind
 
 
+def is_built_in(law: Part, base: str) -> bool:
+    """True for a law of the package in which the module `base` defines its base class."""
+    return type(law).__module__.rpartition(".")[0] == base.rpartition(".")[0]
+
+
 def make_arrays(law: Part) -> None:
     """Convert to arrays the numbers that a generated `__init__` has stored unchanged.
 

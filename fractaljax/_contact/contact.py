@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, ScalarLike
 
-from .._base.laws import make_arrays, refuse, register
+from .._base.laws import is_built_in, make_arrays, refuse, register
 from .._base.parts import Numbers, Part, Record, brief, concrete, number, substitute
 from .load_curve import LoadCurve, load_curve
 
@@ -71,7 +71,7 @@ class Contact(Part):
     @property
     def built_in(self) -> bool:
         """True for a built-in law, whose `__init__` checks its numbers."""
-        return type(self).__module__.rpartition(".")[0] == __name__.rpartition(".")[0]
+        return is_built_in(self, __name__)
 
     @property
     def depends_on_friction(self) -> bool:

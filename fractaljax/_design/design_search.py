@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 
+from .._base.options import check_numbers
 from .._base.parts import brief, whole
 
 
@@ -56,16 +57,7 @@ class DesignSearch:
     kick_bisections: int = 6
 
     def __post_init__(self):
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if field.type is int:
-                whole(field.name, value, 1, 10_000)
-            elif field.type is float:
-                is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-                if not (is_number and 0 < value <= 1):
-                    raise ValueError(
-                        f"{field.name} must be above 0 and at most 1, got {brief(value)}"
-                    )
+        check_numbers(self, most_count=10_000, most=1)
         if not isinstance(self.kick_starts, (tuple, list)) or not self.kick_starts:
             raise TypeError(
                 f"kick_starts must be a tuple of whole numbers, got {brief(self.kick_starts)}"

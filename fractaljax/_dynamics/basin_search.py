@@ -2,6 +2,8 @@
 
 import dataclasses
 
+from .._base.options import check_numbers
+
 
 @dataclasses.dataclass(frozen=True)
 class BasinSearch:
@@ -26,6 +28,9 @@ class BasinSearch:
       `near_distance` are enough without approach.
     - `patience`: rounds without a label after which a start is searched in full.
     - `failures`: full searches without an orbit, after which the coarse run alone decides.
+
+    **Raises:** `ValueError` for a count that is not a whole number of at least 1 (`failures`: 0),
+    and for another number that is not above 0 and finite.
     """
 
     lanes: int = 256
@@ -42,3 +47,6 @@ class BasinSearch:
     approach_rounds: int = 8
     patience: int = 8
     failures: int = 8
+
+    def __post_init__(self):
+        check_numbers(self, least={"failures": 0})

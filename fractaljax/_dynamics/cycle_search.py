@@ -1,9 +1,8 @@
 """The options of the search for a limit cycle."""
 
 import dataclasses
-import math
 
-from .._base.parts import brief, whole
+from .._base.options import check_numbers
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,15 +100,5 @@ class CycleSearch:
     rest_size: float = 1e-6
 
     def __post_init__(self):
-        for field in dataclasses.fields(self):
-            name, value = field.name, getattr(self, field.name)
-            if isinstance(field.default, int):
-                # The decay is judged by the last three returns and one before.
-                value = whole(name, value, 3 if name == "longest_period" else 1)
-            elif isinstance(value, bool) or not (
-                isinstance(value, (int, float)) and 0 < value < math.inf
-            ):
-                raise ValueError(f"{name} must be a number above 0, got {brief(value)}")
-            else:
-                value = float(value)
-            object.__setattr__(self, name, value)  # of plain types, so that programs are kept
+        # The decay is judged by the last three returns and one before.
+        check_numbers(self, least={"longest_period": 3})

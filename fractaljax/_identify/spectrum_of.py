@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import ArrayLike
 
+from .._surface.heights import height_statistics
 from .._surface.measured_spectrum import MeasuredSpectrum
 from .measurement import Measurement
 from .preparation import prepare_heights
@@ -71,9 +72,8 @@ def spectrum_of(
 
 
 def _warn_unless_gaussian(z: np.ndarray, largest_skewness: float, largest_kurtosis: float) -> None:
-    z = remove_plane(z)
-    Sq = np.sqrt(np.mean(z**2))
-    Ssk, Sku = np.mean(z**3) / Sq**3, np.mean(z**4) / Sq**4
+    heights = height_statistics(remove_plane(z))
+    Ssk, Sku = float(heights.skewness), float(heights.kurtosis)
     if abs(Ssk) > largest_skewness or Sku > largest_kurtosis:
         warnings.warn(
             f"heights are far from Gaussian (Ssk {Ssk:.2g}, Sku {Sku:.2g}): a law that has only"

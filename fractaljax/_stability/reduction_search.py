@@ -2,6 +2,8 @@
 
 import dataclasses
 
+from .._base.options import check_numbers
+
 
 @dataclasses.dataclass(frozen=True)
 class ReductionSearch:
@@ -24,6 +26,9 @@ class ReductionSearch:
       looks for the rightmost one first.
     - `coarse_from`, `coarse_share`: degrees of freedom from which there is a coarse space, and the
       largest share of them that it may have. Otherwise it saves no time.
+
+    **Raises:** `ValueError` for a count that is not a whole number of at least 1 (`corners`: 0),
+    and for another number that is not above 0 and finite.
     """
 
     line: int = 33
@@ -38,3 +43,6 @@ class ReductionSearch:
     coarse_tol: float = 1e-3
     coarse_from: int = 40
     coarse_share: float = 0.6
+
+    def __post_init__(self):
+        check_numbers(self, least={"corners": 0})

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from .._base.laws import make_arrays, register
+from .._base.laws import is_built_in, make_arrays, register
 from .._base.parts import Numbers, Part, number, ordered
 from .._base.singular import boxcox
 
@@ -79,8 +79,8 @@ class Spectrum(Part):
             register(law, cls, SPECTRA)
 
     def __check_init__(self):
-        if type(self).__module__.rpartition(".")[0] == __name__.rpartition(".")[0]:
-            return  # a built-in spectrum checks its numbers itself
+        if is_built_in(self, __name__):
+            return  # it checks its numbers itself
         make_arrays(self)
         name = type(self).__name__
         try:
