@@ -220,6 +220,7 @@ class _DrawingLimit(_LogConstraint):
     """A roughness parameter to expect of the surface of a contact, a `Spectrum`, within limits.
 
     Gaussian filters leave the waves from `shortest` to `cutoff` [m], as in `profile_parameters`.
+    `below` is another name of `at_most`.
     """
 
     cutoff: Limit  # longest wavelength that the filter leaves [m], or None
@@ -237,8 +238,11 @@ class _DrawingLimit(_LogConstraint):
         shortest: ArrayLike | None,
         L: ArrayLike,
         L_s: ArrayLike,
+        below: ArrayLike | None,
     ):
-        super().__init__(at_least, at_most)
+        if below is not None and at_most is not None:
+            raise ValueError(f"{self.symbol} takes below or at_most, which are one limit")
+        super().__init__(at_least, at_most if below is None else below)
         self.shortest = None if shortest is None else scalar("shortest", shortest, above=0)
         self.cutoff = None if cutoff is None else scalar("cutoff", cutoff, above=0)
         if self.cutoff is not None and self.shortest is not None:
@@ -272,8 +276,9 @@ class Ra(_DrawingLimit):
         shortest: ArrayLike | None = None,
         L: ArrayLike = 1e-3,
         L_s: ArrayLike = 1e-6,
+        below: ArrayLike | None = None,
     ):
-        super().__init__(at_least, at_most, cutoff, shortest, L, L_s)
+        super().__init__(at_least, at_most, cutoff, shortest, L, L_s, below)
 
     def measure(self, scene):
         return self.expected(scene, profile_parameters).Ra
@@ -297,8 +302,9 @@ class Rz(_DrawingLimit):
         shortest: ArrayLike | None = None,
         L: ArrayLike = 1e-3,
         L_s: ArrayLike = 1e-6,
+        below: ArrayLike | None = None,
     ):
-        super().__init__(at_least, at_most, cutoff, shortest, L, L_s)
+        super().__init__(at_least, at_most, cutoff, shortest, L, L_s, below)
 
     def measure(self, scene):
         return self.expected(scene, profile_parameters).Rz
@@ -322,8 +328,9 @@ class Sq(_DrawingLimit):
         shortest: ArrayLike | None = None,
         L: ArrayLike = 1e-3,
         L_s: ArrayLike = 1e-6,
+        below: ArrayLike | None = None,
     ):
-        super().__init__(at_least, at_most, cutoff, shortest, L, L_s)
+        super().__init__(at_least, at_most, cutoff, shortest, L, L_s, below)
 
     def measure(self, scene):
         return self.expected(scene, areal_parameters).Sq

@@ -144,7 +144,9 @@ class Design(Record):
         """Ra, Rz [m] of a profile, Sq [m] and Sdq of a map, of both surfaces behind the filters.
 
         They are those to expect of the spectrum, as `profile_parameters` says, and printed are a
-        table. The waves of a `Surface` are those of `wavelengths`.
+        table. The waves of a `Surface` are those of `wavelengths`. `quiet_Ra` is the interval of Ra
+        around the design, from a tenth to ten times, within which the growth rate stays below 0
+        while all heights change in proportion, without tolerance and envelope.
 
         **Arguments:**
 
@@ -155,7 +157,9 @@ class Design(Record):
         spectra = self._spectra()
         if spectra is None:
             raise ValueError("a drawing needs a scene whose contact has a surface")
-        return compare_drawings(*spectra, cutoff, shortest, self.wavelengths)
+        scene: Any = self.scene
+        bands = cutoff, shortest, self.wavelengths
+        return compare_drawings(scene, spectra[0], *bands, self.friction_slope)
 
     def topographies(self, n: int = 1024, *, L=None, L_s=None, M=10, key=None) -> Topographies:
         """Both surfaces on a grid of n x n points with the same phases, to see the difference.

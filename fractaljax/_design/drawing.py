@@ -1,12 +1,18 @@
 """What a drawing says of a surface before a design and after it."""
 
+import functools
 from typing import Any
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import ScalarLike
 
 from .._base.parts import Record
 from .._base.table import table
+from .._mechanism.scene import Scene
+from .._stability.stability import growth_rate
 from .._surface.areal_parameters import areal_parameters
 from .._surface.profile_parameters import profile_parameters
 from .._surface.spectrum import Spectrum
@@ -22,24 +28,69 @@ class Drawing(Record):
     Sdq: tuple[float, float]  # root mean square gradient, before and after
     cutoff: float  # longest wavelength that the filters leave [m]
     shortest: float  # shortest wavelength that the filters leave [m]
+    quiet_Ra: tuple[float, float] | None  # where the design stays quiet [m]; None if it is not
 
     def __repr__(self) -> str:
         rows = {"Ra [m]": self.Ra, "Rz [m]": self.Rz, "Sq [m]": self.Sq, "Sdq": self.Sdq}
         columns = [{name: f"{values[i]:.6g}" for name, values in rows.items()} for i in (0, 1)]
         filters = f"wavelengths from {self.cutoff:g} to {self.shortest:g} m"
-        return "\n".join(
-            [table(["before", "after"], columns), f"Ra to Sdq: behind filters, {filters}"]
-        )
+        lines = [table(["before", "after"], columns), f"Ra to Sdq: behind filters, {filters}"]
+        if self.quiet_Ra is not None:
+            low, high = self.quiet_Ra
+            lines.append(f"quiet for Ra from {low:.3g} to {high:.3g} m, all heights in proportion")
+        return "\n".join(lines)
+
+
+@functools.partial(jax.jit, static_argnames="friction_slope")
+def _growth_rates(scene: Scene, factors, friction_slope: bool):
+    """Growth rates [1/s] of a scene with the heights of its surface times each of the factors."""
+
+    def at(factor):
+        surface = scene.contact.surface.times(factor)
+        other = eqx.tree_at(lambda x: x.contact.surface, scene, surface)
+        return growth_rate(other, friction_slope)
+
+    return jax.vmap(at)(factors)
+
+
+def quiet_factors(scene: Scene, friction_slope: bool) -> tuple[float, float] | None:
+    """Between which factors of all heights, from 0.1 to 10, the scene stays quiet.
+
+    None unless it is quiet as it is.
+    """
+    logs = np.linspace(-np.log(10), np.log(10), 257)
+    rates = np.asarray(_growth_rates(scene, jnp.exp(jnp.asarray(logs)), friction_slope))
+    middle, loud = len(logs) // 2, ~(rates < 0)
+    if loud[middle]:
+        return None
+    ends = []
+    for step in (-1, 1):
+        side = slice(middle, None, step)
+        x, y, stop = logs[side], rates[side], loud[side]
+        k = int(np.argmax(stop))
+        if not stop.any():
+            ends.append(x[-1])
+        elif np.isnan(y[k]):
+            ends.append(x[k - 1])
+        else:
+            ends.append(np.interp(0.0, y[k - 1 : k + 1], x[k - 1 : k + 1]))
+    low, high = np.exp(ends)
+    return float(low), float(high)
 
 
 def compare_drawings(
+    scene: Scene,
     before: Spectrum,
-    after: Spectrum,
     cutoff: ScalarLike,
     shortest: ScalarLike,
     wavelengths: tuple[float, float],
+    friction_slope: bool,
 ) -> Drawing:
-    """What to expect of two surfaces behind the filters; a `Surface` has these wavelengths."""
+    """What to expect of the surface `before` and that of a designed scene behind the filters.
+
+    A `Surface` has these wavelengths.
+    """
+    after = scene.contact.surface
     filters: dict[str, Any] = dict(cutoff=cutoff, shortest=shortest)
     if isinstance(before, Surface):
         filters |= dict(zip(("L", "L_s"), wavelengths, strict=True))
@@ -49,11 +100,13 @@ def compare_drawings(
     def both(pair, name) -> tuple[float, float]:
         return float(getattr(pair[0], name)), float(getattr(pair[1], name))
 
+    Ra, factors = both(profiles, "Ra"), quiet_factors(scene, friction_slope)
     return Drawing(
-        both(profiles, "Ra"),
+        Ra,
         both(profiles, "Rz"),
         both(maps, "Sq"),
         both(maps, "Sdq"),
         float(jnp.asarray(cutoff)),
         float(jnp.asarray(shortest)),
+        None if factors is None else (Ra[1] * factors[0], Ra[1] * factors[1]),
     )

@@ -27,12 +27,14 @@ from .._mechanism.structure import Structure
 from .._stability.linearise import linearised
 from .._stability.quartic import rightmost_root
 from .._stability.stability import growth_rate, stability
+from .._surface.spectrum import Spectrum
 from .design import DesignResult, design
 from .envelope import Envelope
 from .joints import with_contact_law, with_contacts
 from .quiet import Kicks
 from .summary import growth_text
 from .tolerance import Tolerance, squeal_probability
+from .wear import check_depths, worn_growth
 
 
 class Question(NamedTuple):
@@ -98,6 +100,7 @@ def verdict(
     tolerance: Any = None,
     envelope: Envelope | Mapping[str, Any] | None = None,
     quiet_within: Any = None,
+    run_in: Sequence[float] | None = None,
     friction_slope: bool = True,
     seed: int = 0,
     progress: bool = True,
@@ -107,8 +110,8 @@ def verdict(
     Its growth rate [1/s] as it is; with the load P in the friction, or without it where it is
     there; under other contact laws; with K_t/K_n between its own, the fractal law's and Mindlin's,
     the worst of 65 values, or 17 of a structure; the probability of squeal, quiet below 5 percent;
-    and the largest kick survived. What no argument asks for is named. The joints of a structure
-    change together.
+    the largest kick survived; and while its surfaces run in. What no argument asks for is named.
+    The joints of a structure change together.
 
     **Arguments:**
 
@@ -120,6 +123,10 @@ def verdict(
     - `tolerance`: as in `squeal_probability`, by default none.
     - `envelope`: as in `squeal_probability`, by default none.
     - `quiet_within`: the kick that has to be survived, as in `design`; by default none.
+    - `run_in`: (least, greatest) mean height worn off, in units of Sq, such as (0, 0.3); by default
+      none. Two maps of 256 x 256 points are drawn from the spectrum of each joint and worn as in
+      the function `run_in`; the stiffness of the joint grows as theirs. A contact without an area
+      of its own needs `area`. Debris and friction that changes are left out.
     - `friction_slope`: False leaves the slope of friction out of growth rates.
     - `seed`: of all that is drawn, 0 by default.
     - `progress`: shows a bar.
@@ -131,6 +138,7 @@ def verdict(
     """
     require_one("x", x)
     flag("friction_slope", friction_slope)
+    depths = None if run_in is None else check_depths(run_in)
     parts = joints_of(x)
     laws_in_use = " and ".join(
         dict.fromkeys(type(part.contact).__name__ for part in parts.values())
@@ -161,11 +169,15 @@ def verdict(
         words = f"comes to rest from {survived:.3g} of {size:.3g}"
         name = f"kicks within {quiet_within}"
         questions.append(Question("smaller kicks", name, words, survived >= size))
+    if depths is not None:
+        questions.append(_wear_question(x, depths, area, friction_slope, seed))
     # A reduced structure does not have all eigenvalues.
     incurable = bool(growth.trace > 0) and getattr(x, "band", None) is None
     others = "area" if any(part.contact.has_surface for part in parts.values()) else "laws"
     options = {f"other contact laws ({others})": by, "scatter (tolerance)": tolerance is not None}
     options["kicks (quiet_within)"] = quiet_within is not None
+    if any(isinstance(getattr(part.contact, "surface", None), Spectrum) for part in parts.values()):
+        options["wear (run_in)"] = depths is not None
     omitted = tuple(name for name, was in options.items() if not was)
     return Verdict(tuple(questions), incurable, omitted)
 
@@ -317,6 +329,18 @@ def _scatter_question(
     quiet = probability.value + probability.undetermined < accepted
     undetermined = not quiet and probability.value < accepted
     return Question(exact, f"{names} scatter{over}", words, quiet, undetermined)
+
+
+def _wear_question(x, depths, area, friction_slope, seed) -> Question:
+    """The growth rate while the surfaces run in, and where it begins to squeal."""
+    worn = worn_growth(x, depths, area, friction_slope, seed)
+    worst = int(np.argmax(worn.rates))
+    words = f"{growth_text(worn.rates[worst])} at {worn.depths[worst]:.3g} Sq"
+    if worn.onset is not None:
+        words += f", squeals from {worn.onset:.3g} Sq on"
+    name = f"worn by {depths[0]:g} to {depths[1]:g} Sq"
+    quiet, undetermined = bool(worn.rates[worst] < 0), bool(np.isnan(worn.rates[worst]))
+    return Question("surfaces without wear", name, words, quiet, undetermined)
 
 
 class Suggestion(Record):

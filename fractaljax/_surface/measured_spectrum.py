@@ -72,6 +72,10 @@ class MeasuredSpectrum(Spectrum):
         inside = (q >= self.q[0] * (1 - 1e-9)) & (q <= self.q[-1] * (1 + 1e-9))  # but for rounding
         return jnp.where(inside, q**2 * C / (2 * math.pi), 0)
 
+    def times(self, factor):
+        table = tuple(C * factor**2 for C in self.C_table)
+        return eqx.tree_at(lambda x: x.C_table, self, table)
+
     def pieces(self, longest=None, count=64):
         x, log_C = self._logs()
         x = jnp.asarray(x, log_C.dtype)

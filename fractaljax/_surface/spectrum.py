@@ -11,8 +11,9 @@ Topogr. 5, 013001, 2017, doi:10.1088/2051-672X/aa51f8).
 
 import abc
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
@@ -107,6 +108,17 @@ class Spectrum(Part):
     def C_at(self, q_x: Float[ArrayLike, "..."], q_y: Float[ArrayLike, "..."]) -> Numbers:
         """Power spectrum [m^4] at wavevectors (q_x, q_y) [rad/m]; by default `C` of the length."""
         return self.C(jnp.hypot(jnp.asarray(q_x), jnp.asarray(q_y)))
+
+    def times(self, factor: Numbers) -> Self:
+        """The surface with all heights times `factor`, a number above 0; not checked.
+
+        By default its Sq is multiplied.
+
+        **Raises:** `ValueError` for a custom spectrum without a number Sq.
+        """
+        if not hasattr(self, "Sq"):
+            raise ValueError(f"{type(self).__name__} must have a number Sq, or a method times")
+        return eqx.tree_at(lambda x: x.Sq, self, factor * self.Sq)
 
     def _ends(self) -> tuple[Any, Any]:
         """The longest and the shortest wavelength of a custom spectrum [m]."""

@@ -3,6 +3,7 @@
 import math
 from typing import final
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import ArrayLike
 
@@ -34,6 +35,9 @@ class Surface(Spectrum):
         # G^(2D-4) alone may underflow.
         wavelength = 2 * math.pi / jnp.asarray(q)
         return (wavelength * (self.G / wavelength) ** (self.D - 2)) ** 2 / 2
+
+    def times(self, factor):
+        return eqx.tree_at(lambda x: x.G, self, self.G * factor ** (1 / (self.D - 2)))
 
     def between(self, L, L_s) -> Pieces:
         """The waves of Eq. 13 from L to L_s, with half a step of gamma beyond first and last."""

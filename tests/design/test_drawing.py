@@ -11,6 +11,7 @@ import pytest
 
 import fractaljax as fj
 from fractaljax._design.constraints import Ra, Rz, Sq
+from fractaljax._design.drawing import quiet_factors
 from tools import both_gradients, refusals
 
 FILTERS: Any = dict(cutoff=8e-4, shortest=2.5e-6)
@@ -42,6 +43,7 @@ def test_residuals(kind, scene):
     assert float(limit(scene)) == pytest.approx(math.log(value / 5e-7), rel=1e-12)
     assert float(kind(at_least=5e-7, **FILTERS)(scene)) == pytest.approx(-float(limit(scene)))
     assert limit.name == f"{kind.__name__} <= 5e-07 m"
+    assert vars(kind(below=5e-7, **FILTERS)) == vars(limit)
 
     def residual(x):
         return limit(scene.replace(Sq=jnp.exp(x[0]), rolloff=jnp.exp(x[1])))
@@ -119,6 +121,7 @@ def test_drawing(best):
 test_refusals = refusals(
     [
         (lambda: Ra(**FILTERS), "Ra needs at_least or at_most"),
+        (lambda: Ra(at_most=1e-6, below=1e-6, **FILTERS), "Ra takes below or at_most"),
         (lambda: Ra(at_most=1e-6, cutoff=1e-6, shortest=1e-3), "cutoff must be at least shortest"),
         (lambda: Sq(at_most=1e-6, L=1e-6, L_s=1e-3), "L must be at least L_s"),
         (
@@ -127,3 +130,36 @@ test_refusals = refusals(
         ),
     ]
 )
+
+
+QUIET = {
+    "fractal": fj.brake_scene().replace(D=2.43197, G=1.23407e-10),
+    "self-affine": pressed().replace(P=0.1, area=1e-6),
+}
+TABLE = fj.MeasuredSpectrum(np.geomspace(1e4, 1e6, 5), 1e-18 * np.geomspace(1, 1e-6, 5))
+QUIET["table"] = pressed(TABLE).replace(P=0.1, area=1e-6)
+
+
+@pytest.mark.parametrize("name", QUIET)
+def test_heights_that_stay_quiet(name):
+    """At the ends, in scenes put together again, the growth rate is 0; within, it is not."""
+    scene = QUIET[name]
+    factors = quiet_factors(scene, True)
+    assert factors is not None and factors[0] < 1 < factors[1]
+    surface = scene.contact.surface
+
+    def growth(factor):
+        if name == "table":
+            other = fj.MeasuredSpectrum(surface.q, np.array(surface.C_table) * factor**2)
+            return float(fj.growth_rate(pressed(other).replace(P=0.1, area=1e-6)))
+        if name == "fractal":  # m is in proportion to G^(2 D - 4)
+            return float(fj.growth_rate(scene.replace(G=surface.G * factor ** (1 / 0.43197))))
+        return float(fj.growth_rate(scene.replace(Sq=factor * surface.Sq)))
+
+    scale = max(abs(growth(0.5)), abs(growth(2.0)))
+    for end in factors:
+        if 0.1001 < end < 9.999:
+            assert abs(growth(end)) < 0.02 * scale
+    for inside in np.geomspace(*factors, 7)[1:-1]:
+        assert growth(inside) < 0
+    assert quiet_factors(pressed(), True) is None

@@ -60,7 +60,7 @@ def test_every_question_and_what_it_rests_on(found):
     lines = repr(found).splitlines()
     assert lines[0].split() == ["growth", "rate", "[1/s]"]
     assert lines[-2].startswith("Quiet, but it rests on: friction on K_n x2; FractalContact; K_t")
-    assert lines[-1] == "Not asked: kicks (quiet_within)."
+    assert lines[-1] == "Not asked: kicks (quiet_within), wear (run_in)."
     # It was given others: those of the brake before the design, 1 N, and a softer material.
     law = persson()
     law = fj.PerssonContact(
