@@ -20,8 +20,7 @@ from .._base.parts import is_traced, nan_where, refused, whole
 from .._base.programs import exported_jit
 from .._contact.contact import Contact
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import substituted, value_of
-from .._mechanism.structure import Structure
+from .._mechanism.quantities import substituted, value_of, with_stiffness
 from .._stability.linearise import assembled
 from .._stability.quadratic import leading
 from .._stability.stability import growth_rate
@@ -37,7 +36,6 @@ from .joints import (
     joint_states,
     slips,
     with_contact_law,
-    with_stiffness,
 )
 from .statement import stated_fields
 from .tolerance import Scatter, quantile
@@ -141,7 +139,7 @@ class DesignProblem(eqx.Module):
         for name, value in fields.items():
             setattr(self, name, value)
         self.modes, self.smooth, self.cuts = 0, False, None
-        if isinstance(x, Structure):
+        if not x.uncoupled:
             most = largest_mode_count(x)
             if modes is not None:
                 self.modes = whole("modes", modes, 1, most)

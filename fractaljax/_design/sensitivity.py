@@ -16,8 +16,7 @@ import numpy as np
 from .._base.parts import Record
 from .._base.table import aligned
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import replaced, target_quantities, unit, value_of
-from .._mechanism.structure import Structure
+from .._mechanism.quantities import replaced, separate_quantities, target_quantities, unit, value_of
 from .evaluator import Evaluator, OnAverage
 from .problem import DesignProblem
 
@@ -160,10 +159,8 @@ def _multipliers(
 
 def _held(x: Mechanism, problem: DesignProblem) -> list[str]:
     """The quantities that neither the design nor the envelope moves."""
-    quantities = x.stored_quantities()
+    quantities = separate_quantities(x)
     names = [name for name in quantities if quantities[name].value is not None]
-    if isinstance(x, Structure):  # a plain name is that of several joints
-        names = [name for name in names if "." in name or name in x.parameters]
     varied = {
         each
         for name in (*problem.names, *problem.conditions)

@@ -19,7 +19,6 @@ from .._mechanism.quantities import (
     value_of,
     with_optional,
 )
-from .._mechanism.scene import Scene
 from .constraints import Constraint, CycleConstraint, Plain
 from .envelope import Envelope
 from .followed import FollowedCycles
@@ -60,7 +59,7 @@ def stated_fields(
         require_scalar(law)
     if (
         laws
-        and not isinstance(x, Scene)
+        and x.sole_joint is None
         and not any(joint.contact.has_surface for joint in x.joints_by_name().values())
     ):
         raise ValueError("laws of a structure need a joint whose contact has a surface")

@@ -35,6 +35,7 @@ class Mechanism(Part):
 
     names: eqx.AbstractVar[tuple[str, ...] | None]  # of the n degrees of freedom
     joint_names: eqx.AbstractVar[tuple[str, ...]]
+    F: eqx.AbstractVar[Any]  # external force [N], None if there is none
     kind: eqx.AbstractClassVar[str]  # in messages
 
     @property
@@ -71,6 +72,11 @@ class Mechanism(Part):
     @abc.abstractmethod
     def joints_by_name(self) -> "dict[str, AnyJoint]":
         """The joints; a scene is its own joint, named ""."""
+
+    @property
+    def sole_joint(self) -> "AnyJoint | None":
+        """The joint of a scene; None for a structure, whose joints have names."""
+        return self.joints_by_name().get("")
 
     @abc.abstractmethod
     def with_joints(self, joints: Mapping[str, Any]) -> Self:
@@ -115,6 +121,10 @@ class Mechanism(Part):
                 listed = ", ".join(new._quantity_names())
                 raise ValueError(f"{self.kind} has no quantity {name!r}; it has {listed}")
         return new
+
+    @abc.abstractmethod
+    def embedded(self, beside: Path) -> tuple[str, dict[Path, bytes]]:
+        """What stands for it in another TOML file, with the contents of files `beside` that one."""
 
     @classmethod
     @abc.abstractmethod

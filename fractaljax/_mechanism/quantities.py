@@ -19,7 +19,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from .._base.parts import brief, is_traced, number, substitute
+from .._base.parts import Quantity, brief, is_traced, number, substitute
+from .._contact.fixed import FixedContact
 from .mechanism import Mechanism
 from .scene import FRICTION
 
@@ -62,6 +63,13 @@ def target_quantities(x: Mechanism, name: str) -> set[str]:
             targets |= {each for each in law if law[each].unit == "-"}
         return targets
     return {f"{joint}.{name}" for joint in x.joint_names} & stored.keys() or {name}
+
+
+def separate_quantities(x: Mechanism) -> dict[str, Quantity]:
+    """The stored quantities without plain names for those of several joints."""
+    stored = x.stored_quantities()
+    shared = {name for name in stored if any(f"{j}.{name}" in stored for j in x.joint_names)}
+    return {name: stored[name] for name in stored if name not in shared}
 
 
 def value_of(x: Mechanism, name: str) -> Float[Array, ""]:
@@ -204,3 +212,13 @@ def with_friction_times(x: Mechanism, factor: ArrayLike) -> Any:
             for name, joint in joints
         }
     )
+
+
+def with_stiffness(x: Mechanism, states: Mapping[str, Any]) -> Any:
+    """`x` with contacts of fixed stiffness in the joints whose states (by name) are given."""
+    joints, zero = x.joints_by_name(), FixedContact(0.0, 0.0, 1.0)
+    for name, state in states.items():
+        P = getattr(joints[name].contact, "P", zero.P)  # of a preloaded joint
+        fixed = substitute(zero, {"K_n": state.K_n, "K_t": state.K_t, "P": P})
+        joints[name] = eqx.tree_at(lambda part: part.contact, joints[name], fixed)
+    return x.with_joints(joints)

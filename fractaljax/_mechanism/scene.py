@@ -87,6 +87,11 @@ class Scene(Mechanism, AnyJoint):
         """The belt velocity [m/s]."""
         return self.oscillator.V
 
+    @property
+    def F(self) -> Numbers:
+        """The external force [N]."""
+        return self.oscillator.F
+
     def stiffness(self) -> tuple[Numbers, Numbers]:
         """(K_n, K_t) [N/m], as the function `stiffness`."""
         return stiffness(self)
@@ -126,6 +131,10 @@ class Scene(Mechanism, AnyJoint):
 
     def _quantity_names(self):
         return list(quantities(self))
+
+    def embedded(self, beside: Path) -> tuple[str, dict[Path, bytes]]:
+        """The text of the scene, and no file."""
+        return self.to_toml(), {}
 
     @classmethod
     def _from_document(cls, document, folder):

@@ -363,6 +363,10 @@ class Structure(Mechanism):
         """
         write_together(self._files(Path(path)))
 
+    def embedded(self, beside: Path) -> tuple[str, dict[Path, bytes]]:
+        """The name of the structure's file, and what `save` writes there."""
+        return beside.name, self._files(beside)
+
     def _files(self, path: Path) -> dict[Path, bytes]:
         """The contents that `save` writes, by file; errors as there."""
         matrices = path.with_suffix(".npz")

@@ -27,6 +27,7 @@ from .._mechanism.quantities import (
     substituted,
     with_friction_times,
     with_optional,
+    with_stiffness,
 )
 from .._mechanism.structure import Structure
 from .linearise import assembled, linearised, with_equilibrium
@@ -227,15 +228,17 @@ class _Plane(eqx.Module):
 
     def at(self, u) -> _Point:
         scene = substituted(self.scene, dict(zip(self.names, self.quantities(u), strict=True)))
-        fractal = [joint for joint in scene.joints_by_name().values() if joint.contact.fractal]
-        laws = [joint.friction for joint in fractal]
-        states = [
-            joint.contact.state(law.mu_s, law.mu_m)
-            for joint, law in zip(fractal, laws, strict=True)
-        ]
-        regimes = tuple(state.regime for state in states)
-        lowest = tuple(law.mu_m for law in laws)
-        system = linearised(scene, self.friction_slope, refuse=False)
+        joints = scene.joints_by_name().items()
+        laws = {name: joint.friction for name, joint in joints if joint.contact.fractal}
+        states = {
+            name: joint.contact.state(laws[name].mu_s, laws[name].mu_m)
+            for name, joint in joints
+            if name in laws
+        }
+        regimes = tuple(state.regime for state in states.values())
+        lowest = tuple(law.mu_m for law in laws.values())
+        # The state of a fractal joint includes its stiffness.
+        system = linearised(with_stiffness(scene, states), self.friction_slope, refuse=False)
         return _Point(*system.critical(self.rigid), system.open, regimes, lowest)
 
 

@@ -16,7 +16,6 @@ from jaxtyping import Array, Bool, Complex, Float, ScalarLike
 from .._base.parts import Record
 from .._base.programs import exported_jit
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.scene import Scene
 from .linearise import linearised, require_equilibrium
 from .margin import damping_ratios
 from .two_directions import two_directions
@@ -226,7 +225,7 @@ def _stability(scene, friction_slope):
 
 
 def require_computable(
-    scene: Scene, friction_slope: bool = True, modes: Stability | None = None
+    scene: Any, friction_slope: bool = True, modes: Stability | None = None
 ) -> None:
     """Refuse a scene whose growth rate or margin is not finite, naming the quantity behind it.
 
