@@ -413,7 +413,7 @@ def design(
     count, designs = designs_to_screen(problem, starts, lattice)
     start = np.asarray(problem.start, float)
     before = evaluator.evaluate(start[None])
-    if not np.isfinite(before.rows).all() and x.uncoupled:
+    if not np.isfinite(before.rows).all():
         require_computable(x, problem.friction_slope)
 
     def solve(problem):

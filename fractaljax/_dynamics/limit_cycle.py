@@ -11,7 +11,6 @@ from jaxtyping import Array, ArrayLike, Float, ScalarLike
 from .._base.parts import concrete, number, raise_unless, require_kind, whole
 from .._base.programs import exported_jit
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.scene import Scene
 from .._stability.stability import growth_rate
 from .cycle import CycleResult, LimitCycle, Orbit
 from .cycle_search import CycleSearch
@@ -128,7 +127,7 @@ def check_arguments(mechanism, start, excitation, rtol, max_returns, search, seg
         count *= 8  # towards an opening segments are short: less than a second compilation
     elif segments is None and (steps_follow_motion(n) or len(joints) > 1):
         count *= 4  # a period may be long beside that of the highest frequency, or of many phases
-    of_scene = isinstance(mechanism, Scene)
+    of_scene = mechanism.sole_joint is not None
     return returns, count, {"of_scene": of_scene, "rtol": rtol, "search": search}
 
 

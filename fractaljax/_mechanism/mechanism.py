@@ -2,19 +2,20 @@
 
 import abc
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import equinox as eqx
-from jaxtyping import Array
+import numpy as np
+from jaxtyping import Array, Float
 
 from .._base.files import read_bounded
 from .._base.parts import Part
 from .._base.toml import naming, read_toml
 
 if TYPE_CHECKING:
-    from .joint import AnyJoint
+    from .joint import AnyJoint, Dof
     from .structure import Structure
 
 
@@ -36,6 +37,7 @@ class Mechanism(Part):
     names: eqx.AbstractVar[tuple[str, ...] | None]  # of the n degrees of freedom
     joint_names: eqx.AbstractVar[tuple[str, ...]]
     F: eqx.AbstractVar[Any]  # external force [N], None if there is none
+    mesh: eqx.AbstractVar[Any]  # for pictures, None if there is none
     kind: eqx.AbstractClassVar[str]  # in messages
 
     @property
@@ -60,6 +62,28 @@ class Mechanism(Part):
     def coarse(self) -> Any:
         """A subspace with approximate modes for a reduced structure, else None."""
         return None
+
+    def index(self, dof: "Dof | np.integer") -> int:
+        """The index of a degree of freedom from `dof`, its index or name.
+
+        **Raises:** `ValueError` if there is none; `TypeError` for anything else.
+        """
+        if isinstance(dof, bool) or not isinstance(dof, (int, str, np.integer)):
+            raise TypeError(f"a degree of freedom must be an index or a name, got {dof!r}")
+        dofs: list[Any] = list((self.names or ()) if isinstance(dof, str) else range(self.n))
+        if dof not in dofs:
+            has = some_of(dofs) or "no names"
+            raise ValueError(f"unknown degree of freedom {dof!r}; the {self.kind} has {has}")
+        return dofs.index(dof)
+
+    @abc.abstractmethod
+    def over_mass(self, forces: Float[Array, "n k"]) -> Float[Array, "n k"]:
+        """M^-1 times forces."""
+
+    @property
+    def is_sparse(self) -> bool:
+        """True if the matrices are large and sparse, so that `reduce` must come first."""
+        return False
 
     @abc.abstractmethod
     def require_one(self) -> None:
@@ -144,3 +168,9 @@ class Mechanism(Part):
         """
         with naming(path):
             return cls._from_document(read_toml(read_bounded(path)), Path(path).parent)
+
+
+def some_of(items: Iterable[Any]) -> str:
+    """At most ten of the items, and their number."""
+    texts = list(map(str, items))
+    return ", ".join(texts[:10]) + (f", ... ({len(texts)} in all)" if len(texts) > 10 else "")

@@ -48,6 +48,7 @@ class Scene(Mechanism, AnyJoint):
 
     kind: ClassVar[str] = "scene"
     names: ClassVar[tuple[str, ...]] = "x1", "x2"  # along the belt, and normal to it
+    mesh: ClassVar[None] = None
     joint_names: ClassVar[tuple[str, ...]] = ("",)
     tangential: ClassVar[tuple[str]] = ("x1",)
     normal: ClassVar[tuple[str]] = ("x2",)
@@ -95,6 +96,10 @@ class Scene(Mechanism, AnyJoint):
     def stiffness(self) -> tuple[Numbers, Numbers]:
         """(K_n, K_t) [N/m], as the function `stiffness`."""
         return stiffness(self)
+
+    def over_mass(self, forces):
+        """M^-1 times forces (2, k)."""
+        return forces / self.oscillator.m
 
     def require_one(self) -> None:
         """Refuse a scene that holds arrays: `jax.vmap` takes many."""

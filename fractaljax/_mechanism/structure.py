@@ -15,6 +15,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from .._base.files import read_bounded, write_together
 from .._base.parts import (
+    Numbers,
     Quantity,
     brief,
     concrete,
@@ -29,7 +30,7 @@ from .._base.parts import (
 )
 from .._base.programs import exported_jit
 from .._base.toml import naming, read_toml
-from .joint import Direction, Dof, Joint, stored_direction
+from .joint import Direction, Joint, stored_direction
 from .matrices import (
     MatrixLike,
     MatrixSum,
@@ -41,7 +42,7 @@ from .matrices import (
     require_mass_matrix,
     square_or_sparse,
 )
-from .mechanism import Mechanism
+from .mechanism import Mechanism, some_of
 from .mesh import Mesh
 from .oscillator import Oscillator
 from .scene import Scene
@@ -126,6 +127,14 @@ class Structure(Mechanism):
         self._check_joints()
         F = self._forces(F) if isinstance(F, Mapping) else F
         self.F = None if F is None else fitting("F", F, (n,))
+
+    def full(self, q: ArrayLike) -> Numbers:
+        """Displacements of all degrees of freedom: `q` itself, but in a reduced structure."""
+        return jnp.asarray(q)
+
+    def over_mass(self, forces: Float[Array, "n k"]) -> Float[Array, "n k"]:
+        """M^-1 times forces."""
+        return jnp.linalg.solve(self.M, forces)
 
     def _full_n(self, n: int) -> int:
         """The number of degrees of freedom of the mesh, for n of the structure."""
@@ -225,19 +234,6 @@ class Structure(Mechanism):
         arrays = self.sums["M"].arrays
         return arrays[0].dtype if arrays else jnp.result_type(float)
 
-    def index(self, dof: Dof | np.integer) -> int:
-        """The index of a degree of freedom from `dof`, its index or name.
-
-        **Raises:** `ValueError` if there is none; `TypeError` for anything else.
-        """
-        if isinstance(dof, bool) or not isinstance(dof, (int, str, np.integer)):
-            raise TypeError(f"a degree of freedom must be an index or a name, got {dof!r}")
-        dofs: list[Any] = list((self.names or ()) if isinstance(dof, str) else range(self.n))
-        if dof not in dofs:
-            has = _some(dofs) or "no names"
-            raise ValueError(f"unknown degree of freedom {dof!r}; the structure has {has}")
-        return dofs.index(dof)
-
     def direction(self, direction: Direction) -> np.ndarray:
         """The weights d (n,) for which d.x is the displacement in `direction`, given as in `Joint`.
 
@@ -284,7 +280,7 @@ class Structure(Mechanism):
         places = [self.index(dof) for dof in loads]
         twice = [dof for dof, place in zip(loads, places, strict=True) if places.count(place) > 1]
         if twice:
-            raise ValueError(f"F gives one degree of freedom twice: {_some(map(repr, twice))}")
+            raise ValueError(f"F gives one degree of freedom twice: {some_of(map(repr, twice))}")
         forces = [number(f"F at {dof}", force) for dof, force in loads.items()]
         return jnp.zeros(self.n).at[np.array(places, int)].set(jnp.array(forces, float))
 
@@ -513,7 +509,7 @@ def _names(names: Iterable[str] | None, n: int) -> tuple[str, ...] | None:
     if not printable or len(names) != n:
         requirement = f"{n} printable strings, one a degree of freedom"
         raise ValueError(
-            f"names must be {requirement}, got {len(names)}: {_some(map(repr, names))}"
+            f"names must be {requirement}, got {len(names)}: {some_of(map(repr, names))}"
         )
     name, times = Counter(names).most_common(1)[0]
     if times > 1:
@@ -536,8 +532,3 @@ def _joints(
         if not isinstance(joint, Joint):
             raise TypeError(f"joint {name} must be a Joint, got {joint!r}")
     return tuple(joints.values()), tuple(joints)
-
-
-def _some(items: Iterable[Any]) -> str:
-    texts = list(map(str, items))
-    return ", ".join(texts[:10]) + (f", ... ({len(texts)} in all)" if len(texts) > 10 else "")

@@ -14,6 +14,7 @@ from .._base.parts import concrete, flag
 from .._base.programs import exported_jit
 from .._base.rounding import rounding_error
 from .._contact.load_curve import loaded_equilibrium
+from .._mechanism.quantities import require_one
 from .._mechanism.reduced import CoarseSpace
 from .._mechanism.structure import Structure, require_single
 from .band import among, in_band
@@ -95,6 +96,7 @@ def linearised(x: Any, friction_slope: bool, refuse: bool = True) -> TwoDirectio
 
     `refuse` as in `assembled`.
     """
+    require_one("scene", x)
     if x.uncoupled:
         return two_directions(x, friction_slope)
     return assembled(x, friction_slope, refuse)

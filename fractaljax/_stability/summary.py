@@ -12,8 +12,10 @@ from .._base.programs import exported_jit
 from .._base.table import table
 from .._contact.contact import Regime
 from .._contact.fixed import FixedContact
+from .._mechanism.joint import AnyJoint, Joint
+from .._mechanism.mechanism import Mechanism
 from .._mechanism.scene import Scene, stiffness
-from .._mechanism.structure import Joint, Structure
+from .._mechanism.structure import Structure
 from .._surface.roughness import roughness
 from .._surface.spectrum import Spectrum
 from .critical_friction import critical_friction
@@ -104,7 +106,15 @@ def _stiffness_rows(K) -> dict[str, str]:
     return {"K_n [N/m]": f"{K_n:.6g}", "K_t [N/m]": f"{K_t:.6g}", "K_t/K_n": ratio}
 
 
-def stability_table(scene: Scene, friction_slope: bool = True) -> str:
+def stability_table(x: Any, friction_slope: bool = True) -> str:
+    """The stability of a scene or a structure.
+
+    **Raises:** `ValueError` if it cannot be computed, as `growth_rate` and `assemble`.
+    """
+    return (_scene_table if x.uncoupled else _structure_table)(x, friction_slope)
+
+
+def _scene_table(scene: Scene, friction_slope: bool) -> str:
     """The rows of one scene, its verdict, every eigenvalue, and a remark on its friction.
 
     **Raises:** `ValueError` if the growth rate cannot be computed.
@@ -128,7 +138,7 @@ def stability_table(scene: Scene, friction_slope: bool = True) -> str:
 
 
 def stiffness_remark(
-    part: Scene | Joint, K: Any = None, name: str = "The joint", follows: str = "What follows"
+    part: AnyJoint, K: Any = None, name: str = "The joint", follows: str = "What follows"
 ) -> list[str]:
     """A line if the law of a contact gives it no stiffness, normal or tangential, else none.
 
@@ -136,8 +146,7 @@ def stiffness_remark(
     """
     if isinstance(part.contact, FixedContact):  # a fixed stiffness is as intended
         return []
-    pair: Any = stiffness(part) if K is None and isinstance(part, Scene) else K
-    K_n, K_t = map(float, pair)
+    K_n, K_t = map(float, part.stiffness() if K is None else K)
     if K_n == 0:
         why = "every contact is plastic" if part.contact.fractal else "its law gives none"
         return [f"{name} carries no stiffness: {why}. {follows} is of the mechanism without it."]
@@ -146,15 +155,13 @@ def stiffness_remark(
     return []
 
 
-def stiffness_remarks(x: Scene | Structure, which: str = "", **words: str) -> list[str]:
+def stiffness_remarks(x: Mechanism, which: str = "", **words: str) -> list[str]:
     """`stiffness_remark` of every joint, with its `words`; `which` follows the joint's name."""
-    if isinstance(x, Scene):
-        return stiffness_remark(x, None, f"The joint{which}", **words)
-    return [
-        line
-        for name, joint in zip(x.joint_names, x.joints, strict=True)
-        for line in stiffness_remark(joint, joint.stiffness(), f"Joint {name}{which}", **words)
-    ]
+    lines = []
+    for name, joint in x.joints_by_name().items():
+        title = f"Joint {name}{which}" if name else f"The joint{which}"
+        lines += stiffness_remark(joint, None, title, **words)
+    return lines
 
 
 def verdict(modes: Stability, without_joint: bool = False) -> dict[str, str]:
@@ -195,7 +202,7 @@ def friction_remark(scene: Scene, speed) -> list[str]:
     ]
 
 
-def structure_table(structure: Structure, friction_slope: bool = True) -> str:
+def _structure_table(structure: Structure, friction_slope: bool) -> str:
     """The joints of a structure, its verdict, and its unstable and its least damped modes.
 
     **Raises:** `ValueError` as `assemble`, if the structure has no equilibrium under F or a joint
