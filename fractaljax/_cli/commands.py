@@ -1,7 +1,6 @@
 """`fractaljax stability`, `cycle` and `scene`."""
 
 from pathlib import Path
-from typing import Any
 
 from .output import csv_text, import_pictures, output, picture
 from .parsing import add_constant_friction, add_out, add_scene_file, load_mechanism
@@ -32,22 +31,20 @@ def _stability(arguments) -> int:
     or least damped. With a mesh, pictures of the unstable modes, mode_1.png and so on, or of the
     first one.
     """
-    from .._mechanism.structure import Structure
-    from .._stability.summary import stability_table, structure_table
+    from .._stability.summary import stability_table
 
     subject, slope = (
         load_mechanism(arguments.scene, structures=True),
         not arguments.constant_friction,
     )
-    table: Any = structure_table if isinstance(subject, Structure) else stability_table
-    if getattr(subject, "mesh", None) is None:
+    if subject.mesh is None:
         if arguments.out is not None:
             raise ValueError("--out needs a structure whose file names a mesh, to draw its modes")
-        print(table(subject, slope))
+        print(stability_table(subject, slope))
         return 0
     with output(arguments.out or Path(_FOLDER)) as write:
         written = write(_mode_pictures(subject, slope))
-    print(table(subject, slope))
+    print(stability_table(subject, slope))
     print(written)
     return 0
 
@@ -58,17 +55,13 @@ def _mode_pictures(structure, friction_slope: bool, most: int = 8) -> dict[str, 
     At most `most` are drawn.
     """
     from .. import plot
-    from .._mechanism.reduced import ReducedStructure
     from .._stability.stability import stability
 
     modes, mesh = stability(structure, friction_slope), structure.mesh.arrays()
     drawn = (modes.unstable() or modes._modes()[:1])[:most]
     files = {}
     for i, mode in enumerate(drawn, start=1):
-        shape = mode.shape
-        if isinstance(structure, ReducedStructure):
-            shape = structure.full(shape)
-        ax = plot.complex_mode(shape, **mesh)
+        ax = plot.complex_mode(structure.full(mode.shape), **mesh)
         words = f"{mode.frequency:.5g} Hz, growth rate {mode.growth_rate:.4g} 1/s"
         ax.set_title(words, fontsize="medium", loc="left")
         files[f"mode_{i}.png"] = picture(ax.figure)
@@ -110,13 +103,10 @@ def _cycle(arguments) -> int:
     from .. import plot
     from .._dynamics.limit_cycle import CycleResult, limit_cycle
     from .._dynamics.summary import cycle_table
-    from .._mechanism.scene import Scene
-    from .._mechanism.structure import Structure
     from .._stability.stability import require_computable
 
     scene = load_mechanism(arguments.scene, structures=True)
-    if isinstance(scene, Scene):
-        require_computable(scene)
+    require_computable(scene)
     options = {name: getattr(arguments, name) for name in ("start", "rtol", "max_returns")}
     options = {name: value for name, value in options.items() if value is not None}
     import_pictures()
@@ -127,7 +117,7 @@ def _cycle(arguments) -> int:
         if has_cycle:
             figure, table = picture(plot.cycle(cycle)), _orbit_text(cycle).encode()
             files = {"cycle.png": figure, "cycle.csv": table}
-            if isinstance(scene, Structure) and scene.mesh is not None:
+            if scene.mesh is not None:
                 files["motion.png"] = picture(plot.cycle_motion(cycle, scene))
             written = write(files)
     print(cycle_table(scene, cycle))

@@ -121,8 +121,6 @@ def _run(arguments) -> int:
     from .._base.parts import scalar
     from .._design.design import design
     from .._design.design_file import design_files, read_design
-    from .._mechanism.scene import Scene
-    from .._mechanism.structure import Structure
     from ..plot.topography import drawn_topographies
 
     if arguments.repeat is None:
@@ -139,13 +137,13 @@ def _run(arguments) -> int:
             x, options = read_design(arguments.repeat)
     if arguments.area is not None:  # before the computation, which a late error would lose
         scalar("--area", arguments.area, above=0)
-        if not isinstance(x, Scene) or not x.contact.has_surface:
+        if x.sole_joint is None or not x.sole_joint.contact.has_surface:
             raise ValueError("--area needs a scene whose contact has a surface")
     import_pictures()
     with output(arguments.out) as write:
         best = design(x, **options, progress=not arguments.quiet)
         heights, designed = [], arguments.out / "design.toml"
-        if isinstance(x, Structure):
+        if x.sole_joint is None:
             made = best.scene._files(designed)
         else:
             made = {designed: _scene_text(best).encode()}
@@ -162,7 +160,7 @@ def _run(arguments) -> int:
             heights = [f"topography.npy: {side} x {side} heights in m, dx = {dx:g} m"]
         written = write(files)
     *table, promise = str(best).splitlines()
-    verdict_lines = [] if isinstance(x, Structure) else _verdict(x, best, arguments.area)
+    verdict_lines = [] if x.sole_joint is None else _verdict(x, best, arguments.area)
     print("\n".join([*table, *_remarks(x, options), *verdict_lines, written, *heights, promise]))
     return 1 if best.violated else 0
 
@@ -252,10 +250,9 @@ def _remarks(x, options) -> list[str]:
     """The lines of `friction_remark` for a scene, over its envelope."""
     from .._design.envelope import Envelope
     from .._mechanism.quantities import replaced
-    from .._mechanism.scene import Scene
     from .._stability.summary import friction_remark
 
-    if not isinstance(x, Scene):
+    if x.sole_joint is None:
         return []
     if options.get("envelope") is not None:
         envelope = Envelope.of(options["envelope"])

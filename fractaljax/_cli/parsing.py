@@ -141,8 +141,8 @@ def load_mechanism(
 
     if path is None:
         return brake_scene()
-    mechanism = load_noted(path) if structures else Scene.load(path)
-    if isinstance(mechanism, Scene) or not mechanism.is_sparse:
+    mechanism: Any = load_noted(path) if structures else Scene.load(path)
+    if not mechanism.is_sparse:
         return mechanism
     from .._stability.reduction import reduce
 

@@ -43,9 +43,8 @@ def _run(arguments) -> int:
     Writes reduced.toml and reduced.npz, which go wherever a structure goes.
     """
     from .._base.table import table
-    from .._mechanism.structure import Structure
     from .._stability.reduction import reduce
-    from .._stability.summary import structure_table
+    from .._stability.summary import stability_table
 
     options: dict[str, Any] = parse_reduction(arguments.structure)
     if arguments.band is not None:
@@ -60,7 +59,7 @@ def _run(arguments) -> int:
     if "band" not in options:
         raise ValueError("--band must be LOW:HIGH in rad/s: the file has no table [reduction]")
     structure = load_noted(arguments.structure)
-    if not isinstance(structure, Structure):
+    if structure.sole_joint is not None:
         raise ValueError(f"{arguments.structure}: a scene has two directions, which are few enough")
     with output(arguments.out) as write:
         reduced = reduce(structure, **options, progress=not arguments.quiet)
@@ -75,6 +74,6 @@ def _run(arguments) -> int:
         "points with eigenvectors": f"{len(reduction.points)}",
     }
     print(
-        f"{table([''], [rows])}\n\n{structure_table(reduced, reduction.friction_slope)}\n{written}"
+        f"{table([''], [rows])}\n\n{stability_table(reduced, reduction.friction_slope)}\n{written}"
     )
     return 0

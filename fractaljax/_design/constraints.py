@@ -118,15 +118,17 @@ class Plain(Constraint):
 
 
 def _surface(scene: Mechanism, symbol: str) -> Surface:
-    if not isinstance(scene, Scene) or not scene.contact.has_surface:
+    joint = scene.sole_joint
+    if joint is None or not joint.contact.has_surface:
         raise ValueError(f"{symbol} needs a scene whose contact has a surface")
-    return scene.contact.surface
+    return joint.contact.surface
 
 
 def _state(scene: Mechanism, symbol: str) -> ContactState:
-    if not isinstance(scene, Scene) or not scene.contact.fractal:
+    joint = scene.sole_joint
+    if joint is None or not joint.contact.fractal:
         raise ValueError(f"{symbol} needs a FractalContact")
-    return scene.contact.state(scene.friction.mu_s, scene.friction.mu_m)
+    return joint.contact.state(joint.friction.mu_s, joint.friction.mu_m)
 
 
 class _LogConstraint(Constraint):
@@ -178,9 +180,8 @@ class RealContactArea(_LogConstraint):
     flat_if_plastic: ClassVar[bool] = True
 
     def measure(self, scene):
-        area = None
-        if isinstance(scene, Scene):
-            area = scene.contact.real_area(scene.friction.mu_m)
+        joint = scene.sole_joint
+        area = None if joint is None else joint.contact.real_area(joint.friction.mu_m)
         if area is None:
             raise ValueError(f"{self.symbol} needs a scene whose contact law has a real area")
         return area
@@ -252,7 +253,8 @@ class _DrawingLimit(_LogConstraint):
 
     def expected(self, scene: Mechanism, parameters: Callable[..., Any]) -> Any:
         """The `profile_parameters` or `areal_parameters` of the surface behind the filters."""
-        surface = getattr(scene.contact, "surface", None) if isinstance(scene, Scene) else None
+        joint = scene.sole_joint
+        surface = None if joint is None else getattr(joint.contact, "surface", None)
         if not isinstance(surface, Spectrum):
             raise ValueError(f"{self.symbol} needs a scene whose contact has a surface")
         band = dict(L=self.L, L_s=self.L_s) if isinstance(surface, Surface) else {}

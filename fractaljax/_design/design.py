@@ -23,7 +23,6 @@ from .._contact.contact import Contact
 from .._contact.persson import PerssonContact
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import replaced
-from .._mechanism.scene import Scene
 from .._stability.stability import growth_rate, require_computable
 from .._stability.summary import stiffness_remarks
 from .._surface.roughness import Roughness, roughness
@@ -109,7 +108,8 @@ class Design(Record):
     @property
     def has_surface(self) -> bool:
         """True for a scene with a fractal surface."""
-        return isinstance(self.scene, Scene) and self.scene.contact.has_surface
+        joint = self.scene.sole_joint
+        return joint is not None and joint.contact.has_surface
 
     @property
     def wavelengths(self) -> tuple[float, float]:
@@ -120,7 +120,8 @@ class Design(Record):
         for constraint in self.options["constraints"]:
             if isinstance(constraint, limits.Roughness):
                 return float(constraint.L), float(constraint.L_s)
-        contact: Any = self.scene.contact if isinstance(self.scene, Scene) else None
+        joint = self.scene.sole_joint
+        contact: Any = None if joint is None else joint.contact
         if isinstance(contact, PerssonContact) and contact.L is not None:
             band: Any = contact.L, contact.L_s
             return float(band[0]), float(band[1])
@@ -222,7 +223,7 @@ class Design(Record):
         for name, (before, after) in (self.cycles or {}).items():
             lines.append(f"{name}: {before:.6g}, then {after:.6g}")
         lines += self._condition_lines() + self._kick_lines()
-        changed = isinstance(self.scene, Scene) and self.result == DesignResult.found
+        changed = self.scene.sole_joint is not None and self.result == DesignResult.found
         if changed and self.sensitivity is not None:
             lines += ["", "What this design hangs on:", repr(self.sensitivity), ""]
         lines += [f"not met: {name}" for name in self.violated]
@@ -416,7 +417,7 @@ def design(
     count, designs = designs_to_screen(problem, starts, lattice)
     start = np.asarray(problem.start, float)
     before = evaluator.evaluate(start[None])
-    if not np.isfinite(before.rows).all() and isinstance(x, Scene):
+    if not np.isfinite(before.rows).all():
         require_computable(x, problem.friction_slope)
 
     def solve(problem):

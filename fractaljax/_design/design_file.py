@@ -55,12 +55,8 @@ def design_files(best: Any, path: Path) -> dict[Path, bytes]:
     }
     files = {}
     for name, x in (("given", best.initial), ("designed", best.scene)):
-        if isinstance(x, Scene):
-            heads[name] = x.to_toml()
-        else:
-            beside = _structure_file(path, name)
-            heads[name] = beside.name
-            files |= x._files(beside)
+        heads[name], more = x.embedded(_structure_file(path, name))
+        files |= more
     options = dict(best.options)
     options["solver"] = options["solver"] and _function_name(options["solver"])
     options["optimiser"] = options["optimiser"] and "optimiser"  # it has no name

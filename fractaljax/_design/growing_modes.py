@@ -8,7 +8,7 @@ import numpy as np
 
 from .._base.programs import exported_jit
 from .._base.ranges import low_discrepancy
-from .._mechanism.structure import Structure
+from .._mechanism.mechanism import Mechanism
 from .._stability.linearise import assembled
 from .._stability.quadratic import leading
 from .joints import with_contact_law
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from .problem import DesignProblem
 
 
-def largest_mode_count(x: Structure) -> int:
+def largest_mode_count(x: Mechanism) -> int:
     """The largest number of modes of a structure that requirements can include."""
     return min(16, x.n)
 
@@ -43,7 +43,7 @@ def _rates(problem: "DesignProblem", us, conditions):
         rates = []
         for each in (problem.stiffened(x)[1], *(with_contact_law(x, law) for law in problem.laws)):
             attached = assembled(each, problem.friction_slope, refuse=False)
-            modes = leading(*attached[:3], problem.modes, x.band)
+            modes = leading(*attached.matrices, problem.modes, x.band)
             rates.append(jnp.where(attached.lost, jnp.nan, modes.s.real))
         return jnp.stack(rates)
 

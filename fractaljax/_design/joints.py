@@ -3,20 +3,16 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._base.parts import is_traced, substitute
+from .._base.parts import is_traced, rebuild
 from .._contact.contact import Contact, on_the_same_joint
 from .._contact.fixed import FixedContact
-from .._mechanism.joint import Joint
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import joints_of, stored_quantities, target_quantities
-from .._mechanism.scene import Scene
-from .._mechanism.structure import Structure
+from .._mechanism.quantities import target_quantities
 from .._stability.band import in_band
 
 
@@ -71,42 +67,27 @@ def joint_states(parts: Mapping[str, Any]) -> dict[str, Any]:
 
 def is_fractal(x, name) -> bool:
     """True if a contact has the source's law."""
-    return joints_of(x)[name].contact.fractal
+    return x.joints_by_name()[name].contact.fractal
 
 
 def slips(x, name) -> bool:
     """True if a contact has the source's tangential law, which slips."""
-    return is_fractal(x, name) and joints_of(x)[name].contact.stiffness_ratio is None
-
-
-def with_stiffness(x, states):
-    """`x` with contacts of fixed stiffness in the joints whose states (by name) are given."""
-    parts, zero = joints_of(x), FixedContact(0.0, 0.0, 1.0)
-    for name, state in states.items():
-        P = getattr(parts[name].contact, "P", zero.P)  # of a preloaded joint
-        fixed = substitute(zero, {"K_n": state.K_n, "K_t": state.K_t, "P": P})
-        parts[name] = eqx.tree_at(lambda part: part.contact, parts[name], fixed)
-    if isinstance(x, Structure):
-        return eqx.tree_at(lambda s: s.joints, x, tuple(parts.values()))
-    return parts[""]
+    return is_fractal(x, name) and x.joints_by_name()[name].contact.stiffness_ratio is None
 
 
 def with_contacts(x: Mechanism, contacts: Mapping[str, Contact]) -> Any:
     """`x` with other contact laws in the joints of these names; the joint of a scene is "".
 
-    **Raises:** `ValueError` naming the joint of a structure that a law does not suit.
+    **Raises:** `ValueError` naming the joint that a law does not suit.
     """
-    if isinstance(x, Scene):
-        return eqx.tree_at(lambda scene: scene.contact, x, contacts.get("", x.contact))
-    joints = joints_of(x)
+    joints = x.joints_by_name()
     for name, contact in contacts.items():
-        joint = joints[name]
-        rest = joint.friction, joint.tangential, joint.normal, joint.V, joint.preload
         try:
-            joints[name] = Joint(contact, *rest)
+            joints[name] = rebuild(joints[name], {"contact": contact})
         except ValueError as error:
-            raise ValueError(f"joint {name} by {type(contact).__name__}: {error}") from None
-    return eqx.tree_at(lambda structure: structure.joints, x, tuple(joints.values()))
+            where = f"joint {name}" if name else "the joint"
+            raise ValueError(f"{where} by {type(contact).__name__}: {error}") from None
+    return x.with_joints(joints)
 
 
 def with_contact_law(x: Mechanism, law: Contact) -> Any:
@@ -116,8 +97,8 @@ def with_contact_law(x: Mechanism, law: Contact) -> Any:
     """
     contacts = {
         name: on_the_same_joint(law, part.contact)
-        for name, part in joints_of(x).items()
-        if isinstance(x, Scene) or part.contact.has_surface
+        for name, part in x.joints_by_name().items()
+        if part.contact.has_surface or not name
     }
     return with_contacts(x, contacts)
 
@@ -126,8 +107,8 @@ def changed_contacts(x, names) -> tuple[str, ...]:
     """The contacts with a law whose stiffness depends on these quantities."""
     affected = {each for name in names for each in target_quantities(x, name)}
     contacts = []
-    for name, part in joints_of(x).items():
-        quantities = {*stored_quantities(part.contact), *stored_quantities(part.friction)}
+    for name, part in x.joints_by_name().items():
+        quantities = {*part.contact.stored_quantities(), *part.friction.stored_quantities()}
         law = not isinstance(part.contact, FixedContact)
         if law and affected & {joint_prefix(name) + each for each in quantities}:
             contacts.append(name)
@@ -137,7 +118,7 @@ def changed_contacts(x, names) -> tuple[str, ...]:
 def least_damping(x) -> tuple[Any, Any]:
     """The least damping rate [1/s] without friction, and the least frequency [rad/s]."""
     xp: Any = jnp if is_traced(x) else np
-    if isinstance(x, Scene):
+    if x.uncoupled:
         o = x.oscillator
         omega = xp.asarray([o.omega_1, o.omega_2], float)
         return (xp.asarray([o.xi_1, o.xi_2], float) * omega).min(), omega.min()

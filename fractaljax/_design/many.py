@@ -13,9 +13,7 @@ from jaxtyping import Array, ArrayLike, Float
 from .._base.parts import Record, brief, flag, is_traced, whole
 from .._contact.contact import Contact
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import replaced, require_one, stored_quantities, value_of
-from .._mechanism.scene import Scene
-from .._mechanism.structure import Structure
+from .._mechanism.quantities import replaced, require_one, separate_quantities, value_of
 from .._sweep.program import Program
 from .._sweep.sweep import run
 from .constraints import CycleConstraint
@@ -175,7 +173,7 @@ def design_many(
     first, stacked, shape = _members(xs)
     if not is_traced(stacked):
         # What is wrong with the arguments is said of a member that is there.
-        most = largest_mode_count(first) if isinstance(first, Structure) else None
+        most = None if first.uncoupled else largest_mode_count(first)
         lowest: Any = 0.0 if K_n_min is None else K_n_min  # its own would take a program
         checked = DesignProblem(
             first, bounds, modes=modes or most, **{**request, "K_n_min": lowest}
@@ -200,7 +198,7 @@ def design_many(
             return _at(first, [leaf[values[_MEMBER]] for leaf in leaves])
 
         program = Program(designed, (_MEMBER,), stacked, [*grid.values()], place)
-        each = 16 if isinstance(first, Structure) else 256
+        each = 256 if first.uncoupled else 16
         if checked.scatter is not None:  # each design is as many as its quadrature has nodes
             each = max(1, each // len(checked.scatter.weights))
         how: dict[str, Any] = dict(each=each, batch_size=batch_size, progress=progress)
@@ -231,14 +229,11 @@ def _members(xs: Any) -> tuple[Any, list[Array], tuple[int, ...]]:
                 raise ValueError(f"xs must be mechanisms of one kind: xs[{i}] differs from xs[0]")
         leaves = zip(*(jax.tree.leaves(x) for x in xs), strict=True)
         return xs[0], [jnp.stack(each) for each in leaves], (len(xs),)
-    if not isinstance(xs, Scene | Structure):
+    if not isinstance(xs, Mechanism):
         raise TypeError(f"xs must be a mechanism with arrays, or a list, got {brief(xs)}")
-    named = stored_quantities(xs)
-    if isinstance(xs, Structure):  # a plain name is that of several joints
-        named = {name: named[name] for name in named if "." in name or name in xs.parameters}
     many = {
         name: each.value
-        for name, each in named.items()
+        for name, each in separate_quantities(xs).items()
         if each.value is not None and each.value.ndim
     }
     shape = jnp.broadcast_shapes(*(value.shape for value in many.values()))

@@ -20,8 +20,7 @@ from .._base.parts import is_traced, nan_where, refused, whole
 from .._base.programs import exported_jit
 from .._contact.contact import Contact
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import joints_of, substituted, value_of
-from .._mechanism.structure import Structure
+from .._mechanism.quantities import substituted, value_of, with_stiffness
 from .._stability.linearise import assembled
 from .._stability.quadratic import leading
 from .._stability.stability import growth_rate
@@ -37,7 +36,6 @@ from .joints import (
     joint_states,
     slips,
     with_contact_law,
-    with_stiffness,
 )
 from .statement import stated_fields
 from .tolerance import Scatter, quantile
@@ -141,7 +139,7 @@ class DesignProblem(eqx.Module):
         for name, value in fields.items():
             setattr(self, name, value)
         self.modes, self.smooth, self.cuts = 0, False, None
-        if isinstance(x, Structure):
+        if not x.uncoupled:
             most = largest_mode_count(x)
             if modes is not None:
                 self.modes = whole("modes", modes, 1, most)
@@ -229,7 +227,7 @@ class DesignProblem(eqx.Module):
             if self.modes:
                 # The rates are NaN where there is no steady sliding; LAPACK gets numbers even so.
                 attached = assembled(each, self.friction_slope, refuse=False)
-                leading_modes = leading(*attached[:3], self.modes, x.band)
+                leading_modes = leading(*attached.matrices, self.modes, x.band)
                 rates += list(jnp.where(attached.lost, jnp.nan, leading_modes.s.real))
                 if not self.least_growth:
                     smooth += list(
@@ -271,7 +269,7 @@ class DesignProblem(eqx.Module):
 
     def stiffened(self, x) -> tuple[dict[str, Any], Any]:
         """States of the contacts of `x` that have one or move, and `x` with their stiffness."""
-        parts = joints_of(x)
+        parts = x.joints_by_name()
         designed_parts = {
             name: part
             for name, part in parts.items()

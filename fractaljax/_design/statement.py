@@ -12,16 +12,13 @@ from .._contact.contact import Contact
 from .._dynamics.scaled import degrees_of_freedom, hybrid_system
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import (
-    joints_of,
     quantity_names,
     replaced,
     require_independent,
     require_one,
-    stored_quantities,
     value_of,
     with_optional,
 )
-from .._mechanism.scene import Scene
 from .constraints import Constraint, CycleConstraint, Plain
 from .envelope import Envelope
 from .followed import FollowedCycles
@@ -62,8 +59,8 @@ def stated_fields(
         require_scalar(law)
     if (
         laws
-        and not isinstance(x, Scene)
-        and not any(joint.contact.has_surface for joint in joints_of(x).values())
+        and x.sole_joint is None
+        and not any(joint.contact.has_surface for joint in x.joints_by_name().values())
     ):
         raise ValueError("laws of a structure need a joint whose contact has a surface")
     for law in laws:
@@ -189,5 +186,5 @@ def checked_bounds(x: Mechanism, bounds: Mapping[str, Sequence[float]]) -> dict[
 
 
 def _is_scale(x, name) -> bool:
-    quantities = stored_quantities(x)
+    quantities = x.stored_quantities()
     return name in quantities and quantities[name].log

@@ -7,7 +7,6 @@ import numpy as np
 from .._base.table import table
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import unit, value_of
-from .._mechanism.scene import Scene
 from .._stability.stability import stability
 from .._stability.summary import ABSENT, scene_rows
 
@@ -45,7 +44,7 @@ def comparison_table(
 
 
 def _rows(x, friction_slope, wavelengths) -> dict[str, str]:
-    if isinstance(x, Scene):
+    if x.uncoupled:
         return scene_rows(x, friction_slope, wavelengths)
     modes, rows = stability(x, friction_slope), {}
     for name, joint in zip(x.joint_names, x.joints, strict=True):

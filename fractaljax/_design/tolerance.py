@@ -29,7 +29,6 @@ from .._mechanism.quantities import (
     value_of,
     with_optional,
 )
-from .._mechanism.structure import Structure
 from .._stability.stability import growth_rate
 from .envelope import Envelope
 from .truncated import REACH, is_fractal_dimension, truncated
@@ -212,7 +211,7 @@ def _largest(dtype) -> float:
 
 def _scattered_names(x: Mechanism, name: str) -> list[str]:
     """The name itself; for a structure the names in all joints that a plain name stands for."""
-    return sorted(target_quantities(x, name)) if isinstance(x, Structure) else [name]
+    return [name] if name in x.derived_quantities() else sorted(target_quantities(x, name))
 
 
 def nodes(dimensions: int, count: int = 55, widening: float = 2.0) -> tuple[np.ndarray, np.ndarray]:
@@ -312,10 +311,9 @@ def squeal_probability(
     truncated to its own instead (see `Tolerance`).
     """
     tolerance, values = Tolerance.of(tolerance), {}
-    n = x.n if isinstance(x, Structure) else 2
     if samples is None:
         # Eigenvalues take a time that grows with the cube of their number.
-        samples = int(np.clip(4e9 / (2 * n) ** 3, 1000, 100_000))
+        samples = int(np.clip(4e9 / (2 * x.n) ** 3, 1000, 100_000))
     if envelope is not None:
         envelope = Envelope.of(envelope)
         envelope.check(x, ())
@@ -329,7 +327,7 @@ def squeal_probability(
     values |= {name: np.broadcast_to(column, samples) for name, column in scattered.items()}
     dtype = jax.tree.leaves(x)[0].dtype
     rows = np.stack([np.asarray(column, dtype) for column in values.values()], axis=1)
-    batch = max(64, 32_768 // n**2)  # about as much memory for all sizes
+    batch = max(64, 32_768 // x.n**2)  # about as much memory for all sizes
     growth = in_batches(
         lambda rows: _growth_rates(x, tuple(values), rows, friction_slope),
         min(batch, samples),

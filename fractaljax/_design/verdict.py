@@ -4,13 +4,12 @@ import functools
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._base.parts import Record, brief, flag, require_kind, require_scalar, scalar, substitute
+from .._base.parts import Record, flag, rebuild, require_kind, require_scalar, scalar, substitute
 from .._base.programs import exported_jit
 from .._base.table import table
 from .._contact.asperity import AsperityContact
@@ -19,14 +18,12 @@ from .._contact.fixed import FixedContact
 from .._contact.fractal import FractalContact
 from .._contact.material import mindlin_ratio
 from .._contact.persson import PerssonContact
-from .._mechanism.joint import Joint
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import joints_of, quantity_names, require_one, unit, value_of
+from .._mechanism.quantities import quantity_names, require_one, unit, value_of
 from .._mechanism.scene import Scene
-from .._mechanism.structure import Structure
-from .._stability.linearise import linearised
 from .._stability.quartic import rightmost_root
 from .._stability.stability import growth_rate, stability
+from .._stability.two_directions import two_directions
 from .._surface.spectrum import Spectrum
 from .design import DesignResult, design
 from .envelope import Envelope
@@ -139,7 +136,7 @@ def verdict(
     require_one("x", x)
     flag("friction_slope", friction_slope)
     depths = None if run_in is None else check_depths(run_in)
-    parts = joints_of(x)
+    parts = x.joints_by_name()
     laws_in_use = " and ".join(
         dict.fromkeys(type(part.contact).__name__ for part in parts.values())
     )
@@ -184,27 +181,19 @@ def verdict(
 
 def _other_load(x: Mechanism, friction_slope: bool) -> list[tuple[str, str, Mechanism]]:
     """With the load P in the friction of all joints that have one, or without it."""
-    along = "x2"
-    if isinstance(x, Scene):
-        if getattr(x.contact, "P", None) is None:
-            return []
-        preloaded = bool(x.preload)
-        other: Any = Scene(x.contact, x.friction, x.oscillator, not preloaded)
-    elif isinstance(x, Structure):
-        along = "n.x"
-        able = [j.normal is not None and hasattr(j.contact, "P") for j in x.joints]
-        able = [can and j.contact.P is not None for can, j in zip(able, x.joints, strict=True)]
-        preloaded = any(can and bool(j.preload) for can, j in zip(able, x.joints, strict=True))
-        falls = friction_slope and any(j.friction.velocity_dependent for j in x.joints)
-        if not any(able) or (preloaded and falls and x.F is None):  # without F there is no slope
-            return []
-        joints = tuple(
-            Joint(j.contact, j.friction, j.tangential, j.normal, j.V, not preloaded) if can else j
-            for can, j in zip(able, x.joints, strict=True)
-        )
-        other = eqx.tree_at(lambda structure: structure.joints, x, joints)
-    else:
-        raise TypeError(f"x must be a Scene or a Structure, got {brief(x)}")
+    joints = x.joints_by_name()
+    able = [
+        name
+        for name, joint in joints.items()
+        if joint.normal is not None and getattr(joint.contact, "P", None) is not None
+    ]
+    preloaded = any(joints[name].preload for name in able)
+    falls = friction_slope and any(j.friction.velocity_dependent for j in joints.values())
+    if not able or (preloaded and falls and x.F is None):  # without F there is no slope
+        return []
+    changed = {name: rebuild(joints[name], {"preload": not preloaded}) for name in able}
+    other = x.with_joints(joints | changed)
+    along = "x2" if x.uncoupled else "n.x"
     force, instead = f"friction on K_n {along}", f"friction on P + K_n {along}"
     if preloaded:
         force, instead = instead, force
@@ -213,9 +202,11 @@ def _other_load(x: Mechanism, friction_slope: bool) -> list[tuple[str, str, Mech
 
 def _laws_of(x: Mechanism, area: Any) -> list[tuple[type[Contact], dict[str, Contact]]]:
     """The other laws of the surfaces on nominal areas, by joint."""
-    parts = {name: p for name, p in joints_of(x).items() if p.contact.has_surface}
+    parts = {name: p for name, p in x.joints_by_name().items() if p.contact.has_surface}
     if not parts:
-        kinds = " and ".join(dict.fromkeys(type(p.contact).__name__ for p in joints_of(x).values()))
+        kinds = " and ".join(
+            dict.fromkeys(type(p.contact).__name__ for p in x.joints_by_name().values())
+        )
         raise ValueError(f"area needs a contact with a surface, got a {kinds}")
     if not isinstance(area, Mapping):
         area = dict.fromkeys(parts, area)
@@ -242,14 +233,14 @@ class _GrowthRates(NamedTuple):
 
 
 @functools.partial(exported_jit, static_argnames="friction_slope")
-def _growth_rates(mechanisms: tuple[Mechanism, ...], friction_slope: bool) -> _GrowthRates:
+def _growth_rates(mechanisms: tuple[Any, ...], friction_slope: bool) -> _GrowthRates:
     """Growth rates of m mechanisms, and of the first over K_t/K_n, in one program.
 
     The ratios of each joint lie between its own, the fractal law's and Mindlin's.
     """
     first, zero = mechanisms[0], FixedContact(0.0, 0.0, 1.0)
     stiffness, ends = {}, []
-    for name, part in joints_of(first).items():
+    for name, part in first.joints_by_name().items():
         contact, friction = part.contact, part.friction
         if getattr(contact, "material", None) is None:
             continue
@@ -260,7 +251,7 @@ def _growth_rates(mechanisms: tuple[Mechanism, ...], friction_slope: bool) -> _G
         stiffness[name] = pairs[0]
         mindlin = jnp.asarray(mindlin_ratio(contact.material.nu), pairs[0][0].dtype)
         ends.append(jnp.stack([*(K_t / K_n for K_n, K_t in pairs), mindlin]))
-    count = 65 if isinstance(first, Scene) else 17  # eigenvalues of a structure take long
+    count = 65 if first.uncoupled else 17  # eigenvalues of a structure take long
     low, high, own_ratio = (
         jnp.stack([of(end) for end in ends]) if ends else jnp.zeros(0)
         for of in (jnp.min, jnp.max, lambda end: end[0])
@@ -272,15 +263,15 @@ def _growth_rates(mechanisms: tuple[Mechanism, ...], friction_slope: bool) -> _G
         contacts = {}
         for (name, (K_n, K_t)), ratio in zip(stiffness.items(), row, strict=True):
             K_t = jnp.where(K_n > 0, ratio * K_n, K_t)
-            P = getattr(joints_of(first)[name].contact, "P", zero.P)
+            P = getattr(first.joints_by_name()[name].contact, "P", zero.P)
             contacts[name] = substitute(zero, {"K_n": K_n, "K_t": K_t, "P": P})
         return with_contacts(first, contacts)
 
-    if isinstance(first, Scene):
+    if first.uncoupled:
         # One closed form for all: each use of it takes long to compile.
-        systems = [linearised(x, friction_slope) for x in mechanisms if isinstance(x, Scene)]
+        systems = [two_directions(x, friction_slope).polynomial for x in mechanisms]
         own_systems = jax.tree.map(lambda *x: jnp.stack(x), *systems)
-        at_ratios = jax.vmap(lambda row: linearised(at(row), friction_slope))(ratios)
+        at_ratios = jax.vmap(lambda row: two_directions(at(row), friction_slope).polynomial)(ratios)
         every = jax.tree.map(lambda *x: jnp.concatenate(x), own_systems, at_ratios)
         rates = jax.vmap(rightmost_root)(every).real
         trace = -(systems[0].c_1 + systems[0].c_2)

@@ -12,7 +12,6 @@ from .._contact.boundary_element import boundary_element
 from .._contact.fixed import FixedContact
 from .._contact.run_in import run_in
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import joints_of
 from .._stability.stability import growth_rate
 from .._surface.spectrum import Spectrum
 from .._surface.surface import Surface
@@ -72,7 +71,7 @@ def worn_growth(
     ends = coarse[coarse >= low]
     fine = np.interp(np.linspace(0, len(ends) - 1, 65), np.arange(len(ends)), ends)
     pairs, logs = {}, {}
-    for name, part in joints_of(x).items():
+    for name, part in x.joints_by_name().items():
         contact = part.contact
         if not isinstance(getattr(contact, "surface", None), Spectrum):
             continue

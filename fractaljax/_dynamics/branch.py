@@ -17,7 +17,6 @@ from .._mechanism.quantities import (
     value_of,
     with_optional,
 )
-from .._mechanism.scene import Scene
 from .contact_state import FORWARD
 from .cycle import LimitCycle, Orbit
 from .follow import BranchEnd, Follower
@@ -330,7 +329,7 @@ def _build_branch(follower: Follower, x, name: str, start, end) -> Branch:
             beside = event.index - 1 if event.index else 1
             rows["stable"][event.index] = rows["stable"][beside]
     joints = [faces[0] for faces in follower.family.template.joints]
-    if not isinstance(x, Scene):
+    if x.sole_joint is None:
         rows["stick_fraction"] = rows["stick_fraction"][:, joints]
     rows["open_fraction"] = rows["open_fraction"][:, joints]
     return Branch(

@@ -17,11 +17,8 @@ from .._base.parts import Numbers, Record, number, require_kind
 from .._base.programs import exported_jit
 from .._mechanism.joint import Dof
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.structure import Structure
 from .hybrid import HybridSystem
 from .scaled import hybrid_system
-
-_NAMES = "x1", "x2"  # of a scene's degrees of freedom
 
 
 class Excitation(Record):
@@ -65,7 +62,7 @@ class Excitation(Record):
         **Raises:** `ValueError` for a degree of freedom that the mechanism does not have, one given
         twice, or arrays of another shape.
         """
-        n = mechanism.n if isinstance(mechanism, Structure) else 2
+        n = mechanism.n
         shape = (n,) if self.dofs is None else (len(self.dofs),)
         if self.amplitude.shape != shape:
             shapes = f"{shape}, got {self.amplitude.shape}"
@@ -79,7 +76,7 @@ class Excitation(Record):
         forces = self.amplitude * jnp.cos(phase), -self.amplitude * jnp.sin(phase)
         if self.dofs is None:
             return forces
-        places = [_index(mechanism, dof) for dof in self.dofs]
+        places = [mechanism.index(dof) for dof in self.dofs]
         if len(set(places)) < len(places):
             raise ValueError(f"the excitation has one degree of freedom twice: {self.dofs}")
         cosine, sine = (jnp.zeros(n, f.dtype).at[np.array(places)].set(f) for f in forces)
@@ -93,15 +90,6 @@ def _numbers(name: str, values: Any) -> Numbers:
     return number(name, values)
 
 
-def _index(mechanism: Mechanism, dof: Dof) -> int:
-    if isinstance(mechanism, Structure):
-        return mechanism.index(dof)
-    dofs: tuple[Any, ...] = _NAMES if isinstance(dof, str) else (0, 1)
-    if dof not in dofs or isinstance(dof, bool):
-        raise ValueError(f"unknown degree of freedom {dof!r}; a scene has x1 and x2")
-    return dofs.index(dof)
-
-
 def excited_system(mechanism: Any, excitation: Excitation | None) -> HybridSystem:
     """The scaled system of a scene or a structure, with the excitation if there is one.
 
@@ -113,10 +101,7 @@ def excited_system(mechanism: Any, excitation: Excitation | None) -> HybridSyste
         return system
     require_kind("excitation", excitation, Excitation)
     cosine, sine = excitation.parts(mechanism)
-    if isinstance(mechanism, Structure):
-        cosine, sine = jnp.linalg.solve(mechanism.M, jnp.stack([cosine, sine], axis=1)).T
-    else:
-        cosine, sine = cosine / mechanism.oscillator.m, sine / mechanism.oscillator.m
+    cosine, sine = mechanism.over_mass(jnp.stack([cosine, sine], axis=1)).T
     Omega = 2 * jnp.pi * excitation.frequency
     omega = jnp.hypot(system.omega, Omega)
     r, unit, n = system.omega / omega, omega * system.speed, system.n

@@ -11,8 +11,6 @@ from jaxtyping import Array, ArrayLike, Float, ScalarLike
 from .._base.parts import concrete, number, raise_unless, require_kind, whole
 from .._base.programs import exported_jit
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import joints_of
-from .._mechanism.scene import Scene
 from .._stability.stability import growth_rate
 from .cycle import CycleResult, LimitCycle, Orbit
 from .cycle_search import CycleSearch
@@ -117,7 +115,7 @@ def refine_cycle(cycle: LimitCycle, arguments: tuple, count: int, static: dict) 
 
 def check_arguments(mechanism, start, excitation, rtol, max_returns, search, segments=None):
     """Options of a search: `max_returns` as a number, segment count, and what is static."""
-    n, joints = degrees_of_freedom(mechanism), joints_of(mechanism)
+    n, joints = degrees_of_freedom(mechanism), mechanism.joints_by_name()
     if excitation is not None:
         require_kind("excitation", excitation, Excitation)
     require_kind("search", search, CycleSearch)
@@ -129,7 +127,7 @@ def check_arguments(mechanism, start, excitation, rtol, max_returns, search, seg
         count *= 8  # towards an opening segments are short: less than a second compilation
     elif segments is None and (steps_follow_motion(n) or len(joints) > 1):
         count *= 4  # a period may be long beside that of the highest frequency, or of many phases
-    of_scene = isinstance(mechanism, Scene)
+    of_scene = mechanism.sole_joint is not None
     return returns, count, {"of_scene": of_scene, "rtol": rtol, "search": search}
 
 

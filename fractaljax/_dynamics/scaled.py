@@ -10,12 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, DTypeLike, Float
 
-from .._base.parts import concrete, number, require_kind, require_scalar
+from .._base.parts import concrete, number
 from .._friction import Coulomb, Friction
-from .._mechanism.joint import Joint
+from .._mechanism.joint import AnyJoint
 from .._mechanism.mechanism import Mechanism
+from .._mechanism.quantities import require_one
 from .._mechanism.scene import Scene, stiffness
-from .._mechanism.structure import Structure, require_single
+from .._mechanism.structure import Structure
 from .hybrid import HybridSystem
 from .joint_force import JointForce, TwoSidedSpring, joint_force
 from .lanes import log_spectral_radius
@@ -28,31 +29,23 @@ def steps_follow_motion(n: int) -> bool:
 
 
 def degrees_of_freedom(mechanism: Mechanism) -> int:
-    """The number n of degrees of freedom of a structure; 2 for a scene.
+    """The number n of degrees of freedom, of a mechanism whose motion is determined.
 
     **Raises:** `TypeError` for anything else; `ValueError` for one that holds a batch, or has two
     joints that slide in one direction at one V.
     """
-    if isinstance(mechanism, Structure):
-        require_single(mechanism)
-        _require_determinate(mechanism)
-        return mechanism.n
-    require_kind("mechanism", mechanism, Scene)
-    require_scalar(mechanism)
-    return 2
-
-
-def _require_determinate(structure: Structure) -> None:
-    joints = zip(structure.joint_names, structure.joints, strict=True)
+    require_one("mechanism", mechanism)
+    joints = mechanism.joints_by_name().items()
     for (name, joint), (other, second) in itertools.combinations(joints, 2):
-        if _stick_as_one(structure, joint, second) or _stick_as_one(structure, second, joint):
+        if _stick_as_one(mechanism, joint, second) or _stick_as_one(mechanism, second, joint):
             raise ValueError(
                 f"joints {name} and {other} slide in one direction at one V: how they share the "
                 "force in stick is not determined, make them one joint or their V two"
             )
+    return mechanism.n
 
 
-def _stick_as_one(structure: Structure, joint: Joint, other: Joint) -> bool:
+def _stick_as_one(structure: Any, joint: AnyJoint, other: AnyJoint) -> bool:
     """True if one joint sticks along its t exactly when the other does, along its t or its n."""
     V, W = (None if j.V is None else concrete(jnp.asarray(j.V)) for j in (joint, other))
     if V is None or W is None:
@@ -74,12 +67,12 @@ def _stick_as_one(structure: Structure, joint: Joint, other: Joint) -> bool:
 
 def hybrid_system(mechanism: Any) -> HybridSystem:
     """The scaled system of a scene or a structure."""
-    is_structure = isinstance(mechanism, Structure)
-    system = _structure_system(mechanism) if is_structure else _scene_system(mechanism)
+    scaled = _uncoupled_system if mechanism.uncoupled else _structure_system
+    system = scaled(mechanism)
     return replace(system, scales=law_scales(system))
 
 
-def _scene_system(scene: Scene) -> HybridSystem:
+def _uncoupled_system(scene: Scene) -> HybridSystem:
     o = scene.oscillator
     K_n, K_t = stiffness(scene)
     a, b = o.omega_1**2 + K_t / o.m, o.omega_2**2 + K_n / o.m

@@ -1,17 +1,18 @@
 """Limit cycles as printed tables."""
 
+from typing import Any
+
 import numpy as np
 
 from .._base.table import table
 from .._mechanism.scene import Scene
-from .._mechanism.structure import Structure
 from .._stability.stability import stability
 from .._stability.summary import friction_remark, stiffness_remarks, verdict
 from .contact_state import STATES
 from .cycle import CycleResult, LimitCycle
 
 
-def cycle_table(mechanism: Scene | Structure, cycle: LimitCycle, most: int = 12) -> str:
+def cycle_table(mechanism: Any, cycle: LimitCycle, most: int = 12) -> str:
     """The result of the search for one limit cycle, its numbers and its switches.
 
     At most that many multipliers and degrees of freedom of a structure are listed.
@@ -25,7 +26,7 @@ def cycle_table(mechanism: Scene | Structure, cycle: LimitCycle, most: int = 12)
         "period [ms]": f"{cycle.period * 1e3:.6g}",
         "frequency [Hz]": f"{cycle.frequency:.6g}",
         "returns in a period": f"{cycle.returns}",
-        **({} if isinstance(mechanism, Structure) else _pulls(mechanism, cycle)),
+        **({} if mechanism.sole_joint is None else _pulls(mechanism, cycle)),
         "estimated error": f"{cycle.error:.1e}",
     }
     regularised = cycle.regularisation_error != 0
@@ -45,7 +46,7 @@ def cycle_table(mechanism: Scene | Structure, cycle: LimitCycle, most: int = 12)
         }
         for i in range(len(cycle.amplitude))
     ]
-    if isinstance(mechanism, Structure):
+    if mechanism.sole_joint is None:
         names = mechanism.names or [f"x{i}" for i in range(1, mechanism.n + 1)]
         largest = sorted(range(mechanism.n), key=lambda i: -cycle.amplitude[i])[:most]
         tables = ["\n".join(lacking)] * bool(lacking) + [

@@ -2,16 +2,117 @@
 
 import abc
 import os
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
 
 from .._base.files import read_bounded
 from .._base.parts import Part
 from .._base.toml import naming, read_toml
 
+if TYPE_CHECKING:
+    from .joint import AnyJoint, Dof
+    from .structure import Structure
+
+
+class Derived(NamedTuple):
+    """A quantity that is not stored but follows from stored ones, and can be set by them."""
+
+    meaning: str  # and symbol
+    domain: dict[str, float]  # as `number` takes it
+    get: Callable[[Any], Array]
+    set: Callable[[Any, Any], dict[str, Any]]  # the changes of stored quantities
+
 
 class Mechanism(Part):
-    """Bodies with friction in their joints; a `Scene` is the smallest."""
+    """Bodies with friction in their joints: a `Structure`, or a `Scene`, the smallest.
+
+    Callers ask the mechanism for what they need, not which class it is.
+    """
+
+    names: eqx.AbstractVar[tuple[str, ...] | None]  # of the n degrees of freedom
+    joint_names: eqx.AbstractVar[tuple[str, ...]]
+    F: eqx.AbstractVar[Any]  # external force [N], None if there is none
+    mesh: eqx.AbstractVar[Any]  # for pictures, None if there is none
+    kind: eqx.AbstractClassVar[str]  # in messages
+
+    @property
+    @abc.abstractmethod
+    def n(self) -> int:
+        """The number of degrees of freedom."""
+
+    @property
+    def uncoupled(self) -> bool:
+        """True for the mass on a belt of Eq. 39, for which equations of closed form hold.
+
+        Its M, C and K are diagonal, and its joint acts along its two degrees of freedom.
+        """
+        return False
+
+    @property
+    def band(self) -> tuple[float, float] | None:
+        """The range of |Im s| [rad/s] in which eigenvalues are valid; None for no limit."""
+        return None
+
+    @property
+    def coarse(self) -> Any:
+        """A subspace with approximate modes for a reduced structure, else None."""
+        return None
+
+    def index(self, dof: "Dof | np.integer") -> int:
+        """The index of a degree of freedom from `dof`, its index or name.
+
+        **Raises:** `ValueError` if there is none; `TypeError` for anything else.
+        """
+        if isinstance(dof, bool) or not isinstance(dof, (int, str, np.integer)):
+            raise TypeError(f"a degree of freedom must be an index or a name, got {dof!r}")
+        dofs: list[Any] = list((self.names or ()) if isinstance(dof, str) else range(self.n))
+        if dof not in dofs:
+            has = some_of(dofs) or "no names"
+            raise ValueError(f"unknown degree of freedom {dof!r}; the {self.kind} has {has}")
+        return dofs.index(dof)
+
+    @abc.abstractmethod
+    def over_mass(self, forces: Float[Array, "n k"]) -> Float[Array, "n k"]:
+        """M^-1 times forces."""
+
+    @property
+    def is_sparse(self) -> bool:
+        """True if the matrices are large and sparse, so that `reduce` must come first."""
+        return False
+
+    @abc.abstractmethod
+    def require_one(self) -> None:
+        """Refuse a batch, and what is too large for computations without reduction."""
+
+    @abc.abstractmethod
+    def as_structure(self) -> "Structure":
+        """This mechanism by its matrices."""
+
+    @abc.abstractmethod
+    def joints_by_name(self) -> "dict[str, AnyJoint]":
+        """The joints; a scene is its own joint, named ""."""
+
+    @property
+    def sole_joint(self) -> "AnyJoint | None":
+        """The joint of a scene; None for a structure, whose joints have names."""
+        return self.joints_by_name().get("")
+
+    @abc.abstractmethod
+    def with_joints(self, joints: Mapping[str, Any]) -> Self:
+        """A copy with other joints of the same names, not checked."""
+
+    @abc.abstractmethod
+    def substituted(self, changes: Mapping[str, Any]) -> Self:
+        """Like `replace` for stored quantities that have a value, without checks."""
+
+    def derived_quantities(self) -> Mapping[str, Derived]:
+        """The quantities that can be set besides the stored ones."""
+        return {}
 
     @abc.abstractmethod
     def _rebuilt(self, changes: dict[str, Any]) -> Self:
@@ -41,9 +142,13 @@ class Mechanism(Part):
         new = self._rebuilt(changes)
         for name in changes:
             if name not in new._quantity_names():
-                kind, listed = type(self).__name__.lower(), ", ".join(new._quantity_names())
-                raise ValueError(f"{kind} has no quantity {name!r}; it has {listed}")
+                listed = ", ".join(new._quantity_names())
+                raise ValueError(f"{self.kind} has no quantity {name!r}; it has {listed}")
         return new
+
+    @abc.abstractmethod
+    def embedded(self, beside: Path) -> tuple[str, dict[Path, bytes]]:
+        """What stands for it in another TOML file, with the contents of files `beside` that one."""
 
     @classmethod
     @abc.abstractmethod
@@ -63,3 +168,9 @@ class Mechanism(Part):
         """
         with naming(path):
             return cls._from_document(read_toml(read_bounded(path)), Path(path).parent)
+
+
+def some_of(items: Iterable[Any]) -> str:
+    """At most ten of the items, and their number."""
+    texts = list(map(str, items))
+    return ", ".join(texts[:10]) + (f", ... ({len(texts)} in all)" if len(texts) > 10 else "")

@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,6 +15,8 @@ from jaxtyping import Array, ArrayLike, Float
 
 from .._base.files import read_bounded, write_together
 from .._base.parts import (
+    Numbers,
+    Quantity,
     brief,
     concrete,
     nan_where,
@@ -24,10 +26,11 @@ from .._base.parts import (
     require_kind,
     require_scalar,
     scalar,
+    substitute,
 )
 from .._base.programs import exported_jit
 from .._base.toml import naming, read_toml
-from .joint import Direction, Dof, Joint, stored_direction
+from .joint import Direction, Joint, stored_direction
 from .matrices import (
     MatrixLike,
     MatrixSum,
@@ -39,7 +42,7 @@ from .matrices import (
     require_mass_matrix,
     square_or_sparse,
 )
-from .mechanism import Mechanism
+from .mechanism import Mechanism, some_of
 from .mesh import Mesh
 from .oscillator import Oscillator
 from .scene import Scene
@@ -70,6 +73,7 @@ class Structure(Mechanism):
     positive definite, which degree of freedom is unknown, or which joint is wrong.
     """
 
+    kind: ClassVar[str] = "structure"
     sums: dict[str, MatrixSum]  # of "M", "C" and "K"
     parameters: dict[str, Float[Array, ""]]  # of the coefficients in them
     F: Float[Array, " n"] | None  # static force [N]
@@ -124,6 +128,14 @@ class Structure(Mechanism):
         F = self._forces(F) if isinstance(F, Mapping) else F
         self.F = None if F is None else fitting("F", F, (n,))
 
+    def full(self, q: ArrayLike) -> Numbers:
+        """Displacements of all degrees of freedom: `q` itself, but in a reduced structure."""
+        return jnp.asarray(q)
+
+    def over_mass(self, forces: Float[Array, "n k"]) -> Float[Array, "n k"]:
+        """M^-1 times forces."""
+        return jnp.linalg.solve(self.M, forces)
+
     def _full_n(self, n: int) -> int:
         """The number of degrees of freedom of the mesh, for n of the structure."""
         return n
@@ -163,15 +175,49 @@ class Structure(Mechanism):
         """The stiffness matrix without the joints [N/m]; errors as for `M`."""
         return self._matrix("K")
 
-    @property
-    def band(self) -> tuple[float, float] | None:
-        """The range of |Im s| [rad/s] in which eigenvalues are valid; None for no limit."""
-        return None
+    def require_one(self) -> None:
+        """Refuse a batch, and a large sparse structure, which must be reduced first."""
+        require_single(self)
+        if self.is_sparse:
+            raise ValueError(too_large(self))
 
-    @property
-    def coarse(self) -> Any:
-        """A subspace with approximate modes for a reduced structure, else None."""
-        return None
+    def as_structure(self) -> "Structure":
+        """The structure itself."""
+        return self
+
+    def joints_by_name(self) -> dict[str, Joint]:
+        """The joints by their names."""
+        return dict(zip(self.joint_names, self.joints, strict=True))
+
+    def with_joints(self, joints: Mapping[str, Any]) -> Self:
+        """A copy with other joints of the same names, not checked."""
+        return eqx.tree_at(lambda structure: structure.joints, self, tuple(joints.values()))
+
+    def stored_quantities(self) -> dict[str, Quantity]:
+        """The numbers of the joints, "D" of the first that has one and "left.D", and parameters."""
+        stored = {}
+        for name, joint in self.joints_by_name().items():
+            plain = joint.stored_quantities()
+            stored = plain | stored | {f"{name}.{each}": plain[each] for each in plain}
+        parameters = {
+            name: Quantity(value, "-", "parameter", False)
+            for name, value in self.parameters.items()
+        }
+        return parameters | stored
+
+    def substituted(self, changes: Mapping[str, Any]) -> Self:
+        """Like `replace` for stored quantities that have a value, without checks."""
+        joints = {}
+        for name, joint in self.joints_by_name().items():
+            full_names = {f"{name}.{plain}": plain for plain in quantities(joint)}
+            plain = {key: value for key, value in changes.items() if key in full_names.values()}
+            full = {full_names[key]: value for key, value in changes.items() if key in full_names}
+            joints[name] = substitute(joint, plain | full)
+        new = self.with_joints(joints)
+        parameters = {name: changes[name] for name in self.parameters if name in changes}
+        if not parameters:
+            return new
+        return eqx.tree_at(lambda s: s.parameters, new, new.parameters | parameters)
 
     @property
     def is_sparse(self) -> bool:
@@ -187,19 +233,6 @@ class Structure(Mechanism):
     def _dtype(self):
         arrays = self.sums["M"].arrays
         return arrays[0].dtype if arrays else jnp.result_type(float)
-
-    def index(self, dof: Dof | np.integer) -> int:
-        """The index of a degree of freedom from `dof`, its index or name.
-
-        **Raises:** `ValueError` if there is none; `TypeError` for anything else.
-        """
-        if isinstance(dof, bool) or not isinstance(dof, (int, str, np.integer)):
-            raise TypeError(f"a degree of freedom must be an index or a name, got {dof!r}")
-        dofs: list[Any] = list((self.names or ()) if isinstance(dof, str) else range(self.n))
-        if dof not in dofs:
-            has = _some(dofs) or "no names"
-            raise ValueError(f"unknown degree of freedom {dof!r}; the structure has {has}")
-        return dofs.index(dof)
 
     def direction(self, direction: Direction) -> np.ndarray:
         """The weights d (n,) for which d.x is the displacement in `direction`, given as in `Joint`.
@@ -247,7 +280,7 @@ class Structure(Mechanism):
         places = [self.index(dof) for dof in loads]
         twice = [dof for dof, place in zip(loads, places, strict=True) if places.count(place) > 1]
         if twice:
-            raise ValueError(f"F gives one degree of freedom twice: {_some(map(repr, twice))}")
+            raise ValueError(f"F gives one degree of freedom twice: {some_of(map(repr, twice))}")
         forces = [number(f"F at {dof}", force) for dof, force in loads.items()]
         return jnp.zeros(self.n).at[np.array(places, int)].set(jnp.array(forces, float))
 
@@ -325,6 +358,10 @@ class Structure(Mechanism):
         file at `path` does not name.
         """
         write_together(self._files(Path(path)))
+
+    def embedded(self, beside: Path) -> tuple[str, dict[Path, bytes]]:
+        """The name of the structure's file, and what `save` writes there."""
+        return beside.name, self._files(beside)
 
     def _files(self, path: Path) -> dict[Path, bytes]:
         """The contents that `save` writes, by file; errors as there."""
@@ -472,7 +509,7 @@ def _names(names: Iterable[str] | None, n: int) -> tuple[str, ...] | None:
     if not printable or len(names) != n:
         requirement = f"{n} printable strings, one a degree of freedom"
         raise ValueError(
-            f"names must be {requirement}, got {len(names)}: {_some(map(repr, names))}"
+            f"names must be {requirement}, got {len(names)}: {some_of(map(repr, names))}"
         )
     name, times = Counter(names).most_common(1)[0]
     if times > 1:
@@ -495,8 +532,3 @@ def _joints(
         if not isinstance(joint, Joint):
             raise TypeError(f"joint {name} must be a Joint, got {joint!r}")
     return tuple(joints.values()), tuple(joints)
-
-
-def _some(items: Iterable[Any]) -> str:
-    texts = list(map(str, items))
-    return ", ".join(texts[:10]) + (f", ... ({len(texts)} in all)" if len(texts) > 10 else "")

@@ -12,16 +12,17 @@ from .._base.programs import exported_jit
 from .._base.table import table
 from .._contact.contact import Regime
 from .._contact.fixed import FixedContact
-from .._mechanism.quantities import sliding_friction
+from .._mechanism.joint import AnyJoint, Joint
+from .._mechanism.mechanism import Mechanism
 from .._mechanism.scene import Scene, stiffness
-from .._mechanism.structure import Joint, Structure
+from .._mechanism.structure import Structure
 from .._surface.roughness import roughness
 from .._surface.spectrum import Spectrum
 from .critical_friction import critical_friction
-from .linearise import Assembled, linearised_at, normal_force, pressed, with_equilibrium
+from .linearise import Assembled, with_equilibrium
 from .margin import damping_ratios
-from .quartic import rightmost_root
 from .stability import Stability, require_computable, stability
+from .two_directions import two_directions
 
 ABSENT = "-"
 _STABLE = "stable against small disturbances"  # all that a growth rate can say
@@ -42,10 +43,10 @@ class _Critical(NamedTuple):
 @functools.partial(exported_jit, static_argnames="friction_slope")
 def _critical(scene: Scene, friction_slope: bool, wavelengths):
     """Critical mode, stiffness, contact state, and the roughness over wavelengths unless None."""
-    joint = pressed(scene)
-    s = rightmost_root(linearised_at(scene, joint, friction_slope))
+    system = two_directions(scene, friction_slope)
+    s = system.rightmost()
     frequency = jnp.abs(s.imag) / (2 * jnp.pi)
-    mode = _Critical(s.real, frequency, damping_ratios(s), normal_force(scene, joint))
+    mode = _Critical(s.real, frequency, damping_ratios(s), system.normal_force)
     rough = None if wavelengths is None else roughness(scene.contact.surface, *wavelengths)
     return mode, stiffness(scene), _contact_state(scene), rough
 
@@ -53,7 +54,7 @@ def _critical(scene: Scene, friction_slope: bool, wavelengths):
 @functools.partial(exported_jit, static_argnames="friction_slope")
 def _numbers(scene: Scene, friction_slope: bool):
     """Stability, stiffness, contact state and friction."""
-    friction = sliding_friction(scene)
+    friction = scene.coefficient()
     return stability(scene, friction_slope), stiffness(scene), _contact_state(scene), friction
 
 
@@ -105,7 +106,15 @@ def _stiffness_rows(K) -> dict[str, str]:
     return {"K_n [N/m]": f"{K_n:.6g}", "K_t [N/m]": f"{K_t:.6g}", "K_t/K_n": ratio}
 
 
-def stability_table(scene: Scene, friction_slope: bool = True) -> str:
+def stability_table(x: Any, friction_slope: bool = True) -> str:
+    """The stability of a scene or a structure.
+
+    **Raises:** `ValueError` if it cannot be computed, as `growth_rate` and `assemble`.
+    """
+    return (_scene_table if x.uncoupled else _structure_table)(x, friction_slope)
+
+
+def _scene_table(scene: Scene, friction_slope: bool) -> str:
     """The rows of one scene, its verdict, every eigenvalue, and a remark on its friction.
 
     **Raises:** `ValueError` if the growth rate cannot be computed.
@@ -129,7 +138,7 @@ def stability_table(scene: Scene, friction_slope: bool = True) -> str:
 
 
 def stiffness_remark(
-    part: Scene | Joint, K: Any = None, name: str = "The joint", follows: str = "What follows"
+    part: AnyJoint, K: Any = None, name: str = "The joint", follows: str = "What follows"
 ) -> list[str]:
     """A line if the law of a contact gives it no stiffness, normal or tangential, else none.
 
@@ -137,8 +146,7 @@ def stiffness_remark(
     """
     if isinstance(part.contact, FixedContact):  # a fixed stiffness is as intended
         return []
-    pair: Any = stiffness(part) if K is None and isinstance(part, Scene) else K
-    K_n, K_t = map(float, pair)
+    K_n, K_t = map(float, part.stiffness() if K is None else K)
     if K_n == 0:
         why = "every contact is plastic" if part.contact.fractal else "its law gives none"
         return [f"{name} carries no stiffness: {why}. {follows} is of the mechanism without it."]
@@ -147,15 +155,13 @@ def stiffness_remark(
     return []
 
 
-def stiffness_remarks(x: Scene | Structure, which: str = "", **words: str) -> list[str]:
+def stiffness_remarks(x: Mechanism, which: str = "", **words: str) -> list[str]:
     """`stiffness_remark` of every joint, with its `words`; `which` follows the joint's name."""
-    if isinstance(x, Scene):
-        return stiffness_remark(x, None, f"The joint{which}", **words)
-    return [
-        line
-        for name, joint in zip(x.joint_names, x.joints, strict=True)
-        for line in stiffness_remark(joint, joint.stiffness(), f"Joint {name}{which}", **words)
-    ]
+    lines = []
+    for name, joint in x.joints_by_name().items():
+        title = f"Joint {name}{which}" if name else f"The joint{which}"
+        lines += stiffness_remark(joint, None, title, **words)
+    return lines
 
 
 def verdict(modes: Stability, without_joint: bool = False) -> dict[str, str]:
@@ -196,7 +202,7 @@ def friction_remark(scene: Scene, speed) -> list[str]:
     ]
 
 
-def structure_table(structure: Structure, friction_slope: bool = True) -> str:
+def _structure_table(structure: Structure, friction_slope: bool) -> str:
     """The joints of a structure, its verdict, and its unstable and its least damped modes.
 
     **Raises:** `ValueError` as `assemble`, if the structure has no equilibrium under F or a joint
@@ -208,7 +214,7 @@ def structure_table(structure: Structure, friction_slope: bool = True) -> str:
             raise ValueError(
                 f"joint {name} is open at the equilibrium: its normal force is {force:.6g} N"
             )
-    for name, X in zip("MCK", attached[:3], strict=True):
+    for name, X in zip("MCK", attached.matrices, strict=True):
         if not np.isfinite(np.asarray(X)).all():
             raise ValueError(f"{name} with the joints attached must be finite")
     modes = stability(structure, friction_slope)

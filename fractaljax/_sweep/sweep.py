@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
 from .._base.memory import require_memory
-from .._base.parts import require_scalar
 from .._mechanism.quantities import (
     axis_values,
     require_independent,
@@ -190,8 +189,7 @@ def _compute_in_turn(batches: Batches, numbers: Sequence[int]) -> Computed:
 
 def _check_axes(x: Any, axes: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """The values of every axis, inside their domains jointly with those of the other axes."""
-    if isinstance(x, Scene):
-        require_scalar(x)
+    x.require_one()
     if not axes:
         raise ValueError("sweep needs an axis, such as D=[2.3, 2.4]")
     grid = {name: np.asarray(axis_values(x, name, values)) for name, values in axes.items()}
@@ -203,7 +201,7 @@ def _check_axes(x: Any, axes: Mapping[str, Any]) -> dict[str, np.ndarray]:
 def _points_each(x: Any) -> int:
     """The default number of points of a batch on a device."""
     points = 8192
-    if not isinstance(x, Structure):
+    if x.uncoupled:
         return points
     # The memory of its modes grows as the square of their number: at all points together, a matrix
     # of the eigenvalue problem has at most 2^21 entries.

@@ -10,8 +10,7 @@ from .._base.parts import whole
 from .._base.ranges import within
 from .._contact.contact import Regime
 from .._design.design import Design
-from .._mechanism.quantities import stored_quantities
-from .._mechanism.scene import Scene, stiffness
+from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
 from .._stability.stability import growth_rate
 from .._sweep.sweep import sweep
@@ -53,11 +52,11 @@ def stability_map(
         window = {"D": (2.1, 2.9), "G": (1e-12, 1e-8)} | window  # of most machined surfaces
     places = np.linspace(0, 1, whole("points", points, 2))
     axes: Any = {name: within(*ends, places) for name, ends in list(window.items())[:2]}
-    single = isinstance(scene, Scene)
-    fractal = single and scene.contact.fractal
+    joint = scene.sole_joint
+    fractal = joint is not None and joint.contact.fractal
 
     def measure(scene):
-        K_n = stiffness(scene)[0] if single else jnp.nan
+        K_n = jnp.nan if joint is None else scene.stiffness()[0]
         return growth_rate(scene, friction_slope), K_n, contact_regime(scene) if fractal else None
 
     growth, K_n, regime = sweep(measure, scene, progress=False, **axes).values
@@ -112,7 +111,7 @@ def design(result: Design, ax: Axes | None = None) -> Axes:
         (result.initial, "o", 6, "white", "given surface"),
         (result.scene, "*", 11, "tab:cyan", final),
     ):
-        quantities: Any = stored_quantities(scene)
+        quantities: Any = scene.stored_quantities()
         style: dict[str, Any] = {"ms": size, "mfc": colour, "mec": "k", "ls": "none", "zorder": 5}
         at = [[float(quantities[name].value)] for name in names]
         handles += ax.plot(*at, marker, label=words, clip_on=False, **style)

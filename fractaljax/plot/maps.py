@@ -171,7 +171,8 @@ def _start(result, ax):
     none = _no_number(result)
     growth = np.ma.masked_where(none, getattr(result.values, "growth_rate", result.values))
 
-    if not (isinstance(result.scene, Scene) and result.scene.contact.fractal):
+    joint = result.scene.sole_joint
+    if joint is None or not joint.contact.fractal:
         return ax, growth, shade_unsteady(ax, x, y, none)
     axes: Any = result.axes
     regime = sweep(contact_regime, result.scene, progress=False, **axes).values

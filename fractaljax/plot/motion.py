@@ -11,7 +11,6 @@ from .._base.parts import require_kind, scalar, whole
 from .._dynamics.contact_state import STATES, find_state
 from .._dynamics.cycle import CycleResult, LimitCycle
 from .._mechanism.mesh import Mesh
-from .._mechanism.reduced import ReducedStructure
 from .._mechanism.structure import Structure
 from .animation import animated, animation_path
 from .axes import Axes, Figure, frequency_unit, legend_above, new_figure
@@ -119,7 +118,6 @@ def _motion(
             f"structure must be that of the cycle, with {n} degrees of freedom and {len(faces)} "
             f"joints, got {structure.n} and {len(structure.joints)}"
         )
-    reduced = structure.reduction if isinstance(structure, ReducedStructure) else None
     mesh_arrays = {"points": points, "dofs": dofs, "cells": cells}
     missing = [name for name, array in mesh_arrays.items() if array is None]
     if len(missing) < len(mesh_arrays):
@@ -128,12 +126,11 @@ def _motion(
         mesh = Mesh(points, dofs, cells)
     elif (mesh := structure.mesh) is None:
         raise ValueError("structure has no mesh: give points, dofs and cells")
-    mesh.require(n if reduced is None else len(reduced.V))
+    mesh.require(structure._full_n(n))
     # The mean and the largest displacements need more times than are shown: 256 or a few more.
     count = frames * -(-256 // frames)
     x = np.asarray(cycle.orbit(count)[1])[:, :n]
-    x = x - x.mean(axis=0)
-    x = x if reduced is None else x @ reduced.V.T
+    x = np.asarray(structure.full(x - x.mean(axis=0)))
     tangential = [each[0] for each in faces]
     states = np.asarray(cycle.contact_states(count))[:, tangential]
     spans = [
