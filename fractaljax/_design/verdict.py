@@ -187,7 +187,9 @@ def _other_load(x: Mechanism, friction_slope: bool) -> list[tuple[str, str, Mech
         if not any(able) or (preloaded and falls and x.F is None):  # without F there is no slope
             return []
         joints = tuple(
-            Joint(j.contact, j.friction, j.tangential, j.normal, j.V, not preloaded) if can else j
+            Joint(j.contact, j.friction, j.tangential, j.normal, j.V, not preloaded, j.loss_factor)
+            if can
+            else j
             for can, j in zip(able, x.joints, strict=True)
         )
         other = eqx.tree_at(lambda structure: structure.joints, x, joints)

@@ -100,7 +100,8 @@ class Joint(Part):
     displacement x_i - x_j, a mapping {degree of freedom: weight}, or all weights as an array or
     floats. Positive `normal` displacement n.x compresses the joint. Friction pushes towards
     positive t.x, as the belt does in Eq. 39. `V` is the sliding velocity; a law without slope needs
-    no V.
+    no V. With a `loss_factor` eta, the structural damping of the joint, K_n and K_t of an oscillation
+    are K_n (1 + i eta) and K_t (1 + i eta) wherever they act, also in the normal force that rubs.
 
     The normal force N on which friction acts is K_n n.x, the source's form. With `preload`, x = 0
     is the state of rest under the load P of the contact, where N = P: N(n.x) is the load curve of
@@ -119,6 +120,7 @@ class Joint(Part):
     normal: Stored | None = eqx.field(static=True)
     preload: bool | str = eqx.field(static=True, metadata={"note": PRELOAD_NOTE})
     V: Numbers | None = quantity("m/s", "sliding velocity", log=True)
+    loss_factor: Numbers | None = quantity("-", "loss factor of the springs")
 
     def __init__(
         self,
@@ -128,6 +130,7 @@ class Joint(Part):
         normal: Direction | None = None,
         V: ArrayLike | None = None,
         preload: bool | str = False,
+        loss_factor: ArrayLike | None = None,
     ):
         self.contact = contact
         self.friction = friction_for(contact, friction)
@@ -141,6 +144,9 @@ class Joint(Part):
         if self.tangential == self.normal:
             raise ValueError(f"tangential and normal must differ, both are {tangential!r}")
         self.V = None if V is None else number("V", V, above=0)
+        self.loss_factor = (
+            None if loss_factor is None else number("loss_factor", loss_factor, at_least=0)
+        )
 
     @property
     def normal_load(self) -> Numbers | None:
@@ -155,6 +161,13 @@ class Joint(Part):
     def stiffness(self) -> tuple[Numbers, Numbers]:
         """(K_n, K_t) [N/m], scalars, from Eqs. 30 and 36 or as given."""
         return self.contact.stiffness(self.friction.mu_s, self.friction.mu_m)
+
+    def complex_stiffness(self, K_n: Numbers, K_t: Numbers) -> tuple[Numbers, Numbers]:
+        """K_n (1 + i eta) and K_t (1 + i eta) of an oscillation; as they are without loss factor."""
+        if self.loss_factor is None:
+            return K_n, K_t
+        complex_one = 1 + 1j * self.loss_factor
+        return K_n * complex_one, K_t * complex_one
 
     def coefficient(self) -> Numbers:
         """The friction coefficient mu at the joint's sliding velocity, a scalar."""

@@ -93,6 +93,37 @@ def matrix_sum(
     return MatrixSum(tuple(arrays), (), tuple(coefficients))
 
 
+def separated(K: Any, K_loss: Any) -> tuple[Any, Any]:
+    """K and K_loss, both real, from a K that may be complex: K + i K_loss, structural damping.
+
+    Both are matrices or sequences of (coefficient, matrix), each of which may be complex. Imaginary
+    parts are added to K_loss.
+    """
+    terms = K if is_sum(K) else [(None, K)]
+    if not any(_is_complex(each) for term in terms for each in term):
+        return K, K_loss
+    loss = [] if K_loss is None else list(K_loss if is_sum(K_loss) else [(None, K_loss)])
+    real = []
+    for coefficient, X in terms:
+        if not (_is_complex(coefficient) or _is_complex(X)):
+            real.append((coefficient, X))
+            continue
+        X = X if hasattr(X, "dtype") else np.asarray(X)
+        if _is_complex(coefficient):
+            X, coefficient = coefficient * X, None
+        real.append((coefficient, X.real))
+        loss.append((coefficient, X.imag))
+    one = is_sum(K) or len(loss) > 1
+    return (real, loss) if one else (real[0][1], loss[0][1])
+
+
+def _is_complex(value: Any) -> bool:
+    """True for a complex number, array, sparse matrix, or nested list with a complex number."""
+    if hasattr(value, "dtype"):
+        return jnp.issubdtype(value.dtype, jnp.complexfloating)
+    return any(isinstance(entry, complex) for entry in jax.tree.leaves(value))
+
+
 def is_sum(value: Any) -> bool:
     """True for a sequence of (coefficient, matrix), False for a nested list of numbers."""
 

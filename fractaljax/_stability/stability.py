@@ -201,6 +201,8 @@ def _stability(scene, friction_slope):
         order = jnp.lexsort((-s.imag, -_rank(s, scene.band)))
         s, x, error = s[order], x[order], error[order]
         counted = in_band(s, scene.band)
+        if scene.has_loss:
+            counted &= jnp.isfinite(error)
         margin, names = least_damping_ratio(among(s, scene.band)), scene.names
     else:
         s, x, error, margin, forces = _solve_scene(scene, friction_slope)
