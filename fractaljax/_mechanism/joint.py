@@ -100,8 +100,8 @@ class Joint(Part):
     displacement x_i - x_j, a mapping {degree of freedom: weight}, or all weights as an array or
     floats. Positive `normal` displacement n.x compresses the joint. Friction pushes towards
     positive t.x, as the belt does in Eq. 39. `V` is the sliding velocity; a law without slope needs
-    no V. With a `loss_factor` eta, the structural damping of the joint, K_n and K_t of an oscillation
-    are K_n (1 + i eta) and K_t (1 + i eta) wherever they act, also in the normal force that rubs.
+    no V. With a `loss_factor` eta, structural damping, the stiffnesses of the joint in an
+    oscillation are K_n (1 + i eta) and K_t (1 + i eta), also in the normal force that rubs.
 
     The normal force N on which friction acts is K_n n.x, the source's form. With `preload`, x = 0
     is the state of rest under the load P of the contact, where N = P: N(n.x) is the load curve of
@@ -163,7 +163,7 @@ class Joint(Part):
         return self.contact.stiffness(self.friction.mu_s, self.friction.mu_m)
 
     def complex_stiffness(self, K_n: Numbers, K_t: Numbers) -> tuple[Numbers, Numbers]:
-        """K_n (1 + i eta) and K_t (1 + i eta) of an oscillation; as they are without loss factor."""
+        """K_n (1 + i eta) and K_t (1 + i eta) of an oscillation; K_n and K_t without eta."""
         if self.loss_factor is None:
             return K_n, K_t
         complex_one = 1 + 1j * self.loss_factor

@@ -1,5 +1,7 @@
 """The matrices of a structure: checked, summed, and transformed to unit mass."""
 
+import functools
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -91,6 +93,29 @@ def matrix_sum(
         kept = [Sparse(X if is_sparse(X) else csr_array(np.asarray(X))) for X in arrays]
         return MatrixSum((), tuple(kept), tuple(coefficients))
     return MatrixSum(tuple(arrays), (), tuple(coefficients))
+
+
+def placed(small: Numbers, places: Sequence[int], n: int, sparse: bool) -> Any:
+    """A matrix (n, n) with `small` (k, k) in the rows and columns `places`, and 0 elsewhere."""
+    index = np.array(places, int)
+    if not sparse:
+        return jnp.zeros((n, n), small.dtype).at[index[:, None], index[None]].set(small)
+    from scipy.sparse import coo_array
+
+    i, j = np.meshgrid(index, index, indexing="ij")
+    return coo_array((np.asarray(small).ravel(), (i.ravel(), j.ravel())), shape=(n, n)).tocsr()
+
+
+def merged(matrix: Any) -> Any:
+    """A matrix or sum with all terms that have no coefficient as one, the first."""
+    if not is_sum(matrix):
+        return matrix
+    plain = [X for coefficient, X in matrix if coefficient is None]
+    rest = [(coefficient, X) for coefficient, X in matrix if coefficient is not None]
+    if not plain:
+        return rest
+    whole = functools.reduce(operator.add, plain)
+    return [(None, whole), *rest] if rest else whole
 
 
 def separated(K: Any, K_loss: Any) -> tuple[Any, Any]:

@@ -31,11 +31,14 @@ from .joint import Direction, Dof, Joint, stored_direction
 from .matrices import (
     MatrixLike,
     MatrixSum,
+    as_array,
     fitting,
     fitting_or_sparse,
     is_sum,
     mass_matrix,
     matrix_sum,
+    merged,
+    placed,
     require_mass_matrix,
     separated,
     square_or_sparse,
@@ -222,6 +225,53 @@ class Structure(Mechanism):
                 damping.append((None, joint.loss_factor * k / omega * jnp.outer(d, d)))
         return self._with_terms({"C": damping, "K_loss": None}, joints, self.F, self.parameters)
 
+    def add(
+        self,
+        dofs: Sequence[Dof],
+        K: MatrixLike | None = None,
+        *,
+        M: MatrixLike | None = None,
+        C: MatrixLike | None = None,
+        K_loss: MatrixLike | None = None,
+    ) -> "Structure":
+        """A copy with small matrices added at some degrees of freedom, as DMIG and K2PP cards do.
+
+        A reduced structure becomes a plain one.
+
+        **Arguments:**
+
+        - `dofs`: the k degrees of freedom, by index or name, in the order of the matrices' rows.
+        - `K`: (k, k) [N/m], added to the stiffness; the imaginary part of a complex one is added to
+          K_loss. None adds nothing, by default, as for the others.
+        - `M`, `C`, `K_loss`: (k, k), added to the matrix of that name.
+
+        **Raises:** `ValueError` for an unknown degree of freedom, one that is given twice, and a
+        matrix of another shape; as `Structure` for the sums.
+        """
+        places = [self.index(dof) for dof in ([dofs] if isinstance(dofs, (int, str)) else dofs)]
+        if len(set(places)) < len(places):
+            raise ValueError(f"dofs gives one degree of freedom twice: {_some(map(repr, dofs))}")
+        K, K_loss = separated(K, K_loss)
+        added: dict[str, Any] = {}
+        for name, X in {"M": M, "C": C, "K": K, "K_loss": K_loss}.items():
+            if X is None:
+                continue
+            terms = self._terms(name) if name in self.sums else []
+            for coefficient, small in X if is_sum(X) else [(None, X)]:
+                small = as_array(name, small)
+                if small.shape != (len(places), len(places)):
+                    raise ValueError(
+                        f"{name} must have shape {(len(places),) * 2}, one row for each of dofs, "
+                        f"got {small.shape}"
+                    )
+                terms.append((coefficient, placed(small, places, self.n, self.is_sparse)))
+            added[name] = terms
+        return self._with_terms(added, self._joints_by_name, self.F, self.parameters)
+
+    @property
+    def _joints_by_name(self) -> dict[str, Joint]:
+        return dict(zip(self.joint_names, self.joints, strict=True))
+
     @property
     def band(self) -> tuple[float, float] | None:
         """The range of |Im s| [rad/s] in which eigenvalues are valid; None for no limit."""
@@ -332,8 +382,9 @@ class Structure(Mechanism):
 
     def _with_terms(self, matrices, joints, F, parameters) -> "Structure":
         """A checked copy with other matrices or terms of them, joints, F and parameters."""
-        kept = {name: self._terms(name) for name in self.sums}
-        arguments = kept | matrices | {"joints": joints, "F": F, "names": self.names}
+        kept = {name: self._terms(name) for name in self.sums} | matrices
+        arguments = {name: merged(X) for name, X in kept.items()}
+        arguments |= {"joints": joints, "F": F, "names": self.names}
         arguments |= {"mesh": self._matching_mesh(), "notes": self.notes}
         if not self.parameters:
             return Structure(**arguments)
@@ -349,10 +400,10 @@ class Structure(Mechanism):
         return list(zip(held.coefficients, held.matrices, strict=True))
 
     def _quantity_names(self):
-        names = ["M", "C", "K", "F", "K_loss", *self.parameters]
+        names = ["M", "C", "K", "F", *self.parameters]
         for name, joint in zip(self.joint_names, self.joints, strict=True):
             names += [*quantities(joint), *(f"{name}.{plain}" for plain in quantities(joint))]
-        return list(dict.fromkeys(names))
+        return list(dict.fromkeys([*names, "K_loss"]))
 
     def _shown(self):
         yield f"n={self.n}"
@@ -367,7 +418,7 @@ class Structure(Mechanism):
             from .reduced import ReducedStructure
 
             return ReducedStructure.from_file(arguments)
-        if "parameters" in arguments or any(is_sum(arguments[name]) for name in "MCK"):
+        if "parameters" in arguments or any(is_sum(x) for x in arguments.values()):
             return ParametricStructure(**arguments)
         return Structure(**arguments)
 

@@ -11,7 +11,6 @@ from .._mechanism.structure import Structure
 from .band import in_band
 from .snapshots import Snapshot, Snapshots, joint_blocks, joint_directions, plain
 
-
 _FACTORS = {"M": (2, 1), "C": (1, 1), "K": (0, 1), "K_loss": (0, 1j)}  # power of s, and unit
 
 

@@ -1,13 +1,14 @@
 """What each part of a mechanism does to its modes: its share of the energy, and of the growth rate.
 
 With x^H (s^2 M + s C + K) x = 0, s = sigma + i omega, and m = x^H M x, c_i = x^H C_i x and
-k_i = x^H K_i x of parts i, m being real and K complex with structural damping, the imaginary part is
+k_i = x^H K_i x of parts i, m being real, the imaginary part is
 
     sigma (2 omega m + Im c) = -sum_i (omega Re c_i + Im k_i),
 
 so that part i contributes -(omega Re c_i + Im k_i)/(2 omega m + Im c) to the growth rate: damping
-by Re c_i, friction, other circulatory forces and structural damping by Im k_i. Gyroscopic terms
-contribute nothing. The work of these forces in a period is the same numbers times 2 pi (2 omega m + Im c).
+by Re c_i, friction and other circulatory forces by Im k_i, and so does structural damping, of which
+K is K + i K_loss. Gyroscopic terms contribute nothing. The work of these forces in a period is the
+same numbers times 2 pi (2 omega m + Im c).
 """
 
 from collections.abc import Mapping
@@ -66,8 +67,9 @@ def energy_shares(
 ) -> EnergyShares:
     """Energy and contribution to the growth rate of each part, in each mode that oscillates.
 
-    Parts are the terms of M, C, K and K_loss, "K" or "K 1", "K 2", ... where it is a sum, and the joints by
-    their names. A joint acts through its springs, its friction and the slope of its friction law.
+    Parts are the terms of M, C, K and K_loss, "K" or "K 1", "K 2", ... where it is a sum, and the
+    joints by their names. A joint acts through its springs, its friction and the slope of its
+    friction law.
 
     The sum of the contributions is the growth rate, as exactly as shapes are known. Where
     gyroscopic modes coalesce, 2 omega m + Im c passes through 0 and they grow without bound. For a

@@ -51,7 +51,7 @@ def joint_blocks(numbers: np.ndarray, normal: tuple[int | None, ...], k: int):
 
 @functools.partial(jax.jit, static_argnames="friction_slope")
 def joint_numbers(structure: Structure, friction_slope: bool) -> Float[Array, "m 5"]:
-    """What each joint adds at the equilibrium: K_n, K_t, mu, c_t, c_n; complex with loss factors."""
+    """What joints add at the equilibrium: K_n, K_t, mu, c_t, c_n; complex with a loss factor."""
     if not structure.joints:
         return jnp.zeros((0, 5))
     attached = attachments(structure, friction_slope).each
