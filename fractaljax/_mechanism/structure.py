@@ -218,7 +218,7 @@ class Structure(Mechanism):
             damping += [(c, X * (1 / scale)) for c, X in self._terms("K_loss")]
         joints = {}
         for name, joint in zip(self.joint_names, self.joints, strict=True):
-            joints[name] = joint.replace(loss_factor=None)
+            joints[name] = rebuild(joint, {"loss_factor": None})
             if joint.loss_factor is None:
                 continue
             for d, k in zip(self._directions(joint), reversed(joint.stiffness()), strict=False):
