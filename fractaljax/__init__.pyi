@@ -104,13 +104,13 @@ from ._stability.boundary import (
 )
 from ._stability.critical_friction import critical_friction as critical_friction
 from ._stability.linearise import assemble as assemble
-from ._stability.margin import margin as margin
 from ._stability.reduction import reduce as reduce, reduction_errors as reduction_errors
 from ._stability.reduction_search import ReductionSearch as ReductionSearch
 from ._stability.shares import EnergyShares as EnergyShares, energy_shares as energy_shares
 from ._stability.stability import (
     Stability as Stability,
     growth_rate as growth_rate,
+    margin as margin,
     stability as stability,
 )
 from ._stability.tracks import (

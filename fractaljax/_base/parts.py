@@ -6,7 +6,7 @@ import functools
 import math
 import operator
 from collections.abc import Iterator, Mapping
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -245,8 +245,30 @@ class Record(eqx.Module):
             yield f"{argument_name(field)}={value!r}"
 
 
+class Quantity(NamedTuple):
+    """A number of a scene, of a structure or of one of their parts."""
+
+    value: Array | None  # None for an optional number without a value
+    unit: str
+    meaning: str
+    log: bool  # positive, and compared by ratios
+
+
 class Part(Record):
     """A part of a scene: its numeric leaves are named quantities in SI units."""
+
+    def stored_quantities(self) -> dict[str, Quantity]:
+        """The numbers stored here and in the parts below, by name."""
+        stored = {}
+        for field in dataclasses.fields(self):
+            value, meant = getattr(self, field.name), field.metadata
+            if isinstance(value, Part):
+                stored |= value.stored_quantities()
+            elif "unit" in meant:
+                stored[quantity_name(field)] = Quantity(
+                    value, meant["unit"], meant["meaning"], meant.get("log", False)
+                )
+        return stored
 
 
 def quantities(part: Part) -> dict[str, tuple[str, ...]]:

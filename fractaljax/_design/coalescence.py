@@ -12,8 +12,8 @@ from jaxtyping import Array, Float
 
 from .._mechanism.scene import Scene
 from .._stability.critical_pair import hopf_test
-from .._stability.linearise import linearised
 from .._stability.quadratic import Leading
+from .._stability.two_directions import two_directions
 
 
 def neighbour_residuals(
@@ -42,7 +42,7 @@ def scene_residuals(
 ) -> list[Float[Array, ""]]:
     """As `neighbour_residuals`, for the two modes of a scene, from its Hurwitz determinant."""
     # (s^2 + c_1 s + a)(s^2 + c_2 s + b) + g at s + target: s^4 + q_3 s^3 + q_2 s^2 + q_1 s + q_0.
-    lin = linearised(scene, friction_slope)
+    lin = two_directions(scene, friction_slope).polynomial
     c_1, c_2 = lin.c_1 + 2 * target, lin.c_2 + 2 * target
     a, b = lin.a + (lin.c_1 + target) * target, lin.b + (lin.c_2 + target) * target
     q_3, q_2, q_1, q_0 = c_1 + c_2, a + b + c_1 * c_2, c_1 * b + c_2 * a, a * b + lin.g

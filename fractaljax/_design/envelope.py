@@ -16,7 +16,7 @@ import numpy as np
 from .._base.parts import Record, brief, scalar
 from .._base.ranges import within
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import quantity_names, replaced, stored_quantities
+from .._mechanism.quantities import quantity_names, replaced
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,7 +118,7 @@ class Envelope(Record):
 
         Names among the `designed` are refused, too.
         """
-        quantities = stored_quantities(x)
+        quantities = x.stored_quantities()
         available = [
             name
             for name in quantity_names(x)

@@ -48,7 +48,7 @@ def _growing_modes(problem: DesignProblem, us):
     def one(u):
         _, x = problem.stiffened(problem.mechanism_at(u, problem.nominal_condition))
         attached = assembled(x, problem.friction_slope, refuse=False)
-        modes = solve(*attached[:3])
+        modes = solve(*attached.matrices)
         order = jnp.argsort(jnp.where(modes.s.imag >= 0, -modes.s.real, jnp.inf))
         chosen = order[: 3 * problem.modes]  # other modes come up at other designs
         vectors = jnp.concatenate([modes.x[chosen], modes.y[chosen]]).T

@@ -43,7 +43,7 @@ def _rates(problem: "DesignProblem", us, conditions):
         rates = []
         for each in (problem.stiffened(x)[1], *(with_contact_law(x, law) for law in problem.laws)):
             attached = assembled(each, problem.friction_slope, refuse=False)
-            modes = leading(*attached[:3], problem.modes, x.band)
+            modes = leading(*attached.matrices, problem.modes, x.band)
             rates.append(jnp.where(attached.lost, jnp.nan, modes.s.real))
         return jnp.stack(rates)
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from .._base.batches import in_batches
 from .._base.programs import exported_jit
-from .._mechanism.quantities import joints_of
 from .joints import joint_states
 from .problem import UNKNOWN, DesignProblem
 from .rows import paired
@@ -80,7 +79,7 @@ def _limits_of_joints(leaves, us, conditions, structure):
     problem: DesignProblem = jax.tree.unflatten(structure, leaves)
 
     def required(u, condition, shift=None):
-        joints = joints_of(problem.mechanism_at(u, condition, shift))
+        joints = problem.mechanism_at(u, condition, shift).joints_by_name()
         model, stiff = problem.joint_residuals(
             joint_states({name: joints[name] for name in problem.contacts})
         )

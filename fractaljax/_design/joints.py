@@ -14,7 +14,7 @@ from .._contact.contact import Contact, on_the_same_joint
 from .._contact.fixed import FixedContact
 from .._mechanism.joint import Joint
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import joints_of, stored_quantities, target_quantities
+from .._mechanism.quantities import target_quantities
 from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
 from .._stability.band import in_band
@@ -71,17 +71,17 @@ def joint_states(parts: Mapping[str, Any]) -> dict[str, Any]:
 
 def is_fractal(x, name) -> bool:
     """True if a contact has the source's law."""
-    return joints_of(x)[name].contact.fractal
+    return x.joints_by_name()[name].contact.fractal
 
 
 def slips(x, name) -> bool:
     """True if a contact has the source's tangential law, which slips."""
-    return is_fractal(x, name) and joints_of(x)[name].contact.stiffness_ratio is None
+    return is_fractal(x, name) and x.joints_by_name()[name].contact.stiffness_ratio is None
 
 
 def with_stiffness(x, states):
     """`x` with contacts of fixed stiffness in the joints whose states (by name) are given."""
-    parts, zero = joints_of(x), FixedContact(0.0, 0.0, 1.0)
+    parts, zero = x.joints_by_name(), FixedContact(0.0, 0.0, 1.0)
     for name, state in states.items():
         P = getattr(parts[name].contact, "P", zero.P)  # of a preloaded joint
         fixed = substitute(zero, {"K_n": state.K_n, "K_t": state.K_t, "P": P})
@@ -98,7 +98,7 @@ def with_contacts(x: Mechanism, contacts: Mapping[str, Contact]) -> Any:
     """
     if isinstance(x, Scene):
         return eqx.tree_at(lambda scene: scene.contact, x, contacts.get("", x.contact))
-    joints = joints_of(x)
+    joints = x.joints_by_name()
     for name, contact in contacts.items():
         joint = joints[name]
         rest = joint.friction, joint.tangential, joint.normal, joint.V, joint.preload
@@ -117,7 +117,7 @@ def with_contact_law(x: Mechanism, law: Contact) -> Any:
     """
     contacts = {
         name: on_the_same_joint(law, part.contact)
-        for name, part in joints_of(x).items()
+        for name, part in x.joints_by_name().items()
         if isinstance(x, Scene) or part.contact.has_surface
     }
     return with_contacts(x, contacts)
@@ -127,8 +127,8 @@ def changed_contacts(x, names) -> tuple[str, ...]:
     """The contacts with a law whose stiffness depends on these quantities."""
     affected = {each for name in names for each in target_quantities(x, name)}
     contacts = []
-    for name, part in joints_of(x).items():
-        quantities = {*stored_quantities(part.contact), *stored_quantities(part.friction)}
+    for name, part in x.joints_by_name().items():
+        quantities = {*part.contact.stored_quantities(), *part.friction.stored_quantities()}
         law = not isinstance(part.contact, FixedContact)
         if law and affected & {joint_prefix(name) + each for each in quantities}:
             contacts.append(name)

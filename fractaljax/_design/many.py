@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Float
 from .._base.parts import Record, brief, flag, is_traced, whole
 from .._contact.contact import Contact
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import replaced, require_one, stored_quantities, value_of
+from .._mechanism.quantities import replaced, require_one, value_of
 from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
 from .._sweep.program import Program
@@ -233,7 +233,7 @@ def _members(xs: Any) -> tuple[Any, list[Array], tuple[int, ...]]:
         return xs[0], [jnp.stack(each) for each in leaves], (len(xs),)
     if not isinstance(xs, Scene | Structure):
         raise TypeError(f"xs must be a mechanism with arrays, or a list, got {brief(xs)}")
-    named = stored_quantities(xs)
+    named = xs.stored_quantities()
     if isinstance(xs, Structure):  # a plain name is that of several joints
         named = {name: named[name] for name in named if "." in name or name in xs.parameters}
     many = {

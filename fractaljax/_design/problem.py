@@ -20,7 +20,7 @@ from .._base.parts import is_traced, nan_where, refused, whole
 from .._base.programs import exported_jit
 from .._contact.contact import Contact
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import joints_of, substituted, value_of
+from .._mechanism.quantities import substituted, value_of
 from .._mechanism.structure import Structure
 from .._stability.linearise import assembled
 from .._stability.quadratic import leading
@@ -229,7 +229,7 @@ class DesignProblem(eqx.Module):
             if self.modes:
                 # The rates are NaN where there is no steady sliding; LAPACK gets numbers even so.
                 attached = assembled(each, self.friction_slope, refuse=False)
-                leading_modes = leading(*attached[:3], self.modes, x.band)
+                leading_modes = leading(*attached.matrices, self.modes, x.band)
                 rates += list(jnp.where(attached.lost, jnp.nan, leading_modes.s.real))
                 if not self.least_growth:
                     smooth += list(
@@ -271,7 +271,7 @@ class DesignProblem(eqx.Module):
 
     def stiffened(self, x) -> tuple[dict[str, Any], Any]:
         """States of the contacts of `x` that have one or move, and `x` with their stiffness."""
-        parts = joints_of(x)
+        parts = x.joints_by_name()
         designed_parts = {
             name: part
             for name, part in parts.items()

@@ -16,7 +16,7 @@ import numpy as np
 from .._base.parts import Record
 from .._base.table import aligned
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import replaced, stored_quantities, target_quantities, unit, value_of
+from .._mechanism.quantities import replaced, target_quantities, unit, value_of
 from .._mechanism.structure import Structure
 from .evaluator import Evaluator, OnAverage
 from .problem import DesignProblem
@@ -106,7 +106,7 @@ def design_sensitivity(
     values = {name: float(value_of(designed, name)) for name in problem.names}
     span = np.asarray(problem.high - problem.low, float).tolist()
     changes: dict[str, dict[str, float]] = {name: {} for name in problem.names}
-    ranges, quantities = {}, stored_quantities(x)
+    ranges, quantities = {}, x.stored_quantities()
     for name in _held(x, problem):
         by = _difference(lambda x: slopes(state(x), u), x, name, size)
         if by is None:
@@ -160,7 +160,7 @@ def _multipliers(
 
 def _held(x: Mechanism, problem: DesignProblem) -> list[str]:
     """The quantities that neither the design nor the envelope moves."""
-    quantities = stored_quantities(x)
+    quantities = x.stored_quantities()
     names = [name for name in quantities if quantities[name].value is not None]
     if isinstance(x, Structure):  # a plain name is that of several joints
         names = [name for name in names if "." in name or name in x.parameters]

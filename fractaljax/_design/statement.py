@@ -12,12 +12,10 @@ from .._contact.contact import Contact
 from .._dynamics.scaled import degrees_of_freedom, hybrid_system
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import (
-    joints_of,
     quantity_names,
     replaced,
     require_independent,
     require_one,
-    stored_quantities,
     value_of,
     with_optional,
 )
@@ -63,7 +61,7 @@ def stated_fields(
     if (
         laws
         and not isinstance(x, Scene)
-        and not any(joint.contact.has_surface for joint in joints_of(x).values())
+        and not any(joint.contact.has_surface for joint in x.joints_by_name().values())
     ):
         raise ValueError("laws of a structure need a joint whose contact has a surface")
     for law in laws:
@@ -189,5 +187,5 @@ def checked_bounds(x: Mechanism, bounds: Mapping[str, Sequence[float]]) -> dict[
 
 
 def _is_scale(x, name) -> bool:
-    quantities = stored_quantities(x)
+    quantities = x.stored_quantities()
     return name in quantities and quantities[name].log

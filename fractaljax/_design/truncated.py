@@ -14,7 +14,6 @@ from jax.scipy.special import ndtr, ndtri
 from jaxtyping import Array
 
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import stored_quantities
 from .._surface.surface import Surface
 
 REACH = 6.0  # standard deviations that must stay inside the domain of a quantity
@@ -22,7 +21,7 @@ REACH = 6.0  # standard deviations that must stay inside the domain of a quantit
 
 def is_fractal_dimension(x: Mechanism, name: str) -> bool:
     """True if a quantity is the D of a surface, of all joints or of one."""
-    quantities = stored_quantities(x)
+    quantities = x.stored_quantities()
     fields = {field.name: field for field in dataclasses.fields(Surface)}
     return name in quantities and quantities[name].meaning == fields["D"].metadata["meaning"]
 

@@ -21,12 +21,12 @@ from .._contact.material import mindlin_ratio
 from .._contact.persson import PerssonContact
 from .._mechanism.joint import Joint
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import joints_of, quantity_names, require_one, unit, value_of
+from .._mechanism.quantities import quantity_names, require_one, unit, value_of
 from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
-from .._stability.linearise import linearised
 from .._stability.quartic import rightmost_root
 from .._stability.stability import growth_rate, stability
+from .._stability.two_directions import two_directions
 from .design import DesignResult, design
 from .envelope import Envelope
 from .joints import with_contact_law, with_contacts
@@ -131,7 +131,7 @@ def verdict(
     """
     require_one("x", x)
     flag("friction_slope", friction_slope)
-    parts = joints_of(x)
+    parts = x.joints_by_name()
     laws_in_use = " and ".join(
         dict.fromkeys(type(part.contact).__name__ for part in parts.values())
     )
@@ -203,9 +203,11 @@ def _other_load(x: Mechanism, friction_slope: bool) -> list[tuple[str, str, Mech
 
 def _laws_of(x: Mechanism, area: Any) -> list[tuple[type[Contact], dict[str, Contact]]]:
     """The other laws of the surfaces on nominal areas, by joint."""
-    parts = {name: p for name, p in joints_of(x).items() if p.contact.has_surface}
+    parts = {name: p for name, p in x.joints_by_name().items() if p.contact.has_surface}
     if not parts:
-        kinds = " and ".join(dict.fromkeys(type(p.contact).__name__ for p in joints_of(x).values()))
+        kinds = " and ".join(
+            dict.fromkeys(type(p.contact).__name__ for p in x.joints_by_name().values())
+        )
         raise ValueError(f"area needs a contact with a surface, got a {kinds}")
     if not isinstance(area, Mapping):
         area = dict.fromkeys(parts, area)
@@ -232,14 +234,14 @@ class _GrowthRates(NamedTuple):
 
 
 @functools.partial(exported_jit, static_argnames="friction_slope")
-def _growth_rates(mechanisms: tuple[Mechanism, ...], friction_slope: bool) -> _GrowthRates:
+def _growth_rates(mechanisms: tuple[Any, ...], friction_slope: bool) -> _GrowthRates:
     """Growth rates of m mechanisms, and of the first over K_t/K_n, in one program.
 
     The ratios of each joint lie between its own, the fractal law's and Mindlin's.
     """
     first, zero = mechanisms[0], FixedContact(0.0, 0.0, 1.0)
     stiffness, ends = {}, []
-    for name, part in joints_of(first).items():
+    for name, part in first.joints_by_name().items():
         contact, friction = part.contact, part.friction
         if getattr(contact, "material", None) is None:
             continue
@@ -262,15 +264,15 @@ def _growth_rates(mechanisms: tuple[Mechanism, ...], friction_slope: bool) -> _G
         contacts = {}
         for (name, (K_n, K_t)), ratio in zip(stiffness.items(), row, strict=True):
             K_t = jnp.where(K_n > 0, ratio * K_n, K_t)
-            P = getattr(joints_of(first)[name].contact, "P", zero.P)
+            P = getattr(first.joints_by_name()[name].contact, "P", zero.P)
             contacts[name] = substitute(zero, {"K_n": K_n, "K_t": K_t, "P": P})
         return with_contacts(first, contacts)
 
     if isinstance(first, Scene):
         # One closed form for all: each use of it takes long to compile.
-        systems = [linearised(x, friction_slope) for x in mechanisms if isinstance(x, Scene)]
+        systems = [two_directions(x, friction_slope).polynomial for x in mechanisms]
         own_systems = jax.tree.map(lambda *x: jnp.stack(x), *systems)
-        at_ratios = jax.vmap(lambda row: linearised(at(row), friction_slope))(ratios)
+        at_ratios = jax.vmap(lambda row: two_directions(at(row), friction_slope).polynomial)(ratios)
         every = jax.tree.map(lambda *x: jnp.concatenate(x), own_systems, at_ratios)
         rates = jax.vmap(rightmost_root)(every).real
         trace = -(systems[0].c_1 + systems[0].c_2)

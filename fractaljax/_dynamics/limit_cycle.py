@@ -11,7 +11,6 @@ from jaxtyping import Array, ArrayLike, Float, ScalarLike
 from .._base.parts import concrete, number, raise_unless, require_kind, whole
 from .._base.programs import exported_jit
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import joints_of
 from .._mechanism.scene import Scene
 from .._stability.stability import growth_rate
 from .cycle import CycleResult, LimitCycle, Orbit
@@ -117,7 +116,7 @@ def refine_cycle(cycle: LimitCycle, arguments: tuple, count: int, static: dict) 
 
 def check_arguments(mechanism, start, excitation, rtol, max_returns, search, segments=None):
     """Options of a search: `max_returns` as a number, segment count, and what is static."""
-    n, joints = degrees_of_freedom(mechanism), joints_of(mechanism)
+    n, joints = degrees_of_freedom(mechanism), mechanism.joints_by_name()
     if excitation is not None:
         require_kind("excitation", excitation, Excitation)
     require_kind("search", search, CycleSearch)

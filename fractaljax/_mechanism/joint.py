@@ -92,7 +92,40 @@ def require_load(contact: Contact, what: str) -> None:
         raise ValueError(f"{what} needs a contact with a normal load P, got {brief(contact)}")
 
 
-class Joint(Part):
+class AnyJoint(Part):
+    """The common face of a `Joint` and of a `Scene`, which is its own joint."""
+
+    contact: eqx.AbstractVar[Any]
+    friction: eqx.AbstractVar[Friction]
+    tangential: eqx.AbstractVar[Stored]
+    normal: eqx.AbstractVar[Stored | None]
+    V: eqx.AbstractVar[Numbers | None]
+    preload: eqx.AbstractVar[bool | str]
+
+    @property
+    def normal_load(self) -> Numbers | None:
+        """P [N], if the friction's normal force includes it; None in the source's form."""
+        return self.contact.P if self.preload or self.normal is None else None
+
+    @property
+    def follows_load_curve(self) -> bool:
+        """True if the normal force is the load curve of the contact law."""
+        curve = self.preload is True and self.normal is not None
+        return curve and self.contact.opening_exponent is not None
+
+    def stiffness(self) -> tuple[Numbers, Numbers]:
+        """(K_n, K_t) [N/m], scalars, from Eqs. 30 and 36 or as given."""
+        return self.contact.stiffness(self.friction.mu_s, self.friction.mu_m)
+
+    def coefficient(self) -> Numbers:
+        """The friction coefficient mu at the joint's sliding velocity, a scalar."""
+        law = self.friction
+        if self.V is None or not law.velocity_dependent:
+            return law.mu_s
+        return law.mu(self.V)
+
+
+class Joint(AnyJoint):
     """A contact with friction between two bodies of a structure, or between a body and the ground.
 
     `tangential` and `normal` are directions t and n, rows (n,) of weights of the degrees of
@@ -148,38 +181,12 @@ class Joint(Part):
             None if loss_factor is None else number("loss_factor", loss_factor, at_least=0)
         )
 
-    @property
-    def normal_load(self) -> Numbers | None:
-        """P [N], if the friction's normal force includes it; None in the source's form."""
-        return self.contact.P if self.preload or self.normal is None else None
-
-    @property
-    def follows_load_curve(self) -> bool:
-        """True if the normal force is the load curve of the contact law."""
-        return self.normal is not None and follows_load_curve(self)
-
-    def stiffness(self) -> tuple[Numbers, Numbers]:
-        """(K_n, K_t) [N/m], scalars, from Eqs. 30 and 36 or as given."""
-        return self.contact.stiffness(self.friction.mu_s, self.friction.mu_m)
-
     def complex_stiffness(self, K_n: Numbers, K_t: Numbers) -> tuple[Numbers, Numbers]:
         """K_n (1 + i eta) and K_t (1 + i eta) of an oscillation; K_n and K_t without eta."""
         if self.loss_factor is None:
             return K_n, K_t
         complex_one = 1 + 1j * self.loss_factor
         return K_n * complex_one, K_t * complex_one
-
-    def coefficient(self) -> Numbers:
-        """The friction coefficient mu at the joint's sliding velocity, a scalar."""
-        law = self.friction
-        if self.V is None or not law.velocity_dependent:
-            return law.mu_s
-        return law.mu(self.V)
-
-
-def follows_load_curve(joint: Any) -> bool:
-    """True if a scene, or a joint with a normal direction, follows the load curve of its law."""
-    return joint.preload is True and joint.contact.opening_exponent is not None
 
 
 # --- directions --------------------------------------------------------------------------------

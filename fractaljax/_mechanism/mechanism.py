@@ -2,16 +2,87 @@
 
 import abc
 import os
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
+
+import equinox as eqx
+from jaxtyping import Array
 
 from .._base.files import read_bounded
 from .._base.parts import Part
 from .._base.toml import naming, read_toml
 
+if TYPE_CHECKING:
+    from .joint import AnyJoint
+    from .structure import Structure
+
+
+class Derived(NamedTuple):
+    """A quantity that is not stored but follows from stored ones, and can be set by them."""
+
+    meaning: str  # and symbol
+    domain: dict[str, float]  # as `number` takes it
+    get: Callable[[Any], Array]
+    set: Callable[[Any, Any], dict[str, Any]]  # the changes of stored quantities
+
 
 class Mechanism(Part):
-    """Bodies with friction in their joints; a `Scene` is the smallest."""
+    """Bodies with friction in their joints: a `Structure`, or a `Scene`, the smallest.
+
+    Callers ask the mechanism for what they need, not which class it is.
+    """
+
+    names: eqx.AbstractVar[tuple[str, ...] | None]  # of the n degrees of freedom
+    joint_names: eqx.AbstractVar[tuple[str, ...]]
+    kind: eqx.AbstractClassVar[str]  # in messages
+
+    @property
+    @abc.abstractmethod
+    def n(self) -> int:
+        """The number of degrees of freedom."""
+
+    @property
+    def uncoupled(self) -> bool:
+        """True for the mass on a belt of Eq. 39, for which equations of closed form hold.
+
+        Its M, C and K are diagonal, and its joint acts along its two degrees of freedom.
+        """
+        return False
+
+    @property
+    def band(self) -> tuple[float, float] | None:
+        """The range of |Im s| [rad/s] in which eigenvalues are valid; None for no limit."""
+        return None
+
+    @property
+    def coarse(self) -> Any:
+        """A subspace with approximate modes for a reduced structure, else None."""
+        return None
+
+    @abc.abstractmethod
+    def require_one(self) -> None:
+        """Refuse a batch, and what is too large for computations without reduction."""
+
+    @abc.abstractmethod
+    def as_structure(self) -> "Structure":
+        """This mechanism by its matrices."""
+
+    @abc.abstractmethod
+    def joints_by_name(self) -> "dict[str, AnyJoint]":
+        """The joints; a scene is its own joint, named ""."""
+
+    @abc.abstractmethod
+    def with_joints(self, joints: Mapping[str, Any]) -> Self:
+        """A copy with other joints of the same names, not checked."""
+
+    @abc.abstractmethod
+    def substituted(self, changes: Mapping[str, Any]) -> Self:
+        """Like `replace` for stored quantities that have a value, without checks."""
+
+    def derived_quantities(self) -> Mapping[str, Derived]:
+        """The quantities that can be set besides the stored ones."""
+        return {}
 
     @abc.abstractmethod
     def _rebuilt(self, changes: dict[str, Any]) -> Self:
@@ -41,8 +112,8 @@ class Mechanism(Part):
         new = self._rebuilt(changes)
         for name in changes:
             if name not in new._quantity_names():
-                kind, listed = type(self).__name__.lower(), ", ".join(new._quantity_names())
-                raise ValueError(f"{kind} has no quantity {name!r}; it has {listed}")
+                listed = ", ".join(new._quantity_names())
+                raise ValueError(f"{self.kind} has no quantity {name!r}; it has {listed}")
         return new
 
     @classmethod

@@ -11,97 +11,36 @@ derived ones come last: K_t/K_n = 0.5 beside K_n = 1e8 N/m sets K_t = 5e7 N/m. A
 quantities of its joints, such as "left.D", and "D" for the D of all joints that have one.
 """
 
-import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from .._base.parts import (
-    Part,
-    brief,
-    is_traced,
-    number,
-    quantities,
-    quantity_name,
-    require_scalar,
-    substitute,
-)
+from .._base.parts import brief, is_traced, number, substitute
 from .mechanism import Mechanism
-from .scene import Scene, stiffness
-from .structure import Structure, require_single, too_large
-
-STIFFNESS_RATIO, FREQUENCY_RATIO, FRICTION = "K_t/K_n", "omega_1/omega_2", "mu"
+from .scene import FRICTION
 
 
 def require_one(name: str, x: Any) -> None:
     """Refuse, as argument `name`, anything but a mechanism, and one that holds a batch."""
-    if isinstance(x, Structure):
-        require_single(x)
-        if x.is_sparse:
-            raise ValueError(too_large(x))
-    elif isinstance(x, Scene):
-        require_scalar(x)
-    else:
+    if not isinstance(x, Mechanism):
         raise TypeError(f"{name} must be a Scene or a Structure, got {brief(x)}")
-
-
-def joints_of(x: Mechanism) -> dict[str, Any]:
-    """The joints of a structure by name; a scene is its own joint, named ""."""
-    if isinstance(x, Structure):
-        return dict(zip(x.joint_names, x.joints, strict=True))
-    return {"": x}
-
-
-class Quantity(NamedTuple):
-    """A number of a scene or structure."""
-
-    value: Array | None  # None for an optional number without a value
-    unit: str
-    meaning: str
-    log: bool  # positive, and compared by ratios
-
-
-def stored_quantities(x: Part | Structure) -> dict[str, Quantity]:
-    """The numbers stored in a scene, a structure or a part by name, without the parts."""
-    stored = {}
-    if isinstance(x, Structure):
-        for name, joint in zip(x.joint_names, x.joints, strict=True):
-            joint_prefix = stored_quantities(joint)
-            stored = (
-                joint_prefix
-                | stored
-                | {f"{name}.{plain}": joint_prefix[plain] for plain in joint_prefix}
-            )
-        parameters = {
-            name: Quantity(value, "-", "parameter", False) for name, value in x.parameters.items()
-        }
-        return parameters | stored
-    for field in dataclasses.fields(x):
-        value, meant = getattr(x, field.name), field.metadata
-        if isinstance(value, Part):
-            stored |= stored_quantities(value)
-        elif "unit" in meant:
-            stored[quantity_name(field)] = Quantity(
-                value, meant["unit"], meant["meaning"], meant.get("log", False)
-            )
-    return stored
+    x.require_one()
 
 
 def quantity_names(x: Mechanism) -> list[str]:
     """The names that `replaced` takes: stored quantities, then the derived ones of a scene."""
-    return list(dict.fromkeys([*stored_quantities(x), *_derived(x)]))
+    return list(dict.fromkeys([*x.stored_quantities(), *x.derived_quantities()]))
 
 
 def require_quantity(x: Mechanism, name: str) -> None:
     """Refuse a name that is neither a stored nor a derived quantity, and list the valid names."""
     names = quantity_names(x)
     if name not in names:
-        kind = "structure" if isinstance(x, Structure) else "scene"
-        raise ValueError(f"{kind} has no quantity {name!r}; it has {', '.join(names)}")
+        raise ValueError(f"{x.kind} has no quantity {name!r}; it has {', '.join(names)}")
 
 
 def require_independent(x: Mechanism, names: Sequence[str]) -> None:
@@ -114,18 +53,15 @@ def require_independent(x: Mechanism, names: Sequence[str]) -> None:
 
 def target_quantities(x: Mechanism, name: str) -> set[str]:
     """The stored quantities that a name sets, with joint names in a structure."""
-    stored = stored_quantities(x)
+    stored = x.stored_quantities()
     if name not in stored:
-        targets = set(_DERIVED[name].set(x, 1.0))
-        if (
-            isinstance(x, Scene) and "friction" in targets
-        ):  # scaled as a whole: any coefficient in it may be its scale
-            law = stored_quantities(x.friction)
+        targets = set(x.derived_quantities()[name].set(x, 1.0))
+        if "friction" in targets:  # scaled as a whole: any coefficient in it may be its scale
+            (joint,) = x.joints_by_name().values()
+            law = joint.friction.stored_quantities()
             targets |= {each for each in law if law[each].unit == "-"}
         return targets
-    if isinstance(x, Structure) and "." not in name and name not in x.parameters:
-        return {f"{joint}.{name}" for joint in x.joint_names if f"{joint}.{name}" in stored}
-    return {name}
+    return {f"{joint}.{name}" for joint in x.joint_names} & stored.keys() or {name}
 
 
 def value_of(x: Mechanism, name: str) -> Float[Array, ""]:
@@ -134,9 +70,9 @@ def value_of(x: Mechanism, name: str) -> Float[Array, ""]:
     **Raises:** `ValueError` for an optional quantity without a value, and for a plain name whose
     value differs between the joints of a structure.
     """
-    stored = stored_quantities(x)
+    stored = x.stored_quantities()
     if name not in stored:
-        return _DERIVED[name].get(x)
+        return x.derived_quantities()[name].get(x)
     values = {each: stored[each].value for each in sorted(target_quantities(x, name))}
     first, *others = values.values()
     if first is None or any(value is None for value in others):
@@ -154,8 +90,8 @@ def replaced(x: Mechanism, values: Mapping[str, ArrayLike]) -> Any:
 
     **Raises:** `ValueError` for values outside their domain; traced values become NaN instead.
     """
-    derived = _derived(x)
-    stored = stored_quantities(x)
+    derived = x.derived_quantities()
+    stored = x.stored_quantities()
     checked = {
         name: value if name in stored else number(name, value, **derived[name].domain)
         for name, value in values.items()
@@ -174,8 +110,9 @@ def require_inside(x: Mechanism, axes: Mapping[str, np.ndarray], batch: int = 2*
     # Domains are intervals, and their limits are monotonic in other quantities, so the corners
     # decide. The exception is mu(V), by which `mu` scales the friction law.
     _require_all_inside(x, ends, batch)
-    if FRICTION in axes and isinstance(x, Scene):
-        law = {"V", *stored_quantities(x.friction)}
+    if FRICTION in axes and FRICTION in x.derived_quantities():
+        (joint,) = x.joints_by_name().values()
+        law = {"V", *joint.friction.stored_quantities()}
         among = {name: values for name, values in axes.items() if name in law}
         if among:
             _require_all_inside(x, {FRICTION: ends[FRICTION], **among}, batch)
@@ -194,24 +131,7 @@ def _require_all_inside(x, axes, batch):
 
 def substituted(x: Mechanism, values: Mapping[str, ArrayLike]) -> Any:
     """Like `replaced`, without checks; every quantity must have a value (`with_optional`)."""
-    settings = _settings(x, values)
-    if "friction" in settings:  # a new law, possibly with another tree structure
-        x = eqx.tree_at(lambda scene: scene.friction, x, settings.pop("friction"))
-    return _substitute(x, settings)
-
-
-def _substitute(x, values):
-    if not isinstance(x, Structure):
-        return substitute(x, values)
-    joints = []
-    for name, joint in zip(x.joint_names, x.joints, strict=True):
-        plain_names = {f"{name}.{plain}": plain for plain in quantities(joint)}
-        plain = {key: value for key, value in values.items() if key in plain_names.values()}
-        named = {plain_names[key]: value for key, value in values.items() if key in plain_names}
-        joints.append(substitute(joint, plain | named))
-    x = eqx.tree_at(lambda s: s.joints, x, tuple(joints))
-    parameters = {name: values[name] for name in x.parameters if name in values}
-    return eqx.tree_at(lambda s: s.parameters, x, x.parameters | parameters) if parameters else x
+    return x.substituted(_settings(x, values))
 
 
 def with_optional(x: Mechanism, names: Sequence[str]) -> Any:
@@ -219,7 +139,7 @@ def with_optional(x: Mechanism, names: Sequence[str]) -> Any:
 
     None cannot be substituted, and it decides what a program computes.
     """
-    stored = stored_quantities(x)
+    stored = x.stored_quantities()
     targets = {name for chosen in names for name in target_quantities(x, chosen)}
     missing = {name: 1.0 for name in targets & stored.keys() if stored[name].value is None}
     return x.replace(**missing) if missing else x
@@ -227,7 +147,7 @@ def with_optional(x: Mechanism, names: Sequence[str]) -> Any:
 
 def _settings(x, values):
     """The changes for `replace` or `substitute` that set quantities to these values."""
-    stored = stored_quantities(x)
+    stored = x.stored_quantities()
     settings = {name: value for name, value in values.items() if name in stored}
     if len(settings) == len(values):
         return settings
@@ -236,7 +156,7 @@ def _settings(x, values):
     )
     for name, value in values.items():
         if name not in stored:
-            settings |= _DERIVED[name].set(updated, value)
+            settings |= x.derived_quantities()[name].set(updated, value)
     return settings
 
 
@@ -255,99 +175,32 @@ def axis_values(x: Mechanism, name: str, values: ArrayLike | Sequence[float]) ->
 
 def unit(x: Mechanism, name: str) -> str:
     """The unit of a quantity, "-" for a ratio."""
-    stored = stored_quantities(x)
+    stored = x.stored_quantities()
     return stored[name].unit if name in stored else "-"
 
 
 def meaning(x: Mechanism, name: str) -> str:
     """The meaning of a quantity in words."""
-    stored = stored_quantities(x)
+    stored = x.stored_quantities()
     if name not in stored:
-        return _DERIVED[name].meaning
+        return x.derived_quantities()[name].meaning
     return stored[name].meaning.split(";")[0].split(",")[0]
 
 
 def label(x: Mechanism, name: str) -> str:
     """Axis label of a quantity: its meaning, symbol and unit."""
-    stored = stored_quantities(x)
+    stored = x.stored_quantities()
     if name not in stored:
         return f"{meaning(x, name)} [-]"
     return f"{meaning(x, name)} {name} [{stored[name].unit}]"
 
 
-# --- friction at the belt velocity --------------------------------------------------------
-
-
-def sliding_friction(scene: Scene) -> Array:
-    """The friction coefficient mu(V) at the belt velocity."""
-    friction = scene.friction
-    if not friction.velocity_dependent:
-        return friction.mu_s
-    return friction.mu(scene.oscillator.V)
-
-
-def with_friction_times(x: Any, factor: ArrayLike) -> Any:
+def with_friction_times(x: Mechanism, factor: ArrayLike) -> Any:
     """A scene or structure with each friction law multiplied by `factor`; not checked."""
-    if isinstance(x, Structure):
-        joints = tuple(with_friction_times(joint, factor) for joint in x.joints)
-        return eqx.tree_at(lambda s: s.joints, x, joints)
-    return eqx.tree_at(lambda part: part.friction, x, x.friction.times(factor))
-
-
-def _friction_times(scene, factor):
-    law = scene.friction
-    scaled = law.times(factor)
-    if not law.amplitudes:
-        return {"friction": scaled}
-    names = {path[-1]: name for name, path in quantities(law).items() if len(path) == 1}
-    return {names[field]: getattr(scaled, field) for field in law.amplitudes}
-
-
-# --- derived quantities -------------------------------------------------------------------
-
-
-class _Derived(NamedTuple):
-    meaning: str  # and symbol
-    domain: dict[str, float]  # as `number` takes it
-    get: Callable[[Any], Array]
-    set: Callable[[Any, Any], dict[str, Any]]
-
-
-def _stiffness_ratio(scene):
-    K_n, K_t = stiffness(scene)
-    return K_t / K_n
-
-
-def _set_stiffness_ratio(scene, ratio):
-    if hasattr(scene.contact, "stiffness_ratio"):
-        return {"stiffness_ratio": ratio}
-    return {"K_t": ratio * scene.contact.K_n}
-
-
-_DERIVED = {
-    STIFFNESS_RATIO: _Derived(
-        "stiffness ratio K_t/K_n", {"at_least": 0}, _stiffness_ratio, _set_stiffness_ratio
-    ),
-    FREQUENCY_RATIO: _Derived(
-        "ratio of natural frequencies ω₁/ω₂",
-        {"above": 0},
-        lambda scene: scene.oscillator.omega_1 / scene.oscillator.omega_2,
-        lambda scene, ratio: {"omega_1": ratio * scene.oscillator.omega_2},
-    ),
-    FRICTION: _Derived(
-        "friction coefficient at the belt velocity µ",
-        {"above": 0},
-        sliding_friction,
-        lambda scene, mu: _friction_times(scene, mu / sliding_friction(scene)),
-    ),
-}
-
-
-def _derived(x: Mechanism) -> Mapping[str, _Derived]:
-    if not isinstance(x, Scene):
-        return {}
-    contact = x.contact
-    settable = hasattr(contact, "stiffness_ratio") or {"K_n", "K_t"} <= {
-        *stored_quantities(contact)
-    }
-    return {name: _DERIVED[name] for name in _DERIVED if settable or name != STIFFNESS_RATIO}
+    joints = x.joints_by_name().items()
+    return x.with_joints(
+        {
+            name: eqx.tree_at(lambda part: part.friction, joint, joint.friction.times(factor))
+            for name, joint in joints
+        }
+    )

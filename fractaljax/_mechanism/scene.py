@@ -1,15 +1,16 @@
 """A scene: a contact, a friction law and an oscillator."""
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax
 from jaxtyping import Array, Float
 
 from .._base.files import write_whole
-from .._base.parts import Numbers, quantities, rebuild, require_kind, require_scalar
+from .._base.parts import Numbers, quantities, rebuild, require_kind, require_scalar, substitute
 from .._base.toml import part_table, read_part, read_toml, write_toml
 from .._contact.contact import Contact
 from .._contact.fractal import FractalContact
@@ -19,16 +20,21 @@ from .._surface.surface import Surface
 from .joint import (
     JOINT_LAWS,
     PRELOAD_NOTE,
-    follows_load_curve,
+    AnyJoint,
     friction_for,
     preload_form,
     require_load,
 )
-from .mechanism import Mechanism
+from .mechanism import Derived, Mechanism
 from .oscillator import Oscillator
 
+if TYPE_CHECKING:
+    from .structure import Structure
 
-class Scene(Mechanism):
+STIFFNESS_RATIO, FREQUENCY_RATIO, FRICTION = "K_t/K_n", "omega_1/omega_2", "mu"
+
+
+class Scene(Mechanism, AnyJoint):
     """A mass on a belt, with its contact and friction, as one frozen pytree.
 
     The friction along the belt acts on the normal force N = K_n x_2, the source's form. With
@@ -39,6 +45,12 @@ class Scene(Mechanism):
     **Raises:** `TypeError` for a part of the wrong kind; `ValueError` if the contact is fractal
     and the smallest friction exceeds 0.9, the limit of Eq. 19, and for preload without a P.
     """
+
+    kind: ClassVar[str] = "scene"
+    names: ClassVar[tuple[str, ...]] = "x1", "x2"  # along the belt, and normal to it
+    joint_names: ClassVar[tuple[str, ...]] = ("",)
+    tangential: ClassVar[tuple[str]] = ("x1",)
+    normal: ClassVar[tuple[str]] = ("x2",)
 
     contact: Any  # a Contact; its other attributes depend on its class
     friction: Friction  # friction law at the belt
@@ -61,14 +73,53 @@ class Scene(Mechanism):
             require_load(contact, "preload")
 
     @property
-    def normal_load(self) -> Numbers | None:
-        """P [N], if the friction's normal force includes it; None in the source's form."""
-        return self.contact.P if self.preload else None
+    def n(self) -> int:
+        """The number of degrees of freedom, 2."""
+        return 2
 
     @property
-    def follows_load_curve(self) -> bool:
-        """True if the normal force is the load curve of the contact law."""
-        return follows_load_curve(self)
+    def uncoupled(self) -> bool:
+        """True: the equations of the mass on a belt have closed forms."""
+        return True
+
+    @property
+    def V(self) -> Numbers:
+        """The belt velocity [m/s]."""
+        return self.oscillator.V
+
+    def stiffness(self) -> tuple[Numbers, Numbers]:
+        """(K_n, K_t) [N/m], as the function `stiffness`."""
+        return stiffness(self)
+
+    def require_one(self) -> None:
+        """Refuse a scene that holds arrays: `jax.vmap` takes many."""
+        require_scalar(self)
+
+    def as_structure(self) -> "Structure":
+        """As `Structure.from_scene`."""
+        from .structure import Structure
+
+        return Structure.from_scene(self)
+
+    def joints_by_name(self) -> dict[str, AnyJoint]:
+        """The scene, which is its own joint, by the name ""."""
+        return {"": self}
+
+    def with_joints(self, joints: Mapping[str, Any]) -> "Scene":
+        """The only one of `joints`."""
+        return joints[""]
+
+    def substituted(self, changes: Mapping[str, Any]) -> "Scene":
+        """Like `replace` for stored quantities that have a value, without checks."""
+        changes = dict(changes)
+        friction = changes.pop("friction", self.friction)  # perhaps another tree structure
+        return substitute(eqx.tree_at(lambda scene: scene.friction, self, friction), changes)
+
+    def derived_quantities(self) -> dict[str, Derived]:
+        """K_t/K_n where a quantity of the contact sets it, omega_1/omega_2 and mu(V)."""
+        names = self.contact.stored_quantities().keys()
+        settable = hasattr(self.contact, "stiffness_ratio") or {"K_n", "K_t"} <= names
+        return {name: _DERIVED[name] for name in _DERIVED if settable or name != STIFFNESS_RATIO}
 
     def _rebuilt(self, changes):
         return rebuild(self, changes)
@@ -116,6 +167,48 @@ def stiffness(scene: Scene) -> tuple[Float[Array, ""], Float[Array, ""]]:
     require_kind("scene", scene, Scene)
     require_scalar(scene)
     return scene.contact.stiffness(scene.friction.mu_s, scene.friction.mu_m)
+
+
+# --- derived quantities -------------------------------------------------------------------
+
+
+def _stiffness_ratio(scene):
+    K_n, K_t = stiffness(scene)
+    return K_t / K_n
+
+
+def _set_stiffness_ratio(scene, ratio):
+    if hasattr(scene.contact, "stiffness_ratio"):
+        return {"stiffness_ratio": ratio}
+    return {"K_t": ratio * scene.contact.K_n}
+
+
+def _set_friction(scene, mu):
+    law = scene.friction
+    scaled = law.times(mu / scene.coefficient())
+    if not law.amplitudes:
+        return {"friction": scaled}
+    names = {path[-1]: name for name, path in quantities(law).items() if len(path) == 1}
+    return {names[field]: getattr(scaled, field) for field in law.amplitudes}
+
+
+_DERIVED = {
+    STIFFNESS_RATIO: Derived(
+        "stiffness ratio K_t/K_n", {"at_least": 0}, _stiffness_ratio, _set_stiffness_ratio
+    ),
+    FREQUENCY_RATIO: Derived(
+        "ratio of natural frequencies ω₁/ω₂",
+        {"above": 0},
+        lambda scene: scene.oscillator.omega_1 / scene.oscillator.omega_2,
+        lambda scene, ratio: {"omega_1": ratio * scene.oscillator.omega_2},
+    ),
+    FRICTION: Derived(
+        "friction coefficient at the belt velocity µ",
+        {"above": 0},
+        AnyJoint.coefficient,
+        _set_friction,
+    ),
+}
 
 
 def brake_scene() -> Scene:

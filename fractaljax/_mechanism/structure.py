@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from .._base.files import read_bounded, write_together
 from .._base.parts import (
+    Quantity,
     brief,
     concrete,
     nan_where,
@@ -24,6 +25,7 @@ from .._base.parts import (
     require_kind,
     require_scalar,
     scalar,
+    substitute,
 )
 from .._base.programs import exported_jit
 from .._base.toml import naming, read_toml
@@ -79,6 +81,7 @@ class Structure(Mechanism):
     positive definite, which degree of freedom is unknown, or which joint is wrong.
     """
 
+    kind: ClassVar[str] = "structure"
     sums: dict[str, MatrixSum]  # of "M", "C", "K", and "K_loss" if there is any
     parameters: dict[str, Float[Array, ""]]  # of the coefficients in them
     F: Float[Array, " n"] | None  # static force [N]
@@ -217,7 +220,7 @@ class Structure(Mechanism):
             scale = float(omega) if self.sums["K_loss"].sparse else omega
             damping += [(c, X * (1 / scale)) for c, X in self._terms("K_loss")]
         joints = {}
-        for name, joint in zip(self.joint_names, self.joints, strict=True):
+        for name, joint in self.joints_by_name().items():
             joints[name] = rebuild(joint, {"loss_factor": None})
             if joint.loss_factor is None:
                 continue
@@ -266,21 +269,51 @@ class Structure(Mechanism):
                     )
                 terms.append((coefficient, placed(small, places, self.n, self.is_sparse)))
             added[name] = terms
-        return self._with_terms(added, self._joints_by_name, self.F, self.parameters)
+        return self._with_terms(added, self.joints_by_name(), self.F, self.parameters)
 
-    @property
-    def _joints_by_name(self) -> dict[str, Joint]:
+    def require_one(self) -> None:
+        """Refuse a batch, and a large sparse structure, which must be reduced first."""
+        require_single(self)
+        if self.is_sparse:
+            raise ValueError(too_large(self))
+
+    def as_structure(self) -> "Structure":
+        """The structure itself."""
+        return self
+
+    def joints_by_name(self) -> dict[str, Joint]:
+        """The joints by their names."""
         return dict(zip(self.joint_names, self.joints, strict=True))
 
-    @property
-    def band(self) -> tuple[float, float] | None:
-        """The range of |Im s| [rad/s] in which eigenvalues are valid; None for no limit."""
-        return None
+    def with_joints(self, joints: Mapping[str, Any]) -> Self:
+        """A copy with other joints of the same names, not checked."""
+        return eqx.tree_at(lambda structure: structure.joints, self, tuple(joints.values()))
 
-    @property
-    def coarse(self) -> Any:
-        """A subspace with approximate modes for a reduced structure, else None."""
-        return None
+    def stored_quantities(self) -> dict[str, Quantity]:
+        """The numbers of the joints, "D" of the first that has one and "left.D", and parameters."""
+        stored = {}
+        for name, joint in self.joints_by_name().items():
+            plain = joint.stored_quantities()
+            stored = plain | stored | {f"{name}.{each}": plain[each] for each in plain}
+        parameters = {
+            name: Quantity(value, "-", "parameter", False)
+            for name, value in self.parameters.items()
+        }
+        return parameters | stored
+
+    def substituted(self, changes: Mapping[str, Any]) -> Self:
+        """Like `replace` for stored quantities that have a value, without checks."""
+        joints = {}
+        for name, joint in self.joints_by_name().items():
+            full_names = {f"{name}.{plain}": plain for plain in quantities(joint)}
+            plain = {key: value for key, value in changes.items() if key in full_names.values()}
+            full = {full_names[key]: value for key, value in changes.items() if key in full_names}
+            joints[name] = substitute(joint, plain | full)
+        new = self.with_joints(joints)
+        parameters = {name: changes[name] for name in self.parameters if name in changes}
+        if not parameters:
+            return new
+        return eqx.tree_at(lambda s: s.parameters, new, new.parameters | parameters)
 
     @property
     def is_sparse(self) -> bool:

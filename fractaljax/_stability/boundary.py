@@ -20,23 +20,16 @@ from .._contact.contact import Regime
 from .._continuation import Continuation, Curve, CurveEnd, trace
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import (
-    joints_of,
     require_independent,
     require_inside,
     require_one,
     require_quantity,
-    stored_quantities,
     substituted,
     with_friction_times,
     with_optional,
 )
-from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
-from .critical_friction import critical_frequency, hopf_test_function
-from .critical_pair import critical_pair
-from .linearise import Pressed, assembled, linearised_at, pressed, with_equilibrium
-from .quadratic import solve
-from .quartic import rightmost_root
+from .linearise import assembled, linearised, with_equilibrium
 
 Window = tuple[str, float, float]
 
@@ -102,7 +95,7 @@ class Boundary(Record):
 
 
 def hopf_boundary(
-    scene: Scene | Structure,
+    scene: Mechanism,
     x: Window,
     y: Window,
     *,
@@ -154,7 +147,7 @@ def hopf_boundary(
     low, high = jnp.asarray(ends.T, jax.tree.leaves(scene)[0].dtype)
     scene = with_optional(scene, names)
     rigid = None
-    if isinstance(scene, Structure):
+    if not scene.uncoupled:
         with_equilibrium(scene, friction_slope)
         rigid = _rigid(scene, friction_slope)
     field = _Field(_Plane(scene, low, high, rigid, names, logarithmic, friction_slope))
@@ -191,7 +184,7 @@ def _check_window(scene, which, window) -> Window:
 
 def _decisive_values(scene, name, low, high) -> np.ndarray:
     """The values of a range that decide if all of it is inside the domain of the scene."""
-    quantities = stored_quantities(scene)
+    quantities = scene.stored_quantities()
     # mu(V), by which "mu" scales the friction law, is least at V = v_m: perhaps between the ends.
     other = {"V": "v_m", "v_m": "V"}.get(name)
     value = quantities[other].value if other in quantities else None
@@ -234,7 +227,7 @@ class _Plane(eqx.Module):
 
     def at(self, u) -> _Point:
         scene = substituted(self.scene, dict(zip(self.names, self.quantities(u), strict=True)))
-        fractal = [joint for joint in joints_of(scene).values() if joint.contact.fractal]
+        fractal = [joint for joint in scene.joints_by_name().values() if joint.contact.fractal]
         laws = [joint.friction for joint in fractal]
         states = [
             joint.contact.state(law.mu_s, law.mu_m)
@@ -242,24 +235,15 @@ class _Plane(eqx.Module):
         ]
         regimes = tuple(state.regime for state in states)
         lowest = tuple(law.mu_m for law in laws)
-        if isinstance(scene, Structure):
-            attached = assembled(scene, self.friction_slope, refuse=False)
-            pair = critical_pair(*attached.matrices, self.rigid, scene.band)
-            return _Point(*pair, attached.open, regimes, lowest)
-        pressed_joints = [Pressed(state.K_n, state.K_t, None) for state in states]
-        joint = pressed_joints[0] if pressed_joints else pressed(scene)
-        lin = linearised_at(scene, joint, self.friction_slope)
-        damping = jnp.stack([lin.c_1, lin.c_2]) / jnp.sqrt(lin.a + lin.b)
-        growth, frequency = rightmost_root(lin).real, critical_frequency(lin)
-        test = hopf_test_function(lin)
-        return _Point(test, frequency, growth, damping, jnp.isnan(test), regimes, lowest)
+        system = linearised(scene, self.friction_slope, refuse=False)
+        return _Point(*system.critical(self.rigid), system.open, regimes, lowest)
 
 
 @functools.partial(jax.jit, static_argnums=1)
 def _rigid(structure: Structure, friction_slope: bool):
     """The number of rigid-body eigenvalues, at little friction."""
     x = with_friction_times(structure, 1e-3)
-    return (solve(*assembled(x, friction_slope).matrices).s == 0).sum()
+    return (assembled(x, friction_slope).solve().s == 0).sum()
 
 
 @jax.jit
@@ -319,7 +303,9 @@ class _Field:
         if lost.any():
             place = zip(self.plane.names, self.quantities(us[lost][0]), strict=True)
             where = ", ".join(f"{name} = {value:.6g}" for name, value in place)
-            loaded = any(x.normal_load is not None for x in joints_of(self.plane.scene).values())
+            loaded = any(
+                x.normal_load is not None for x in self.plane.scene.joints_by_name().values()
+            )
             may = "; the joint may be open there" if loaded else ""
             raise ValueError(f"stability cannot be computed at {where}{may}")
         return tests.astype(float), gradients.astype(float)

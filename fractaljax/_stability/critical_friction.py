@@ -20,53 +20,18 @@ from .._base.parts import brief, concrete, flag, nan_where
 from .._base.programs import exported_jit
 from .._base.singular import positive_sqrt, safe_divide
 from .._contact.contact import MU_M_MAX
-from .._mechanism.oscillator import (
-    Linearised,
-    dimensionless,
-    linearise,
-    static_normal_force,
-)
-from .._mechanism.quantities import joints_of, require_one, sliding_friction, with_friction_times
+from .._mechanism.joint import Joint
+from .._mechanism.mechanism import Mechanism
+from .._mechanism.oscillator import dimensionless, linearise, static_normal_force
+from .._mechanism.quantities import require_one, with_friction_times
 from .._mechanism.scene import Scene, stiffness
-from .._mechanism.structure import Joint, Structure
-from .critical_pair import critical_pair, least_test
+from .critical_pair import least_test
 from .linearise import assembled, linearised
-from .quadratic import solve
-
-
-def critical_coupling(lin: Linearised) -> Float[Array, ""]:
-    """g_c [1/s^4], the coupling at which a pair of eigenvalues is imaginary.
-
-    Without damping it depends on how the damping vanishes: the value is that of equal damping,
-    (a - b)^2/4, at which the modes coalesce.
-    """
-    a_3, a_1 = lin.c_1 + lin.c_2, lin.c_1 * lin.b + lin.c_2 * lin.a
-    half = jnp.full_like(a_3, 0.5)
-    # Two quotients: products of dampings would underflow in derivatives in float32.
-    share = safe_divide(lin.c_1, a_3, half) * safe_divide(lin.c_2, a_3, half)
-    return share * ((lin.a - lin.b) ** 2 + a_3 * a_1)
-
-
-def hopf_test_function(lin: Linearised) -> Float[Array, ""]:
-    """(g_c - g)/(a + b)^2 [-], below 0 exactly where an eigenvalue has a positive real part.
-
-    It varies on the scale of the stiffness, unlike the growth rate and the margin, which vary on
-    that of the damping. That suits Newton's method. Negative where a direction has negative
-    damping, whatever g_c.
-    """
-    _, lin = dimensionless(lin)
-    value = critical_coupling(lin) - lin.g
-    return jnp.where((lin.c_1 < 0) | (lin.c_2 < 0), -jnp.abs(value), value)
-
-
-def critical_frequency(lin: Linearised) -> Float[Array, ""]:
-    """Frequency [Hz] of the imaginary pair where g = g_c: omega^2 = a_1/a_3."""
-    a_3, a_1 = lin.c_1 + lin.c_2, lin.c_1 * lin.b + lin.c_2 * lin.a
-    return positive_sqrt(safe_divide(a_1, a_3, (lin.a + lin.b) / 2)) / (2 * jnp.pi)
+from .two_directions import critical_coupling
 
 
 def critical_friction(
-    scene: Scene | Structure, friction_slope: bool = True, joint: str | None = None
+    scene: Mechanism, friction_slope: bool = True, joint: str | None = None
 ) -> Float[Array, ""]:
     """Friction coefficient mu(V) at which the scene or structure starts to squeal [-], a scalar.
 
@@ -100,20 +65,20 @@ def critical_friction(
     """
     require_one("scene", scene)
     sloping = flag("friction_slope", friction_slope)
-    if isinstance(scene, Structure):
-        coefficient = _coefficient(scene, joint)
-        factor = _factor_of_structure(scene, sloping)
-        return jnp.where(factor == jnp.inf, jnp.inf, coefficient * _finite(factor))
-    if joint is not None:
-        raise ValueError(f"joint names one of a structure, got {brief(joint)} for a scene")
-    return _critical_friction_of_scene(scene, sloping)
+    if scene.uncoupled:
+        if joint is not None:
+            raise ValueError(f"joint names one of a structure, got {brief(joint)} for a scene")
+        return _critical_friction_of_scene(scene, sloping)
+    coefficient = _coefficient(scene, joint)
+    factor = _factor_of_structure(scene, sloping)
+    return jnp.where(factor == jnp.inf, jnp.inf, coefficient * _finite(factor))
 
 
 def _finite(factor):
     return jnp.where(factor == jnp.inf, 1, factor)
 
 
-def _coefficient(structure: Structure, name: str | None) -> Array:
+def _coefficient(structure: Any, name: str | None) -> Array:
     """mu at the sliding velocity of the named joint, or the one that all joints share."""
     names = ", ".join(structure.joint_names)
     if not structure.joints:
@@ -148,7 +113,7 @@ def _critical_friction_of_scene(scene: Scene, friction_slope: bool) -> Float[Arr
     sloping = friction_slope and scene.friction.velocity_dependent
     if scene.contact.depends_on_friction or sloping or scene.follows_load_curve:
         factor, _ = _first_factor(scene, friction_slope)
-        return jnp.where(factor == jnp.inf, jnp.inf, sliding_friction(scene) * _finite(factor))
+        return jnp.where(factor == jnp.inf, jnp.inf, scene.coefficient() * _finite(factor))
     K_n, K_t = stiffness(scene)
     m = scene.oscillator.m
     lin = linearise(scene.oscillator, scene.friction, K_n, K_t, friction_slope=False)
@@ -178,10 +143,8 @@ class _FactorSearch(NamedTuple):
 
 def _test(x, factor, friction_slope, rigid):
     """The Hopf test function with each friction law times a factor."""
-    if isinstance(x, Structure):
-        attached = assembled(with_friction_times(x, factor), friction_slope, refuse=False)
-        return critical_pair(*attached.matrices, rigid, x.band).test
-    return hopf_test_function(linearised(with_friction_times(x, factor), friction_slope))
+    scaled = with_friction_times(x, factor)
+    return linearised(scaled, friction_slope, refuse=False).hopf_test(rigid)
 
 
 def _signs(x, factors, friction_slope, rigid):
@@ -190,13 +153,13 @@ def _signs(x, factors, friction_slope, rigid):
     One for each factor (k,). A number is 0 where rounding decides the sign. Rigid-body modes are
     those at the first factor, the least; later ones mean divergence.
     """
-    if not isinstance(x, Structure):
+    if x.uncoupled:
         values = jax.vmap(lambda f: _test(x, f, friction_slope, None))(factors)
         return values, jnp.isnan(values), None
 
     def modes_at(factor):
         attached = assembled(with_friction_times(x, factor), friction_slope, refuse=False)
-        return solve(*attached.matrices), attached
+        return attached.solve(), attached
 
     modes, attached = jax.vmap(modes_at)(factors)
     rigid = jnp.where(rigid < 0, (modes.s[0] == 0).sum(), rigid)
@@ -210,7 +173,7 @@ def _lattice(x):
     dtype = jax.tree.leaves(x)[0].dtype
     share = (jnp.arange(512, dtype=dtype) + 0.5) / 512
     factors = share / (1 - share)
-    for part in joints_of(x).values():
+    for part in x.joints_by_name().values():
         if part.contact.yields:
             lowest = part.friction.mu_m
             most = safe_divide(MU_M_MAX, lowest, jnp.full_like(lowest, jnp.inf))
@@ -252,7 +215,7 @@ def _first_factor(x: Any, friction_slope: bool):
         )
 
     zero, number = jnp.zeros((), groups.dtype), jnp.zeros((), int)
-    rigid = number - 1 if isinstance(x, Structure) else None
+    rigid = None if x.uncoupled else number - 1
     start = _FactorSearch(zero, zero + jnp.inf, zero - 1, zero > 0, number, number, rigid)
     final = jax.lax.while_loop(onward, search, start)
     bracketed = final.high < jnp.inf

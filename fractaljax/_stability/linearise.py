@@ -1,21 +1,27 @@
-"""The linearised equations about the sliding equilibrium: of a scene, and of a structure."""
+"""The linearised equations about the sliding equilibrium: by closed form, or by matrices."""
 
+import dataclasses
 import math
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float, ScalarLike
 
-from .._base.lapack import solve
+from .._base.lapack import solve as solve_linear
 from .._base.parts import concrete, flag
 from .._base.programs import exported_jit
 from .._base.rounding import rounding_error
-from .._contact.load_curve import LoadCurve, loaded_equilibrium
-from .._mechanism.oscillator import Linearised, linearise, static_normal_force
-from .._mechanism.quantities import sliding_friction
-from .._mechanism.scene import Scene, stiffness
+from .._contact.load_curve import loaded_equilibrium
+from .._mechanism.reduced import CoarseSpace
 from .._mechanism.structure import Structure, require_single
+from .band import among, in_band
+from .critical_pair import CriticalPair, critical_pair
+from .margin import least_damping_ratio
+from .quadratic import Modes, solve
+from .rightmost import rightmost
+from .two_directions import Eigensolution, TwoDirections, load_curve, on_curve, two_directions
 
 NO_EQUILIBRIUM = (
     "F has no static equilibrium to rounding: a rigid-body mode is left free; hold the structure, "
@@ -27,63 +33,7 @@ NO_PRESSED_EQUILIBRIUM = (
 )
 
 
-class Pressed(NamedTuple):
-    """The joint of a scene as it is at the equilibrium."""
-
-    K_n: Array
-    K_t: Array
-    static: tuple[Array, Array] | None  # x_01 and the normal force, where a load curve decides them
-
-
-def pressed(scene: Scene) -> Pressed:
-    """Stiffness at the equilibrium: the contact's own, or on a load curve its slope there."""
-    (K_n, K_t), P = stiffness(scene), scene.normal_load
-    if P is None or not scene.follows_load_curve:
-        return Pressed(K_n, K_t, None)
-    o, mu, curve = scene.oscillator, sliding_friction(scene), _curve_of(scene)
-    r_1, r_2 = 1 / (o.m * o.omega_1**2 + K_t), 1 / (o.m * o.omega_2**2 + K_n)
-    # A missing load does not push along x_2, nor rub along x_1.
-    by = K_n * r_2 * (1 + mu**2 * K_t * r_1) / (1 + mu**2 * K_n * r_2 * K_t * r_1)
-    linear = static_normal_force(o, K_n, K_t, mu, P) / P - 1
-    e = loaded_equilibrium([curve], linear[None], by[None, None])[0]
-    force, slope = _on_curve(curve, e)
-    x_01 = (o.F / jnp.sqrt(2.0) + mu * P * force) * r_1
-    return Pressed(K_n * slope, K_t, (x_01, P * force))
-
-
-def linearised(scene: Scene, friction_slope: bool) -> Linearised:
-    """The characteristic polynomial of a scene (Eq. 43), with the stiffness of its contact."""
-    return linearised_at(scene, pressed(scene), friction_slope)
-
-
-def linearised_at(scene: Scene, at: Pressed, friction_slope: bool) -> Linearised:
-    """As `linearised`, with the joint `at` its equilibrium."""
-    load = scene.normal_load
-    o, law = scene.oscillator, scene.friction
-    return linearise(o, law, at.K_n, at.K_t, friction_slope, load, at.static)
-
-
-def normal_force(scene: Scene, at: Pressed) -> Float[Array, " 1"] | None:
-    """The normal force [N] at the equilibrium of a preloaded scene; at most 0 if it is open."""
-    if scene.normal_load is None:
-        return None
-    if at.static is not None:
-        return at.static[1][None]
-    mu, P = sliding_friction(scene), scene.normal_load
-    return static_normal_force(scene.oscillator, at.K_n, at.K_t, mu, P)[None]
-
-
-def _curve_of(joint: Any) -> LoadCurve:
-    """The load curve of a scene or joint that follows one."""
-    return joint.contact.load_curve(joint.friction.mu_s, joint.friction.mu_m)
-
-
-def _on_curve(curve: LoadCurve, e) -> tuple[Array, Array]:
-    """N/P and its slope."""
-    return jax.jvp(curve, (e,), (jnp.ones_like(e),))
-
-
-class Assembled(NamedTuple):
+class Assembled(eqx.Module):
     """M x'' + C x' + K x = 0, each matrix (n, n), with the joints attached."""
 
     M: jax.Array
@@ -92,6 +42,8 @@ class Assembled(NamedTuple):
     C_error: jax.Array | None  # bound on the rounding error of C due to the equilibrium
     normal_force: jax.Array | None  # (m,) [N], as `Stability` has it
     supported: jax.Array | None  # whether there is an equilibrium, where one is needed
+    band: tuple[float, float] | None = eqx.field(static=True)  # of a reduced structure
+    coarse: CoarseSpace | None = eqx.field(static=True)
 
     @property
     def open(self) -> jax.Array:
@@ -104,9 +56,50 @@ class Assembled(NamedTuple):
         return self.open if self.supported is None else self.open | ~self.supported
 
     @property
-    def matrices(self) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array | None]:
-        """What `solve` takes."""
-        return self.M, self.C, self.K, self.C_error
+    def matrices(self) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """(M, C, K)."""
+        return self.M, self.C, self.K
+
+    def solve(self) -> Modes:
+        """All modes, with the rounding errors of their eigenvalues."""
+        return solve(*self.matrices, self.C_error)
+
+    def rightmost(self) -> Complex[Array, ""]:
+        """The eigenvalue with the largest real part [1/s]."""
+        return rightmost(self.matrices, self.band, self.coarse)
+
+    def margin(self, shift: ScalarLike = 0.0) -> Float[Array, ""]:
+        """As `margin`."""
+        return least_damping_ratio(among(self.solve().s - shift, self.band))
+
+    def modes(self) -> Eigensolution:
+        """All modes, those in the band first, the largest real part first."""
+        s, x, error, _ = self.solve()
+        rank = s.real if self.band is None else jnp.where(in_band(s, self.band), s.real, -jnp.inf)
+        order = jnp.lexsort((-s.imag, -rank))
+        s, x, error = s[order], x[order], error[order]
+        margin, counted = least_damping_ratio(among(s, self.band)), in_band(s, self.band)
+        if jnp.iscomplexobj(self.K):  # structural damping: some places may be left over
+            counted &= jnp.isfinite(error)
+        return Eigensolution(s, x, error, margin, counted)
+
+    def hopf_test(self, rigid: Array) -> Float[Array, ""]:
+        """The Hopf test function; `rigid` is the number of rigid-body eigenvalues."""
+        return self.critical(rigid).test
+
+    def critical(self, rigid: Array) -> CriticalPair:
+        """The critical mode, as `critical_pair`."""
+        return critical_pair(*self.matrices, self.C_error, rigid, self.band)
+
+
+def linearised(x: Any, friction_slope: bool, refuse: bool = True) -> TwoDirections | Assembled:
+    """The linearised equations of a mechanism, in closed form where there is one.
+
+    `refuse` as in `assembled`.
+    """
+    if x.uncoupled:
+        return two_directions(x, friction_slope)
+    return assembled(x, friction_slope, refuse)
 
 
 def assemble(
@@ -131,7 +124,7 @@ def assemble(
     **Raises:** `ValueError` for a batch, where a slope needs F and there is none, and if there is
     no equilibrium: a rigid-body mode is free.
     """
-    return with_equilibrium(structure, friction_slope)[:3]
+    return with_equilibrium(structure, friction_slope).matrices
 
 
 class Attachment(NamedTuple):
@@ -249,11 +242,12 @@ def assembled(structure: Structure, friction_slope: bool, refuse: bool = True) -
     uncertain = any(each is not None for each in attached.errors)
     error = jax.lax.stop_gradient(error) if uncertain else None
     forces = jnp.stack(attached.forces) if attached.loaded else None
-    system = Assembled(structure.M, C, K, error, forces, attached.supported)
+    about = structure.band, structure.coarse
+    system = Assembled(structure.M, C, K, error, forces, attached.supported, *about)
     if not refuse or (forces is None and attached.supported is None):
         return system
     C, K = (jnp.where(system.lost, jnp.nan, X) for X in (C, K))
-    return system._replace(C=C, K=K)
+    return dataclasses.replace(system, C=C, K=K)
 
 
 # One program: operation by operation the first call would compile sixty.
@@ -289,13 +283,13 @@ def _tangents(structure: Structure, F) -> tuple[list[tuple[Array, Array, Array |
     K_n, P = (jnp.stack([jnp.asarray(tangents[i][k]) for i in curved])[:, None] for k in (0, 2))
     # What the loads lack, one column each.
     columns = (lacking * P).T
-    displacements = solve(K, jnp.concatenate([total[:, None], columns], axis=1))
+    displacements = solve_linear(K, jnp.concatenate([total[:, None], columns], axis=1))
     relative_forces = K_n / P * normals @ displacements
-    curves = [_curve_of(structure.joints[i]) for i in curved]
+    curves = [load_curve(structure.joints[i]) for i in curved]
     displaced = loaded_equilibrium(curves, relative_forces[:, 0], relative_forces[:, 1:])
     for i, curve, e, n in zip(curved, curves, displaced, normals, strict=True):
         contact_stiffness, K_t, load = tangents[i]
-        force, slope = _on_curve(curve, e)
+        force, slope = on_curve(curve, e)
         load = jnp.asarray(load)
         tangent = load * (force - slope * e)
         F = F + (load - tangent) * n
@@ -303,7 +297,7 @@ def _tangents(structure: Structure, F) -> tuple[list[tuple[Array, Array, Array |
     return tangents, F
 
 
-def with_equilibrium(structure: Structure, friction_slope: bool) -> Assembled:
+def with_equilibrium(structure: Any, friction_slope: bool) -> Assembled:
     """As `assembled`.
 
     **Raises:** `ValueError` if the structure has no equilibrium, unless it is traced.
@@ -324,7 +318,7 @@ def require_equilibrium(x: Any, friction_slope: bool, result: Array) -> None:
 
     **Raises:** `ValueError` as `with_equilibrium`.
     """
-    values = concrete(result) if isinstance(x, Structure) else None
+    values = None if x.uncoupled else concrete(result)
     if values is not None and values.ndim == 0 and math.isnan(values):
         with_equilibrium(x, friction_slope)
 
@@ -335,12 +329,12 @@ def _equilibrium(F, K, directions) -> tuple[jax.Array, jax.Array, jax.Array]:
     x_0 (n,) solves K x_0 = F, the joints being in K and their friction under preload in F. The
     last result is True if there is an x_0 to rounding.
     """
-    x_0 = solve(K, F)
+    x_0 = solve_linear(K, F)
     along = directions @ x_0
     # K dx = -dK x_0 with |dK| <= eps |K| entry by entry, so that d.dx = -(K^-T d).(dK x_0).
     K, x_0, F, size = jax.lax.stop_gradient((K, jnp.abs(x_0), F, jnp.abs(along)))
     eps = jnp.finfo(K.dtype).eps
-    through = jnp.abs(solve(K.T, directions.T))
+    through = jnp.abs(solve_linear(K.T, directions.T))
     errors = rounding_error(K.dtype) * (jnp.abs(K) @ x_0) @ through
     supported = eps * jnp.abs(K).max() * x_0.max() <= 0.01 * jnp.abs(F).max()
     supported |= errors.max() <= 0.01 * size.max()

@@ -8,58 +8,12 @@ the modes are. Smooth minima with the sign of the true one extract the product u
 and the smaller of u_1 and u_2 from their product and their sum.
 """
 
-import functools
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float, ScalarLike
 
 from .._base.singular import positive_sqrt
-from .._mechanism.mechanism import Mechanism
 from .._mechanism.oscillator import Linearised, dimensionless
-from .._mechanism.structure import Structure
-from .band import among
-from .linearise import assembled, linearised, require_equilibrium
-from .quadratic import solve
-
-
-def margin(
-    scene: Mechanism, shift: ScalarLike = 0.0, friction_slope: bool = True
-) -> Float[Array, ""]:
-    """Margin of stability [-], a scalar: above 0 exactly where the growth rate is below `shift`.
-
-    Its scale is that of a damping ratio. For a scene with lightly damped, well separated modes it
-    is 0.5 to 1 times the least decay rate over the rms natural frequency sqrt((a + b)/2) in
-    contact; for modes within their damping of each other, about 0.3 times. It is analytic in the
-    scene where modes coalesce and where they cross. Only without any damping is it not: there it is
-    0 where stable and negative in flutter.
-
-    For a structure, it is the least damping ratio, which has kinks where modes cross: a smooth
-    measure of n degrees of freedom takes a Lyapunov equation of size 2n. With a shift the ratios
-    are those of the eigenvalues minus the shift. Rigid-body modes do not count without a shift.
-
-    **Arguments:**
-
-    - `scene`: a scene or structure of scalars.
-    - `shift`: growth rate [1/s] at which the margin is 0, a scalar, 0 by default.
-    - `friction_slope`: as in `growth_rate`; the margin is NaN where the growth rate is.
-
-    **Raises:** as `growth_rate`; `TypeError` for a `shift` that is no number.
-    """
-    kind = jnp.dtype(bool) if shift is None else jnp.result_type(shift)
-    if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
-        raise TypeError(f"shift must be a real number, got {kind}; friction_slope comes third")
-    value = _margin(scene, shift, friction_slope)
-    require_equilibrium(scene, friction_slope, value)
-    return value
-
-
-@functools.partial(jax.jit, static_argnums=2)
-def _margin(scene, shift, friction_slope):
-    if isinstance(scene, Structure):
-        s = solve(*assembled(scene, friction_slope).matrices).s
-        return least_damping_ratio(among(s - shift, scene.band))
-    return margin_of(linearised(scene, friction_slope), shift)
 
 
 def damping_ratios(s: Complex[Array, " k"]) -> Float[Array, " k"]:

@@ -93,7 +93,7 @@ def energy_shares(
     flag("friction_slope", friction_slope)
     modes = stability(x, friction_slope) if modes is None else modes
     require_kind("modes", modes, Stability)
-    structure = Structure.from_scene(x) if isinstance(x, Scene) else x
+    structure = x.as_structure()
     s: Any = np.asarray(modes.eigenvalues)
     shapes, counted = np.asarray(modes.shapes), np.asarray(modes.counted)
     if shapes.shape != (2 * structure.n, structure.n):

@@ -1,6 +1,6 @@
 """Linear stability of steady sliding: eigenvalues of a scene or a structure, and its modes.
 
-A scene takes the closed form of `quartic.py`, a structure LAPACK's route of `quadratic.py`.
+Two directions take the closed form of `quartic.py`, matrices LAPACK's route of `quadratic.py`.
 """
 
 import functools
@@ -11,28 +11,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float, ScalarLike
 
 from .._base.parts import Record
 from .._base.programs import exported_jit
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.oscillator import Linearised
-from .._mechanism.quantities import sliding_friction
 from .._mechanism.scene import Scene
-from .._mechanism.structure import Structure
-from . import quartic
-from .band import among, in_band
-from .linearise import (
-    assembled,
-    linearised,
-    linearised_at,
-    normal_force,
-    pressed,
-    require_equilibrium,
-)
-from .margin import damping_ratios, least_damping_ratio, margin_of
-from .quadratic import solve
-from .rightmost import rightmost
+from .linearise import linearised, require_equilibrium
+from .margin import damping_ratios
+from .two_directions import two_directions
 
 
 class Mode(NamedTuple):
@@ -163,10 +150,43 @@ def growth_rate(scene: Mechanism, friction_slope: bool = True) -> Float[Array, "
 
 @functools.partial(exported_jit, static_argnames="friction_slope")
 def _growth_rate(scene, friction_slope):
-    if isinstance(scene, Structure):
-        attached = assembled(scene, friction_slope)
-        return rightmost(attached.matrices[:3], scene.band, scene.coarse).real
-    return quartic.rightmost_root(linearised(scene, friction_slope)).real
+    return linearised(scene, friction_slope).rightmost().real
+
+
+def margin(
+    scene: Mechanism, shift: ScalarLike = 0.0, friction_slope: bool = True
+) -> Float[Array, ""]:
+    """Margin of stability [-], a scalar: above 0 exactly where the growth rate is below `shift`.
+
+    Its scale is that of a damping ratio. For a scene with lightly damped, well separated modes it
+    is 0.5 to 1 times the least decay rate over the rms natural frequency sqrt((a + b)/2) in
+    contact; for modes within their damping of each other, about 0.3 times. It is analytic in the
+    scene where modes coalesce and where they cross. Only without any damping is it not: there it is
+    0 where stable and negative in flutter.
+
+    For a structure, it is the least damping ratio, which has kinks where modes cross: a smooth
+    measure of n degrees of freedom takes a Lyapunov equation of size 2n. With a shift the ratios
+    are those of the eigenvalues minus the shift. Rigid-body modes do not count without a shift.
+
+    **Arguments:**
+
+    - `scene`: a scene or structure of scalars.
+    - `shift`: growth rate [1/s] at which the margin is 0, a scalar, 0 by default.
+    - `friction_slope`: as in `growth_rate`; the margin is NaN where the growth rate is.
+
+    **Raises:** as `growth_rate`; `TypeError` for a `shift` that is no number.
+    """
+    kind = jnp.dtype(bool) if shift is None else jnp.result_type(shift)
+    if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
+        raise TypeError(f"shift must be a real number, got {kind}; friction_slope comes third")
+    value = _margin(scene, shift, friction_slope)
+    require_equilibrium(scene, friction_slope, value)
+    return value
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _margin(scene, shift, friction_slope):
+    return linearised(scene, friction_slope).margin(shift)
 
 
 def stability(scene: Mechanism, friction_slope: bool = True) -> Stability:
@@ -185,28 +205,11 @@ def stability(scene: Mechanism, friction_slope: bool = True) -> Stability:
     return result
 
 
-def _solve_scene(scene, friction_slope):
-    joint = pressed(scene)
-    lin, forces = linearised_at(scene, joint, friction_slope), normal_force(scene, joint)
-    s, mobility = quartic.roots(lin), sliding_friction(scene) / scene.oscillator.m
-    x = _displacements(lin, s, mobility, joint.K_n, joint.K_t)
-    return s, x, quartic.resolutions(lin, s), margin_of(lin), forces
-
-
 @functools.partial(exported_jit, static_argnames="friction_slope")
 def _stability(scene, friction_slope):
-    if isinstance(scene, Structure):
-        attached = assembled(scene, friction_slope)
-        forces, (s, x, error, _) = attached.normal_force, solve(*attached.matrices)
-        order = jnp.lexsort((-s.imag, -_rank(s, scene.band)))
-        s, x, error = s[order], x[order], error[order]
-        counted = in_band(s, scene.band)
-        if scene.has_loss:
-            counted &= jnp.isfinite(error)
-        margin, names = least_damping_ratio(among(s, scene.band)), scene.names
-    else:
-        s, x, error, margin, forces = _solve_scene(scene, friction_slope)
-        counted, names = jnp.ones(s.shape, bool), ("x1", "x2")
+    system = linearised(scene, friction_slope)
+    forces = system.normal_force
+    s, x, error, margin, counted = system.modes()
     largest = jnp.abs(jax.lax.stop_gradient(x)).argmax(axis=1)
     return Stability(
         eigenvalues=s,
@@ -216,32 +219,10 @@ def _stability(scene, friction_slope):
         margin=margin,
         resolutions=error,
         shapes=x / jnp.take_along_axis(x, largest[:, None], axis=1),
-        names=names,
+        names=scene.names,
         normal_force=forces,
         counted=counted,
     )
-
-
-def _rank(s, band):
-    """The real part; -inf, so last, outside the band."""
-    return s.real if band is None else jnp.where(in_band(s, band), s.real, -jnp.inf)
-
-
-def _displacements(lin: Linearised, s, mobility, K_n, K_t) -> Complex[Array, "4 2"]:
-    """(x1, x2) of each eigenvalue s of a scene, of any length; `mobility` is mu/m.
-
-    (s^2 + c_1 s + a) x1 = mu K_n/m x2 and (s^2 + c_2 s + b) x2 = -mu K_t/m x1.
-    """
-    unit = lin.a + lin.b
-    first, second = ((s * (s + c) + k) / unit for c, k in ((lin.c_1, lin.a), (lin.c_2, lin.b)))
-    to_1, to_2 = (jnp.full_like(s, mobility * K / unit) for K in (K_n, K_t))
-    # Either equation will do; the other may be 0 = 0.
-    size_1, size_2 = (jnp.abs(y.real) + jnp.abs(y.imag) for y in (first, second))
-    by_first = size_1 + to_1.real >= size_2 + to_2.real
-    x = jnp.stack([jnp.where(by_first, to_1, second), jnp.where(by_first, first, -to_2)], axis=-1)
-    # Two equal modes without coupling: any shape is one.
-    none = (x == 0).all(axis=-1, keepdims=True)
-    return jnp.where(none, jnp.array([1, 0], x.dtype)[None], x)
 
 
 def require_computable(
@@ -261,12 +242,12 @@ def require_computable(
         raise ValueError(
             f"the joint is open at its equilibrium: the normal force is {force[0]:.6g} N"
         )
-    joint = pressed(scene)
-    lin = linearised_at(scene, joint, friction_slope)
+    system = two_directions(scene, friction_slope)
+    lin = system.polynomial
     quantities = {
-        "K_n [N/m]": joint.K_n,
-        "K_t [N/m]": joint.K_t,
-        "the friction at V": sliding_friction(scene),
+        "K_n [N/m]": system.K_n,
+        "K_t [N/m]": system.K_t,
+        "the friction at V": scene.coefficient(),
         "(K_t/m + omega_1^2) [1/s^2]": lin.a,
         "(K_n/m + omega_2^2) [1/s^2]": lin.b,
         "the damping of x1 [1/s]": lin.c_1,

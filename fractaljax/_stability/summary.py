@@ -12,16 +12,15 @@ from .._base.programs import exported_jit
 from .._base.table import table
 from .._contact.contact import Regime
 from .._contact.fixed import FixedContact
-from .._mechanism.quantities import sliding_friction
 from .._mechanism.scene import Scene, stiffness
 from .._mechanism.structure import Joint, Structure
 from .._surface.roughness import roughness
 from .._surface.spectrum import Spectrum
 from .critical_friction import critical_friction
-from .linearise import Assembled, linearised_at, normal_force, pressed, with_equilibrium
+from .linearise import Assembled, with_equilibrium
 from .margin import damping_ratios
-from .quartic import rightmost_root
 from .stability import Stability, require_computable, stability
+from .two_directions import two_directions
 
 ABSENT = "-"
 _STABLE = "stable against small disturbances"  # all that a growth rate can say
@@ -42,10 +41,10 @@ class _Critical(NamedTuple):
 @functools.partial(exported_jit, static_argnames="friction_slope")
 def _critical(scene: Scene, friction_slope: bool, wavelengths):
     """Critical mode, stiffness, contact state, and the roughness over wavelengths unless None."""
-    joint = pressed(scene)
-    s = rightmost_root(linearised_at(scene, joint, friction_slope))
+    system = two_directions(scene, friction_slope)
+    s = system.rightmost()
     frequency = jnp.abs(s.imag) / (2 * jnp.pi)
-    mode = _Critical(s.real, frequency, damping_ratios(s), normal_force(scene, joint))
+    mode = _Critical(s.real, frequency, damping_ratios(s), system.normal_force)
     rough = None if wavelengths is None else roughness(scene.contact.surface, *wavelengths)
     return mode, stiffness(scene), _contact_state(scene), rough
 
@@ -53,7 +52,7 @@ def _critical(scene: Scene, friction_slope: bool, wavelengths):
 @functools.partial(exported_jit, static_argnames="friction_slope")
 def _numbers(scene: Scene, friction_slope: bool):
     """Stability, stiffness, contact state and friction."""
-    friction = sliding_friction(scene)
+    friction = scene.coefficient()
     return stability(scene, friction_slope), stiffness(scene), _contact_state(scene), friction
 
 
@@ -208,7 +207,7 @@ def structure_table(structure: Structure, friction_slope: bool = True) -> str:
             raise ValueError(
                 f"joint {name} is open at the equilibrium: its normal force is {force:.6g} N"
             )
-    for name, X in zip("MCK", attached[:3], strict=True):
+    for name, X in zip("MCK", attached.matrices, strict=True):
         if not np.isfinite(np.asarray(X)).all():
             raise ValueError(f"{name} with the joints attached must be finite")
     modes = stability(structure, friction_slope)

@@ -35,7 +35,6 @@ from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
 from .band import in_band
 from .linearise import assembled
-from .quadratic import solve
 
 _NONE = complex(np.nan, np.nan)
 
@@ -226,9 +225,8 @@ def _modes_of(x: Scene | Structure, name: str, friction_slope: bool) -> Callable
 def _states(x: Scene | Structure, name: str, value: Any, friction_slope: bool):
     """Eigenvalues, right and left states, and which are counted, at a value of the quantity."""
     x = substituted(x, {name: value})
-    x = Structure.from_scene(x) if isinstance(x, Scene) else x
-    M, C, K, C_error = assembled(x, friction_slope).matrices
-    modes = solve(M, C, K, C_error)
+    system = assembled(x.as_structure(), friction_slope)
+    (M, C, _), modes = system.matrices, system.solve()
     s, Y = modes.s[:, None], modes.y
     left = jnp.concatenate([s * (Y @ M) + Y @ C, Y @ M], axis=1)
     right = jnp.concatenate([modes.x, s * modes.x], axis=1)

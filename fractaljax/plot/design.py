@@ -10,7 +10,6 @@ from .._base.parts import whole
 from .._base.ranges import within
 from .._contact.contact import Regime
 from .._design.design import Design
-from .._mechanism.quantities import stored_quantities
 from .._mechanism.scene import Scene, stiffness
 from .._mechanism.structure import Structure
 from .._stability.stability import growth_rate
@@ -112,7 +111,7 @@ def design(result: Design, ax: Axes | None = None) -> Axes:
         (result.initial, "o", 6, "white", "given surface"),
         (result.scene, "*", 11, "tab:cyan", final),
     ):
-        quantities: Any = stored_quantities(scene)
+        quantities: Any = scene.stored_quantities()
         style: dict[str, Any] = {"ms": size, "mfc": colour, "mec": "k", "ls": "none", "zorder": 5}
         at = [[float(quantities[name].value)] for name in names]
         handles += ax.plot(*at, marker, label=words, clip_on=False, **style)

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from .._design.many import DesignMany
-from .._mechanism.quantities import label, require_quantity, stored_quantities
+from .._mechanism.quantities import label, require_quantity
 from .axes import Axes, ensure_axes, legend_above
 
 
@@ -38,7 +38,7 @@ def design_map(
         require_quantity(designs.member, name)
     ax, met = ensure_axes(ax), np.asarray(designs.met)
     values = np.where(met, designs[quantity], np.nan)
-    words, quantities = label(designs.member, quantity), stored_quantities(designs.member)
+    words, quantities = label(designs.member, quantity), designs.member.stored_quantities()
     scale = quantity in quantities and quantities[quantity].log
     axes: list[np.ndarray] = [
         designs.mechanism_quantity(name) for name in ((x,) if y is None else (x, y))

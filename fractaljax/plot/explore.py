@@ -33,16 +33,13 @@ from .._mechanism.quantities import (
     require_independent,
     require_inside,
     require_quantity,
-    sliding_friction,
-    stored_quantities,
     substituted,
     unit,
     value_of,
     with_optional,
 )
 from .._mechanism.scene import Scene, stiffness
-from .._stability.linearise import linearised_at, pressed
-from .._stability.quartic import rightmost_root
+from .._stability.two_directions import two_directions
 from .._surface.roughness import roughness
 from .._surface.surface import frequency_count
 from .._surface.topography import random_phases
@@ -193,9 +190,8 @@ def point(scene: Scene) -> dict[str, Any]:
 
     "coupling" and "first" are the factors of (s^2 + c_1 s + a) x1 = mu K_n/m x2, for the mode.
     """
-    joint, (K_n, K_t) = pressed(scene), stiffness(scene)
-    lin = linearised_at(scene, joint, True)
-    s = rightmost_root(lin)
+    system, (K_n, K_t) = two_directions(scene, True), stiffness(scene)
+    lin, s = system.polynomial, system.rightmost()
     re, im = s.real, s.imag
     numbers = {
         "growth_rate": re,
@@ -203,7 +199,7 @@ def point(scene: Scene) -> dict[str, Any]:
         "K_n": K_n,
         "K_t": K_t,
         "V": scene.oscillator.V,
-        "coupling": sliding_friction(scene) * joint.K_n / scene.oscillator.m,
+        "coupling": scene.coefficient() * system.K_n / scene.oscillator.m,
         "first_real": re**2 - im**2 + lin.c_1 * re + lin.a,
         "first_imag": (2 * re + lin.c_1) * im,
         "plastic": False,
@@ -248,7 +244,7 @@ def _axis(scene: Scene, name: str, window: Any, count: int) -> Axis:
         raise ValueError(f"{name} must be (low, high), got {window!r}")
     if not ends[0] <= value <= ends[1]:
         raise ValueError(f"the window of {name} must hold its value, {value:g}, got {window!r}")
-    quantity = stored_quantities(scene).get(name)
+    quantity = scene.stored_quantities().get(name)
     log = quantity is not None and quantity.log
     space: Any = np.geomspace if log else np.linspace
     nodes = space(*ends, count)

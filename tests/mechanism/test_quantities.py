@@ -16,8 +16,6 @@ from fractaljax._mechanism.quantities import (
     require_independent,
     require_inside,
     require_quantity,
-    sliding_friction,
-    stored_quantities,
     substituted,
     unit,
     value_of,
@@ -38,7 +36,7 @@ def mu_of(mu_s, mu_m, v_m, V):
 
 
 def test_quantities_with_names_units_and_values():
-    own = stored_quantities(BRAKE)
+    own = BRAKE.stored_quantities()
     assert own["D"].value == 2.4 and own["V"].value == 0.15
     assert (own["omega_1"].unit, own["P"].meaning) == ("rad/s", "normal load")
     assert own["stiffness_ratio"].value is None
@@ -77,7 +75,7 @@ def test_two_names_of_one_quantity_and_unknown_ones_are_refused():
 
 def test_a_structure_has_the_numbers_of_its_joints():
     structure = two_joints(4)
-    own = stored_quantities(structure)
+    own = structure.stored_quantities()
     assert own["right.K_n"].value == 5e6 and own["K_n"].value == 3e6 and own["K_n"].log
     assert quantity_names(structure)[0] == "K_n" and not {"M", "F", "mu"} & own.keys()
     assert unit(structure, "left.V") == "m/s"
@@ -154,9 +152,9 @@ def test_ratios_scaled_laws_and_arrays_are_set():
     scene = with_friction_times(FIXED, 0.5)
     assert float(scene.friction.mu_s) == 0.2
     assert float(scene.friction.mu_m) == 0.125
-    assert float(sliding_friction(scene)) == pytest.approx(float(sliding_friction(FIXED)) / 2)
-    assert sliding_friction(FIXED) == pytest.approx(mu_of(0.4, 0.25, 0.5, 0.15), rel=1e-15)
-    assert sliding_friction(CONSTANT) == 0.4
+    assert float(scene.coefficient()) == pytest.approx(float(FIXED.coefficient()) / 2)
+    assert FIXED.coefficient() == pytest.approx(mu_of(0.4, 0.25, 0.5, 0.15), rel=1e-15)
+    assert CONSTANT.coefficient() == 0.4
     # As a grid gives them, and as `vmap` and `jit` see them.
     mu, V = np.array([[0.2, 0.3]] * 3), np.array([[0.1] * 2, [0.2] * 2, [0.3] * 2])
     grid = replaced(BRAKE, {"mu": mu, "V": V}).friction

@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 
 import fractaljax as fj
 from fractaljax._base.ranges import is_logarithmic, within
-from fractaljax._mechanism.quantities import sliding_friction
 from tools import refusals
 
 BRAKE = fj.brake_scene()
@@ -193,7 +192,7 @@ def test_it_says_where_the_regime_or_the_friction_correction_changes():
     name = "step of Eq. 19"
     steps = [x for end, x in ends(name) if end == fj.BoundaryEnd.friction_correction]
     assert len(steps) == 2
-    at = 0.3 / 0.25 * float(sliding_friction(PROBLEMS[name][0]))
+    at = 0.3 / 0.25 * float(PROBLEMS[name][0].coefficient())
     assert max(abs(x - at) for x in steps) < 1e-6
     assert "at mu_m = 0.3, where Eq. 19 has a step" in repr(boundary(name))
 

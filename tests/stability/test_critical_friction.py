@@ -11,9 +11,12 @@ import pytest
 import scipy.optimize
 
 import fractaljax as fj
-from fractaljax._mechanism.quantities import sliding_friction, with_friction_times
-from fractaljax._stability.critical_friction import critical_frequency, hopf_test_function
-from fractaljax._stability.linearise import linearised
+from fractaljax._mechanism.quantities import with_friction_times
+from fractaljax._stability.two_directions import (
+    critical_frequency,
+    hopf_test_function,
+    two_directions,
+)
 from quartics import log_uniform, many_rightmost, stacked
 from tools import both_gradients, both_modes, mostly_slow, reference_scene
 
@@ -105,7 +108,7 @@ def test_gradients_of_the_closed_form_in_a_batch_and_at_held_stiffness():
     held = BRAKE.replace(contact=fj.FixedContact(*fj.stiffness(BRAKE)))
     closed = float(constant(held))
     assert closed != pytest.approx(float(fj.critical_friction(BRAKE)), rel=1e-3)
-    lin = linearised(with_friction_times(held, closed / sliding_friction(held)), False)
+    lin = two_directions(with_friction_times(held, closed / held.coefficient()), False).polynomial
     assert abs(float(hopf_test_function(lin))) < 1e-15
 
 
@@ -124,7 +127,7 @@ QUICK = ("slope", "driven", "fractal")
 def test_first_root_is_where_squeal_starts(name):
     """No growth below, growth 0 at it and squeal above; the same as Brent's method finds."""
     scene = SCENES[name]
-    factor = float(fj.critical_friction(scene)) / float(sliding_friction(scene))
+    factor = float(fj.critical_friction(scene)) / float(scene.coefficient())
     below = jnp.linspace(0.002, 1 - 1e-9, 400) * factor
     assert (growths_at(scene, below) <= 0).all()
     assert float(growth_at(scene, factor * (1 + 1e-6))) > 0
@@ -231,7 +234,7 @@ def test_hopf_test_function_is_negative_exactly_where_it_squeals():
     np.testing.assert_array_equal((test < 0)[sure], (growth > 0)[sure])
     # omega^2 = a_1/a_3 is the imaginary eigenvalue there.
     scene = fixed().replace(mu=fj.critical_friction(fixed()))
-    found = critical_frequency(linearised(scene, True))
+    found = critical_frequency(two_directions(scene, True).polynomial)
     assert float(found) == pytest.approx(float(fj.stability(scene).frequency), rel=1e-12)
 
 
