@@ -2,7 +2,7 @@
 
 import io
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +47,7 @@ class _Source:
 
     def __init__(self, table: dict[str, Any], folder: Path):
         self.folder, self.names = folder, table.get("names")
+        self.names_of_files = False
         self.held: dict[str, Any] = {}
         self.unread: dict[str, str] = {}  # reasons by name, for the file of matrices
         self.notes: list[str] = []
@@ -129,11 +130,18 @@ class _Source:
 
     def _read(self, path: Path) -> Matrices:
         model = read_matrices(path)
-        self.names = self.names or model.names
         self.notes += [f"{path.name}: {note}" for note in model.notes]
+        if self.names is None:
+            self.names, self.names_of_files = model.names, True
         if model.names is None or tuple(self.names) == model.names:
             return model
-        return _expanded(model, list(self.names))
+        missing = [name for name in model.names if name not in self.names]
+        if missing and self.names_of_files:
+            raise ValueError(
+                f"{path.name} has the degree of freedom {missing[0]}, which the files before it "
+                "have not"
+            )
+        return model if missing else _expanded(model, self.names)
 
 
 def read_structure(document: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -218,16 +226,11 @@ def _with_loss(K: Any, eta: float) -> Any:
     return K + 1j * eta * K.real
 
 
-def _expanded(model: Matrices, names: list[str]) -> Matrices:
-    """A model of some of the degrees of freedom `names`, with all of them, by their names.
-
-    Entries without a place keep the model as it is, and its shape will be refused.
-    """
+def _expanded(model: Matrices, names: Sequence[str]) -> Matrices:
+    """A model of some of the degrees of freedom `names`, with all of them, by their names."""
     from scipy.sparse import coo_array
 
     place = {name: i for i, name in enumerate(names)}
-    if not set(model.names or ()) <= place.keys():
-        return model
     index = np.array([place[name] for name in model.names or ()])
     n, k = len(names), len(index)
     for name, X in list(model.matrices.items()):
