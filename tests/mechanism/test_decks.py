@@ -168,7 +168,7 @@ def test_parts_are_added_by_name():
 def test_a_file_of_some_degrees_of_freedom(tmp_path):
     """Its entries go to the places of their names; a name without a place is refused."""
     (tmp_path / "deck.pch").write_text(dmig("KGG", PAD) + dmig("MGG", M))
-    (tmp_path / "k2pp.bdf").write_text("DMIG,K2PP,0,6,2\nDMIG,K2PP,9,1,,7,3,-5.,,9,1,7.\n")
+    (tmp_path / "k2pp.bdf").write_text("DMIG,K2PP,0,6,2\nDMIG,K2PP,9,1,,7,3,-5.\n,9,1,7.\n")
     path = tmp_path / "deck.toml"
     text = '[structure]\nmatrices = "deck.pch"\nM = "MGG"\nK = [{}]\n' + BY_NAME
     both = '{matrix = "KGG"}, {matrix = "K2PP", file = "k2pp.bdf"}'
