@@ -138,14 +138,14 @@ def test_critical_friction_and_its_slopes():
     with mp.workdps(40):
 
         def critical(eta, loss):
-            return mp.findroot(lambda mu: growth(mu, eta, loss), (1.5, 2.5), solver="anderson")
+            return mp.findroot(lambda mu: growth(mu, eta, loss), (1.42, 1.5), solver="anderson")
 
         at = [mp.mpf(x) for x in ETA[::-1]]
         right, slopes = float(critical(*at)), [*slopes_in_digits(critical, at)]
     np.testing.assert_allclose(fj.critical_friction(structure()), right, rtol=1e-11)
     for row in gradients(lambda v: fj.critical_friction(structure(MU, *v)), ETA[::-1]):
         np.testing.assert_allclose(row, slopes, rtol=1e-7)
-    tracks = fj.track_modes(structure(), "mu", np.linspace(0.8, 1.2, 5) * right)
+    tracks = fj.track_modes(structure(), "mu", np.linspace(0.8, 1.3, 5) * right)
     crossing = tracks.crossings()[0]
     np.testing.assert_allclose(crossing.value, right, rtol=1e-10)
     assert crossing.starts and (tracks.mac > 0.8).all() and tracks.eigenvalues.shape == (5, 3)
@@ -174,7 +174,12 @@ def test_what_does_not_oscillate_has_no_hysteresis():
     assert fj.margin(fallen) == -1
     modes = fj.stability(fallen)
     assert modes.unstable()[0].frequency == 0 and len(modes.unstable()) == 1
-    # By friction, where 1 + K_n n.(n - mu t) = 0.
+
+
+@pytest.mark.slow
+def test_static_divergence_by_friction():
+    """Where 1 + K_n n.(n - mu t) = 0, K_loss or not."""
+    one = np.eye(2)
     joint = fj.Joint(fj.FixedContact(3.0, 0.0), fj.Coulomb(0.2), [1.0, 0.0], [1.0, 0.2])
     x = fj.Structure(one, 0.1 * one, one, joint, K_loss=0.1 * one)
     critical = jax.value_and_grad(lambda K_n: fj.critical_friction(x.replace(K_n=K_n)))
@@ -184,6 +189,7 @@ def test_what_does_not_oscillate_has_no_hysteresis():
 # --- reduction, shares, viscous damping ---------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_reduction_keeps_structural_damping():
     n = 30
     chain = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
@@ -244,23 +250,25 @@ def test_equivalent_viscous_damping():
     one = fj.Structure([[1.0]], None, [[4.0]], K_loss=[[0.2]]).equivalent_viscous(1 / np.pi)
     motion = fj.simulate(one, [1.0, 0.0], 10.0)
     s = complex(-0.05, np.sqrt(4 - 0.05**2))
-    t = np.asarray(motion.t)
+    t = np.asarray(motion.times)
     exact = np.exp(s.real * t) * (np.cos(s.imag * t) - s.real / s.imag * np.sin(s.imag * t))
-    np.testing.assert_allclose(np.asarray(motion.x)[:, 0], exact, atol=1e-7)
+    np.testing.assert_allclose(np.asarray(motion.states)[:, 0], exact, atol=1e-7)
 
 
 def test_complex_terms_are_structural_damping():
+    x: Any
     x = fj.ParametricStructure(
         M, C, [((1 + 0.02j), K), ("a", PART * 0.1j)], parameters={"a": 2.0}, K_loss=PART
     )
     np.testing.assert_allclose(x.K, K, rtol=1e-15)
     np.testing.assert_allclose(x.K_loss, 0.02 * K + 1.2 * PART, rtol=1e-15)
-    np.testing.assert_allclose(fj.Structure(M, C, K + 1j * PART).K_loss, PART)
+    x = fj.Structure(M, C, K + 1j * PART)
+    np.testing.assert_allclose(x.K_loss, PART)
     assert fj.Structure(M, C, K).K_loss is None
     assert fj.Structure(M, C, K).replace(K_loss=PART).K_loss is not None
     for name in "MC":
         with pytest.raises(TypeError, match=f"{name} must be an array of real numbers"):
-            fj.Structure(**({"M": M, "C": C, "K": K} | {name: 1j * M}))
+            fj.Structure(*(1j * X if name == other else X for other, X in zip("MCK", (M, C, K))))
     with pytest.raises(ValueError, match=r"K_loss must have shape \(3, 3\) as M demands"):
         fj.Structure(M, C, K, K_loss=np.eye(2))
     with pytest.raises(ValueError, match="loss_factor must be at least 0"):
