@@ -268,7 +268,7 @@ def test_complex_terms_are_structural_damping():
     assert fj.Structure(M, C, K).replace(K_loss=PART).K_loss is not None
     for name in "MC":
         with pytest.raises(TypeError, match=f"{name} must be an array of real numbers"):
-            fj.Structure(*(1j * X if name == other else X for other, X in zip("MCK", (M, C, K))))
+            fj.Structure(1j * M if name == "M" else M, 1j * C if name == "C" else C, K)
     with pytest.raises(ValueError, match=r"K_loss must have shape \(3, 3\) as M demands"):
         fj.Structure(M, C, K, K_loss=np.eye(2))
     with pytest.raises(ValueError, match="loss_factor must be at least 0"):
