@@ -10,13 +10,13 @@ from numpy.lib import format as npy
 from .parts import one_line
 
 
-def read_npy(content: bytes, name: str) -> np.ndarray:
-    """The array in the bytes of a .npy file, in native byte order.
+def read_npy(content: bytes, name: str, kinds: str = "iuf") -> np.ndarray:
+    """The array in the bytes of a .npy file, in native byte order, of one of NumPy's `kinds`.
 
     The header is compared with the size of the content before any memory is allocated.
 
-    **Raises:** `ValueError` that names the array `name`, unless the file is intact and holds real
-    numbers.
+    **Raises:** `ValueError` that names the array `name`, unless the file is intact and holds such
+    numbers, real ones by default.
     """
     file = io.BytesIO(content)
     try:
@@ -26,7 +26,7 @@ def read_npy(content: bytes, name: str) -> np.ndarray:
         shape, columns_first, dtype = header(file)
     except Exception as error:  # of many kinds, even from Python's tokenizer
         raise _unsound(error) from None
-    if dtype.kind not in "iuf":
+    if dtype.kind not in kinds:
         raise ValueError(f"{name} must be real numbers, got {dtype}")
     start, size = file.tell(), math.prod(shape) * dtype.itemsize
     if size != len(content) - start:
@@ -38,12 +38,13 @@ def read_npy(content: bytes, name: str) -> np.ndarray:
     return array.astype(dtype.newbyteorder("="))
 
 
-def read_npz(content: bytes, most: int) -> dict[str, np.ndarray]:
+def read_npz(content: bytes, most: int, kinds: str = "iuf") -> dict[str, np.ndarray]:
     """The arrays in the bytes of a .npz file, by name, of at most `most` bytes in total.
 
     **Raises:** `ValueError` as `read_npy` and `read_members`.
     """
-    return {name: read_npy(member, name) for name, member in read_members(content, most).items()}
+    members = read_members(content, most)
+    return {name: read_npy(member, name, kinds) for name, member in members.items()}
 
 
 def read_members(content: bytes, most: int) -> dict[str, bytes]:

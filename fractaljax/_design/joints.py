@@ -122,18 +122,22 @@ def least_damping(x) -> tuple[Any, Any]:
         o = x.oscillator
         omega = xp.asarray([o.omega_1, o.omega_2], float)
         return (xp.asarray([o.xi_1, o.xi_2], float) * omega).min(), omega.min()
+    kind = complex if x.has_loss else float
     M, C, K = (xp.asarray(X, float) for X in (x.M, x.C, x.K))
+    K = K if x.K_loss is None else K + 1j * xp.asarray(x.K_loss, float)
     for joint in x.joints:
-        stiffness = joint.stiffness()
+        stiffness = joint.complex_stiffness(*joint.stiffness())
         for each, dofs in zip(stiffness, (joint.normal, joint.tangential), strict=True):
             if dofs is None:
                 continue
             d = xp.asarray(x.direction(dofs), float)
-            K = K + xp.asarray(each, float) * xp.outer(d, d)
+            K = K + xp.asarray(each, kind) * xp.outer(d, d)
     zero, eye = xp.zeros_like(M), xp.eye(len(M))
     A = xp.block([[zero, eye], [-xp.linalg.solve(M, K), -xp.linalg.solve(M, C)]])
     s = xp.linalg.eigvals(A)
     inside = xp.asarray(in_band(jnp.asarray(s), x.band))
+    if x.has_loss:
+        inside = inside & (s.imag > 0)
     inside = inside | ~inside.any()
     damping = -xp.where(inside, s.real, -xp.inf).max()
     return xp.maximum(damping, 0.0), xp.where(inside, abs(s), xp.inf).min()

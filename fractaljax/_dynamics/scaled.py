@@ -103,6 +103,11 @@ def _uncoupled_system(scene: Scene) -> HybridSystem:
 
 
 def _structure_system(structure: Structure) -> HybridSystem:
+    if structure.has_loss:
+        raise ValueError(
+            "structural damping belongs to an oscillation, not to motion in time: take "
+            "x.equivalent_viscous(frequency) in the place of x, with a frequency in Hz"
+        )
     n, dtype = structure.n, structure.M.dtype
     K, rows, weights, offsets, speeds, faces = structure.K, [], [], [], [], []
     joint_forces: list[JointForce] = []

@@ -133,7 +133,8 @@ class Joint(AnyJoint):
     displacement x_i - x_j, a mapping {degree of freedom: weight}, or all weights as an array or
     floats. Positive `normal` displacement n.x compresses the joint. Friction pushes towards
     positive t.x, as the belt does in Eq. 39. `V` is the sliding velocity; a law without slope needs
-    no V.
+    no V. With a `loss_factor` eta, structural damping, the stiffnesses of the joint in an
+    oscillation are K_n (1 + i eta) and K_t (1 + i eta), also in the normal force that rubs.
 
     The normal force N on which friction acts is K_n n.x, the source's form. With `preload`, x = 0
     is the state of rest under the load P of the contact, where N = P: N(n.x) is the load curve of
@@ -152,6 +153,7 @@ class Joint(AnyJoint):
     normal: Stored | None = eqx.field(static=True)
     preload: bool | str = eqx.field(static=True, metadata={"note": PRELOAD_NOTE})
     V: Numbers | None = quantity("m/s", "sliding velocity", log=True)
+    loss_factor: Numbers | None = quantity("-", "loss factor of the springs")
 
     def __init__(
         self,
@@ -161,6 +163,7 @@ class Joint(AnyJoint):
         normal: Direction | None = None,
         V: ArrayLike | None = None,
         preload: bool | str = False,
+        loss_factor: ArrayLike | None = None,
     ):
         self.contact = contact
         self.friction = friction_for(contact, friction)
@@ -174,6 +177,16 @@ class Joint(AnyJoint):
         if self.tangential == self.normal:
             raise ValueError(f"tangential and normal must differ, both are {tangential!r}")
         self.V = None if V is None else number("V", V, above=0)
+        self.loss_factor = (
+            None if loss_factor is None else number("loss_factor", loss_factor, at_least=0)
+        )
+
+    def complex_stiffness(self, K_n: Numbers, K_t: Numbers) -> tuple[Numbers, Numbers]:
+        """K_n (1 + i eta) and K_t (1 + i eta) of an oscillation; K_n and K_t without eta."""
+        if self.loss_factor is None:
+            return K_n, K_t
+        complex_one = 1 + 1j * self.loss_factor
+        return K_n * complex_one, K_t * complex_one
 
 
 # --- directions --------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ _FULL, _TEXT, _SPARSE = range(3)
 def read_matlab_4(content: bytes, largest: int) -> dict[str, Any]:
     """The variables of a file by name, as arrays or sparse matrices of at most `largest` rows.
 
-    A variable that is no matrix of real numbers is returned as a `ValueError`.
+    A variable that is no matrix of numbers is returned as a `ValueError`.
 
     **Raises:** `ValueError` if the file is damaged.
     """
@@ -42,32 +42,35 @@ def read_matlab_4(content: bytes, largest: int) -> dict[str, Any]:
             raise ValueError("it ends within a variable")
         if name in variables:
             raise ValueError(f"it holds {name} twice")
-        values = np.frombuffer(content[start : start + size], dtype).astype(dtype.newbyteorder("="))
+        parts = [
+            np.frombuffer(content[at : at + size], dtype).astype(dtype.newbyteorder("="))
+            for at in (start, start + size)[: 1 + imaginary]
+        ]
+        values = parts[0] + 1j * parts[1] if len(parts) == 2 else parts[0]
         values = values.reshape((rows, columns), order="F")
         try:
-            variables[name] = _matrix(name, what, bool(imaginary), values, largest)
+            variables[name] = _matrix(name, what, values, largest)
         except ValueError as error:
             variables[name] = error
     return variables
 
 
-def _matrix(name: str, what: int, is_complex: bool, values: np.ndarray, largest: int) -> Any:
+def _matrix(name: str, what: int, values: np.ndarray, largest: int) -> Any:
     if what == _TEXT:
         raise ValueError(f"{name} must be real numbers, got text")
-    # The imaginary parts of a sparse matrix are a fourth column.
-    if is_complex or (what == _SPARSE and values.shape[1] == 4):
-        raise ValueError(f"{name} must be real numbers, got complex ones")
     return values if what == _FULL else _sparse(name, values, largest)
 
 
 def _sparse(name: str, table: np.ndarray, largest: int) -> Any:
     """The sparse matrix from lines of row, column and value; the last line is its shape."""
     whole = np.isfinite(table[:, :2]).all() and (table[:, :2] == np.rint(table[:, :2])).all()
-    if table.shape[1] != 3 or not len(table) or not whole:
+    if table.shape[1] not in (3, 4) or not len(table) or not whole:
         raise ValueError(f"{name} is damaged: it has no rows, columns and values")
     rows, columns = map(int, table[-1, :2])
     check_size(name, (rows, columns), largest)
-    i, j, values = table[:-1].T
+    i, j, values, *imaginary = table[:-1].T  # a fourth column is of imaginary parts
+    if imaginary:
+        values = values + 1j * imaginary[0]
     inside = (i >= 1) & (i <= rows) & (j >= 1) & (j <= columns)
     if not inside.all():
         raise ValueError(f"{name} is damaged: an entry lies outside {rows} x {columns}")

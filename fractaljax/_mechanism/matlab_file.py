@@ -1,4 +1,4 @@
-"""Numeric matrices in MATLAB files of versions 5 to 7 and 4.
+"""Numeric matrices in MATLAB files of versions 5 to 7, 7.3 and 4.
 
 `scipy.io.loadmat` cannot serve: damaged sparse matrices crash the interpreter (SciPy 1.17), and a
 small file may unpack to any size.
@@ -13,6 +13,7 @@ import numpy as np
 
 from .._base.file_limits import FileLimits
 from .matlab4_file import read_matlab_4
+from .matlab73_file import read_matlab_7_3
 from .matrix_entries import check_size
 
 _ORDERS = {b"\0\1IM": "<", b"\1\0MI": ">"}
@@ -28,12 +29,12 @@ _COMPLEX, _LOGICAL = 0x800, 0x200  # flags
 def read_matlab(content: bytes, limits: FileLimits) -> dict[str, Any]:
     """The variables of a .mat file by name, as arrays or sparse matrices within `limits`.
 
-    A variable that is no matrix of real numbers is returned as a `ValueError`.
+    A variable that is no matrix of numbers is returned as a `ValueError`.
 
     **Raises:** `ValueError` if the file is damaged or too large.
     """
     if content.startswith((b"MATLAB 7.3", b"\x89HDF")):
-        raise ValueError("it is of MATLAB's version 7.3; save it with -v7")
+        return read_matlab_7_3(content, limits)
     order = _ORDERS.get(content[124:128])
     if order is None and b"\0" in content[:4]:  # always so in version 4, never in a text
         return read_matlab_4(content, limits.dofs)
@@ -108,9 +109,8 @@ def _holds_bytes(data: bytes, begun: np.ndarray) -> bool:
 def _matrix(name: str, flags: int, parts: list[tuple[int, bytes]], order: str, largest: int) -> Any:
     import scipy.sparse
 
-    if flags & 0xFF not in _NUMBERS or flags & _COMPLEX:
+    if flags & 0xFF not in _NUMBERS:
         kind = _KINDS.get(flags & 0xFF, f"MATLAB's class {flags & 0xFF}")
-        kind = "complex ones" if flags & 0xFF in _NUMBERS else kind
         raise ValueError(f"{name} must be real numbers, got {kind}")
     sparse = flags & 0xFF == _SPARSE
     arrays: list[np.ndarray] = []
@@ -121,6 +121,9 @@ def _matrix(name: str, flags: int, parts: list[tuple[int, bytes]], order: str, l
         if kind not in _TYPES or len(data) % dtype.itemsize:
             raise ValueError(f"{name} is damaged: it has numbers of type {kind}")
         arrays.append(np.frombuffer(data, dtype).astype(dtype.newbyteorder("=")))
+    if flags & _COMPLEX and len(arrays) > 1 and len(arrays[-1]) == len(arrays[-2]):
+        imaginary = arrays.pop()
+        arrays[-1] = arrays[-1] + 1j * imaginary
     shape = tuple(arrays[0].tolist())
     if len(arrays) != (4 if sparse else 2) or min(shape, default=-1) < 0:
         raise ValueError(f"{name} is damaged: it has {len(arrays) - 1} arrays")

@@ -1,5 +1,7 @@
 """The matrices of a structure: checked, summed, and transformed to unit mass."""
 
+import functools
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -91,6 +93,60 @@ def matrix_sum(
         kept = [Sparse(X if is_sparse(X) else csr_array(np.asarray(X))) for X in arrays]
         return MatrixSum((), tuple(kept), tuple(coefficients))
     return MatrixSum(tuple(arrays), (), tuple(coefficients))
+
+
+def placed(small: Numbers, places: Sequence[int], n: int, sparse: bool) -> Any:
+    """A matrix (n, n) with `small` (k, k) in the rows and columns `places`, and 0 elsewhere."""
+    index = np.array(places, int)
+    if not sparse:
+        return jnp.zeros((n, n), small.dtype).at[index[:, None], index[None]].set(small)
+    from scipy.sparse import coo_array
+
+    i, j = np.meshgrid(index, index, indexing="ij")
+    return coo_array((np.asarray(small).ravel(), (i.ravel(), j.ravel())), shape=(n, n)).tocsr()
+
+
+def merged(matrix: Any) -> Any:
+    """A matrix or sum with all terms that have no coefficient as one, the first."""
+    if not is_sum(matrix):
+        return matrix
+    plain = [X for coefficient, X in matrix if coefficient is None]
+    rest = [(coefficient, X) for coefficient, X in matrix if coefficient is not None]
+    if not plain:
+        return rest
+    whole = functools.reduce(operator.add, plain)
+    return [(None, whole), *rest] if rest else whole
+
+
+def separated(K: Any, K_loss: Any) -> tuple[Any, Any]:
+    """K and K_loss, both real, from a K that may be complex: K + i K_loss, structural damping.
+
+    Both are matrices or sequences of (coefficient, matrix), each of which may be complex. Imaginary
+    parts are added to K_loss.
+    """
+    terms = K if is_sum(K) else [(None, K)]
+    if not any(_is_complex(each) for term in terms for each in term):
+        return K, K_loss
+    loss = [] if K_loss is None else list(K_loss if is_sum(K_loss) else [(None, K_loss)])
+    real = []
+    for coefficient, X in terms:
+        if not (_is_complex(coefficient) or _is_complex(X)):
+            real.append((coefficient, X))
+            continue
+        X = X if hasattr(X, "dtype") else np.asarray(X)
+        if _is_complex(coefficient):
+            X, coefficient = coefficient * X, None
+        real.append((coefficient, X.real))
+        loss.append((coefficient, X.imag))
+    one = is_sum(K) or len(loss) > 1
+    return (real, loss) if one else (real[0][1], loss[0][1])
+
+
+def _is_complex(value: Any) -> bool:
+    """True for a complex number, array, sparse matrix, or nested list with a complex number."""
+    if hasattr(value, "dtype"):
+        return jnp.issubdtype(value.dtype, jnp.complexfloating)
+    return any(isinstance(entry, complex) for entry in jax.tree.leaves(value))
 
 
 def is_sum(value: Any) -> bool:

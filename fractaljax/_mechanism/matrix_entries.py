@@ -31,7 +31,8 @@ def assemble(
     import scipy.sparse
 
     check_size(name, shape, largest)
-    i, j, values = np.asarray(i, np.int64), np.asarray(j, np.int64), np.asarray(values, float)
+    i, j, values = np.asarray(i, np.int64), np.asarray(j, np.int64), np.asarray(values)
+    values = values if values.dtype.kind == "c" else values.astype(float)
     if mirror:
         off = i != j
         i, j = np.concatenate([i, j[off]]), np.concatenate([j, i[off]])

@@ -5,7 +5,6 @@ import dataclasses
 import gzip
 import io
 import os
-import re
 import struct
 import zlib
 from pathlib import Path
@@ -23,11 +22,7 @@ from .matrix_market import BANNER, read_entries
 from .nastran import read_dmig, read_op4
 
 _PACKED = {".gz": gzip.open, ".bz2": bz2.open}
-_COMPLEX = re.compile("must be real numbers, got .*complex")
-_DAMPING = (
-    "; a complex K, K (1 + i eta), is structural damping: save its real part as K and imag(K) /"
-    " omega as C, of the frequency omega [rad/s] in question"
-)
+_KINDS = "iufc"  # of numbers in NumPy
 
 
 class _ByName(dict[str, Any]):
@@ -45,10 +40,12 @@ class _ByName(dict[str, Any]):
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Matrices:
-    """Matrices by name, in float64, and the names of their degrees of freedom if a file has them.
+    """Matrices by name, and the names of their degrees of freedom if a file has them.
 
-    Each is a `scipy.sparse.csr_array`, square (n, n), or a load of one column (n, 1). Only Nastran
-    matrices may have another shape, because it also writes matrices for recovering results.
+    Each is a `scipy.sparse.csr_array`, square (n, n), or a load of one column (n, 1), in float64,
+    or in complex128 where a number has an imaginary part: as K, `Structure` takes it for K + i
+    K_loss with structural damping. Only Nastran matrices may have another shape, because it also
+    writes matrices for recovering results.
 
     `unread` says by name why another item of the file is no such matrix; `matrices[name]` raises
     that as a `ValueError`. `mirrored` names matrices of which the file holds one triangle without
@@ -79,15 +76,15 @@ def read_matrices(path: str | os.PathLike, limits: FileLimits = FileLimits()) ->
     """Read the matrices of a finite-element model, sparse.
 
     `.npz`: one sparse matrix of `scipy.sparse.save_npz`, or arrays of `numpy.savez`. `.mat`: MATLAB
-    version 4 to 7. `.mtx`: Matrix Market, or Abaqus (*MATRIX OUTPUT). `.op4`: OUTPUT4 of Nastran.
-    `.pch`, `.bdf`, `.dat`: DMIG cards of Nastran. `.hb`, `.rb`, `.rua`, `.rsa`, `.matrix`:
-    Harwell-Boeing in ASCII, which Ansys writes with HBMAT. Each may be compressed as .gz or .bz2. A
-    single matrix is named after its file. Symmetric matrices are filled. Matrices of Abaqus and
-    DMIG cards come with sorted names of degrees of freedom, "node.dof". At most 1 GiB and 1000000
-    degrees of freedom are read, or what `limits` says.
+    version 4 to 7, and 7.3 where h5py is installed. `.mtx`: Matrix Market, or Abaqus (*MATRIX
+    OUTPUT). `.op4`: OUTPUT4 of Nastran. `.pch`, `.bdf`, `.dat`: DMIG cards of Nastran. `.hb`,
+    `.rb`, `.rua`, `.rsa`, `.matrix`: Harwell-Boeing in ASCII, which Ansys writes with HBMAT. Each
+    may be compressed as .gz or .bz2. A single matrix is named after its file. Symmetric matrices
+    are filled. Matrices of Abaqus and DMIG cards come with sorted names of degrees of freedom,
+    "node.dof". At most 1 GiB and 1000000 degrees of freedom are read, or what `limits` says.
 
-    A matrix that is complex, not finite, or neither square nor one column (except rectangular ones
-    of Nastran), and text or a cell array of MATLAB leave the others readable: `unread` says why.
+    A matrix that is not finite, or neither square nor one column (except rectangular ones of
+    Nastran), and text or a cell array of MATLAB leave the others readable: `unread` says why.
     Abaqus does not say whether it writes one triangle: `mirrored` names matrices that were filled
     because no entry has a mirror image.
 
@@ -144,16 +141,15 @@ def _check_candidates(
                 raise value
             matrices[name] = _check_matrix(name, value, any_shape, largest)
         except ValueError as error:
-            why = str(error)
-            unread[name] = why + _DAMPING * bool(_COMPLEX.search(why))
+            unread[name] = str(error)
     return matrices, unread
 
 
 def _check_matrix(name: str, value: Any, any_shape: bool, largest: int):
-    """A checked sparse matrix in float64 from a dense or sparse one."""
+    """A checked sparse matrix from a dense or sparse one, complex if any number in it is."""
     import scipy.sparse
 
-    if value.dtype.kind not in "iufb":
+    if value.dtype.kind not in "b" + _KINDS:
         raise ValueError(f"{name} must be real numbers, got {value.dtype}")
     shape = value.shape
     if len(shape) == 1 or (len(shape) == 2 and shape[0] == 1 and not scipy.sparse.issparse(value)):
@@ -163,7 +159,10 @@ def _check_matrix(name: str, value: Any, any_shape: bool, largest: int):
         raise ValueError(f"{name} must be square or one column, got shape {shape}")
     check_size(name, value.shape, largest)
     with np.errstate(over="ignore"):  # numbers may be longer than 64 bits
-        matrix = scipy.sparse.csr_array(value, dtype=np.float64)
+        kind = np.complex128 if value.dtype.kind == "c" else np.float64
+        matrix = scipy.sparse.csr_array(value, dtype=kind)
+    if kind is np.complex128 and not matrix.data.imag.any():
+        matrix = matrix.real.tocsr()
     if not np.isfinite(matrix.data).all():
         raise ValueError(f"{name} must be finite")
     matrix.sum_duplicates()  # SciPy adds duplicate entries
@@ -181,7 +180,7 @@ def _npz(stem: str, content: bytes, limits: FileLimits):
         (k for k in ("csr", "csc", "coo", "bsr", "dia") if k.encode() in members["format"]), ""
     )
     arrays = {
-        name: read_npy(member, name)
+        name: read_npy(member, name, _KINDS)
         for name, member in members.items()
         if name not in ("format", "_is_array")
     }
@@ -203,7 +202,7 @@ def _npz(stem: str, content: bytes, limits: FileLimits):
 
 def _array(member: bytes, name: str) -> np.ndarray | ValueError:
     try:
-        return read_npy(member, name)
+        return read_npy(member, name, _KINDS)
     except ValueError as error:
         return error
 
@@ -218,8 +217,6 @@ def _mtx(stem: str, content: bytes, limits: FileLimits):
     blank = content[: len(content) - len(banner)].count(b"\n")
     content = banner.replace(b"\n", b"\n" * (1 + blank), 1)
     shape, i, j, values = read_entries(io.BytesIO(content), limits.dofs, limits.matrices)
-    if np.iscomplexobj(values):
-        return {stem: ValueError(f"{stem} must be real numbers, got complex ones")}, None
     return {stem: assemble(stem, shape, i, j, values, limits.dofs)}, None
 
 

@@ -22,8 +22,8 @@ _Column = tuple[int, int, np.ndarray]  # number and first row, both from 1, and 
 def read_op4(content: bytes, largest: int) -> dict[str, Any]:
     """The sparse matrices of an OUTPUT4 file by their names.
 
-    Such a file holds symmetric matrices in full. A matrix that is complex, too large or damaged is
-    returned as a `ValueError`.
+    Such a file holds symmetric matrices in full. A matrix that is too large or damaged is returned
+    as a `ValueError`.
 
     **Raises:** `ValueError` with the line or the matrix that is wrong.
     """
@@ -34,7 +34,7 @@ def read_op4(content: bytes, largest: int) -> dict[str, Any]:
             raise ValueError(f"it gives {name} twice")
         unfit = _unfit(name, shape, kind, largest)
         try:
-            pieces = list(columns)
+            pieces = [_numbers(name, piece) if kind > 2 else piece for piece in columns]
             matrices[name] = unfit or _assemble_columns(name, shape, pieces, largest)
         except ValueError as error:  # the rest of the file cannot be located
             raise (unfit or error) from None
@@ -44,13 +44,20 @@ def read_op4(content: bytes, largest: int) -> dict[str, Any]:
 def _unfit(name: str, shape: tuple[int, int], kind: int, largest: int) -> ValueError | None:
     """The reason why a matrix cannot be read, from its first record."""
     try:
-        if kind not in (1, 2):
-            remark = "complex ones" if kind in (3, 4) else "of 1 to 4"
-            raise ValueError(f"{name} must be real numbers, got type {kind}, {remark}")
+        if kind not in (1, 2, 3, 4):
+            raise ValueError(f"{name} must be real numbers, got type {kind}, of 1 to 4")
         check_size(name, shape, largest)
     except ValueError as error:
         return error
     return None
+
+
+def _numbers(name: str, piece: _Column) -> _Column:
+    """A part of a column of complex numbers, from their real and imaginary parts in turn."""
+    number, first, parts = piece
+    if len(parts) % 2:
+        raise ValueError(f"{name} is damaged: a complex number has no imaginary part")
+    return number, first, parts[::2] + 1j * parts[1::2]
 
 
 def _assemble_columns(
@@ -79,7 +86,7 @@ def _binary(content: bytes, word: str) -> Iterator[tuple[str, tuple[int, int], i
             raise ValueError("it is damaged: a matrix was to begin")
         columns, rows, _, kind = np.frombuffer(record, f"{sign}i{wide}", 4).tolist()
         name = _name(record[4 * wide :])
-        real = f"{sign}f{8 if kind == 2 else wide}"
+        real = f"{sign}f{8 if kind in (2, 4) else wide}"
         yield (
             name,
             (abs(rows), columns),
@@ -186,50 +193,48 @@ def read_dmig(content: bytes, largest: int):
     """The sparse matrices in DMIG cards by their names, and the names of the degrees of freedom.
 
     Other cards are ignored. All matrices share the degrees of freedom that occur in any of them; a
-    scalar point has component 0, and a rectangular matrix keeps its own columns. A complex matrix
-    is returned as a `ValueError`, and its degrees of freedom are ignored.
+    scalar point has component 0, and a rectangular matrix keeps its own columns. A complex number
+    is its real and imaginary part, or amplitude and phase in degrees where the first card says so.
 
     **Raises:** `ValueError` with the line that is wrong.
     """
-    heads: dict[str, tuple[int, int]] = {}  # by name: the form, and the columns of form 9
-    entries: dict[str, list[tuple[int, int, int, int, str]]] = {}
-    unfit: dict[str, ValueError] = {}
+    # By name: the form, the columns of form 9, and how numbers are written.
+    heads: dict[str, tuple[int, int, str]] = {}
+    entries: dict[str, list[tuple[int, int, int, int, str, str]]] = {}
     for number, line, fields in _cards(content):
         name, point, *rest = fields
         try:
             if point == "0":
                 form, kind = int(rest[0]), int(rest[1])
-                what = "must have a form of 1, 2, 6 and 9, type 1 or 2 (real), and a new name"
-                wrong = wrong_line(number, line, what)
-                if form not in (1, 2, 6, 9) or kind not in (1, 2, 3, 4) or name in heads | unfit:
-                    raise wrong
-                if kind > 2:
-                    unfit[name] = ValueError(f"{name} must be real numbers, got complex: {wrong}")
-                else:
-                    heads[name] = form, int(rest[5] or 0)
-                continue
-            if name in unfit:
+                if form not in (1, 2, 6, 9) or kind not in (1, 2, 3, 4) or name in heads:
+                    what = "must have a form of 1, 2, 6 and 9, a type of 1 to 4, and a new name"
+                    raise wrong_line(number, line, what)
+                polar = int(rest[3] or 0) > 0
+                written = "real" if kind < 3 else "polar" if polar else "complex"
+                heads[name] = form, int(rest[5] or 0), written
                 continue
             column = int(point), int(rest[0] or 0)
             for k in range(2, len(rest), 4):
                 node, dof, value, imaginary = rest[k : k + 4]
                 if node:
-                    if not re.fullmatch(REAL.decode(), value, re.ASCII) or imaginary:
+                    is_complex = name in heads and heads[name][2] != "real"
+                    second = (imaginary or "0") if is_complex else "0"
+                    good = all(re.fullmatch(REAL.decode(), x, re.ASCII) for x in (value, second))
+                    if not good or (imaginary and not is_complex):
                         raise ValueError
                     row = int(node), int(dof or 0)
-                    entries.setdefault(name, []).append((*row, *column, value))
+                    entries.setdefault(name, []).append((*row, *column, value, second))
                 elif dof or value or imaginary:
                     raise ValueError
         except (ValueError, IndexError) as error:
             if str(error).startswith("line"):
                 raise
             raise wrong_line(number, line, "begins a DMIG card that cannot be read") from None
-    if not heads | unfit:
+    if not heads:
         raise ValueError("it holds no DMIG card that begins a matrix")
     if not set(entries) <= set(heads):
         raise ValueError(f"no DMIG card begins {', '.join(sorted(set(entries) - set(heads)))}")
-    matrices, names = _dmig_matrices(heads, entries, largest) if heads else ({}, None)
-    return matrices | unfit, names
+    return _dmig_matrices(heads, entries, largest)
 
 
 def _dmig_matrices(heads, entries, largest):
@@ -237,10 +242,14 @@ def _dmig_matrices(heads, entries, largest):
     for name in heads:
         rows = entries.get(name, [])
         index[name] = np.array([row[:4] for row in rows], np.int64).reshape(-1, 4).T
-        values[name] = as_floats(" ".join(row[4] for row in rows).encode())
+        values[name], more = (as_floats(" ".join(row[k] for row in rows).encode()) for k in (4, 5))
+        if heads[name][2] == "complex":
+            values[name] = values[name] + 1j * more
+        elif heads[name][2] == "polar":
+            values[name] = values[name] * np.exp(1j * np.deg2rad(more))
         if (index[name] < 0).any() or not np.isfinite(values[name]).all():
             raise ValueError(f"{name} must have finite numbers at points from 1 on")
-    square = [index[name] for name, (form, _) in heads.items() if form in (1, 6)]
+    square = [index[name] for name, (form, *_) in heads.items() if form in (1, 6)]
     both = [*(x[:2] for x in index.values()), *(x[2:] for x in square)]
     place, names = label_dofs(*np.concatenate(both, axis=1))
     begun = 0
@@ -248,7 +257,7 @@ def _dmig_matrices(heads, entries, largest):
     for name in heads:
         rows[name] = place[begun : (begun := begun + index[name].shape[1])]
     matrices = {}
-    for name, (form, columns) in heads.items():
+    for name, (form, columns, _) in heads.items():
         i, width = rows[name], len(names)
         if form in (1, 6):
             j = place[begun : (begun := begun + len(i))]

@@ -63,8 +63,8 @@ class ReducedStructure(ParametricStructure):
 
     **Arguments:**
 
-    - `M`, `C`, `K`, `joints`, `parameters`, `F`: as in `ParametricStructure`, of the r degrees of
-      freedom.
+    - `M`, `C`, `K`, `joints`, `parameters`, `F`, `K_loss`: as in `ParametricStructure`, of the r
+      degrees of freedom.
     - `reduction`: the basis, the band and the accuracy.
     - `mesh`: that of the large structure, by default none.
     """
@@ -72,10 +72,19 @@ class ReducedStructure(ParametricStructure):
     reduction: Reduction = eqx.field(static=True)  # the basis and the accuracy
 
     def __init__(
-        self, M, C, K, joints, parameters, F, reduction: Reduction, mesh: Mesh | None = None
+        self,
+        M,
+        C,
+        K,
+        joints,
+        parameters,
+        F,
+        reduction: Reduction,
+        mesh: Mesh | None = None,
+        K_loss=None,
     ):
         self.reduction = reduction
-        super().__init__(M, C, K, joints, parameters, F, mesh=mesh)
+        super().__init__(M, C, K, joints, parameters, F, K_loss=K_loss, mesh=mesh)
 
     @property
     def band(self) -> tuple[float, float]:

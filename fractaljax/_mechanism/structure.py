@@ -34,12 +34,16 @@ from .joint import Direction, Joint, stored_direction
 from .matrices import (
     MatrixLike,
     MatrixSum,
+    as_array,
     fitting,
     fitting_or_sparse,
     is_sum,
     mass_matrix,
     matrix_sum,
+    merged,
+    placed,
     require_mass_matrix,
+    separated,
     square_or_sparse,
 )
 from .mechanism import Mechanism, some_of
@@ -59,12 +63,17 @@ class Structure(Mechanism):
       them. Rotations have their own units.
     - `C`: damping matrix (n, n) [N s/m] without the joints, which need not be symmetric; zero if
       None.
-    - `K`: stiffness matrix (n, n) [N/m] without the joints, which need not be symmetric.
+    - `K`: stiffness matrix (n, n) [N/m] without the joints, which need not be symmetric. The
+      imaginary part of a complex one is added to `K_loss`.
     - `joints`: one `Joint`, a sequence of them (named joint_1, joint_2, ...) or a mapping from
-      names.
+      names; none by default.
     - `F`: (n,) [N], or a mapping from degrees of freedom to forces, by default none. It presses the
       joints together: the slope of a friction law acts through the static equilibrium under it.
     - `names`: names of the n degrees of freedom, by default none.
+    - `K_loss`: structural (hysteretic) damping (n, n) [N/m], such as the sum of loss factor times
+      stiffness of all parts, by default none. An oscillation with Im s > 0 has s^2 M + s C + K +
+      i K_loss, and its conjugate the conjugate; what does not oscillate has no hysteresis, so that
+      static divergence is that of K. Motion in time needs `equivalent_viscous`.
     - `mesh`: a `Mesh` for pictures, by default none.
     - `notes`: changes made on reading the matrices' files, such as a mirrored triangle; `load` sets
       them.
@@ -74,7 +83,7 @@ class Structure(Mechanism):
     """
 
     kind: ClassVar[str] = "structure"
-    sums: dict[str, MatrixSum]  # of "M", "C" and "K"
+    sums: dict[str, MatrixSum]  # of "M", "C", "K", and "K_loss" if there is any
     parameters: dict[str, Float[Array, ""]]  # of the coefficients in them
     F: Float[Array, " n"] | None  # static force [N]
     joints: tuple[Joint, ...]  # in the order of their names
@@ -88,13 +97,15 @@ class Structure(Mechanism):
         M: MatrixLike,
         C: MatrixLike | None,
         K: MatrixLike,
-        joints: Joint | Sequence[Joint] | Mapping[str, Joint],
+        joints: Joint | Sequence[Joint] | Mapping[str, Joint] = (),
         F: ArrayLike | Sequence[float] | Mapping[Any, ArrayLike] | None = None,
         names: Iterable[str] | None = None,
+        K_loss: MatrixLike | None = None,
         mesh: Mesh | None = None,
         notes: Iterable[str] = (),
     ):
-        self._fill({"M": M, "C": C, "K": K}, {}, joints, F, names, mesh, notes)
+        matrices = {"M": M, "C": C, "K": K, "K_loss": K_loss}
+        self._fill(matrices, {}, joints, F, names, mesh, notes)
 
     def _fill(self, matrices, parameters, joints, F, names, mesh, notes):
         self.parameters = parameters
@@ -113,11 +124,14 @@ class Structure(Mechanism):
             mass = eqx.tree_at(lambda x: x.arrays, mass, halves)
         n = mass.shape[-1]
         fit = functools.partial(fitting_or_sparse, shape=(n, n))
-        stiffness = matrix_sum("K", matrices["K"], parameters, fit)
+        K, K_loss = separated(matrices["K"], matrices["K_loss"])
+        stiffness = matrix_sum("K", K, parameters, fit)
         damping = matrices["C"]
         if damping is None:
             damping = 0 * abs(stiffness.at(parameters))
         self.sums = {"M": mass, "C": matrix_sum("C", damping, parameters, fit), "K": stiffness}
+        if K_loss is not None:
+            self.sums["K_loss"] = matrix_sum("K_loss", K_loss, parameters, fit)
         self.names = _names(names, n)
         self.mesh = mesh
         if mesh is not None:
@@ -174,6 +188,97 @@ class Structure(Mechanism):
     def K(self) -> Float[Array, "n n"]:
         """The stiffness matrix without the joints [N/m]; errors as for `M`."""
         return self._matrix("K")
+
+    @property
+    def K_loss(self) -> Float[Array, "n n"] | None:
+        """The structural damping without the joints [N/m], None if none; errors as for `M`."""
+        return self._matrix("K_loss") if "K_loss" in self.sums else None
+
+    @property
+    def complex_K(self) -> Any:
+        """K + i K_loss (n, n) [N/m], or K without K_loss; errors as for `M`."""
+        K_loss = self.K_loss
+        return self.K if K_loss is None else self.K + 1j * K_loss
+
+    @property
+    def has_loss(self) -> bool:
+        """True if the matrices or a joint have structural damping."""
+        return "K_loss" in self.sums or any(j.loss_factor is not None for j in self.joints)
+
+    def equivalent_viscous(self, frequency: ArrayLike) -> "Structure":
+        """A copy with viscous damping in the place of structural damping, C + K_loss/(2 pi f).
+
+        At the frequency f both take the same energy off an oscillation: s C = i K_loss at s =
+        2 pi f i. Above it the viscous damping is larger, below it smaller. A joint with a loss
+        factor gets dashpots beside its springs, loss_factor K_n/(2 pi f) along the normal and
+        loss_factor K_t/(2 pi f) along the tangential direction, with its stiffness at its load;
+        friction acts on the forces of the springs alone, and the dashpots remain where the joint
+        opens. A reduced structure becomes a plain one.
+
+        **Arguments:**
+
+        - `frequency`: f [Hz], above 0, such as that of the mode in question.
+
+        **Raises:** `ValueError` unless f is above 0.
+        """
+        omega = 2 * jnp.pi * number("frequency", frequency, above=0)
+        if not self.has_loss:
+            return self
+        damping = self._terms("C")
+        if "K_loss" in self.sums:
+            scale = float(omega) if self.sums["K_loss"].sparse else omega
+            damping += [(c, X * (1 / scale)) for c, X in self._terms("K_loss")]
+        joints = {}
+        for name, joint in self.joints_by_name().items():
+            joints[name] = rebuild(joint, {"loss_factor": None})
+            if joint.loss_factor is None:
+                continue
+            for d, k in zip(self._directions(joint), reversed(joint.stiffness()), strict=False):
+                damping.append((None, joint.loss_factor * k / omega * jnp.outer(d, d)))
+        return self._with_terms({"C": damping, "K_loss": None}, joints, self.F, self.parameters)
+
+    def add(
+        self,
+        dofs: Sequence[Dof],
+        K: MatrixLike | None = None,
+        *,
+        M: MatrixLike | None = None,
+        C: MatrixLike | None = None,
+        K_loss: MatrixLike | None = None,
+    ) -> "Structure":
+        """A copy with small matrices added at some degrees of freedom, as DMIG and K2PP cards do.
+
+        A reduced structure becomes a plain one.
+
+        **Arguments:**
+
+        - `dofs`: the k degrees of freedom, by index or name, in the order of the matrices' rows.
+        - `K`: (k, k) [N/m], added to the stiffness; the imaginary part of a complex one is added to
+          K_loss. None adds nothing, by default, as for the others.
+        - `M`, `C`, `K_loss`: (k, k), added to the matrix of that name.
+
+        **Raises:** `ValueError` for an unknown degree of freedom, one that is given twice, and a
+        matrix of another shape; as `Structure` for the sums.
+        """
+        places = [self.index(dof) for dof in ([dofs] if isinstance(dofs, (int, str)) else dofs)]
+        if len(set(places)) < len(places):
+            raise ValueError(f"dofs gives one degree of freedom twice: {_some(map(repr, dofs))}")
+        K, K_loss = separated(K, K_loss)
+        added: dict[str, Any] = {}
+        for name, X in {"M": M, "C": C, "K": K, "K_loss": K_loss}.items():
+            if X is None:
+                continue
+            terms = self._terms(name) if name in self.sums else []
+            for coefficient, small in X if is_sum(X) else [(None, X)]:
+                small = as_array(name, small)
+                if small.shape != (len(places), len(places)):
+                    raise ValueError(
+                        f"{name} must have shape {(len(places),) * 2}, one row for each of dofs, "
+                        f"got {small.shape}"
+                    )
+                terms.append((coefficient, placed(small, places, self.n, self.is_sparse)))
+            added[name] = terms
+        return self._with_terms(added, self.joints_by_name(), self.F, self.parameters)
 
     def require_one(self) -> None:
         """Refuse a batch, and a large sparse structure, which must be reduced first."""
@@ -293,13 +398,9 @@ class Structure(Mechanism):
         parameters = self.parameters | {
             name: number(name, changes[name]) for name in self.parameters if name in changes
         }
-        if changes.keys() & {*self.sums, "F"}:
-            arguments = {name: changes.get(name, self._terms(name)) for name in self.sums}
-            arguments |= {"joints": joints, "F": changes.get("F", self.F), "names": self.names}
-            arguments |= {"mesh": self._matching_mesh(), "notes": self.notes}
-            if not self.parameters:
-                return Structure(**arguments)
-            return ParametricStructure(**arguments, parameters=parameters)
+        matrices = {name: changes[name] for name in ("M", "C", "K", "K_loss") if name in changes}
+        if matrices or "F" in changes:
+            return self._with_terms(matrices, joints, changes.get("F", self.F), parameters)
         # The matrices are unchanged and need no new check or factorisation.
         new = eqx.tree_at(lambda structure: structure.joints, self, tuple(joints.values()))
         new._check_joints()
@@ -307,6 +408,16 @@ class Structure(Mechanism):
             new = eqx.tree_at(lambda structure: structure.parameters, new, parameters)
             _check_coefficients(new)
         return new
+
+    def _with_terms(self, matrices, joints, F, parameters) -> "Structure":
+        """A checked copy with other matrices or terms of them, joints, F and parameters."""
+        kept = {name: self._terms(name) for name in self.sums} | matrices
+        arguments = {name: merged(X) for name, X in kept.items()}
+        arguments |= {"joints": joints, "F": F, "names": self.names}
+        arguments |= {"mesh": self._matching_mesh(), "notes": self.notes}
+        if not self.parameters:
+            return Structure(**arguments)
+        return ParametricStructure(**arguments, parameters=parameters)
 
     def _matching_mesh(self) -> Mesh | None:
         """The mesh, if it has the degrees of freedom of the matrices, else None."""
@@ -321,7 +432,7 @@ class Structure(Mechanism):
         names = ["M", "C", "K", "F", *self.parameters]
         for name, joint in zip(self.joint_names, self.joints, strict=True):
             names += [*quantities(joint), *(f"{name}.{plain}" for plain in quantities(joint))]
-        return list(dict.fromkeys(names))
+        return list(dict.fromkeys([*names, "K_loss"]))
 
     def _shown(self):
         yield f"n={self.n}"
@@ -336,7 +447,7 @@ class Structure(Mechanism):
             from .reduced import ReducedStructure
 
             return ReducedStructure.from_file(arguments)
-        if "parameters" in arguments or any(is_sum(arguments[name]) for name in "MCK"):
+        if "parameters" in arguments or any(is_sum(x) for x in arguments.values()):
             return ParametricStructure(**arguments)
         return Structure(**arguments)
 
@@ -394,6 +505,9 @@ class ParametricStructure(Structure):
     - `joints`: as in `Structure`, by default none.
     - `parameters`: {name: number}, by default none.
     - `F`, `names`, `mesh`, `notes`: as in `Structure`.
+    - `K_loss`: as in `Structure`, or a list of (coefficient, matrix), such as ("eta", K_pad) for a
+      loss factor that is a parameter. Matrices and numeric coefficients of K may be complex: their
+      imaginary parts are added to it.
 
     **Raises:** as `Structure`; `ValueError` for a coefficient that is not finite or reads an
     unknown parameter, and for a parameter with the name of another quantity.
@@ -408,14 +522,16 @@ class ParametricStructure(Structure):
         parameters: Mapping[str, ArrayLike] | None = None,
         F: ArrayLike | Sequence[float] | Mapping[Any, ArrayLike] | None = None,
         names: Iterable[str] | None = None,
+        K_loss: Any = None,
         mesh: Mesh | None = None,
         notes: Iterable[str] = (),
     ):
         if not isinstance(parameters or {}, Mapping):
             raise TypeError(f"parameters must be a mapping, got {brief(parameters)}")
         held = {name: number(str(name), value) for name, value in (parameters or {}).items()}
-        self._fill({"M": M, "C": C, "K": K}, held, joints, F, names, mesh, notes)
-        taken = {"M", "C", "K", "F", "pi"}.union(*map(quantities, self.joints))
+        matrices = {"M": M, "C": C, "K": K, "K_loss": K_loss}
+        self._fill(matrices, held, joints, F, names, mesh, notes)
+        taken = {"M", "C", "K", "F", "K_loss", "pi"}.union(*map(quantities, self.joints))
         for name in held:
             if not (isinstance(name, str) and name.isidentifier()):
                 raise ValueError(f"a parameter's name must be like Omega or k_1, got {name!r}")

@@ -2,7 +2,7 @@
 
 import io
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from .._base import toml
 from .._base.file_limits import FileLimits
 from .._base.files import read_bounded
 from .._base.numpy_file import read_npz
-from .._base.parts import brief
+from .._base.parts import brief, scalar
 from .._version import __version__
 from .coefficient import Expression
 from .damping import modal_damping, rayleigh_damping
@@ -21,16 +21,20 @@ from .matrices import MatrixSum, is_sparse
 from .matrix_file import Matrices, read_matrices
 from .mesh import Mesh
 
-_MATRICES = ("M", "C", "K")
+_MATRICES = ("M", "C", "K", "K_loss")
 _BASES = ("V", "W", "residuals", "touched", "coarse_V", "coarse_W")
 _MESH = "mesh."  # prefix of its arrays in the file of matrices
 _TABLES = ("structure", "parameters", "joints", "reduction", "reduced")
 _SPARSE = ("data", "indices", "indptr", "shape")  # a matrix in compressed rows
-_MATRIX_FORMS = "the name of a file or of a matrix, or a list of {coefficient = ..., matrix = ...}"
+_MATRIX_FORMS = (
+    "the name of a file or of a matrix, or a list of {coefficient = ..., matrix = ..., file = ...}"
+)
+_TERM = ("coefficient", "matrix", "file")
 _KEYS = {  # of [structure]: types, and their description
     "matrices": (str, "the name of a file"),
     **dict.fromkeys(_MATRICES, ((str, list), _MATRIX_FORMS)),
     "F": ((list, dict, str), "a list, a table or a file's name"),
+    "loss_factor": ((float, int), "a number"),
     "rayleigh": (list, "[alpha, beta]"),
     "damping_ratio": ((float, int, list), "a number or a list of one a mode"),
     "names": (list, "a list"),
@@ -43,6 +47,7 @@ class _Source:
 
     def __init__(self, table: dict[str, Any], folder: Path):
         self.folder, self.names = folder, table.get("names")
+        self.names_of_files = False
         self.held: dict[str, Any] = {}
         self.unread: dict[str, str] = {}  # reasons by name, for the file of matrices
         self.notes: list[str] = []
@@ -72,24 +77,41 @@ class _Source:
             )
         return matrices[key]
 
+    def chosen(self, file: str, name: str) -> Any:
+        """The matrix `name` of another file."""
+        matrices = self._read(self.folder / file).matrices
+        try:
+            return matrices[name]
+        except KeyError:
+            raise ValueError(f"{file} has no {name!r}; it holds {', '.join(matrices)}") from None
+
     def sum(self, key: str, value: Any) -> Any:
-        """M, C or K in the form that `Structure` takes."""
+        """M, C, K or K_loss in the form that `Structure` takes.
+
+        A term of K with a loss factor is complex, K (1 + i eta).
+        """
         if isinstance(value, str):
             return self.matrix(key, value)
-        terms = []
+        terms, allowed = [], (*_TERM, "loss_factor") if key == "K" else _TERM
         for term in value:
             if not isinstance(term, dict):
                 raise ValueError(f"[structure] {key} must be {_MATRIX_FORMS}, got {brief(term)}")
-            toml.refuse_unknown(f"a term of [structure] {key}", term, ("coefficient", "matrix"))
-            if not isinstance(term.get("matrix"), str):
+            toml.refuse_unknown(f"a term of [structure] {key}", term, allowed)
+            name, file = term.get("matrix"), term.get("file")
+            if not isinstance(name, str):
                 raise ValueError(f"a term of [structure] {key} lacks the key 'matrix'")
-            terms.append((term.get("coefficient"), self.matrix(key, term["matrix"])))
+            if not (file is None or isinstance(file, str)):
+                raise ValueError(f"file in a term of [structure] {key} must be a name, got {file}")
+            X = self.matrix(key, name) if file is None else self.chosen(file, name)
+            eta = term.get("loss_factor")
+            X = X if eta is None else _with_loss(X, _loss_factor(f"a term of {key}", eta))
+            terms.append((term.get("coefficient"), X))
         return terms
 
     def refuse_unused(self) -> None:
         """Refuse unused arrays in the file of matrices."""
         if self.file is not None and self.file.lower().endswith(".npz"):
-            allowed = [*_MATRICES, "F", *_BASES]
+            allowed = ["M", "C", "K", "F", "K_loss", *_BASES]
             rest = [
                 name for name in self.held if name not in self.used and not name.startswith(_MESH)
             ]
@@ -108,9 +130,18 @@ class _Source:
 
     def _read(self, path: Path) -> Matrices:
         model = read_matrices(path)
-        self.names = self.names or model.names
         self.notes += [f"{path.name}: {note}" for note in model.notes]
-        return model
+        if self.names is None:
+            self.names, self.names_of_files = model.names, True
+        if model.names is None or tuple(self.names) == model.names:
+            return model
+        missing = [name for name in model.names if name not in self.names]
+        if missing and self.names_of_files:
+            raise ValueError(
+                f"{path.name} has the degree of freedom {missing[0]}, which the files before it "
+                "have not"
+            )
+        return model if missing else _expanded(model, self.names)
 
 
 def read_structure(document: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -146,17 +177,22 @@ def read_structure(document: dict[str, Any], folder: Path) -> dict[str, Any]:
     for name in ("M", "K"):
         if name not in matrices:
             raise ValueError(f"[structure] lacks the matrix {name}, or matrices that has it")
+    if "loss_factor" in table:
+        eta = _loss_factor("[structure]", table["loss_factor"])
+        terms = matrices["K"] if isinstance(matrices["K"], list) else [(None, matrices["K"])]
+        terms = [(c, _with_loss(X, eta)) for c, X in terms]
+        matrices["K"] = terms if isinstance(matrices["K"], list) else terms[0][1]
     damping = [key for key in ("C", "rayleigh", "damping_ratio") if key in table | matrices]
     if len(damping) > 1:
         raise ValueError(f"[structure] gives damping twice: {' and '.join(damping)}")
     if "rayleigh" in table:
         if len(table["rayleigh"]) != 2:
             raise ValueError(f"[structure] rayleigh must be [alpha, beta], got {table['rayleigh']}")
-        matrices["C"] = _rayleigh(matrices["M"], matrices["K"], *table["rayleigh"])
+        matrices["C"] = _rayleigh(matrices["M"], _real(matrices["K"]), *table["rayleigh"])
     if "damping_ratio" in table:
         ratio = table["damping_ratio"]
         ratio = np.asarray(ratio) if isinstance(ratio, list) else ratio
-        matrices["C"] = modal_damping(_one("M", matrices), _one("K", matrices), ratio)
+        matrices["C"] = modal_damping(_one("M", matrices), _real(_one("K", matrices)), ratio)
     names = source.names
     F = matrices.get("F", table.get("F"))
     F = np.asarray(F.toarray()) if F is not None and is_sparse(F) else F
@@ -180,6 +216,34 @@ def read_structure(document: dict[str, Any], folder: Path) -> dict[str, Any]:
     return arguments | ({"parameters": parameters} if parameters else {})
 
 
+def _loss_factor(where: str, value: Any) -> float:
+    """A checked loss factor of stiffness."""
+    return float(scalar(f"loss_factor of {where}", value, at_least=0))
+
+
+def _with_loss(K: Any, eta: float) -> Any:
+    """K (1 + i eta), beside the structural damping that it already has."""
+    return K + 1j * eta * K.real
+
+
+def _expanded(model: Matrices, names: Sequence[str]) -> Matrices:
+    """A model of some of the degrees of freedom `names`, with all of them, by their names."""
+    from scipy.sparse import coo_array
+
+    place = {name: i for i, name in enumerate(names)}
+    index = np.array([place[name] for name in model.names or ()])
+    n, k = len(names), len(index)
+    for name, X in list(model.matrices.items()):
+        if X.shape not in ((k, k), (k, 1)):
+            continue
+        entries = X.tocoo()
+        i, j = entries.coords
+        width, j = (n, index[j]) if X.shape[1] == k else (1, j)
+        whole = coo_array((entries.data, (index[i], j)), shape=(n, width))
+        model.matrices[name] = whole.tocsr()
+    return model
+
+
 def _is_stored(value: Any, held: Mapping[str, Any]) -> bool:
     """True if the file of matrices contains a matrix, or all of its terms."""
     terms = value if isinstance(value, list) else [{"matrix": value}]
@@ -190,6 +254,11 @@ def _one(name: str, matrices: Mapping[str, Any]) -> Any:
     if isinstance(matrices[name], list):
         raise ValueError(f"[structure] damping_ratio needs {name} as one matrix: give C")
     return matrices[name]
+
+
+def _real(K: Any) -> Any:
+    """K, or each of its terms, without structural damping."""
+    return [(c, X.real) for c, X in K] if isinstance(K, list) else K.real
 
 
 def _rayleigh(M: Any, K: Any, alpha: Any, beta: Any) -> Any:
@@ -214,7 +283,7 @@ def _npz(path: Path) -> dict[str, Any]:
     """The arrays of a .npz file, sparse ones from the parts "K.data", "K.indices", ..."""
     most = FileLimits.matrices
     with toml.naming(path.name):
-        arrays: dict[str, Any] = read_npz(read_bounded(path, most), most)
+        arrays: dict[str, Any] = read_npz(read_bounded(path, most), most, kinds="iufc")
         for name in [key.removesuffix(".data") for key in arrays if key.endswith(".data")]:
             parts = [arrays.pop(f"{name}.{part}", None) for part in _SPARSE]
             arrays[name] = _compressed(name, *parts)
@@ -238,7 +307,7 @@ def structure_text(structure: Any, matrices: str) -> str:
     **Raises:** `ValueError` for a coefficient that is a function.
     """
     table = {
-        "matrices": toml.Noted(matrices, "M, C, K and perhaps F and a mesh"),
+        "matrices": toml.Noted(matrices, "M, C, K and perhaps K_loss, F and a mesh"),
         "names": structure.names,
     }
     for name, held in structure.sums.items():

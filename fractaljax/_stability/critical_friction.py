@@ -163,7 +163,8 @@ def _signs(x, factors, friction_slope, rigid):
 
     modes, attached = jax.vmap(modes_at)(factors)
     rigid = jnp.where(rigid < 0, (modes.s[0] == 0).sum(), rigid)
-    values = jax.vmap(least_test, (0, 0, None, None))(modes, attached.C, rigid, x.band)
+    over = jax.vmap(least_test, (0, 0, 0, None, None))
+    values = over(modes, attached.C, attached.K, rigid, x.band)
     return values, jax.vmap(lambda system: system.open)(attached), rigid
 
 

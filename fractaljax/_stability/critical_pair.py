@@ -58,7 +58,7 @@ def critical_pair(
     """
     s = solve(M, C, K, C_error).s
     fixed = jax.lax.stop_gradient(s)
-    chosen = _choice(fixed, rigid, ~(C != 0).any(), band)
+    chosen = _choice(fixed, rigid, C, K, band)
     i = jnp.argmin(chosen.test)
     j, alone, undamped = (x[i] for x in (chosen.partner, chosen.alone, chosen.undamped))
     sigma, delta = _mean_and_spread(M, C, K, s, i, j)
@@ -82,17 +82,21 @@ def critical_pair(
 def least_test(
     modes: Modes,
     C: Float[Array, "n n"],
+    K: Float[Array, "n n"],
     rigid: Int[Array, ""],
     band: tuple[float, float] | None = None,
 ) -> Float[Array, ""]:
     """T [1/s^2] as in `critical_pair`, without derivatives; 0 if rounding may decide its sign."""
-    test = _choice(modes.s, rigid, ~(C != 0).any(), band).test
+    test = _choice(modes.s, rigid, C, K, band).test
     unresolved = jnp.abs(modes.s.real) <= modes.error
     test = jnp.where(unresolved, jnp.maximum(test, 0), test).min()
     return jnp.where(jnp.isnan(modes.s).any(), jnp.nan, test)
 
 
-def _choice(s: Complex[Array, " k"], rigid, conservative, band) -> _Choice:
+def _choice(s: Complex[Array, " k"], rigid, C, K, band) -> _Choice:
+    conservative, hysteretic = ~(C != 0).any(), jnp.iscomplexobj(K)
+    if hysteretic:
+        conservative &= ~(K.imag != 0).any()
     place, size = jnp.arange(len(s)), jnp.abs(s)
     smaller = (size[None] < size[:, None]) | (
         (size[None] == size[:, None]) & (place[None] < place[:, None])
@@ -106,6 +110,8 @@ def _choice(s: Complex[Array, " k"], rigid, conservative, band) -> _Choice:
     coalesced, single = jnp.finfo(size.dtype).eps ** 0.5, _resolution(size.dtype)
     undamped = jnp.abs(sigma.real) <= jnp.where(conservative, coalesced, single) * size
     alone = (s.imag > 0) & (s[partner] == s.conj()) & ~(undamped & conservative)
+    if hysteretic:  # static divergence, of the problem without K_loss
+        alone |= (s.imag == 0) & (s.real > 0)
     test = jnp.where(alone, _alone(s.real, size), hopf_test(sigma, delta, undamped))
     counted &= in_band(s, band)
     test = jnp.where(counted & (s.imag >= 0), test, jnp.inf)

@@ -79,8 +79,10 @@ class Assembled(eqx.Module):
         rank = s.real if self.band is None else jnp.where(in_band(s, self.band), s.real, -jnp.inf)
         order = jnp.lexsort((-s.imag, -rank))
         s, x, error = s[order], x[order], error[order]
-        margin = least_damping_ratio(among(s, self.band))
-        return Eigensolution(s, x, error, margin, in_band(s, self.band))
+        margin, counted = least_damping_ratio(among(s, self.band)), in_band(s, self.band)
+        if jnp.iscomplexobj(self.K):  # structural damping: some places may be left over
+            counted &= jnp.isfinite(error)
+        return Eigensolution(s, x, error, margin, counted)
 
     def hopf_test(self, rigid: Array) -> Float[Array, ""]:
         """The Hopf test function; `rigid` is the number of rigid-body eigenvalues."""
@@ -113,7 +115,8 @@ def assemble(
     and the equilibrium is that under F and the friction mu P t; for a load curve N_0 = N(n.x_0),
     and the tangent at N_0 takes the place of P + K_n n.x. C and K are NaN where such a joint is
     open, N_0 <= 0, and under `jit` where there is no equilibrium. A joint without normal has N_0 =
-    P and no term with n.
+    P and no term with n. With structural damping K is complex, K + i K_loss, for Im s > 0, and K_n
+    and K_t of a joint with a loss factor are so in all of these terms but the equilibrium's.
 
     **Arguments:**
 
@@ -129,7 +132,7 @@ def assemble(
 class Attachment(NamedTuple):
     """What one joint adds to the matrices, by its directions t and n."""
 
-    K_n: jax.Array
+    K_n: jax.Array  # complex with a loss factor, as K_t
     K_t: jax.Array
     mu: jax.Array
     c_t: jax.Array  # of t t^T in C
@@ -199,7 +202,7 @@ def attachments(structure: Structure, friction_slope: bool) -> Attachments:
         }
     zero = jnp.zeros((), K.dtype)
     each, damping_errors, forces = [], [], []
-    for i, joint in enumerate(joints):
+    for i, (joint, part) in enumerate(zip(joints, structure.joints, strict=True)):
         N, N_error, t_x, t_error = joint.P, 0.0, zero, zero
         if i in displaced:
             (t_x, n_x), (t_error, n_error) = displaced[i]
@@ -212,7 +215,8 @@ def attachments(structure: Structure, friction_slope: bool) -> Attachments:
             c_n = zero if joint.n is None else -by_t * t_x
             error = jnp.abs(joint.slope) * N_error, jnp.abs(by_t) * t_error
             error = error if i in displaced else None
-        each.append(Attachment(joint.K_n, joint.K_t, joint.mu, c_t, c_n))
+        K_n, K_t = part.complex_stiffness(joint.K_n, joint.K_t)
+        each.append(Attachment(K_n, K_t, joint.mu, c_t, c_n))
         damping_errors.append(error)
     return Attachments(each, damping_errors, forces, loaded, supported)
 
@@ -224,7 +228,7 @@ def assembled(structure: Structure, friction_slope: bool, refuse: bool = True) -
     are numbers there as well. Inside a compiled program nothing is raised.
     """
     attached = attachments(structure, friction_slope)
-    C, K = structure.C, structure.K
+    C, K = structure.C, structure.complex_K
     error = jnp.zeros_like(C)
     for joint, by, uncertain in zip(structure.joints, attached.each, attached.errors, strict=True):
         t = jnp.asarray(structure.direction(joint.tangential))

@@ -19,6 +19,7 @@ from .._base.lapack import one_by_one
 from .._base.rounding import rounding_error
 from .._mechanism.matrices import mass_normalised
 from .band import in_band
+from .hysteretic import physical_modes
 
 
 class Modes(NamedTuple):
@@ -46,11 +47,19 @@ def solve(
 ) -> Modes:
     """All 2n modes. `C_error` bounds the error of C beyond rounding.
 
-    A rigid-body mode has K x = 0 and s = 0 within rounding.
+    A rigid-body mode has K x = 0 and s = 0 within rounding. A complex K is K + i K_loss, with
+    structural damping: `hysteretic.py` says which solutions are modes then.
     """
+    if jnp.iscomplexobj(K):
+        return physical_modes(_solutions(M, C, K, C_error), _solutions(M, C, K.real, C_error))
+    return _solutions(M, C, K, C_error)
+
+
+def _solutions(M, C, K, C_error) -> Modes:
+    """All 2n solutions (s, x) of the problem as it is."""
     # Units of every degree of freedom and of time that make matrices of order one. They are
     # powers of two, so that scaling rounds nothing.
-    units = _power_of_two(-_half_exponent(jnp.diagonal(M)), K.dtype)
+    units = _power_of_two(-_half_exponent(jnp.diagonal(M)), M.dtype)
     M, C, K, C_error = jax.tree.map(lambda X: X * units[:, None] * units[None], (M, C, K, C_error))
     stiffness, damping = _row_sum(K), _row_sum(C)
     no_exponent = -2000  # below that of any number
@@ -58,7 +67,7 @@ def solve(
         jnp.where(stiffness > 0, _half_exponent(stiffness), no_exponent),
         jnp.where(damping > 0, jnp.frexp(damping)[1], no_exponent),
     )
-    omega = _power_of_two(jnp.where(exponent > no_exponent, exponent, 0), K.dtype)
+    omega = _power_of_two(jnp.where(exponent > no_exponent, exponent, 0), M.dtype)
     C_error = None if C_error is None else C_error / omega
     scaled = _modes(M, C / omega, K / omega / omega, C_error)
     s = omega * jnp.where(scaled.rigid, 0, scaled.z)
@@ -90,7 +99,10 @@ def leading(
 
     def eigenvalues(places):
         s, x, y = modes.s[places], modes.x[places], modes.y[places]
-        return s - s**2 * _between(y, dM, x) - s * _between(y, dC, x) - _between(y, dK, x)
+        moved = s - s**2 * _between(y, dM, x) - s * _between(y, dC, x) - _between(y, dK, x)
+        if not jnp.iscomplexobj(K):
+            return moved
+        return jnp.where(s.imag == 0, moved.real, moved)  # K_loss keeps what is real so
 
     s = jnp.where(sought[places], eigenvalues(places), -1 if band is None else -band[1])
     neighbour = jnp.where(paired & sought[places], eigenvalues(nearest), s)

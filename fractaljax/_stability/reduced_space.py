@@ -11,6 +11,8 @@ from .._mechanism.structure import Structure
 from .band import in_band
 from .snapshots import Snapshot, Snapshots, joint_blocks, joint_directions, plain
 
+_FACTORS = {"M": (2, 1), "C": (1, 1), "K": (0, 1), "K_loss": (0, 1j)}  # power of s, and unit
+
 
 def decomposed(vectors: list[np.ndarray], weight: np.ndarray, cut: float) -> np.ndarray:
     """An orthonormal basis (n, r) in the norm of a lumped mass, of vectors (n, k), complex or not.
@@ -104,13 +106,15 @@ def _in_space(rows: np.ndarray, T: np.ndarray) -> np.ndarray:
     return np.concatenate([reduced.reshape(-1, rows.shape[1]), rest])
 
 
-def _terms(x: Structure) -> Iterator[tuple[int, Callable | None, Any]]:
-    """The power of s, the coefficient and the matrix of every term, always in one order."""
-    for name, power in (("M", 2), ("C", 1), ("K", 0)):
+def _terms(x: Structure) -> Iterator[tuple[str, Callable | None, Any]]:
+    """The name of its matrix, the coefficient and the matrix of every term, always in one order."""
+    for name in _FACTORS:
+        if name not in x.sums:
+            continue
         held = x.sums[name]
         matrices = held.matrices if held.sparse else map(np.asarray, held.arrays)
         for coefficient, X in zip(held.coefficients, matrices, strict=True):
-            yield power, coefficient, X
+            yield name, coefficient, X
 
 
 def estimated_errors(
@@ -120,14 +124,16 @@ def estimated_errors(
     from scipy.linalg import eig
 
     terms = [
-        (power, 1.0 if c is None else float(c(parameters)), X) for power, c, X in _terms(reduced)
+        (*_FACTORS[name], 1.0 if c is None else float(c(parameters)), X)
+        for name, c, X in _terms(reduced)
     ]
     D, normal = joint_directions(reduced)
     blocks = joint_blocks(numbers, normal, D.shape[1])
     r = reduced.n
-    K, C, M = total = np.zeros((3, r, r))
-    for power, c, X in terms:
-        total[power] += c * X
+    lossy = "K_loss" in reduced.sums or np.iscomplexobj(numbers)
+    K, C, M = total = np.zeros((3, r, r), complex if lossy else float)
+    for power, unit, c, X in terms:
+        total[power] += unit * c * X
     C += D @ blocks[0] @ D.T
     K += D @ blocks[1] @ D.T
     omega, inverse = reduced.reduction.band[1], np.linalg.inv(M)
@@ -141,7 +147,7 @@ def estimated_errors(
     def residual(vectors, transposed):
         along = D.T @ vectors
         of_C, of_K = (X.T if transposed else X for X in blocks)
-        parts = [c * s**power * vectors for power, c, _ in terms]
+        parts = [unit * c * s**power * vectors for power, unit, c, _ in terms]
         return np.concatenate([*parts, s * (of_C @ along) + of_K @ along])
 
     error = (residual(p, True) * (reduced.reduction.residuals @ residual(q, False))).sum(axis=0)

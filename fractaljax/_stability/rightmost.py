@@ -35,6 +35,9 @@ def rightmost(
     matrices: Matrices, band: tuple[float, float] | None, coarse: CoarseSpace | None
 ) -> Complex[Array, ""]:
     """The eigenvalue with the largest real part, in a `band` if there is one."""
+    if jnp.iscomplexobj(matrices[2]):  # structural damping
+        s = quadratic.solve(*matrices).s
+        return s[jnp.argmax(_rank(jax.lax.stop_gradient(s), band))]
     return _mode(band, coarse, *matrices).s
 
 
@@ -77,11 +80,13 @@ def _dynamic_stiffness(s, M, C, K) -> Complex[Array, "n n"]:
 
 def _rightmost_of_all(band, M, C, K) -> _Mode:
     modes = quadratic.solve(M, C, K)
-    rank = (
-        modes.s.real if band is None else jnp.where(in_band(modes.s, band), modes.s.real, -jnp.inf)
-    )
-    i = jnp.argmax(rank)  # sorting would double the time to compile
+    i = jnp.argmax(_rank(modes.s, band))  # sorting would double the time to compile
     return _Mode(modes.s[i], modes.x[i], modes.y[i])
+
+
+def _rank(s, band):
+    """Real parts, -inf outside the band."""
+    return s.real if band is None else jnp.where(in_band(s, band), s.real, -jnp.inf)
 
 
 # --- from the modes of a coarse space -------------------------------------------------------------

@@ -6,8 +6,9 @@ k_i = x^H K_i x of parts i, m being real, the imaginary part is
     sigma (2 omega m + Im c) = -sum_i (omega Re c_i + Im k_i),
 
 so that part i contributes -(omega Re c_i + Im k_i)/(2 omega m + Im c) to the growth rate: damping
-by Re c_i, friction and other circulatory forces by Im k_i. Gyroscopic terms contribute nothing. The
-work of these forces in a period is the same numbers times 2 pi (2 omega m + Im c).
+by Re c_i, friction and other circulatory forces by Im k_i, and so does structural damping, of which
+K is K + i K_loss. Gyroscopic terms contribute nothing. The work of these forces in a period is the
+same numbers times 2 pi (2 omega m + Im c).
 """
 
 from collections.abc import Mapping
@@ -66,8 +67,9 @@ def energy_shares(
 ) -> EnergyShares:
     """Energy and contribution to the growth rate of each part, in each mode that oscillates.
 
-    Parts are the terms of M, C and K, "K" or "K 1", "K 2", ... where it is a sum, and the joints by
-    their names. A joint acts through its springs, its friction and the slope of its friction law.
+    Parts are the terms of M, C, K and K_loss, "K" or "K 1", "K 2", ... where it is a sum, and the
+    joints by their names. A joint acts through its springs, its friction and the slope of its
+    friction law.
 
     The sum of the contributions is the growth rate, as exactly as shapes are known. Where
     gyroscopic modes coalesce, 2 omega m + Im c passes through 0 and they grow without bound. For a
@@ -124,17 +126,18 @@ def energy_shares(
 def _forms(structure: Structure, x: np.ndarray, friction_slope: bool) -> dict[str, Any]:
     """(m, c, k) of each part for shapes x (k, n), each a number or (k,)."""
     forms = {}
-    for place, (name, held) in enumerate(structure.sums.items()):
+    for name, held in structure.sums.items():
+        place, unit = {"M": (0, 1), "C": (1, 1), "K": (2, 1), "K_loss": (2, 1j)}[name]
         terms = list(zip(held.coefficients, held.arrays, strict=True))
         for i, (coefficient, X) in enumerate(terms, start=1):
             value = evaluated(coefficient, structure.parameters)
             form = np.einsum("ki,ki->k", x.conj(), x @ np.asarray(X).T)
-            form = form * (1.0 if value is None else float(value))
+            form = unit * form * (1.0 if value is None else float(value))
             part = name if len(terms) == 1 else f"{name} {i}"
             forms[part] = [form if place == other else 0.0 for other in range(3)]
     attached = np.asarray(joint_numbers(structure, friction_slope))
     for name, joint, by in zip(structure.joint_names, structure.joints, attached, strict=True):
-        K_n, K_t, mu, c_t, c_n = map(float, by)
+        K_n, K_t, mu, c_t, c_n = by
         t = x @ structure.direction(joint.tangential)
         n = 0 * t if joint.normal is None else x @ structure.direction(joint.normal)
         # As `assemble` adds them.

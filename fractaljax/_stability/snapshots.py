@@ -37,7 +37,7 @@ def joint_directions(structure: Structure) -> _Directions:
 
 def joint_blocks(numbers: np.ndarray, normal: tuple[int | None, ...], k: int):
     """(C, K) (k, k) that the joints add between their directions, from `joint_numbers` (m, 5)."""
-    C, K = np.zeros((2, k, k))
+    C, K = np.zeros((2, k, k), numbers.dtype)
     for t, (n, (K_n, K_t, mu, c_t, c_n)) in enumerate(zip(normal, numbers, strict=True)):
         C[t, t] += c_t
         K[t, t] += K_t
@@ -51,7 +51,7 @@ def joint_blocks(numbers: np.ndarray, normal: tuple[int | None, ...], k: int):
 
 @functools.partial(jax.jit, static_argnames="friction_slope")
 def joint_numbers(structure: Structure, friction_slope: bool) -> Float[Array, "m 5"]:
-    """What each joint adds at the equilibrium: K_n, K_t, mu, c_t, c_n."""
+    """What joints add at the equilibrium: K_n, K_t, mu, c_t, c_n; complex with a loss factor."""
     if not structure.joints:
         return jnp.zeros((0, 5))
     attached = attachments(structure, friction_slope).each
@@ -64,7 +64,9 @@ def projected(structure: Structure, V: np.ndarray, W: np.ndarray) -> dict[str, A
     for name, joint in zip(structure.joint_names, structure.joints, strict=True):
         t = structure.direction(joint.tangential) @ V
         n = None if joint.normal is None else structure.direction(joint.normal) @ V
-        joints[name] = Joint(joint.contact, joint.friction, t, n, joint.V, joint.preload)
+        joints[name] = Joint(
+            joint.contact, joint.friction, t, n, joint.V, joint.preload, joint.loss_factor
+        )
     terms = {
         name: list(zip(held.coefficients, held.projected(W, V).arrays, strict=True))
         for name, held in structure.sums.items()
@@ -132,12 +134,12 @@ class Snapshots:
         return min(self.search.candidates * len(self.ranges), self.search.most_candidates)
 
     def springs(self, x: Structure) -> Any:
-        """K of a structure with the springs and the friction of its joints, sparse."""
+        """K of a structure with the springs and the friction of its joints, sparse and real."""
         numbers = [
             (*map(float, joint.stiffness()), float(joint.coefficient()), 0.0, 0.0)
             for joint in x.joints
         ]
-        return self.matrices(x, np.array(numbers).reshape(-1, 5))[2]
+        return self.matrices(x, np.array(numbers).reshape(-1, 5), static=True)[2]
 
     def statics(self, x: Structure) -> tuple[np.ndarray, np.ndarray]:
         """Displacements (n, k) under F and along the joints' directions; left ones of the latter.
@@ -172,8 +174,13 @@ class Snapshots:
 
         return numbers_at
 
-    def matrices(self, x: Structure, numbers: np.ndarray) -> tuple[Any, Any, Any]:
-        """(M, C, K), sparse, with the joints attached."""
+    def matrices(
+        self, x: Structure, numbers: np.ndarray, static: bool = False
+    ) -> tuple[Any, Any, Any]:
+        """(M, C, K), sparse, with the joints attached; K is complex with structural damping.
+
+        Not if it is `static`.
+        """
         from scipy.sparse import csr_array
 
         D, normal = self.directions
@@ -183,7 +190,9 @@ class Snapshots:
             plain(x, name) + D @ csr_array(block) @ D.T
             for name, block in zip("CK", blocks, strict=True)
         )
-        return plain(x, "M").tocsr(), C.tocsr(), K.tocsr()
+        if "K_loss" in x.sums and not static:
+            K = K + 1j * plain(x, "K_loss")
+        return plain(x, "M").tocsr(), C.real.tocsr(), K.tocsr()
 
     def take(self, u: np.ndarray) -> Snapshot:
         """All modes in the band at a point, and static displacements."""

@@ -230,7 +230,8 @@ def _states(x: Scene | Structure, name: str, value: Any, friction_slope: bool):
     s, Y = modes.s[:, None], modes.y
     left = jnp.concatenate([s * (Y @ M) + Y @ C, Y @ M], axis=1)
     right = jnp.concatenate([modes.x, s * modes.x], axis=1)
-    return modes.s, right, left, in_band(modes.s, x.band)
+    counted = in_band(modes.s, x.band)
+    return modes.s, right, left, counted & jnp.isfinite(modes.error) if x.has_loss else counted
 
 
 class _Modes(NamedTuple):
