@@ -1,0 +1,20 @@
+"""Published results beside ours. Each module holds the cases of one subject."""
+
+from . import (
+    belts,
+    coupling,
+    damper,
+    disc,
+    finite_elements,
+    follower,
+    rough,
+    smooth,
+    source,
+    two_blocks,
+)
+from .case import Case
+
+_MODULES = (
+    *(source, coupling, disc, follower, belts, two_blocks, damper, rough, smooth, finite_elements),
+)
+CASES: dict[str, Case] = {case.name: case for module in _MODULES for case in module.CASES}
