@@ -86,7 +86,7 @@ def _sinou() -> CaseResult:
         roots = [np.roots(_polynomial(*eta, x)).real.max() for x in mu[::4]]
         curves.append(Curve(mu[::4], roots, f"quartic, {label}", False))
         curves.append(Curve(mu, growth(model, jnp.asarray(mu)), f"fractaljax, {label}", True))
-    panel = Panel("friction coefficient mu [-]", "growth rate [1/s]", curves, {"ylim": (-30, 80)})
+    panel = Panel("friction coefficient mu [-]", "growth rate [1/s]", curves)
     return CaseResult(checks, [panel])
 
 

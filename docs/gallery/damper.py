@@ -44,13 +44,12 @@ def _den_hartog() -> CaseResult:
             closed(f"product of the multipliers {at} [-]", _decay(r, share), product, 1e-9),
         ]
     for share in (0.2, 0.5, 0.7):
-        ratios = np.array([0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 1.2, 1.25, 1.3, 1.4, 1.5])
-        ours = np.array([float(cycle(r, share).amplitude[0]) / 2 for r in ratios])
-        dense, label = np.concatenate([np.linspace(0.5, 0.86, 31), np.linspace(1.19, 1.5, 16)]), ""
-        label = f"friction {share:g} F"
-        curves.append(Curve(dense, _published(dense, share), f"Den Hartog, {label}", False))
-        for k, part in enumerate((np.s_[:7], np.s_[7:])):
-            curves.append(Curve(ratios[part], ours[part], f"fractaljax, {label}" * (k == 0), True))
+        below, above = np.linspace(0.55, 0.85, 13), np.linspace(1.2, 1.5, 9)
+        both, label = np.concatenate([below, above]), f"friction {share:g} F"
+        curves.append(Curve(both, _published(both, share), f"Den Hartog, {label}", False))
+        for ratios, name in ((below, f"fractaljax, {label}"), (above, "")):
+            amplitudes = [float(cycle(r, share).amplitude[0]) / 2 for r in ratios]
+            curves.append(Curve(ratios, amplitudes, name, True))
     axes = "frequency ratio r [-]", "amplitude [F/k]"
     return CaseResult(checks, [Panel(*axes, curves)])
 

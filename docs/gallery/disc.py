@@ -1,4 +1,4 @@
-"""The wobbling disc of von Wagner, Hochlenert and Hagedorn: it squeals below a critical speed."""
+"""The wobbling disc of von Wagner, Hochlenert and Hagedorn: it squeals above a critical speed."""
 
 from typing import Any
 

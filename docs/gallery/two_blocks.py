@@ -45,7 +45,8 @@ def _by_scipy(V):
         for event in events:
             event.terminal, event.direction = True, -1
         events += [lambda _, y: y[2], lambda _, y: y[3]]  # x is largest or least
-        options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-14, "max_step": 0.1}
+        options: dict[str, Any] = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-14}
+        options["max_step"] = np.inf if begin is None else 0.1  # fine enough for a picture
         piece = solve_ivp(partial(_rate, signs, V), (t, t + 50), y, events=events, **options)
         t, y, i = piece.t[-1], piece.y[:, -1].copy(), int(len(piece.t_events[0]) == 0)
         if begin is not None:
@@ -56,7 +57,7 @@ def _by_scipy(V):
         signs = signs.copy()
         signs[i] = np.sign(pull) if breaks or abs(pull) > _FRICTION[i] else 0
         y[2 + i] = V
-        if breaks and i == 0 and t > 150:
+        if breaks and i == 0 and t > 350:
             begin = begin or (t, y)
             if t > begin[0] and np.allclose(y, begin[1], rtol=0, atol=1e-8):
                 period = t - begin[0]
@@ -94,7 +95,8 @@ def _galvanetto() -> CaseResult:
             x, v = orbit[[i, i + 2], :: len(orbit[0]) // 40]
             curves.append(Curve(x, v, f"{name} block, by SciPy", False))
             curves.append(Curve(states[:, i], states[:, i + 2], f"{name} block, fractaljax", True))
-        panels.append(Panel(f"displacement [m], V = {V:g} m/s", "velocity [m/s]", curves))
+        axes = f"displacement [m], V = {V:g} m/s", "velocity [m/s]"
+        panels.append(Panel(*axes, curves, {"ylim": (-5 * V, 2 * V)}))  # room for the legend
     return CaseResult(checks, panels)
 
 
