@@ -9,7 +9,6 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-import jax
 import matplotlib as mpl
 from gallery import CASES
 from gallery.case import Case, CaseResult, Check
@@ -138,5 +137,4 @@ def main() -> int:
 
 if __name__ == "__main__":
     mpl.use("agg")
-    jax.config.update("jax_enable_x64", True)
     raise SystemExit(main())

@@ -1,6 +1,10 @@
 """Published results beside ours. Each module holds the cases of one subject."""
 
-from . import (
+import jax
+
+jax.config.update("jax_enable_x64", True)  # before modules make their materials
+
+from . import (  # noqa: E402
     belts,
     coupling,
     damper,
@@ -12,7 +16,7 @@ from . import (
     source,
     two_blocks,
 )
-from .case import Case
+from .case import Case  # noqa: E402
 
 _MODULES = (
     *(source, coupling, disc, follower, belts, two_blocks, damper, rough, smooth, finite_elements),
