@@ -1,12 +1,18 @@
-"""Run the published cases and write validation.md with its pictures.
+"""Run the published cases of docs/gallery and write validation.md with its pictures.
 
-`FRACTALJAX_BRAKE=FOLDER python docs/make_validation.py`, with the folder of the brake's matrices.
+`FRACTALJAX_BRAKE=FOLDER python docs/make_validation.py`, with the folder of the brake's matrices;
+or the names of cases, whose sections and pictures alone are written. Exit status 1 if one differs.
 """
 
+import argparse
+import re
+from collections.abc import Mapping
 from pathlib import Path
 
-import jax
 import matplotlib as mpl
+from gallery import CASES
+from gallery.case import Case, CaseResult, Check
+from gallery.picture import picture
 from writing import run, small_png, table
 
 import fractaljax as fj
@@ -16,12 +22,13 @@ PAGE = Path(__file__).with_name("validation.md")
 INTRODUCTION = """\
 # Validation
 
-What others published, computed again: our curve over theirs, number beside number.
+What others published, computed again: our curve over theirs, number beside number. The cases are
+modules of docs/gallery, each a few lines of the article's equations.
 
-    fractaljax validate                             # all of it: exit status 1 if a number differs
-    fractaljax validate leine thomsen --out gallery # two cases, with their pictures
+    fractaljax validate                             # checks an installation in a minute
+    python docs/make_validation.py leine den_hartog # in the repository: two cases with pictures
 
-In Python it is `fj.validate("leine")`. The tolerance comes from the digits that were printed, the
+In Python it is `fj.validate()`. The tolerance comes from the digits that were printed, the
 order of an approximation, or the grid. The basis says where a published number is from:
 
 - **stated**: it is printed in the article.
@@ -31,7 +38,6 @@ order of an approximation, or the grid. The basis says where a published number 
   closed form or SciPy's.
 
 The last column is the difference in percent of the tolerance; of a range, whether it is met.
-
 """
 
 CLOSING = """\
@@ -42,17 +48,18 @@ Written by `python docs/make_validation.py`.
 """
 
 
-def rows(case: fj.ValidatedCase) -> list[list[str]]:
+def rows(checks: list[Check]) -> list[list[str]]:
     """The rows of a case's table."""
-    found = []
-    for quantity, published, ours, _, tolerance, basis, result in case.rows():
-        check = next(check for check in case.checks if check.quantity == quantity)
-        used = result
-        if result == "ok":
-            share = abs(check.difference or 0.0) / check.tolerance if check.tolerance else 0.0
+    written = []
+    _, cells = fj.Validation({"": checks}).rows()
+    for check, (_, quantity, published, ours, _, tolerance, basis, used) in zip(
+        checks, cells, strict=True
+    ):
+        if check.agrees:
+            share = abs(check.difference) / check.tolerance if check.tolerance else 0.0
             used = f"{share:.0%}" if check.tolerance else "within"
-        found.append([quantity, published, ours, tolerance, basis, used])
-    return found
+        written.append([quantity, published, ours, tolerance, basis, used])
+    return written
 
 
 def picture_of(name: str) -> Path:
@@ -60,41 +67,74 @@ def picture_of(name: str) -> Path:
     return PAGE.with_name(f"validation_{name}.png")
 
 
-def section(case: fj.ValidatedCase) -> str:
+def section(case: Case, checks: list[Check]) -> str:
     """The part of the page on one case."""
     source = case.citation
     if case.doi is not None:
         source += f", [doi:{case.doi}](https://doi.org/{case.doi})"
     head = ["quantity", "published", "ours", "tolerance", "basis", "difference"]
-    lines = [f"## {case.title}", "", f"`{case.name}`: {source}.", "", *table(head, rows(case)), ""]
-    notes = [f"- {check.quantity}: {check.note}." for check in case.checks if check.note]
+    lines = [
+        f"## {case.title}",
+        "",
+        f"`{case.name}`: {source}.",
+        "",
+        *table(head, rows(checks)),
+        "",
+    ]
+    notes = [f"- {check.quantity}: {check.note}." for check in checks if check.note]
     lines += [*notes, ""] if notes else []
-    return "\n".join(
-        [*lines, f"![{case.title}: ours over theirs]({picture_of(case.name).name})", ""]
-    )
+    image = f"![{case.title}: ours over theirs]({picture_of(case.name).name})"
+    return "\n".join([*lines, image, ""])
 
 
-def page(found: fj.Validation) -> str:
+def contents() -> str:
+    """A list of the cases with a link to each: the gallery at a glance."""
+
+    def anchor(title: str) -> str:
+        return re.sub(r"[^\w -]", "", title).lower().replace(" ", "-")
+
+    cases = CASES.values()
+    return "".join(f"- [{case.title}](#{anchor(case.title)})\n" for case in cases)
+
+
+def page(sections: Mapping[str, str]) -> str:
     """The text of validation.md."""
-    return INTRODUCTION + "\n".join([*map(section, found.cases.values()), CLOSING])
+    parts = [INTRODUCTION, contents(), *(sections[name] for name in CASES), CLOSING]
+    return "\n".join(parts)
 
 
-def main() -> None:
-    """Write the page and its pictures.
+def sections_of(text: str) -> dict[str, str]:
+    """The sections of a page by the name of their case."""
+    parts = re.split(r"^(?=## )", text.partition("\nOf the source's Figs.")[0], flags=re.MULTILINE)
+    return {part.split("`")[1]: part.rstrip("\n") + "\n" for part in parts[1:]}
 
-    **Raises:** `SystemExit` if a case lacks its data.
+
+def main() -> int:
+    """Write the page and its pictures; 1 if a number differs.
+
+    **Raises:** `SystemExit` for an unknown case, and if a case lacks its data.
     """
-    found = fj.validate()
-    if lacking := [case.reason for case in found.cases.values() if case.reason]:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument(
+        "cases", nargs="*", metavar="CASE", choices=[*CASES, []], help="default all"
+    )
+    chosen = parser.parse_args().cases or list(CASES)
+    if lacking := [reason for name in chosen if (reason := CASES[name].missing())]:
         raise SystemExit("; ".join(lacking))
-    print(found)
-    contents = {PAGE: lambda: page(found).encode()}
-    for name, case in found.cases.items():
-        contents[picture_of(name)] = lambda case=case: small_png(fj.plot.validation(case))
-    run(contents)
+    results: dict[str, CaseResult] = {}
+    for name in chosen:
+        results[name] = CASES[name].run()
+        print(fj.Validation({name: results[name].checks}), flush=True)
+    sections = sections_of(PAGE.read_text(encoding="utf-8"))
+    sections |= {name: section(CASES[name], list(one.checks)) for name, one in results.items()}
+    files = {PAGE: lambda: page(sections).encode()}
+    for name, one in results.items():
+        figure = picture(CASES[name], one.panels)
+        files[picture_of(name)] = lambda figure=figure: small_png(figure)
+    run(files)
+    return int(not all(check.agrees for one in results.values() for check in one.checks))
 
 
 if __name__ == "__main__":
     mpl.use("agg")
-    jax.config.update("jax_enable_x64", True)
-    main()
+    raise SystemExit(main())

@@ -138,7 +138,6 @@ from ._surface.topography import topography as topography
 from ._sweep.result import Sweep as Sweep
 from ._sweep.sweep import sweep as sweep
 from ._validate.validate import (
-    ValidatedCase as ValidatedCase,
     Validation as Validation,
     validate as validate,
 )

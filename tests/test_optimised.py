@@ -134,7 +134,7 @@ CALLS: dict[str, Callable[[], Any]] = {
     "topography": lambda: fj.topography(SURFACE, 1e-3, 16, key=jax.random.key(0), L_s=1e-4),
     "track_modes": lambda: fj.track_modes(STRUCTURE, "D", [2.4, 2.41]).eigenvalues,
     "validate": lambda: [
-        check.ours for check in fj.validate("ziegler", **QUIET).cases["ziegler"].checks
+        check.ours for check in fj.validate("reference", **QUIET).cases["reference"]
     ],
     "verdict": lambda: [float(question.quiet) for question in fj.verdict(BRAKE, **QUIET).questions],
 }

@@ -1,1 +1,1 @@
-"""Published results beside ours. Each module holds the cases of one subject."""
+"""The self-check of an installation: closed forms and published numbers beside ours."""

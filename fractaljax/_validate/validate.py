@@ -1,84 +1,51 @@
-"""Run published cases and put their numbers beside ours."""
+"""Check an installation against closed forms and published numbers."""
 
 import dataclasses
-import functools
-import importlib
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import jax
 
 from .._base.parts import flag
 from .._base.table import aligned
-from .case import Case, Check, Panel
+from .check import Check
 
-_MODULES = ("source", "coupling", "follower", "belts", "rough", "smooth", "finite_elements")
 _TITLES = ["case", "quantity", "published", "ours", "difference", "tolerance", "basis", "result"]
-
-
-@dataclasses.dataclass(frozen=True)
-class ValidatedCase:
-    """One published case after its run."""
-
-    name: str  # by which `validate` takes it
-    title: str  # what is computed
-    citation: str  # of the article
-    doi: str | None  # of the article
-    checks: tuple[Check, ...]  # each published number beside ours
-    panels: tuple[Panel, ...] = dataclasses.field(repr=False)  # the curves of its picture
-    reason: str = ""  # why it did not run, or what ended it
-    failed: bool = False  # True if an error ended it
-
-    @property
-    def agrees(self) -> bool:
-        """True if no number differs by more than its tolerance, and no error ended the run."""
-        return not self.failed and all(check.agrees is not False for check in self.checks)
-
-    def rows(self) -> list[list[str]]:
-        """The rows of the table, without the name of the case: one for each number."""
-        rows = [_cells(check) for check in self.checks]
-        if self.reason:
-            dashes = ["-"] * (len(_TITLES) - 3)
-            rows.append([self.title, *dashes, "FAILS" if self.failed else "NOT RUN"])
-        return rows
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Validation:
     """Published numbers beside ours, as `validate` returns them; printed as a table."""
 
-    cases: dict[str, ValidatedCase]  # by name
+    cases: Mapping[str, Sequence[Check]]  # by name, each published number beside ours
 
     @property
     def agrees(self) -> bool:
-        """True if all cases that ran agree with the published numbers."""
-        return all(case.agrees for case in self.cases.values())
+        """True if no number differs by more than its tolerance."""
+        return all(check.agrees for checks in self.cases.values() for check in checks)
 
     def rows(self) -> tuple[list[str], list[list[str]]]:
         """The titles and the rows of the table: one for each number."""
-        rows = [[case.name, *row] for case in self.cases.values() for row in case.rows()]
-        return _TITLES, rows
+        checks = ((name, check) for name, checks in self.cases.items() for check in checks)
+        return _TITLES, [[name, *_cells(check)] for name, check in checks]
 
     def notes(self) -> Iterator[str]:
-        """Notes below the table, a line each: misprints, and why a case did not run."""
-        for case in self.cases.values():
-            for check in case.checks:
+        """Notes below the table, a line each: misprints, and what ended a case."""
+        for name, checks in self.cases.items():
+            for check in checks:
                 if check.note:
-                    yield f"{case.name}, {check.quantity}: {check.note}"
-            if case.reason:
-                yield f"{case.name}: {case.reason}"
+                    yield f"{name}, {check.quantity}: {check.note}"
 
     def summary(self) -> str:
-        """How many checks agree, differ and did not run, in one line."""
-        verdicts = [check.agrees for case in self.cases.values() for check in case.checks]
-        lacking = sum(bool(case.reason) and not case.failed for case in self.cases.values())
-        right, skipped = verdicts.count(True), lacking + verdicts.count(None)
-        wrong = verdicts.count(False) + sum(case.failed for case in self.cases.values())
-        said = f"{_count(right, 'number')} of {_count(len(self.cases) - lacking, 'case')} agree"
-        said += "s" if right == 1 else ""
-        said += f", {wrong} {'does' if wrong == 1 else 'do'} not" if wrong else ""
-        return said + (f", {skipped} not run." if skipped else ".")
+        """How many numbers agree and differ, in one line."""
+        verdicts = [check.agrees for checks in self.cases.values() for check in checks]
+        right, wrong, cases = verdicts.count(True), verdicts.count(False), len(self.cases)
+        text = (
+            f"{right} number{'' if right == 1 else 's'} of {cases} case{'' if cases == 1 else 's'} "
+        )
+        text += "agrees" if right == 1 else "agree"
+        return text + (f", {wrong} {'does' if wrong == 1 else 'do'} not." if wrong else ".")
 
     def __repr__(self) -> str:
         titles, rows = self.rows()
@@ -92,20 +59,18 @@ class Validation:
 
 
 def validate(*cases: str, progress: bool = True) -> Validation:
-    """Compute published results, and compare the numbers in a table.
+    """Check this installation: numbers with a published or closed form beside ours, in a table.
 
-    Each number has a tolerance, from the digits that were printed or the order of an approximation,
-    and a basis: `stated` in the article, a `closed form` that follows from its equations, the
-    solution of its equations by `SciPy`, or `corrected` where the article is wrong, with a note
-    that says how. SI units unless the quantity names another. A case without its data says so and
-    is not counted. The 4669-degree-of-freedom brake needs the folder of its matrices, in the
-    environment variable FRACTALJAX_BRAKE. All cases together take about three minutes.
-
-    `plot.validation(case)` draws our curves over theirs.
+    The cases are `reference`, stiffness, its slope and onset of squeal of the reference brake;
+    `hoffmann`, mode coupling in closed form; and `leine`, a stick-slip limit cycle. Each number has
+    a tolerance, from the digits that were printed or the rounding, and a basis: `stated` in the
+    article, or a `closed form` that follows from its equations. All cases together take well under
+    a minute, nearly all of it compilation. The gallery of published cases is a page of the
+    documentation.
 
     **Arguments:**
 
-    - `cases`: names of published cases, by default all.
+    - `cases`: names of cases, by default all.
     - `progress`: shows a bar.
 
     **Returns:** a `Validation`.
@@ -114,72 +79,41 @@ def validate(*cases: str, progress: bool = True) -> Validation:
     """
     from tqdm import tqdm
 
-    chosen = [case_named(name) for name in cases] or list(case_names().values())
+    from .cases import CASES
+
+    for name in cases:
+        if name not in CASES:
+            raise ValueError(f"no case {name!r}; the cases are {', '.join(CASES)}")
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise ValueError('validate needs 64 bits: jax.config.update("jax_enable_x64", True)')
-    validated = {}
+    chosen, validated = cases or tuple(CASES), {}
     with tqdm(total=len(chosen), unit="case", disable=not flag("progress", progress)) as bar:
-        for case in chosen:
-            bar.set_description(case.name)
-            validated[case.name] = _run(case)
+        for name in chosen:
+            bar.set_description(name)
+            validated[name] = computed(CASES[name])
             bar.update()
     return Validation(validated)
 
 
-@functools.cache
-def case_names() -> dict[str, Case]:
-    """All published cases by name, in the order of the gallery."""
-    modules = (importlib.import_module(f"{__package__}.{name}") for name in _MODULES)
-    return {case.name: case for module in modules for case in module.CASES}
-
-
-def case_named(name: str) -> Case:
-    """The case with this name.
-
-    **Raises:** `ValueError` for an unknown name.
-    """
-    published = case_names()
-    if name not in published:
-        raise ValueError(f"no case {name!r}; the cases are {', '.join(published)}")
-    return published[name]
-
-
-def _run(case: Case) -> ValidatedCase:
-    head = case.name, case.title, case.citation, case.doi
-    if reason := case.missing():
-        return ValidatedCase(*head, (), (), f"not run: {reason}")
+def computed(case: Callable[[], Sequence[Check]]) -> Sequence[Check]:
+    """The checks of a case; one that fails if no convergence, or no cycle, ends it."""
     try:
-        checks, panels = case.run()
-    except RuntimeError as error:  # no convergence, or no cycle
-        return ValidatedCase(*head, (), (), _reason(error), failed=True)
-    return ValidatedCase(*head, tuple(checks), tuple(panels))
-
-
-def _reason(error: RuntimeError) -> str:
-    """The message of an error; the relevant line of JAX's if a compiled program raised it."""
-    checked = re.search(r"EquinoxRuntimeError: (.+)", str(error))
-    return checked[1] if checked else str(error).partition("\n")[0]
+        return case()
+    except RuntimeError as error:
+        # A compiled program's message holds the relevant line of JAX's.
+        checked = re.search(r"EquinoxRuntimeError: (.+)", str(error))
+        reason = checked[1] if checked else str(error).partition("\n")[0]
+        return (Check("all [-]", math.nan, math.nan, 0.0, "-", reason),)
 
 
 def _cells(check: Check) -> list[str]:
-    published = check.published
-    if isinstance(published, tuple):
-        shown = " to ".join(_digits(end, check.tolerance) for end in published)
-    else:
-        shown = _digits(published, check.tolerance)
-    if check.ours is None or check.difference is None:
-        return [check.quantity, shown, "-", "-", "-", check.basis, "NOT RUN"]
+    ends = check.published if isinstance(check.published, tuple) else (check.published,)
+    shown = " to ".join(_digits(end, check.tolerance) for end in ends)
     ours = _digits(check.ours, check.tolerance)
     margin = f"{check.tolerance:.1e}" if check.tolerance else "0"
     difference = f"{check.difference:+.1e}" if check.difference else "0"
-    return [check.quantity, shown, ours, difference, margin, check.basis, _VERDICTS[check.agrees]]
-
-
-def _count(n: int, noun: str) -> str:
-    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
-
-
-_VERDICTS = {True: "ok", False: "DIFFERS", None: "NOT RUN"}
+    verdict = "ok" if check.agrees else "FAILS" if math.isnan(check.ours) else "DIFFERS"
+    return [check.quantity, shown, ours, difference, margin, check.basis, verdict]
 
 
 def _digits(number: float, tolerance: float) -> str:

@@ -2,7 +2,7 @@
 
 Without an Axes it makes a new figure, outside pyplot and its global state: `ax.figure`, which
 Jupyter shows as the last expression of a cell. `cycle`, `cycles`, `modes`, `mode_tracks`,
-`stiffness`, `laws`, `topographies` and `validation` fill a figure of their own and return it.
+`stiffness`, `laws` and `topographies` fill a figure of their own and return it.
 """
 
 from .._base.lazy import make_lazy

@@ -35,4 +35,3 @@ from .shapes import animate_mode as animate_mode, complex_mode as complex_mode
 from .topography import topographies as topographies, topography as topography
 from .tracks import mode_tracks as mode_tracks
 from .trajectory import trajectory as trajectory
-from .validation import validation as validation

@@ -6,8 +6,9 @@ from scipy.optimize import brentq
 from scipy.special import i1
 
 import fractaljax as fj
+from fractaljax._validate.cases import falling_friction
 
-from .case import STATED, Case, CaseResult, Check, Curve, Panel, closed, numerical
+from .case import Case, CaseResult, Check, Curve, Panel, closed, numerical, self_checked
 
 
 def _belt(friction: fj.Friction, V: float, m=1.0, c=0.0, k=1.0, P=1.0) -> fj.Structure:
@@ -131,15 +132,10 @@ def _harmonic(drop, v_0, c, sizes):
 
 
 def _leine() -> CaseResult:
-    cycle = fj.limit_cycle(_belt(fj.HyperbolicStribeck(1.0, 3.0), 0.2), [0.0, 0.0])
+    cycle = fj.limit_cycle(falling_friction(), [0.0, 0.0])
     theirs = _stick_slip(lambda w: 1 / (1 + 3 * w), 0.2)
-    note = (
-        "the initial state 1.133944669704, of whose decimals eight count: SciPy has 1.133944676441"
-    )
-    printed = Check(
-        "largest x, as printed [m]", 1.133944669704, float(cycle.state[0]), 1e-8, STATED, note
-    )
-    return CaseResult([printed, *_cycle_checks(cycle, theirs)], [_portrait(cycle, theirs)])
+    checks = [*self_checked("leine"), *_cycle_checks(cycle, theirs)]
+    return CaseResult(checks, [_portrait(cycle, theirs)])
 
 
 def _thomsen() -> CaseResult:

@@ -1,40 +1,28 @@
 """Published curves, and ours over them."""
 
 import textwrap
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
+import matplotlib as mpl
 import numpy as np
 
-from .axes import Figure, new_figure
+from fractaljax.plot.axes import Figure, new_figure
 
-if TYPE_CHECKING:
-    from .._validate.validate import ValidatedCase
-else:
-    ValidatedCase = Any
+from .case import Case, Panel
 
 _MARKS = "osD^v<"
 _STYLES = "solid", "dashed", "dashdot", "dotted"
 
 
-def validation(case: ValidatedCase) -> Figure:
-    """The curves of a published case: theirs as marks or dashed, ours as lines; the figure.
-
-    **Arguments:**
-
-    - `case`: a member of `Validation.cases`.
-
-    **Raises:** `ValueError` for a case that did not run.
-    """
-    import matplotlib as mpl
-
-    if not case.panels:
-        raise ValueError(f"{case.name} has no curves: {case.reason}")
-    width = max(6.4, 5.4 * len(case.panels))
+def picture(case: Case, panels: Sequence[Panel]) -> Figure:
+    """The curves of a published case: theirs as marks or dashed, ours as lines; the figure."""
+    width = max(6.4, 5.4 * len(panels))
     figure = new_figure(width, 4.9)
     source = case.citation + ("" if case.doi is None else f", doi:{case.doi}")
     figure.suptitle(f"{case.title}\n{textwrap.fill(source, round(14 * width))}", fontsize="small")
-    axes = figure.subplots(1, len(case.panels), squeeze=False)[0]
-    for ax, panel in zip(axes, case.panels, strict=True):
+    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    for ax, panel in zip(axes, panels, strict=True):
         ours = [curve for curve in panel.curves if curve.ours and curve.label]
         colours = mpl.colormaps["viridis"](np.linspace(0, 0.8, len(ours)))
         mine = marks = dashes = -1
