@@ -148,7 +148,9 @@ def test_derivatives_of_every_root(x):
     exact = exact_tangents(x)
     ours = np.asarray(roots(Linearised(*x)))
     order = sorted(range(4), key=lambda i: place(ours[i]))
-    for slopes, fastest in zip(parts_slopes(jnp.array(x)), growth_slopes(jnp.array(x)), strict=True):
+    for slopes, fastest in zip(
+        parts_slopes(jnp.array(x)), growth_slopes(jnp.array(x)), strict=True
+    ):
         real, imag = np.asarray(slopes)[:, order]
         np.testing.assert_allclose(real + 1j * imag, exact, rtol=1e-11, atol=1e-12)
         np.testing.assert_allclose(fastest, slopes[0, 0], rtol=1e-12, atol=1e-13)
