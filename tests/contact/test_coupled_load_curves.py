@@ -7,7 +7,6 @@ import pytest
 
 from fractaljax._contact.load_curve import loaded_equilibrium
 
-
 W = jnp.array([[0.6, 0.3], [0.2, 0.7]])  # each responds to the other
 
 

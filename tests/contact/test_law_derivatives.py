@@ -87,7 +87,10 @@ def test_a_pressed_surface_by_every_quantity():
 
     def numbers(u):
         s = pressed(u)
-        sums = [jnp.sum(weights * x) for weights, x in zip(CHANGES[1:], (s.pressure, s.gap))]
+        sums = [
+            jnp.sum(weights * x)
+            for weights, x in zip(CHANGES[1:], (s.pressure, s.gap), strict=True)
+        ]
         return jnp.stack([sums[0] / LOAD, sums[1] / 1e-12, s.mean_gap / 1e-6])
 
     check_slopes(numbers, np.ones((1, 4)), ("heights", "dx", "E", "P"), 1e-6, 1e-6, 1e-5)
