@@ -1,5 +1,7 @@
 """Derivatives of the implicit solutions of contact laws by each argument."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,7 +27,7 @@ def test_a_joint_by_every_quantity():
     def logs(row):
         D, G, gamma, P, E, nu, sigma_y, H, mu_s, mu_m = row
         material = fj.Material(E, nu, sigma_y, H)
-        state = fj.contact_state(fj.Surface(D, G, gamma), material, P, mu_s=mu_s, mu_m=mu_m)
+        state: Any = fj.contact_state(fj.Surface(D, G, gamma), material, P, mu_s=mu_s, mu_m=mu_m)
         values = state.K_n, state.K_t, state.A_r, state.a_e, state.Q_e, state.plastic_share
         return jnp.log(jnp.stack(values))
 
