@@ -47,6 +47,36 @@ def test_grazing_of_the_belt():
     assert curve.side == 1 and curve.swapped().side == -1 and belt().grazings[0].side == -1
 
 
+NAMES = ("mu_s", "mu_d", "v_0", "C", "K", "P")
+AT = np.array([1.0, 0.5, 0.5, 0.1, 1.0, 1.0])
+
+
+def test_events_move_with_every_number_of_the_belt():
+    """The Hopf point as its closed form, the grazing as the phase plane's."""
+
+    events = belt().hopf[0], belt().grazings[0]
+
+    @jax.jit
+    @jax.jacfwd
+    def slopes_at(p):
+        C, K = (jnp.reshape(x, (1, 1)) for x in p[3:5])
+        x = BELT.replace(**dict(zip(NAMES, (*p[:3], C, K, p[5]), strict=True)))
+        return jnp.stack([event.value_at(x) for event in events])
+
+    slopes, (hopf, graze) = np.asarray(slopes_at(AT)), (float(event.value) for event in events)
+    mu_s, mu_d, v_0, c, _, P = AT
+    drop, log = mu_s - mu_d, np.log(P * (mu_s - mu_d) / (v_0 * c))
+    np.testing.assert_allclose(hopf, v_0 * log, rtol=1e-9)
+    by_hopf = [v_0 / drop, -v_0 / drop, log - 1, -v_0 / c, 0, v_0 / P]
+    np.testing.assert_allclose(slopes[0], by_hopf, rtol=1e-8, atol=1e-9)
+
+    # Where the least speed is 0, by the implicit function.
+    at, h = np.array([graze, *AT]), 1e-5
+    ends = [[least_speed(*(at + k * h * unit)) for k in (-1, 1)] for unit in np.eye(7)]
+    by_V, *by_numbers = np.diff(ends, axis=1)[:, 0]
+    np.testing.assert_allclose(slopes[1], -np.array(by_numbers) / by_V, rtol=1e-6, atol=1e-7)
+
+
 @pytest.mark.slow
 def test_slope_is_the_derivative_of_the_event():
     curve, event = grazing(), belt().grazings[0]

@@ -53,6 +53,8 @@ def test_rows_and_files(name, tmp_path):
         assert jax.tree.structure(found) == jax.tree.structure(x)
         assert all(map(np.array_equal, jax.tree.leaves(found), jax.tree.leaves(x)))
         assert found.joints[0].normal_load == 50.0 and found.joints[0].preload
+    if name not in ("index", "pair", "weights", "array"):  # of each form once: a program each
+        return
     t, n = np.array(row, float), other[0]
     found = fj.assemble(structure(given, n), friction_slope=False)[2]
     mu = float(LAW.mu(0.2))

@@ -9,7 +9,7 @@ from matplotlib.colors import to_rgba
 import fractaljax as fj
 from fractaljax import plot
 from structures import belt_cycle, two_joints
-from tools import assert_whole, refusals
+from tools import assert_whole, mostly_slow, refusals
 
 BLOCK: dict[str, Any] = {  # moves along x, with a held edge
     "points": [[0.0, 0.0], [4.0, 0.0], [4.0, 1.0], [0.0, 1.0]],
@@ -25,8 +25,7 @@ def displaced(cycle, share, samples=256):
     return x[round(share * samples) % samples] - x.mean(axis=0)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("at", [0.0, 0.25, 0.5])
+@pytest.mark.parametrize("at", mostly_slow([0.0, 0.25, 0.5], 0.25))
 def test_places_marks_and_lanes(at):
     structure, cycle = belt_cycle()
     figure: Any = plot.cycle_motion(cycle, structure, at=at, scale=0.5, **BLOCK)

@@ -12,6 +12,7 @@ import scipy.optimize
 
 import fractaljax as fj
 from fractaljax._mechanism.quantities import with_friction_times
+from fractaljax._stability.critical_friction import _lattice
 from fractaljax._stability.two_directions import (
     critical_frequency,
     hopf_test_function,
@@ -110,6 +111,19 @@ def test_gradients_of_the_closed_form_in_a_batch_and_at_held_stiffness():
     assert closed != pytest.approx(float(fj.critical_friction(BRAKE)), rel=1e-3)
     lin = two_directions(with_friction_times(held, closed / held.coefficient()), False).polynomial
     assert abs(float(hopf_test_function(lin))) < 1e-15
+
+
+@pytest.mark.parametrize("law", ["fractal", "asperity"])
+def test_laws_that_yield_are_searched_up_to_the_limit_of_eq_19(law):
+    """mu_m <= 0.9: beyond it the first root of an asperity joint was 2.2, where there is none."""
+    contact = BRAKE.contact
+    if law == "asperity":
+        contact = fj.AsperityContact(contact.surface, contact.material, contact.P, 1e-4)
+    factors = _lattice(BRAKE.replace(contact=contact))
+    assert (
+        float(factors[-1]) * 0.25 == pytest.approx(0.9, rel=1e-15) and factors.max() == factors[-1]
+    )
+    assert _lattice(fixed())[-1] > 1000
 
 
 SCENES = {

@@ -140,17 +140,20 @@ def exact_tangents(x):
     return np.transpose(columns)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "x", [(5.0, 3.0, 0.01, 0.04, 0.5), (5.0, 3.0, 0.1, -0.2, 2.0), (5.0, 3.0, 6.0, 9.0, 0.7)]
 )
 def test_derivatives_of_every_root(x):
+    """By every coefficient, and of the root that `rightmost_root` picks."""
     exact = exact_tangents(x)
     ours = np.asarray(roots(Linearised(*x)))
     order = sorted(range(4), key=lambda i: place(ours[i]))
-    for slopes in parts_slopes(jnp.array(x)):
+    for slopes, fastest in zip(
+        parts_slopes(jnp.array(x)), growth_slopes(jnp.array(x)), strict=True
+    ):
         real, imag = np.asarray(slopes)[:, order]
         np.testing.assert_allclose(real + 1j * imag, exact, rtol=1e-11, atol=1e-12)
+        np.testing.assert_allclose(fastest, slopes[0, 0], rtol=1e-12, atol=1e-13)
 
 
 @pytest.mark.parametrize(
