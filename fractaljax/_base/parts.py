@@ -292,9 +292,11 @@ def substitute(part: _PartT, changes: Mapping[str, Any]) -> _PartT:
 
 def require_scalar(part: Part) -> None:
     """Refuse a part that holds arrays: the laws take one scene, `jax.vmap` takes many."""
-    for name, path in quantities(part).items():
-        value = leaf(part, path)
-        if isinstance(value, jax.Array) and value.ndim:
+    for field in dataclasses.fields(part):
+        name, value = quantity_name(field), getattr(part, field.name)
+        if isinstance(value, Part):
+            require_scalar(value)
+        elif isinstance(value, jax.Array) and value.ndim and not field.metadata.get("table", False):
             raise ValueError(
                 f"{name} must be a scalar, got shape {value.shape}; use jax.vmap for many scenes"
             )

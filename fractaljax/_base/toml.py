@@ -61,7 +61,7 @@ def _value(value: Any) -> str:
             return "{" + ", ".join(_row(key, inner) for key, inner in value.items()) + "}"
         case list() | tuple():
             return "[" + ", ".join(map(_value, value)) + "]"
-    return repr(float(value))
+    return _value(value.tolist()) if getattr(value, "ndim", 0) else repr(float(value))
 
 
 def _quoted(text: str) -> str:

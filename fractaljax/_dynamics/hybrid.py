@@ -133,6 +133,11 @@ class HybridSystem(eqx.Module):
         return self.linear and not any(law.velocity_dependent for law in self.laws)
 
     @property
+    def has_jump(self) -> bool:
+        """True if the static coefficient of a law may lie above its limit at vanishing speed."""
+        return any(law.has_jump for law in self.laws)
+
+    @property
     def constant(self) -> int | None:
         """The component of a state that no motion changes at the section: z of an excitation."""
         return self.n - 1 if self.excited else None
@@ -285,6 +290,12 @@ class HybridSystem(eqx.Module):
     def limits(self, loads) -> Array:
         """The largest friction force of each face in stick (f, ...)."""
         return self.at_each_face(lambda law, load: law.mu_s * load, loads)
+
+    def static_excess(self) -> Array:
+        """The static coefficient of each face (f,) less the limit at vanishing speed, over it."""
+        return self.at_each_face(
+            lambda law, one: one * (law.mu_s / law.kinetic_limit() - 1), jnp.ones_like(self.P)
+        )
 
     def over_static(self, speeds) -> Array:
         """The coefficient of friction at sliding speeds (f, ...) [m/s], over the static one."""

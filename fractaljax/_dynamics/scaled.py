@@ -215,11 +215,16 @@ def start_state(start: ArrayLike | Sequence[float], n: int) -> Float[Array, " 2n
 def scaled_start(system: HybridSystem, start: Array | None) -> Float[Array, " 2n"]:
     """The start in scaled units, constant: by default the displaced equilibrium.
 
-    It is displaced by V/omega along the first joint's t. An excitation begins at t = 0.
+    It is displaced by V/omega along the first joint's t, or for a law with a jump begins with V
+    along t. An excitation begins at t = 0.
     """
     if start is None:
         kick = system.section_direction
         kick = jnp.concatenate([kick / jnp.sum(kick**2), jnp.zeros_like(kick)])
+        if system.has_jump:
+            # Steady sliding may well attract, and this start sticks.
+            jumps = system.static_excess()[0] > 64 * jnp.finfo(kick.dtype).eps
+            kick = jnp.where(jumps, jnp.roll(kick, system.n), kick)
         y = system.mechanism_state(system.equilibrium() + kick)
     else:
         y = start / system.units

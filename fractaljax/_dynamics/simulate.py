@@ -329,7 +329,10 @@ def simulate(
     n = whole("max_steps", max_steps, 1)
     rtol = check_rtol(rtol, y.dtype)
     if regularisation is not None:
+        from .regularised import without_jump
+
         eps = number("regularisation", regularisation, above=0)
+        mechanism = without_jump(mechanism)
         trajectory = _regularised(system, y, t0, end, saveat, eps, solver, rtol, n)
     else:
         h = jnp.asarray(min(0.25 * (rtol / 1e-9) ** 0.125, 0.5), y.dtype)

@@ -26,7 +26,8 @@ from .._base.parts import (
 from .._base.toml import Laws
 from .._contact.contact import MU_M_MAX, Contact, refused_stiffness
 from .._contact.laws import CONTACTS
-from .._friction import LAWS, Friction
+from .._friction import Friction
+from .._friction_laws import LAWS
 from .._surface.spectra import SPECTRA
 
 # Classes by their names in files.
@@ -160,7 +161,7 @@ class Joint(Part):
         """The friction coefficient mu at the joint's sliding velocity, a scalar."""
         law = self.friction
         if self.V is None or not law.velocity_dependent:
-            return law.mu_s
+            return law.kinetic_limit()
         return law.mu(self.V)
 
 

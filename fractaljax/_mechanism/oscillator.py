@@ -138,7 +138,7 @@ def linearise(
     is open, and c_1 is NaN.
     """
     m, V = oscillator.m, oscillator.V
-    mu = friction.mu(V) if friction.velocity_dependent else friction.mu_s
+    mu = friction.mu(V) if friction.velocity_dependent else friction.kinetic_limit()
     c_1 = 2 * oscillator.xi_1 * oscillator.omega_1
     c_2 = 2 * oscillator.xi_2 * oscillator.omega_2
     N = None if static is None else static[1]

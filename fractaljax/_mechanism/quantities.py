@@ -282,7 +282,7 @@ def sliding_friction(scene: Scene) -> Array:
     """The friction coefficient mu(V) at the belt velocity."""
     friction = scene.friction
     if not friction.velocity_dependent:
-        return friction.mu_s
+        return friction.kinetic_limit()
     return friction.mu(scene.oscillator.V)
 
 
