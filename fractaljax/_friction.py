@@ -129,6 +129,10 @@ class Friction(Part):
         side = jnp.sign(sign)
         return kinetic * sign + side * (self.mu(side * v) - kinetic)
 
+    def in_motion(self) -> "Friction":
+        """The law in the form that is evaluated at every step of a motion, by default itself."""
+        return self
+
     def times(self, factor: ArrayLike) -> "Friction":
         """The law as a whole times `factor`, a number above 0; not checked."""
         law, names = (self, self.amplitudes) if self.amplitudes else (Scaled(self), ("factor",))
@@ -344,3 +348,6 @@ class Scaled(Friction, law="scaled"):
 
     def mu(self, speed):
         return self.factor * self.of.mu(speed)
+
+    def in_motion(self):
+        return Scaled(self.of.in_motion(), self.factor)

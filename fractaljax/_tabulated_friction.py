@@ -153,10 +153,12 @@ class TabulatedFriction(Friction, law="tabulated"):
         return jnp.vectorize(self._mu)(speed, *self._conditions)
 
     def _mu(self, speed, *conditions) -> Float[Array, ""]:
-        first, last = self.speeds[0], self.speeds[-1]
-        # Below 0 the first cubic goes on, for steps that overshoot.
-        at = jnp.where((speed < first) & (first > 0), first, jnp.where(speed > last, last, speed))
+        at = _inside(self.speeds, speed)
         return monotone_cubic(self.speeds, self._column(*conditions), at)
+
+    def in_motion(self):
+        column = self._column(*self._conditions)
+        return _Cubics(self.speeds, column, monotone_slopes(self.speeds, column), self.static)
 
     @property
     def _conditions(self) -> list[Numbers]:
@@ -175,10 +177,46 @@ class TabulatedFriction(Friction, law="tabulated"):
         return table
 
 
+@final
+class _Cubics(Friction):
+    """A table at one pressure and temperature with its slopes, which a motion needs at each step."""
+
+    speeds: Float[Array, " n"]
+    column: Float[Array, " n"]
+    slopes: Float[Array, " n"]
+    static: Numbers | None
+
+    @property
+    def has_jump(self):
+        return self.static is not None
+
+    @property
+    def mu_s(self):
+        return self.kinetic_limit() if self.static is None else self.static
+
+    def kinetic_limit(self):
+        return self.mu(jnp.zeros((), self.column.dtype))
+
+    def mu(self, speed):
+        at = _inside(self.speeds, jnp.asarray(speed))
+        return cubics_at(self.speeds, self.column, self.slopes, at)
+
+
+def _inside(speeds: Float[Array, " n"], speed: Array) -> Array:
+    """The speed, or that of the end of a table beyond it; below 0 the first cubic goes on."""
+    first, last = speeds[0], speeds[-1]
+    # A step may overshoot to below 0.
+    return jnp.where((speed < first) & (first > 0), first, jnp.where(speed > last, last, speed))
+
+
 def monotone_cubic(x: Float[Array, " n"], y: Float[Array, " n"], at: Array) -> Array:
-    """The monotone cubic through the points (x, y) at one place; the cubics at the ends go on."""
-    slopes = monotone_slopes(x, y)
-    k = jnp.clip(jnp.searchsorted(x, at, side="right") - 1, 0, len(x) - 2)
+    """The monotone cubic through the points (x, y) at places of any shape; end cubics go on."""
+    return cubics_at(x, y, monotone_slopes(x, y), at)
+
+
+def cubics_at(x: Float[Array, " n"], y, slopes, at: Array) -> Array:
+    """Cubics through points (x, y) with these slopes, at places of any shape; end cubics go on."""
+    k = jnp.clip(jnp.searchsorted(x, at, side="right", method="compare_all") - 1, 0, len(x) - 2)
     h = (x[1:] - x[:-1])[k]
     t = (at - x[k]) / h
     low, high = (1 + 2 * t) * (1 - t) ** 2, t**2 * (3 - 2 * t)

@@ -22,6 +22,7 @@ from .orbit import orbit
 from .scaled import (
     check_rtol,
     degrees_of_freedom,
+    require_drive,
     scaled_start,
     start_state,
     steps_follow_motion,
@@ -118,6 +119,7 @@ def refine_cycle(cycle: LimitCycle, arguments: tuple, count: int, static: dict) 
 def check_arguments(mechanism, start, excitation, rtol, max_returns, search, segments=None):
     """Options of a search: `max_returns` as a number, segment count, and what is static."""
     n, joints = degrees_of_freedom(mechanism), joints_of(mechanism)
+    require_drive(mechanism, excitation)
     if excitation is not None:
         require_kind("excitation", excitation, Excitation)
     require_kind("search", search, CycleSearch)
@@ -166,11 +168,15 @@ def limit_cycle(
     - `start`: (2n,), [x, v] in m and m/s; by default the sliding equilibrium, displaced by V/omega
       along t, where omega^2 is the sum of the squared eigenfrequencies for a scene, and the root
       of the sum of their fourth powers for a structure. If mu_s of the first joint lies above
-      mu(0), it is not displaced but has the velocity V along t, with which the joint sticks.
+      mu(0), it is not displaced but has the velocity V along t, with which the joint sticks. With
+      V = 0 it is the equilibrium without friction.
     - `excitation`: a harmonic force. The returns are then its periods, at each of which its time is
       0 again: the section is stroboscopic, `state` is that at the time 0, `period` is `returns`
       periods of the excitation (above 1 the motion is subharmonic), and none of the 2n
-      `multipliers` is 1 by itself. `start` is the state at the time 0.
+      `multipliers` is 1 by itself. `start` is the state at the time 0. Joints may then have V = 0,
+      as friction dampers do. One that sticks for a whole period, with a `stick_fraction` of 1, may
+      rest at any place within its limits: at that where the motion from `start` leaves it, with a
+      multiplier of 1 and one of 0.
     - `regularisation`: eps [m/s], to replace sgn v by tanh(v/eps), of laws without a jump. The cycle is then compared
       with the exact law's from the same start: `regularisation_error` is the largest relative
       difference of period and amplitudes, and the result `depends_on_eps` where it is above

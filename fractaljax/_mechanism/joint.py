@@ -101,7 +101,8 @@ class Joint(Part):
     displacement x_i - x_j, a mapping {degree of freedom: weight}, or all weights as an array or
     floats. Positive `normal` displacement n.x compresses the joint. Friction pushes towards
     positive t.x, as the belt does in Eq. 39. `V` is the sliding velocity; a law without slope needs
-    no V.
+    no V. With V = 0 nothing drives the joint, as in a friction damper: only a motion under an
+    excitation slides it.
 
     The normal force N on which friction acts is K_n n.x, the source's form. With `preload`, x = 0
     is the state of rest under the load P of the contact, where N = P: N(n.x) is the load curve of
@@ -109,7 +110,7 @@ class Joint(Part):
     `preload="linear"`. Without `normal`, N is the constant P, and there is neither a normal spring
     nor a friction face normal to the belt. The tangential spring K_t is present in all forms.
 
-    **Raises:** `TypeError` for a part of the wrong kind; `ValueError` unless V > 0, for directions
+    **Raises:** `TypeError` for a part of the wrong kind; `ValueError` unless V >= 0, for directions
     that are zero or have one degree of freedom twice, for a missing P where it is needed, and for
     friction that `Scene` refuses.
     """
@@ -141,7 +142,7 @@ class Joint(Part):
             raise ValueError("V must be given for friction that depends on the sliding velocity")
         if self.tangential == self.normal:
             raise ValueError(f"tangential and normal must differ, both are {tangential!r}")
-        self.V = None if V is None else number("V", V, above=0)
+        self.V = None if V is None else number("V", V, at_least=0)
 
     @property
     def normal_load(self) -> Numbers | None:

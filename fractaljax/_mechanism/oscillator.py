@@ -13,7 +13,8 @@ class Oscillator(Part):
 
     Without the contact, K_i = m omega_i^2 and C_i = 2 xi_i omega_i m.
 
-    **Raises:** `ValueError` unless m, omega_1, omega_2, V > 0, xi_1, xi_2 >= 0 and F is finite.
+    **Raises:** `ValueError` unless m, omega_1, omega_2 > 0, xi_1, xi_2, V >= 0 and F is finite. With V
+    = 0 it does not slide by itself: only motions under an excitation are computed.
     """
 
     m: Numbers = quantity("kg", "mass", log=True)
@@ -44,7 +45,7 @@ class Oscillator(Part):
         self.xi_1 = number("xi_1", xi_1, at_least=0)
         self.xi_2 = number("xi_2", xi_2, at_least=0)
         self.F = number("F", F)
-        self.V = number("V", V, above=0)
+        self.V = number("V", V, at_least=0)
 
 
 class Linearised(eqx.Module):

@@ -17,13 +17,16 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from .._base.parts import (
     Part,
     brief,
+    concrete,
     is_traced,
+    nan_where,
     number,
     quantities,
     quantity_name,
@@ -54,6 +57,26 @@ def joints_of(x: Mechanism) -> dict[str, Any]:
     if isinstance(x, Structure):
         return dict(zip(x.joint_names, x.joints, strict=True))
     return {"": x}
+
+
+def require_sliding(x: Any, where: str) -> Any:
+    """`x`, whose joints must have V above 0 `where` that is needed, or no V.
+
+    **Raises:** `ValueError` naming the joint; where V is traced, x becomes NaN instead.
+    """
+    if not isinstance(x, Mechanism):
+        return x
+    for name, joint in joints_of(x).items():
+        V = joint.oscillator.V if isinstance(x, Scene) else joint.V
+        if V is None:
+            continue
+        stored = concrete(V)
+        if stored is None:
+            x = nan_where(jnp.any(V == 0), x)
+        elif (stored == 0).any():
+            of = f" of joint {name}" if name else ""
+            raise ValueError(f"V{of} must be above 0 {where}, got 0.0: the joint only sticks")
+    return x
 
 
 class Quantity(NamedTuple):

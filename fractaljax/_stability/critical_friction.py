@@ -26,7 +26,13 @@ from .._mechanism.oscillator import (
     linearise,
     static_normal_force,
 )
-from .._mechanism.quantities import joints_of, require_one, sliding_friction, with_friction_times
+from .._mechanism.quantities import (
+    joints_of,
+    require_one,
+    require_sliding,
+    sliding_friction,
+    with_friction_times,
+)
 from .._mechanism.scene import Scene, stiffness
 from .._mechanism.structure import Joint, Structure
 from .critical_pair import critical_pair, least_test
@@ -99,6 +105,7 @@ def critical_friction(
     a trace).
     """
     require_one("scene", scene)
+    scene = require_sliding(scene, "for steady sliding")
     sloping = flag("friction_slope", friction_slope)
     if isinstance(scene, Structure):
         coefficient = _coefficient(scene, joint)

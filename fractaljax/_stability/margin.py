@@ -19,6 +19,7 @@ from .._mechanism.mechanism import Mechanism
 from .._mechanism.oscillator import Linearised, dimensionless
 from .._mechanism.structure import Structure
 from .band import among
+from .._mechanism.quantities import require_sliding
 from .linearise import assembled, linearised, require_equilibrium
 from .quadratic import solve
 
@@ -49,7 +50,7 @@ def margin(
     kind = jnp.dtype(bool) if shift is None else jnp.result_type(shift)
     if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
         raise TypeError(f"shift must be a real number, got {kind}; friction_slope comes third")
-    value = _margin(scene, shift, friction_slope)
+    value = _margin(require_sliding(scene, "for steady sliding"), shift, friction_slope)
     require_equilibrium(scene, friction_slope, value)
     return value
 

@@ -17,7 +17,7 @@ from .._base.parts import Record
 from .._base.programs import exported_jit
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.oscillator import Linearised
-from .._mechanism.quantities import sliding_friction
+from .._mechanism.quantities import require_sliding, sliding_friction
 from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
 from . import quartic
@@ -154,9 +154,9 @@ def growth_rate(scene: Mechanism, friction_slope: bool = True) -> Float[Array, "
     - `friction_slope`: False leaves out the slope of the friction law, as the source's Eq. 43 does.
 
     **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`; if a structure without F has
-    friction with a slope; and if one has no equilibrium.
+    friction with a slope; if one has no equilibrium; and for V = 0.
     """
-    growth = _growth_rate(scene, friction_slope)
+    growth = _growth_rate(require_sliding(scene, "for steady sliding"), friction_slope)
     require_equilibrium(scene, friction_slope, growth)
     return growth
 
@@ -180,7 +180,7 @@ def stability(scene: Mechanism, friction_slope: bool = True) -> Stability:
 
     **Raises:** as `growth_rate`.
     """
-    result = _stability(scene, friction_slope)
+    result = _stability(require_sliding(scene, "for steady sliding"), friction_slope)
     require_equilibrium(scene, friction_slope, result.growth_rate)
     return result
 
