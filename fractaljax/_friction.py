@@ -182,7 +182,9 @@ class Coulomb(Friction, law="coulomb"):
     """
 
     kinetic: Numbers = quantity("-", "friction coefficient", name="mu")
-    static: Numbers | None = quantity("-", "static friction coefficient, by default mu", name="mu_s")
+    static: Numbers | None = quantity(
+        "-", "static friction coefficient, by default mu", name="mu_s"
+    )
 
     velocity_dependent: ClassVar[bool] = False
     lowest: ClassVar[str] = "mu"

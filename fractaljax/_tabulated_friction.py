@@ -108,7 +108,9 @@ class TabulatedFriction(Friction, law="tabulated"):
             self.static = ordered("mu_s", static, "mu(0)", self.kinetic_limit())
 
     @classmethod
-    def from_csv(cls, path: str | os.PathLike, mu_s: ArrayLike | None = None) -> "TabulatedFriction":
+    def from_csv(
+        cls, path: str | os.PathLike, mu_s: ArrayLike | None = None
+    ) -> "TabulatedFriction":
         """The law in a text file of two columns, speed and coefficient, in this order.
 
         Columns are separated by semicolons, tabs, commas or spaces; unless commas separate, a
@@ -179,7 +181,7 @@ class TabulatedFriction(Friction, law="tabulated"):
 
 @final
 class _Cubics(Friction):
-    """A table at one pressure and temperature with its slopes, which a motion needs at each step."""
+    """A table at one pressure and temperature, with the slopes that each step of a motion needs."""
 
     speeds: Float[Array, " n"]
     column: Float[Array, " n"]
@@ -261,9 +263,8 @@ def _array(name: str, values: Any, **domain: float) -> Array:
         try:
             values = jnp.asarray(values) if is_traced(values) else np.asarray(values)
         except (ValueError, TypeError):
-            raise ValueError(f"{name} must be rows of numbers of one length, got {brief(values)}")
-        if getattr(values, "dtype", None) == object:
-            raise TypeError(f"{name} must be real numbers, got {brief(values)}")
+            message = f"{name} must be rows of numbers of one length, got {brief(values)}"
+            raise ValueError(message) from None
     return number(name, values, **domain)
 
 

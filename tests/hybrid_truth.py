@@ -146,7 +146,9 @@ class Mechanism:
     @cached_property
     def units(self) -> np.ndarray:
         """Scales of [x, x']."""
-        V = max(abs(j.V) for j in self.joints)
+        V = (
+            max(abs(j.V) for j in self.joints) or 1.0
+        )  # without a belt, a speed of the order of 1 m/s
         return np.repeat([V / self.omega, V], len(self.M))
 
     def map_in_units(self, A) -> np.ndarray:

@@ -177,10 +177,10 @@ def limit_cycle(
       as friction dampers do. One that sticks for a whole period, with a `stick_fraction` of 1, may
       rest at any place within its limits: at that where the motion from `start` leaves it, with a
       multiplier of 1 and one of 0.
-    - `regularisation`: eps [m/s], to replace sgn v by tanh(v/eps), of laws without a jump. The cycle is then compared
-      with the exact law's from the same start: `regularisation_error` is the largest relative
-      difference of period and amplitudes, and the result `depends_on_eps` where it is above
-      1e-3. Derivatives differ by far more than values do.
+    - `regularisation`: eps [m/s], to replace sgn v by tanh(v/eps), of laws without a jump. The
+      cycle is then compared with the exact law's from the same start: `regularisation_error` is the
+      largest relative difference of period and amplitudes, and the result `depends_on_eps` where it
+      is above 1e-3. Derivatives differ by far more than values do.
     - `solver`: a diffrax solver for the regularised law, Tsit5 by default; an implicit one, such
       as Kvaerno5, for a small eps.
     - `max_steps`: most steps of that solver in one period, 4096 by default.
@@ -214,5 +214,7 @@ def limit_cycle(
 
         eps = number("regularisation", regularisation, above=0)
         steps = whole("max_steps", max_steps, 1)
-        cycle = regularised_cycle(without_jump(mechanism), start, excitation, eps, cycle, solver, static["rtol"], steps)
+        cycle = regularised_cycle(
+            without_jump(mechanism), start, excitation, eps, cycle, solver, static["rtol"], steps
+        )
     return raise_unless(CycleResult.converged, cycle) if throw else cycle

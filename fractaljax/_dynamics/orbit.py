@@ -62,8 +62,9 @@ def corrections(
     They solve dy_next = A dy + b dt + gap on every segment of the chain, with the same stretch
     dt/duration in a phase, and c dy_next = -guard at its end. The component `constant` of the first
     state, which repeats whatever it is, does not change; nor does what `resting` (n, n, ...)
-    projects on, displacements and velocities of faces that stick throughout. Returns them and the product of all maps
-    (2n, 2n), the Jacobian of the return map. No segment from `count` on is used.
+    projects on, displacements and velocities of faces that stick throughout. Returns them and the
+    product of all maps (2n, 2n), the Jacobian of the return map. No segment from `count` on is
+    used.
     """
     n, used, lanes = len(gap), segments.used, segments.duration.ndim - 1
     ends = used & (segments.guard != NONE)

@@ -13,8 +13,8 @@ class Oscillator(Part):
 
     Without the contact, K_i = m omega_i^2 and C_i = 2 xi_i omega_i m.
 
-    **Raises:** `ValueError` unless m, omega_1, omega_2 > 0, xi_1, xi_2, V >= 0 and F is finite. With V
-    = 0 it does not slide by itself: only motions under an excitation are computed.
+    **Raises:** `ValueError` unless m, omega_1, omega_2 > 0, xi_1, xi_2, V >= 0 and F is finite. With
+    V = 0 it does not slide by itself: only motions under an excitation are computed.
     """
 
     m: Numbers = quantity("kg", "mass", log=True)

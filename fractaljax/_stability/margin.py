@@ -17,9 +17,9 @@ from jaxtyping import Array, Complex, Float, ScalarLike
 from .._base.singular import positive_sqrt
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.oscillator import Linearised, dimensionless
+from .._mechanism.quantities import require_sliding
 from .._mechanism.structure import Structure
 from .band import among
-from .._mechanism.quantities import require_sliding
 from .linearise import assembled, linearised, require_equilibrium
 from .quadratic import solve
 
