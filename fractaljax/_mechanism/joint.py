@@ -29,6 +29,7 @@ from .._contact.laws import CONTACTS
 from .._friction import Friction
 from .._friction_laws import LAWS
 from .._surface.spectra import SPECTRA
+from .oscillator import belt_velocity
 
 # Classes by their names in files.
 JOINT_LAWS: Laws = {
@@ -102,7 +103,7 @@ class Joint(Part):
     floats. Positive `normal` displacement n.x compresses the joint. Friction pushes towards
     positive t.x, as the belt does in Eq. 39. `V` is the sliding velocity; a law without slope needs
     no V. With V = 0 nothing drives the joint, as in a friction damper: only a motion under an
-    excitation slides it.
+    excitation slides it. A V that is traced must be above 0.
 
     The normal force N on which friction acts is K_n n.x, the source's form. With `preload`, x = 0
     is the state of rest under the load P of the contact, where N = P: N(n.x) is the load curve of
@@ -142,7 +143,7 @@ class Joint(Part):
             raise ValueError("V must be given for friction that depends on the sliding velocity")
         if self.tangential == self.normal:
             raise ValueError(f"tangential and normal must differ, both are {tangential!r}")
-        self.V = None if V is None else number("V", V, at_least=0)
+        self.V = None if V is None else belt_velocity(V)
 
     @property
     def normal_load(self) -> Numbers | None:

@@ -17,7 +17,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
@@ -26,7 +25,6 @@ from .._base.parts import (
     brief,
     concrete,
     is_traced,
-    nan_where,
     number,
     quantities,
     quantity_name,
@@ -62,7 +60,7 @@ def joints_of(x: Mechanism) -> dict[str, Any]:
 def require_sliding(x: Any, where: str) -> Any:
     """`x`, whose joints must have V above 0 `where` that is needed, or no V.
 
-    **Raises:** `ValueError` naming the joint; where V is traced, x becomes NaN instead.
+    **Raises:** `ValueError` naming the joint, as far as V is known.
     """
     if not isinstance(x, Mechanism):
         return x
@@ -71,9 +69,7 @@ def require_sliding(x: Any, where: str) -> Any:
         if V is None:
             continue
         stored = concrete(V)
-        if stored is None:
-            x = nan_where(jnp.any(V == 0), x)
-        elif (stored == 0).any():
+        if stored is not None and (stored == 0).any():
             of = f" of joint {name}" if name else ""
             raise ValueError(f"V{of} must be above 0 {where}, got 0.0: the joint only sticks")
     return x
