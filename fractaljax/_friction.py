@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 import inspect
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, ClassVar, final
 
 import equinox as eqx
@@ -183,7 +183,7 @@ class Coulomb(Friction, law="coulomb"):
 
     kinetic: Numbers = quantity("-", "friction coefficient", name="mu")
     static: Numbers | None = quantity(
-        "-", "static friction coefficient, by default mu", name="mu_s"
+        "-", "static friction coefficient, by default mu", name="mu_s", absent=True
     )
 
     velocity_dependent: ClassVar[bool] = False
@@ -194,9 +194,6 @@ class Coulomb(Friction, law="coulomb"):
         self.static = (
             None if mu_s is None else ordered("mu_s", number("mu_s", mu_s), "mu", self.kinetic)
         )
-
-    def _shown(self) -> Iterator[str]:
-        return (text for text in super()._shown() if text != "mu_s=None")
 
     @property
     def amplitudes(self):

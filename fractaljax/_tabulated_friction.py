@@ -28,9 +28,9 @@ from ._base.toml import naming
 from ._friction import Friction
 
 
-def _table_field(note: str, name: str | None = None) -> Any:
+def _table_field(note: str) -> Any:
     """A field that holds an array of one law, not of a batch of laws."""
-    return eqx.field(metadata={"note": note, "table": True} | ({"name": name} if name else {}))
+    return eqx.field(metadata={"note": note, "table": True, "absent": True})
 
 
 @final
@@ -72,13 +72,13 @@ class TabulatedFriction(Friction, law="tabulated"):
     coefficients: Float[Array, "n ..."] = _table_field(
         "-, friction coefficients there, by speed, pressure and temperature"
     )
-    static: Numbers | None = quantity(
-        "-", "static friction coefficient, by default that at vanishing speed", name="mu_s"
-    )
+    static: Numbers | None = quantity("-", "static friction coefficient", name="mu_s", absent=True)
     pressures: Float[Array, " p"] | None = _table_field("Pa, pressures, if they are an axis")
     temperatures: Float[Array, " T"] | None = _table_field("K, temperatures, if they are an axis")
-    pressure: Numbers | None = quantity("Pa", "nominal pressure at which friction is", log=True)
-    temperature: Numbers | None = quantity("K", "temperature at which friction is")
+    pressure: Numbers | None = quantity(
+        "Pa", "nominal pressure at which friction is", log=True, absent=True
+    )
+    temperature: Numbers | None = quantity("K", "temperature at which friction is", absent=True)
 
     def __init__(
         self,

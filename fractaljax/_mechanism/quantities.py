@@ -24,6 +24,7 @@ from .._base.parts import (
     Part,
     brief,
     concrete,
+    is_absent,
     is_traced,
     number,
     quantities,
@@ -103,7 +104,7 @@ def stored_quantities(x: Part | Structure) -> dict[str, Quantity]:
         value, meant = getattr(x, field.name), field.metadata
         if isinstance(value, Part):
             stored |= stored_quantities(value)
-        elif "unit" in meant:
+        elif "unit" in meant and not is_absent(field, value):
             stored[quantity_name(field)] = Quantity(
                 value, meant["unit"], meant["meaning"], meant.get("log", False)
             )
@@ -179,7 +180,10 @@ def replaced(x: Mechanism, values: Mapping[str, ArrayLike]) -> Any:
         name: value if name in stored else number(name, value, **derived[name].domain)
         for name, value in values.items()
     }
-    return x.replace(**_settings(x, checked))
+    new = x.replace(**_settings(x, checked))
+    if any(name.rpartition(".")[2] == "V" for name in values):
+        require_sliding(new, "where it is varied")
+    return new
 
 
 def require_inside(x: Mechanism, axes: Mapping[str, np.ndarray], batch: int = 2**16) -> None:

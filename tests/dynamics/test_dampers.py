@@ -103,12 +103,15 @@ X, EXCITATION = damper(0.8, 0.2)
 test_refusals = refusals(
     [
         (lambda: damper(0.8, 0.2, V=-1.0), "^V must be at least 0, got -1"),
-        (lambda: fj.growth_rate(X), "^V of joint 1 must be above 0 for steady sliding, got 0"),
-        (lambda: fj.margin(X), "^V of joint 1 must be above 0 for steady sliding, got 0"),
-        (lambda: fj.limit_cycle(X), "^V of joint 1 must be above 0 without an excitation"),
+        (
+            lambda: fj.growth_rate(X),
+            "^V of joint joint_1 must be above 0 for steady sliding, got 0",
+        ),
+        (lambda: fj.margin(X), "^V of joint joint_1 must be above 0 for steady sliding, got 0"),
+        (lambda: fj.limit_cycle(X), "^V of joint joint_1 must be above 0 without an excitation"),
         (
             lambda: fj.simulate(X, [0, 0], 1.0),
-            "^V of joint 1 must be above 0 without an excitation",
+            "^V of joint joint_1 must be above 0 without an excitation",
         ),
     ]
 )

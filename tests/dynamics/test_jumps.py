@@ -128,7 +128,7 @@ test_refusals = refusals(
         (lambda: fj.Coulomb(0.2, mu_s=0.1), r"^mu_s must be at least mu = 0\.2, got 0\.1$"),
         (
             lambda: fj.simulate(block(Jump(0.3, 0.2)), [0.0, 0.0], 1.0, regularisation=1e-3),
-            r"^friction of joint 1 must not have mu_s above mu\(0\) where it is regularised",
+            r"^friction of joint joint_1 must not have mu_s above mu\(0\) where it is regularised",
         ),
     ]
 )
