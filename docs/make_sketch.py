@@ -1,4 +1,4 @@
-"""Draw sketch.png: the mass on the belt and the joint between them, `python docs/make_sketch.py`."""
+"""Draw sketch.png: the mass on the belt and its joint, `python docs/make_sketch.py`."""
 
 from pathlib import Path
 

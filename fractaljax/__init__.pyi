@@ -77,6 +77,7 @@ from ._friction import (
     HyperbolicStribeck as HyperbolicStribeck,
     Stribeck as Stribeck,
 )
+from ._friction_laws import TabulatedFriction as TabulatedFriction
 from ._identify.analysis import SpectralAnalysis as SpectralAnalysis
 from ._identify.files import read_measurement as read_measurement
 from ._identify.identify import Identification as Identification, identify as identify

@@ -1,6 +1,8 @@
 """Friction laws: the coefficient as a function of the sliding speed."""
 
 import abc
+import dataclasses
+import inspect
 from collections.abc import Callable
 from typing import Any, ClassVar, final
 
@@ -10,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from ._base.laws import make_arrays, refuse, register
+from ._base.laws import is_built_in, make_arrays, refuse, register
 from ._base.parts import Numbers, Part, concrete, number, ordered, quantity, require_kind
 from ._base.singular import safe_divide
 
@@ -55,8 +57,12 @@ class Friction(Part):
     100 m/s, and at least 0; the source means the minimum of its Eq. 38. A field or a property of
     either name replaces it.
 
-    **Raises:** `ValueError` unless mu(0) > 0 and a field mu_s is mu(0), and for a name that
-    another law has. For a traced law every number is NaN instead.
+    A field mu_s may lie above mu(0), the limit of mu at vanishing speed. The law then has a jump:
+    in stick the friction force is at most mu_s times the normal force, and where it reaches that
+    limit it falls to mu(0) times the normal force as sliding begins.
+
+    **Raises:** `ValueError` unless mu(0) > 0 and a field mu_s is at least mu(0), and for a name
+    that another law has. For a traced law every number is NaN instead.
     """
 
     velocity_dependent: ClassVar[bool] = True  # if False, neither slope nor speed is traced
@@ -73,25 +79,29 @@ class Friction(Part):
             register(law, cls, LAWS)
 
     def __check_init__(self):
-        if type(self).__module__ == __name__:
+        if is_built_in(self, __name__):
             return
         make_arrays(self)
-        static = concrete(number("mu(0)", self.mu(jnp.zeros((), _dtype(self))), above=0))
-        stored = concrete(jnp.asarray(self.mu_s))
-        if static is None or stored is None:
-            self._refuse_traced()
-            return
-        if not np.allclose(stored, static, rtol=8 * float(jnp.finfo(stored.dtype).eps), atol=0):
-            raise ValueError(f"mu_s must be mu(0) = {static}, got {stored}")
+        kinetic = concrete(number("mu(0)", self.mu(jnp.zeros((), _dtype(self))), above=0))
+        static = concrete(jnp.asarray(self.mu_s))
+        if kinetic is None or static is None:
+            kinetic, static = self.mu(jnp.zeros((), _dtype(self))), jnp.asarray(self.mu_s)
+            refuse(self, ~(kinetic > 0) | ~_at_least(static, kinetic))
+        elif not np.all(_at_least(static, kinetic)):
+            raise ValueError(f"mu_s must be at least mu(0) = {kinetic}, got {static}")
 
-    def _refuse_traced(self) -> None:
-        """Set the numbers of a traced user-defined law to NaN where its mu(0) is wrong."""
-        static = self.mu(jnp.zeros((), _dtype(self)))
-        stored = jnp.asarray(self.mu_s)
-        bad = ~(static > 0) | ~jnp.isclose(
-            stored, static, rtol=8 * float(jnp.finfo(stored.dtype).eps), atol=0
-        )
-        refuse(self, bad)
+    @property
+    def has_jump(self) -> bool:
+        """True if mu_s may lie above mu(0), which is decided when a program is traced."""
+        if is_built_in(self, __name__):
+            return False
+        # As a field, or as a property.
+        field = any(field.name == "mu_s" for field in dataclasses.fields(self))
+        return field or inspect.getattr_static(type(self), "mu_s") is not Friction.__dict__["mu_s"]
+
+    def kinetic_limit(self) -> Numbers:
+        """mu(0), the limit of the coefficient at vanishing speed: mu_s for a law without a jump."""
+        return self.mu(jnp.zeros((), _dtype(self))) if self.has_jump else self.mu_s
 
     @abc.abstractmethod
     def mu(self, speed: ArrayLike) -> Numbers:
@@ -105,7 +115,7 @@ class Friction(Part):
     def branch(self, v: ArrayLike, sign: ArrayLike) -> Numbers:
         """mu of one sliding direction, continued smoothly through v = 0.
 
-        branch(0, +-1) = +-mu_s.
+        branch(0, +-1) = +-mu(0).
 
         **Arguments:**
 
@@ -113,10 +123,15 @@ class Friction(Part):
         - `sign`: the direction, +1 or -1. A sign between them smooths the jump at v = 0, and
           nothing else.
         """
+        kinetic = self.kinetic_limit()
         if not self.velocity_dependent:
-            return self.mu_s * sign
+            return kinetic * sign
         side = jnp.sign(sign)
-        return self.mu_s * sign + side * (self.mu(side * v) - self.mu_s)
+        return kinetic * sign + side * (self.mu(side * v) - kinetic)
+
+    def in_motion(self) -> "Friction":
+        """The law in the form that is evaluated at every step of a motion, by default itself."""
+        return self
 
     def times(self, factor: ArrayLike) -> "Friction":
         """The law as a whole times `factor`, a number above 0; not checked."""
@@ -127,6 +142,11 @@ class Friction(Part):
 
 def _dtype(law: Friction) -> Any:
     return jnp.result_type(float, *jax.tree.leaves(law))
+
+
+def _at_least(static: Any, kinetic: Any) -> Any:
+    """True where a static coefficient is at least the kinetic one, to rounding."""
+    return static >= kinetic * (1 - 8 * float(jnp.finfo(static.dtype).eps))
 
 
 def _least_coefficient(law: Friction) -> Numbers:
@@ -151,31 +171,53 @@ def _least_coefficient(law: Friction) -> Numbers:
 
 @final
 class Coulomb(Friction, law="coulomb"):
-    """Constant friction.
+    """Constant friction, perhaps with a higher static coefficient.
 
     **Arguments:**
 
-    - `mu`: friction coefficient [-].
+    - `mu`: friction coefficient [-], of sliding at every speed.
+    - `mu_s`: static friction coefficient [-], at least `mu`; by default there is none but `mu`.
 
-    **Raises:** `ValueError` unless mu > 0.
+    **Raises:** `ValueError` unless mu > 0 and mu_s >= mu.
     """
 
-    mu_s: Numbers = quantity("-", "friction coefficient", name="mu")
+    kinetic: Numbers = quantity("-", "friction coefficient", name="mu")
+    static: Numbers | None = quantity(
+        "-", "static friction coefficient, by default mu", name="mu_s", absent=True
+    )
 
     velocity_dependent: ClassVar[bool] = False
     lowest: ClassVar[str] = "mu"
-    amplitudes: ClassVar[tuple[str, ...]] = ("mu_s",)
 
-    def __init__(self, mu: ArrayLike):
-        self.mu_s = number("mu", mu, above=0)
+    def __init__(self, mu: ArrayLike, mu_s: ArrayLike | None = None):
+        self.kinetic = number("mu", mu, above=0)
+        self.static = (
+            None if mu_s is None else ordered("mu_s", number("mu_s", mu_s), "mu", self.kinetic)
+        )
+
+    @property
+    def amplitudes(self):
+        return ("kinetic", "static") if self.has_jump else ("kinetic",)
+
+    @property
+    def has_jump(self):
+        return self.static is not None
+
+    @property
+    def mu_s(self):
+        """The largest friction coefficient in stick."""
+        return self.kinetic if self.static is None else self.static
 
     @property
     def mu_m(self):
         """The friction coefficient, at every speed."""
-        return self.mu_s
+        return self.kinetic
+
+    def kinetic_limit(self):
+        return self.kinetic
 
     def mu(self, speed):
-        return self.mu_s * jnp.ones_like(speed)
+        return self.kinetic * jnp.ones_like(speed)
 
 
 @final
@@ -291,8 +333,20 @@ class Scaled(Friction, law="scaled"):
         return self.of.velocity_dependent
 
     @property
+    def has_jump(self):
+        return self.of.has_jump
+
+    @property
+    def mu_s(self):
+        # Without a jump as of any other law.
+        return self.factor * self.of.mu_s if self.has_jump else self.mu(jnp.zeros((), _dtype(self)))
+
+    @property
     def mu_m(self):
         return self.factor * self.of.mu_m
 
     def mu(self, speed):
         return self.factor * self.of.mu(speed)
+
+    def in_motion(self):
+        return Scaled(self.of.in_motion(), self.factor)

@@ -13,13 +13,14 @@ integrated again. Inside, time is in 1/omega, velocity in the belt's speed V and
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
 from numpy.polynomial import chebyshev
 from scipy.integrate import DOP853, OdeSolution, solve_ivp
+from scipy.interpolate import PchipInterpolator
 from scipy.optimize import brentq
 
 OPEN = 9
@@ -30,7 +31,8 @@ FIT = np.linalg.inv(chebyshev.chebvander(2 * NODES - 1, 11))
 SLOPE = chebyshev.chebder(np.eye(12))  # of coefficients those of the derivative
 
 LAWS = {
-    "coulomb": lambda w, mu: mu + 0 * w,
+    "coulomb": lambda w, mu, mu_s=None: mu + 0 * w,
+    "tabulated": lambda w, speeds, coefficients, mu_s=None: table(speeds, coefficients)(w),
     "stribeck": lambda w, mu_s, mu_m, v_m: (
         mu_s - 1.5 * (mu_s - mu_m) * (w / v_m) + 0.5 * (mu_s - mu_m) * (w / v_m) ** 3
     ),
@@ -39,6 +41,22 @@ LAWS = {
     ),
     "hyperbolic": lambda w, mu_s, delta: mu_s / (1 + delta * w),
 }
+
+
+@cache
+def table(speeds, coefficients):
+    """SciPy's monotone cubic through a table, constant beyond its last speed."""
+    cubic = PchipInterpolator(speeds, coefficients)
+    last = coefficients[-1]
+
+    def mu(w):
+        w = np.asarray(w)
+        k = np.clip(np.searchsorted(speeds, w.real, "right") - 1, 0, len(speeds) - 2)
+        a, b, c, d = cubic.c[:, k]
+        t = w - np.asarray(speeds)[k]  # complex for a slope
+        return np.where(w.real > speeds[-1], last, ((a * t + b) * t + c) * t + d)[()]
+
+    return mu
 
 
 class Diverged(ArithmeticError):
@@ -54,7 +72,8 @@ class Joint:
     """A joint with the direction t (n,), pressed by P along n (n,) where `preload`.
 
     Without n its normal force is P. Without `preload` it is K_n n.x, of either sign (the source's
-    form). mu is a function of the sliding speed that can be continued a little below zero.
+    form). mu is a function of the sliding speed that can be continued a little below zero. Static
+    friction is mu(0), or above it where it is given.
     """
 
     t: np.ndarray
@@ -65,6 +84,7 @@ class Joint:
     K_n: float = 0.0
     K_t: float = 0.0
     preload: bool = True
+    static: float | None = None
 
     @property
     def lifts(self) -> bool:
@@ -81,7 +101,8 @@ class Face:
     mu: Callable
     load: float
     slope: np.ndarray
-    still: float  # mu(0)
+    still: float  # the coefficient in stick
+    jumps: bool  # above mu(0)
 
 
 @dataclass(frozen=True)
@@ -103,13 +124,14 @@ class Mechanism:
         for given in problem["joints"]:
             law, constants = given["friction"][0], dict(given["friction"][1])
 
-            def mu(w, law=LAWS[law], constants=constants):
-                return law(w, **constants)
+            def mu(w, function=LAWS[law], constants=constants):
+                return function(w, **constants)
 
             n = None if given.get("normal") is None else np.array(given["normal"], float)
             rest = {k: given[k] for k in ("P", "K_n", "K_t", "preload") if k in given}
             t = np.array(given["tangential"], float)
-            joints.append(Joint(t, given["V"], mu, n, **rest))
+            static = constants.get("mu_s") if law in ("coulomb", "tabulated") else None
+            joints.append(Joint(t, given["V"], mu, n, static=static, **rest))
         return cls(M, C, K, F, tuple(joints))
 
     @cached_property
@@ -124,7 +146,9 @@ class Mechanism:
     @cached_property
     def units(self) -> np.ndarray:
         """Scales of [x, x']."""
-        V = max(abs(j.V) for j in self.joints)
+        V = (
+            max(abs(j.V) for j in self.joints) or 1.0
+        )  # without a belt, a speed of the order of 1 m/s
         return np.repeat([V / self.omega, V], len(self.M))
 
     def map_in_units(self, A) -> np.ndarray:
@@ -154,13 +178,15 @@ class Mechanism:
     def faces(self) -> tuple[Face, ...]:
         found = []
         for i, j in enumerate(self.joints):
-            still, none = float(j.mu(0.0)), np.zeros(len(self.M))
+            kinetic, none = float(j.mu(0.0)), np.zeros(len(self.M))
+            still = kinetic if j.static is None else j.static
+            jumps = still > kinetic
             slope = none if j.n is None else j.K_n * j.n
             load = j.P if j.preload else 0.0
-            found.append(Face(i, j.t, j.V, j.mu, load, slope, still))
+            found.append(Face(i, j.t, j.V, j.mu, load, slope, still, jumps))
             # Both directions of the source's form have their states, also without a force.
             if j.n is not None and (j.K_t or not j.preload):
-                found.append(Face(i, j.n, j.V, j.mu, 0.0, -j.K_t * j.t, still))
+                found.append(Face(i, j.n, j.V, j.mu, 0.0, -j.K_t * j.t, still, jumps))
         return tuple(found)
 
     @cached_property
@@ -351,6 +377,8 @@ def next_mode(mechanism, z, t, mode, event) -> tuple[tuple[int, ...], dict]:
         return mode, {event: 1}
     if kind == "w":
         options[at] = (-mode[at], 0, mode[at])
+        if mechanism.faces[at].jumps:  # it may agree with stick and with slip: it sticks
+            options[at] = (0, -mode[at], mode[at])
     elif kind == "limit":
         options[at], decided = (event[2],), (at,)
     else:
@@ -364,7 +392,7 @@ def next_mode(mechanism, z, t, mode, event) -> tuple[tuple[int, ...], dict]:
     for i in options:
         if after[i]:
             alone = decided == (i,) and sum(a != b for a, b in zip(mode, after, strict=True)) == 1
-            zeros["w", i] = 2 if alone else 1
+            zeros["w", i] = 2 if alone and not mechanism.faces[i].jumps else 1
     return after, zeros
 
 

@@ -145,6 +145,10 @@ PROGRAMS: dict[str, Program] = {
     "run_in": Program(_worn, 2.4, 3.5),
     "run_in, slope": Program(jax.jacrev(lambda D: _worn(D)[0].std()), 2.4, 3.5),
     "growth_rate": of(fj.growth_rate),
+    "growth_rate, friction by a table": of(
+        fj.growth_rate,
+        BRAKE.replace(friction=fj.TabulatedFriction([0.0, 0.1, 1.0], [0.4, 0.3, 0.25], 0.5)),
+    ),
     "growth_rate of a structure": of(fj.growth_rate, STRUCTURE),
     "growth_rate, pressed": of(fj.growth_rate, PRESSED, slow=True),
     "growth_rate, slope": slope(fj.growth_rate),

@@ -213,6 +213,7 @@ LAWS: dict[str, Any] = {
     "stribeck": fj.Stribeck,
     "exponential": fj.ExponentialStribeck,
     "hyperbolic": fj.HyperbolicStribeck,
+    "tabulated": fj.TabulatedFriction,
 }
 
 

@@ -42,12 +42,13 @@ class Cubic(fj.Friction):
 
 
 class Peaked(fj.Friction):
-    """A law whose own mu_s is not its value at rest."""
+    """A law whose own mu_s is not its value at rest, but `share` of it."""
 
     mu_s: Any
+    share: Any = 0.5
 
     def mu(self, speed):
-        return self.mu_s * (1 - jnp.exp(-jnp.asarray(speed)) / 2)
+        return self.mu_s / self.share * (1 - jnp.exp(-jnp.asarray(speed)) / 2)
 
 
 WRONG: Any = None
@@ -85,7 +86,8 @@ def test_slope_in_both_precisions_and_nan_under_jit():
     assert np.isnan(jax.jit(fj.Stribeck)(0.4, 0.5, 0.5).mu(0.1))
     cubic = jax.jit(lambda high: Cubic(high, 0.1, 0.5).mu(jnp.array(0.1)))
     np.testing.assert_allclose(cubic(0.4), Cubic(0.4, 0.1, 0.5).mu(jnp.array(0.1)), rtol=1e-15)
-    assert np.isnan(cubic(-0.4)) and np.isnan(jax.jit(lambda mu_s: Peaked(mu_s).mu(0.1))(0.5))
+    peaked = jax.jit(lambda mu_s, share: Peaked(mu_s, share).mu(0.1))
+    assert np.isnan(cubic(-0.4)) and np.isnan(peaked(0.5, 0.4)) and peaked(0.5, 0.6) > 0.4
 
 
 def viscous(s, d, v, c, w):
@@ -331,7 +333,8 @@ test_refusals = refusals(
         (lambda: Cubic(-0.4, 0.1, 0.5), r"^mu\(0\) must be above 0, got -0\.4"),
         (lambda: Scaled(WRONG), "^of must be a Friction, got None"),
         (lambda: Scaled(CUBIC, 0.0), r"^factor must be above 0, got 0\.0"),
-        (lambda: Peaked(0.5), r"^mu_s must be mu\(0\) = 0\.25, got 0\.5"),
+        (lambda: Peaked(0.5, 0.25), r"^mu_s must be at least mu\(0\) = 1\.0, got 0\.5"),
+        (lambda: fj.Coulomb(0.4, mu_s=0.3), r"^mu_s must be at least mu = 0\.4, got 0\.3"),
     ],
     kind=(ValueError, TypeError),
 )

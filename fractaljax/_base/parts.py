@@ -201,6 +201,7 @@ def quantity(
     log: bool = False,
     name: str | None = None,
     argument: str | None = None,
+    absent: bool = False,
 ) -> Any:
     """A numeric field of a part, with its unit and its meaning for files and tables.
 
@@ -213,8 +214,9 @@ def quantity(
       attribute.
     - `argument`: name of the argument of `__init__` if the quantity needs another, because some
       other part of a scene has one of that name.
+    - `absent`: True for a number that may be None, and is then no quantity; False by default.
     """
-    named = {"name": name, "argument": argument}
+    named = {"name": name, "argument": argument, "absent": absent or None}
     named = {key: value for key, value in named.items() if value is not None}
     return eqx.field(metadata={"unit": unit, "meaning": meaning, "log": log, **named})
 
@@ -222,6 +224,11 @@ def quantity(
 def quantity_name(field: dataclasses.Field) -> str:
     """The name of a field of a part in files, tables and `replace`."""
     return field.metadata.get("name", field.name)
+
+
+def is_absent(field: dataclasses.Field, value: Any) -> bool:
+    """True for a quantity that a part does not have, for it has no value."""
+    return value is None and field.metadata.get("absent", False)
 
 
 def argument_name(field: dataclasses.Field) -> str:
@@ -240,6 +247,8 @@ class Record(eqx.Module):
             if not field.repr:
                 continue
             value = getattr(self, field.name)
+            if is_absent(field, value):
+                continue
             if isinstance(value, jax.Array) and not isinstance(value, Tracer):
                 value = value.item() if value.ndim == 0 else np.asarray(value)
             yield f"{argument_name(field)}={value!r}"
@@ -264,7 +273,7 @@ class Part(Record):
             value, meant = getattr(self, field.name), field.metadata
             if isinstance(value, Part):
                 stored |= value.stored_quantities()
-            elif "unit" in meant:
+            elif "unit" in meant and not is_absent(field, value):
                 stored[quantity_name(field)] = Quantity(
                     value, meant["unit"], meant["meaning"], meant.get("log", False)
                 )
@@ -276,6 +285,8 @@ def quantities(part: Part) -> dict[str, tuple[str, ...]]:
     paths = {}
     for field in dataclasses.fields(part):
         value = getattr(part, field.name)
+        if is_absent(field, value):
+            continue
         paths[quantity_name(field)] = (field.name,)
         if isinstance(value, Part):
             paths |= {name: (field.name, *path) for name, path in quantities(value).items()}
@@ -295,7 +306,7 @@ def rebuild(part: _PartT, changes: Mapping[str, Any]) -> _PartT:
     arguments, changed = {}, False
     for field in dataclasses.fields(part):
         old, name = getattr(part, field.name), quantity_name(field)
-        new = changes.get(name, old)
+        new = old if is_absent(field, old) else changes.get(name, old)
         if isinstance(new, Part):
             new = rebuild(new, {other: x for other, x in changes.items() if other != name})
         changed |= new is not old
@@ -314,9 +325,11 @@ def substitute(part: _PartT, changes: Mapping[str, Any]) -> _PartT:
 
 def require_scalar(part: Part) -> None:
     """Refuse a part that holds arrays: the laws take one scene, `jax.vmap` takes many."""
-    for name, path in quantities(part).items():
-        value = leaf(part, path)
-        if isinstance(value, jax.Array) and value.ndim:
+    for field in dataclasses.fields(part):
+        name, value = quantity_name(field), getattr(part, field.name)
+        if isinstance(value, Part):
+            require_scalar(value)
+        elif isinstance(value, jax.Array) and value.ndim and not field.metadata.get("table", False):
             raise ValueError(
                 f"{name} must be a scalar, got shape {value.shape}; use jax.vmap for many scenes"
             )

@@ -9,7 +9,7 @@ import tomllib
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any, NamedTuple, cast
 
-from .parts import Part, argument_name, brief, quantity_name
+from .parts import Part, argument_name, brief, is_absent, quantity_name
 
 Laws = Mapping[str, Mapping[str, type[Part]]]  # by field, then by the name of the law
 
@@ -61,7 +61,7 @@ def _value(value: Any) -> str:
             return "{" + ", ".join(_row(key, inner) for key, inner in value.items()) + "}"
         case list() | tuple():
             return "[" + ", ".join(map(_value, value)) + "]"
-    return repr(float(value))
+    return _value(value.tolist()) if getattr(value, "ndim", 0) else repr(float(value))
 
 
 def _quoted(text: str) -> str:
@@ -77,6 +77,8 @@ def part_table(part: Part, laws: Laws) -> dict[str, Any]:
     table = {}
     for field in dataclasses.fields(part):
         name, value = quantity_name(field), getattr(part, field.name)
+        if is_absent(field, value):
+            continue
         if isinstance(value, Part):
             one_kind = name not in laws or type(value) is field.type
             table[name] = part_table(value, laws) if one_kind else law_table(name, value, laws)

@@ -9,8 +9,8 @@ from jaxtyping import Array, Bool, Float
 from .events import Cubic
 from .guard import SECTION
 from .hybrid import HybridSystem
-from .lanes import log_spectral_radius
-from .orbit import PeriodicOrbit
+from .lanes import log_spectral_radius, product
+from .orbit import PeriodicOrbit, block_diagonal
 from .segments import Segments, cumulative, next_start
 from .transition import switch
 
@@ -58,7 +58,12 @@ def growth_of(system: HybridSystem, orbit: PeriodicOrbit) -> Float[Array, " g"]:
 
     The multipliers of an excitation, which are 1, are left out too. Without an orbit it is NaN.
     """
-    jacobian = system.mechanism_state(jnp.swapaxes(system.mechanism_state(orbit.jacobian), 0, 1))
+    jacobian = orbit.jacobian
+    if system.excited:
+        # The place where a face rests neither grows nor decays.
+        resting = system.resting(orbit.segments.s, orbit.segments.used)
+        jacobian = jacobian - product(jacobian, block_diagonal(resting, resting))
+    jacobian = system.mechanism_state(jnp.swapaxes(system.mechanism_state(jacobian), 0, 1))
     # After 40 squarings the logarithm of a power's size is too small by rounding alone.
     log = log_spectral_radius(jnp.swapaxes(jacobian, 0, 1), squarings=40)
     return jnp.where(orbit.converged, log, jnp.nan)

@@ -23,7 +23,7 @@ from .follow import BranchEnd, Follower
 from .guard import NONE, SECTION
 from .itinerary import Family, Phase, Shooting, Solution, build_solution
 from .limit_cycle import limit_cycle
-from .scaled import check_rtol, degrees_of_freedom
+from .scaled import check_rtol, degrees_of_freedom, require_drive
 from .sensitivity import event_value
 from .shooting import Chain, Lifted, Window, linearised
 
@@ -147,6 +147,7 @@ def continue_cycle(
     """
     require_one("x", x)
     degrees_of_freedom(x)
+    require_drive(x, None)
     if isinstance(start, BranchEvent):
         x = x.replace(**{start.name: start.value})
     low, high = checked_window(x, name, window)

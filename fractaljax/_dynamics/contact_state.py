@@ -107,6 +107,11 @@ def _stick_or_reverse(event: Event) -> Array:
     Under a negative load it always reverses: the sliding mode there is repelling.
     """
     system, y, s, ended = event
+    if system.has_jump:
+        # Static friction may hold a face which sliding friction would let go on.
+        _, holding = system.forces_at_rest(y, jnp.where(ended, STICK, s))
+        loads = system.loads(y[: system.n])
+        return jnp.where((-s * holding > system.limits(loads)) | (loads < 0), -s, STICK)
     reversed_s = jnp.where(ended & (s != STICK), -s, s)
     rate = system.along(system.field(y, reversed_s)[system.n :])
     reverses = (s * rate > 0) | (system.loads(y[: system.n]) < 0)

@@ -18,6 +18,7 @@ from .guard import NONE, UNUSED
 from .hybrid import HybridSystem
 from .lanes import log_spectral_radius, product
 from .maps import exact_maps
+from .orbit import block_diagonal
 from .segments import Segments, flow, mean_square, next_start
 
 VELOCITY_REFERENCE = 1e-9  # [m/s], of levels
@@ -163,6 +164,11 @@ class Orbit(eqx.Module):
             return so_far + jump[:, None] * jnp.sum(c[:, None] * so_far, axis=0)[None], None
 
         monodromy = jax.lax.scan(chain, eye, (local.A, jump.T, local.c.T))[0]
+        if system.excited:
+            # Friction stops a face at rest within the period.
+            resting = system.resting(s, segments.used)
+            stopped = block_diagonal(jnp.zeros_like(resting), resting)
+            monodromy = monodromy - product(monodromy, stopped)
         return system.mechanism_state(system.mechanism_state(monodromy).T).T
 
     def _segment(self, times) -> Int[Array, " n"]:

@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, ScalarLike
@@ -94,15 +95,22 @@ def excited_system(mechanism: Any, excitation: Excitation | None) -> HybridSyste
     """The scaled system of a scene or a structure, with the excitation if there is one.
 
     Its last degree of freedom is z, dimensionless and of order one. Its unit of time is the
-    reciprocal of hypot(omega, Omega), so that no frequency exceeds 1.
+    reciprocal of hypot(omega, Omega), so that no frequency exceeds 1. Where the first joint has V =
+    0, the unit of velocity is the amplitude of the acceleration times that of time.
     """
-    system = hybrid_system(mechanism)
     if excitation is None:
-        return system
+        return hybrid_system(mechanism)
     require_kind("excitation", excitation, Excitation)
     cosine, sine = excitation.parts(mechanism)
     cosine, sine = mechanism.over_mass(jnp.stack([cosine, sine], axis=1)).T
     Omega = 2 * jnp.pi * excitation.frequency
+
+    def unit_speed(V, omega):
+        largest = jnp.max(jnp.hypot(cosine, sine)) / jnp.hypot(omega, Omega)
+        largest = jax.lax.stop_gradient(jnp.where(largest > 0, largest, 1))
+        return jnp.where(V > 0, V, largest)
+
+    system = hybrid_system(mechanism, unit_speed)
     omega = jnp.hypot(system.omega, Omega)
     r, unit, n = system.omega / omega, omega * system.speed, system.n
     Omega = Omega / omega

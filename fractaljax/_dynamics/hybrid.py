@@ -133,6 +133,11 @@ class HybridSystem(eqx.Module):
         return self.linear and not any(law.velocity_dependent for law in self.laws)
 
     @property
+    def has_jump(self) -> bool:
+        """True if the static coefficient of a law may lie above its limit at vanishing speed."""
+        return any(law.has_jump for law in self.laws)
+
+    @property
     def constant(self) -> int | None:
         """The component of a state that no motion changes at the section: z of an excitation."""
         return self.n - 1 if self.excited else None
@@ -278,6 +283,20 @@ class HybridSystem(eqx.Module):
         """True for faces whose joint is open in contact states s."""
         return in_states(s, [state for state in STATES if not state.closed])
 
+    def resting(self, s, used) -> Array:
+        """Projector (n, n, ...) of x onto t of the faces that stick in all used s (f, N, ...).
+
+        Only a face that nothing drives sticks for a whole period, and then at any place.
+        """
+        assert self.T is not None  # of an excited system
+        rests = jnp.all(self.is_held(s) | ~used[None], axis=1)
+        T = jnp.where(rests[:, None], self.over_lanes(self.T, s.ndim - 1)[:, :, 0], 0)
+        identity = np.eye(len(T), dtype=T.dtype).reshape(len(T), len(T), *(1,) * (rests.ndim - 1))
+        alone = ~(rests[:, None] & rests[None])
+        W = jnp.where(alone, identity, product(T, jnp.swapaxes(T, 0, 1)))
+        by = jnp.stack([solve_positive(W, T[:, i]) for i in range(T.shape[1])], axis=1)
+        return product(jnp.swapaxes(T, 0, 1), by)
+
     def is_held(self, s) -> Array:
         """True for faces that contact states s hold at w = 0."""
         return in_states(s, [state for state in self.states if state.force is None])
@@ -285,6 +304,12 @@ class HybridSystem(eqx.Module):
     def limits(self, loads) -> Array:
         """The largest friction force of each face in stick (f, ...)."""
         return self.at_each_face(lambda law, load: law.mu_s * load, loads)
+
+    def static_excess(self) -> Array:
+        """The static coefficient of each face (f,) less the limit at vanishing speed, over it."""
+        return self.at_each_face(
+            lambda law, one: one * (law.mu_s / law.kinetic_limit() - 1), jnp.ones_like(self.P)
+        )
 
     def over_static(self, speeds) -> Array:
         """The coefficient of friction at sliding speeds (f, ...) [m/s], over the static one."""
@@ -457,6 +482,8 @@ class HybridSystem(eqx.Module):
     def equilibrium(self) -> Float[Array, " 2n"]:
         """The closed, forward-slipping equilibrium (Eq. 40) as a state."""
         mu = self.at_each_face(lambda law, V: law.mu(self.speed * V), self.V)
+        if self.excited:  # without V friction is anything up to its limit: here it is 0
+            mu = mu * jnp.sign(self.V)
         K = jnp.diag(self.K) if self.K.ndim == 1 else self.K
         B = jnp.eye(self.n, dtype=K.dtype) if self.B is None else self.B
         coupled = K - product(B * mu[None], self.L)

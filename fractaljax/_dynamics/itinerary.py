@@ -211,6 +211,10 @@ class Shooting:
         """Orders of the guards' zeros (k, M) at the start and at the end of each phase."""
         system = self.family.template
         numbers = system.guard_numbers
+        # Where friction falls by a jump, w starts with its first derivative.
+        jumps = np.zeros(len(system.P), bool)
+        if system.has_jump:
+            jumps = np.asarray(system.static_excess() > 64 * jnp.finfo(system.P.dtype).eps)
         count = numbers.count
         before, after = np.zeros((count, self.padded), int), np.zeros((count, self.padded), int)
         for p, phase in enumerate(self.phases):
@@ -220,7 +224,8 @@ class Shooting:
                     continue
                 if was == STICK:
                     # Released by its own limit w starts with its second derivative.
-                    before[numbers.lower(i), p] = 2 if numbers.face(last.guard) == i else 1
+                    smooth = numbers.face(last.guard) == i and not jumps[i]
+                    before[numbers.lower(i), p] = 2 if smooth else 1
                 elif was == -now:
                     before[numbers.lower(i), p] = 1
             if numbers.opens_joint(last.guard) and last.s != phase.s:

@@ -20,6 +20,7 @@ from .orbit import orbit
 from .scaled import (
     check_rtol,
     degrees_of_freedom,
+    require_drive,
     scaled_start,
     start_state,
     steps_follow_motion,
@@ -116,6 +117,7 @@ def refine_cycle(cycle: LimitCycle, arguments: tuple, count: int, static: dict) 
 def check_arguments(mechanism, start, excitation, rtol, max_returns, search, segments=None):
     """Options of a search: `max_returns` as a number, segment count, and what is static."""
     n, joints = degrees_of_freedom(mechanism), mechanism.joints_by_name()
+    require_drive(mechanism, excitation)
     if excitation is not None:
         require_kind("excitation", excitation, Excitation)
     require_kind("search", search, CycleSearch)
@@ -163,15 +165,20 @@ def limit_cycle(
       on a CPU `jax.lax.map(..., batch_size=32)` is quicker.
     - `start`: (2n,), [x, v] in m and m/s; by default the sliding equilibrium, displaced by V/omega
       along t, where omega^2 is the sum of the squared eigenfrequencies for a scene, and the root
-      of the sum of their fourth powers for a structure.
+      of the sum of their fourth powers for a structure. If mu_s of the first joint lies above
+      mu(0), it is not displaced but has the velocity V along t, with which the joint sticks. With
+      V = 0 it is the equilibrium without friction.
     - `excitation`: a harmonic force. The returns are then its periods, at each of which its time is
       0 again: the section is stroboscopic, `state` is that at the time 0, `period` is `returns`
       periods of the excitation (above 1 the motion is subharmonic), and none of the 2n
-      `multipliers` is 1 by itself. `start` is the state at the time 0.
-    - `regularisation`: eps [m/s], to replace sgn v by tanh(v/eps). The cycle is then compared
-      with the exact law's from the same start: `regularisation_error` is the largest relative
-      difference of period and amplitudes, and the result `depends_on_eps` where it is above
-      1e-3. Derivatives differ by far more than values do.
+      `multipliers` is 1 by itself. `start` is the state at the time 0. Joints may then have V = 0,
+      as friction dampers do. One that sticks for a whole period, with a `stick_fraction` of 1, may
+      rest at any place within its limits: at that where the motion from `start` leaves it, with a
+      multiplier of 1 and one of 0.
+    - `regularisation`: eps [m/s], to replace sgn v by tanh(v/eps), of laws without a jump. The
+      cycle is then compared with the exact law's from the same start: `regularisation_error` is the
+      largest relative difference of period and amplitudes, and the result `depends_on_eps` where it
+      is above 1e-3. Derivatives differ by far more than values do.
     - `solver`: a diffrax solver for the regularised law, Tsit5 by default; an implicit one, such
       as Kvaerno5, for a small eps.
     - `max_steps`: most steps of that solver in one period, 4096 by default.
@@ -189,7 +196,8 @@ def limit_cycle(
       everything is NaN where there is no cycle.
 
     **Raises:** `ValueError` for a start of another shape, an rtol above 0.1 or below what the
-    precision can hold, less than 16 segments or max_returns below 1; `RuntimeError` if `throw`.
+    precision can hold, less than 16 segments, max_returns below 1, or the regularised law of
+    friction with a jump; `RuntimeError` if `throw`.
     Under a trace (`jit`, `vmap`) everything is NaN instead.
     """
     start = None if start is None else start_state(start, degrees_of_freedom(mechanism))
@@ -200,9 +208,11 @@ def limit_cycle(
     if segments is None:
         cycle = refine_cycle(cycle, arguments, count, static)
     if regularisation is not None:
-        from .regularised import regularised_cycle
+        from .regularised import regularised_cycle, without_jump
 
         eps = number("regularisation", regularisation, above=0)
         steps = whole("max_steps", max_steps, 1)
-        cycle = regularised_cycle(*inputs, eps, cycle, solver, static["rtol"], steps)
+        cycle = regularised_cycle(
+            without_jump(mechanism), start, excitation, eps, cycle, solver, static["rtol"], steps
+        )
     return raise_unless(CycleResult.converged, cycle) if throw else cycle

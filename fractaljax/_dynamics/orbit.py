@@ -49,14 +49,22 @@ def _chain(body: Callable, carry, arrays: tuple, lanes: int, count=None) -> tupl
 
 @functools.partial(jax.jit, static_argnames="constant")  # traced once for all places of a program
 def corrections(
-    local: Maps, segments: Segments, gap, guard, constant: int | None = None, count=None
+    local: Maps,
+    segments: Segments,
+    gap,
+    guard,
+    constant: int | None = None,
+    count=None,
+    resting=None,
 ):
     """Changes of states and durations that close the gaps and bring the guards to zero.
 
     They solve dy_next = A dy + b dt + gap on every segment of the chain, with the same stretch
     dt/duration in a phase, and c dy_next = -guard at its end. The component `constant` of the first
-    state, which repeats whatever it is, does not change. Returns them and the product of all maps
-    (2n, 2n), the Jacobian of the return map. No segment from `count` on is used.
+    state, which repeats whatever it is, does not change; nor does what `resting` (n, n, ...)
+    projects on, displacements and velocities of faces that stick throughout. Returns them and the
+    product of all maps (2n, 2n), the Jacobian of the return map. No segment from `count` on is
+    used.
     """
     n, used, lanes = len(gap), segments.used, segments.duration.ndim - 1
     ends = used & (segments.guard != NONE)
@@ -89,6 +97,9 @@ def corrections(
     if constant is not None:
         matrix = matrix.at[constant].set(jnp.broadcast_to(eye[constant, :n], shift.shape))
         shift = shift.at[constant].set(0)
+    if resting is not None:
+        # Such a displacement repeats whatever it is.
+        matrix = matrix + block_diagonal(resting, resting)
     first = solve(matrix, shift)
     stretch = jnp.sum(stretch[:n] * first[:, None], axis=0) + stretch[n]
 
@@ -108,6 +119,13 @@ def corrections(
 
     _, dy = _chain(along, first, (local.A, local.b * dt[None] + gap), lanes, count)
     return dy, dt, jacobian
+
+
+def block_diagonal(A, B) -> Array:
+    """[[A, 0], [0, B]] of matrices (n, n, ...) of one shape."""
+    none = jnp.zeros_like(A)
+    rows = [jnp.concatenate([A, none], axis=1), jnp.concatenate([none, B], axis=1)]
+    return jnp.concatenate(rows)
 
 
 class PeriodicOrbit(eqx.Module):
@@ -163,6 +181,7 @@ def solve_periodic_orbits(
         longest_step = jnp.maximum(longest_step, extent / 8)
     tolerance = jnp.maximum(1e3 * eps, 1e-2 * rtol) * size
     together = segments_together(segments)
+    resting = system.resting(s, used) if system.excited else None
     A = jnp.zeros((y.shape[1], len(y), *y[:, 0].shape), y.dtype)
     no_maps = Maps(A, jnp.zeros_like(y), jnp.zeros_like(y))
     far = jnp.where(active, big, jnp.inf).astype(y.dtype)
@@ -201,7 +220,7 @@ def solve_periodic_orbits(
         target = next_start(y)
         off = chosen_guard(system, target, s, guard)
         dy, dt, jacobian = corrections(
-            local, orbits.segments, ends - target, off, system.constant, many
+            local, orbits.segments, ends - target, off, system.constant, many, resting
         )
         largest, longest = jnp.max(jnp.abs(dy), axis=(0, 1)), jnp.max(jnp.abs(dt), axis=0)
         error = jnp.maximum(
@@ -261,9 +280,10 @@ def _orbit_tangent(
 
     gap, off = jax.jvp(equations, (system,), (tangent,))[1]
     local = exact_maps(system, segments)
+    resting = system.resting(segments.s, segments.used) if system.excited else None
 
     def solution(gap, off):
-        return corrections(local, segments, gap, off, system.constant)[:2]
+        return corrections(local, segments, gap, off, system.constant, resting=resting)[:2]
 
     # Linear, hence its own derivative, without the constant parts that no scan can transpose.
     return jax.jvp(solution, (jnp.zeros_like(gap), jnp.zeros_like(off)), (gap, off))[1]

@@ -15,6 +15,7 @@ import numpy as np
 import optimistix
 from jaxtyping import Array, Float
 
+from .._base.parts import concrete, nan_where
 from .._mechanism.mechanism import Mechanism
 from .cycle import CycleResult, Fractions, LimitCycle, Ranges, repels
 from .events import Cubic
@@ -144,6 +145,29 @@ def share_below_zero(times, values, rates) -> Float[Array, ""]:
     zero = zero - cubic(zero) / jnp.where(slope == 0, 1, slope)
     below = jnp.where(starts == ends, starts, jnp.where(starts, zero, 1 - zero))
     return jnp.sum(below * h) / times[-1]
+
+
+def without_jump(mechanism: Any) -> Any:
+    """`mechanism`, unless a static coefficient lies above mu(0): tanh has no room for its peak.
+
+    **Raises:** `ValueError` naming the joint; a traced mechanism becomes NaN instead.
+    """
+    for name, joint in mechanism.joints_by_name().items():
+        law = joint.friction
+        if not law.has_jump:
+            continue
+        excess = law.mu_s / law.kinetic_limit() - 1
+        jumps = excess > 64 * jnp.finfo(excess.dtype).eps
+        values = concrete(jumps)
+        if values is None:
+            mechanism = nan_where(jumps.any(), mechanism)
+        elif values.any():
+            of = f" of joint {name}" if name else ""
+            raise ValueError(
+                f"friction{of} must not have mu_s above mu(0) where it is regularised: "
+                "leave regularisation out"
+            )
+    return mechanism
 
 
 @eqx.filter_jit

@@ -1,7 +1,7 @@
 """A scene or structure as a hybrid system in scaled units, its start, and its tolerance."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,13 +14,22 @@ from .._base.parts import concrete, number
 from .._friction import Coulomb, Friction
 from .._mechanism.joint import AnyJoint
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import require_one
+from .._mechanism.quantities import require_one, require_sliding
 from .._mechanism.scene import Scene, stiffness
 from .._mechanism.structure import Structure
 from .hybrid import HybridSystem
 from .joint_force import JointForce, TwoSidedSpring, joint_force
 from .lanes import log_spectral_radius
 from .law_scales import law_scales
+
+
+def require_drive(mechanism: Mechanism, excitation: Any) -> None:
+    """Refuse a joint with V = 0 without an excitation, as far as V is known.
+
+    **Raises:** `ValueError` naming the joint.
+    """
+    if excitation is None:
+        require_sliding(mechanism, "without an excitation, which simulate and limit_cycle take")
 
 
 def steps_follow_motion(n: int) -> bool:
@@ -65,25 +74,35 @@ def _stick_as_one(structure: Any, joint: AnyJoint, other: AnyJoint) -> bool:
     return K_t is not None and bool(K_t > 0)
 
 
-def hybrid_system(mechanism: Any) -> HybridSystem:
-    """The scaled system of a scene or a structure."""
+def hybrid_system(mechanism: Any, unit_speed: Callable | None = None) -> HybridSystem:
+    """The scaled system of a scene or a structure.
+
+    The unit of velocity is the V of the first joint, or unit_speed(V, omega).
+    """
     scaled = _uncoupled_system if mechanism.uncoupled else _structure_system
-    system = scaled(mechanism)
+    system = scaled(mechanism, unit_speed)
+    laws = zip(system.laws, system.sharing, strict=True)
+    prepared = tuple(
+        law.in_motion() if len(joints) == 1 else jax.vmap(lambda law: law.in_motion())(law)
+        for law, joints in laws
+    )
+    system = replace(system, laws=prepared)
     return replace(system, scales=law_scales(system))
 
 
-def _uncoupled_system(scene: Scene) -> HybridSystem:
+def _uncoupled_system(scene: Scene, unit_speed: Callable | None) -> HybridSystem:
     o = scene.oscillator
     K_n, K_t = stiffness(scene)
     a, b = o.omega_1**2 + K_t / o.m, o.omega_2**2 + K_n / o.m
     omega = jnp.sqrt(a + b)
-    f = o.F / o.m / jnp.sqrt(2.0) / omega / o.V
-    unit, zero = o.m * omega * o.V, jnp.zeros_like(f)
+    speed = o.V if unit_speed is None else unit_speed(o.V, omega)
+    f = o.F / o.m / jnp.sqrt(2.0) / omega / speed
+    unit, zero = o.m * omega * speed, jnp.zeros_like(f)
     K = jnp.stack([a, b]) / omega**2
     P = zero if scene.normal_load is None else scene.normal_load / unit
     return HybridSystem(
         laws=(scene.friction,),
-        speed=o.V,
+        speed=speed,
         omega=omega,
         force_unit=unit,
         K=K,
@@ -95,14 +114,14 @@ def _uncoupled_system(scene: Scene) -> HybridSystem:
             [jnp.stack([zero, K_n / o.m / omega**2]), jnp.stack([-K_t / o.m / omega**2, zero])]
         ),
         P=jnp.stack([P, zero]),
-        V=jnp.ones_like(K),
+        V=jnp.ones_like(K) if unit_speed is None else jnp.full_like(K, o.V / speed),
         joint_forces=(joint_force(scene),),
         faces=((0, 1),),
         sharing=((0,),),
     )
 
 
-def _structure_system(structure: Structure) -> HybridSystem:
+def _structure_system(structure: Structure, unit_speed: Callable | None) -> HybridSystem:
     if structure.has_loss:
         raise ValueError(
             "structural damping belongs to an oscillation, not to motion in time: take "
@@ -153,6 +172,7 @@ def _structure_system(structure: Structure) -> HybridSystem:
     # Between the highest eigenfrequency and n^(1/4) times it.
     omega = jnp.sum(K * K.T) ** 0.25
     speed = V[0] if structure.joints else jnp.asarray(speed_unit, dtype)
+    speed = speed if unit_speed is None else unit_speed(speed, omega)
     unit = omega * speed
     return HybridSystem(
         laws=laws,
@@ -213,11 +233,18 @@ def start_state(start: ArrayLike | Sequence[float], n: int) -> Float[Array, " 2n
 def scaled_start(system: HybridSystem, start: Array | None) -> Float[Array, " 2n"]:
     """The start in scaled units, constant: by default the displaced equilibrium.
 
-    It is displaced by V/omega along the first joint's t. An excitation begins at t = 0.
+    It is displaced by V/omega along the first joint's t, or for a law with a jump begins with V
+    along t. Where that joint has V = 0 it begins at rest. An excitation begins at t = 0.
     """
     if start is None:
         kick = system.section_direction
         kick = jnp.concatenate([kick / jnp.sum(kick**2), jnp.zeros_like(kick)])
+        if system.has_jump:
+            # Steady sliding may well attract, and this start sticks.
+            jumps = system.static_excess()[0] > 64 * jnp.finfo(kick.dtype).eps
+            kick = jnp.where(jumps, jnp.roll(kick, system.n), kick)
+        if system.excited:
+            kick = kick * jnp.sign(system.V[0])
         y = system.mechanism_state(system.equilibrium() + kick)
     else:
         y = start / system.units

@@ -33,7 +33,7 @@ from .exact_step import step_to_switch
 from .excitation import Excitation, excited_system
 from .guard import NONE
 from .hybrid import HybridSystem
-from .scaled import check_rtol, degrees_of_freedom, start_state
+from .scaled import check_rtol, degrees_of_freedom, require_drive, start_state
 from .segments import chosen_guard, flow
 from .transition import first_contact_state, switch
 
@@ -323,13 +323,17 @@ def simulate(
     everything is NaN instead.
     """
     start = start_state(start, degrees_of_freedom(mechanism))
+    require_drive(mechanism, excitation)
     t0, t1 = _times(t0, t1)
     system, y, t0, end = _scaled(mechanism, excitation, start, t0, t1)
     saveat = None if saveat is None else _checked(saveat, t0, t1)
     n = whole("max_steps", max_steps, 1)
     rtol = check_rtol(rtol, y.dtype)
     if regularisation is not None:
+        from .regularised import without_jump
+
         eps = number("regularisation", regularisation, above=0)
+        mechanism = without_jump(mechanism)
         trajectory = _regularised(system, y, t0, end, saveat, eps, solver, rtol, n)
     else:
         h = jnp.asarray(min(0.25 * (rtol / 1e-9) ** 0.125, 0.5), y.dtype)

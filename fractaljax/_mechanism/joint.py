@@ -26,8 +26,10 @@ from .._base.parts import (
 from .._base.toml import Laws
 from .._contact.contact import MU_M_MAX, Contact, refused_stiffness
 from .._contact.laws import CONTACTS
-from .._friction import LAWS, Friction
+from .._friction import Friction
+from .._friction_laws import LAWS
 from .._surface.spectra import SPECTRA
+from .oscillator import belt_velocity
 
 # Classes by their names in files.
 JOINT_LAWS: Laws = {
@@ -121,7 +123,7 @@ class AnyJoint(Part):
         """The friction coefficient mu at the joint's sliding velocity, a scalar."""
         law = self.friction
         if self.V is None or not law.velocity_dependent:
-            return law.mu_s
+            return law.kinetic_limit()
         return law.mu(self.V)
 
 
@@ -134,7 +136,9 @@ class Joint(AnyJoint):
     floats. Positive `normal` displacement n.x compresses the joint. Friction pushes towards
     positive t.x, as the belt does in Eq. 39. `V` is the sliding velocity; a law without slope needs
     no V. With a `loss_factor` eta, structural damping, the stiffnesses of the joint in an
-    oscillation are K_n (1 + i eta) and K_t (1 + i eta), also in the normal force that rubs.
+    oscillation are K_n (1 + i eta) and K_t (1 + i eta), also in the normal force that rubs. With
+    V = 0 nothing drives the joint, as in a friction damper: only a motion under an excitation
+    slides it. A V that is traced must be above 0.
 
     The normal force N on which friction acts is K_n n.x, the source's form. With `preload`, x = 0
     is the state of rest under the load P of the contact, where N = P: N(n.x) is the load curve of
@@ -142,7 +146,7 @@ class Joint(AnyJoint):
     `preload="linear"`. Without `normal`, N is the constant P, and there is neither a normal spring
     nor a friction face normal to the belt. The tangential spring K_t is present in all forms.
 
-    **Raises:** `TypeError` for a part of the wrong kind; `ValueError` unless V > 0, for directions
+    **Raises:** `TypeError` for a part of the wrong kind; `ValueError` unless V >= 0, for directions
     that are zero or have one degree of freedom twice, for a missing P where it is needed, and for
     friction that `Scene` refuses.
     """
@@ -176,7 +180,7 @@ class Joint(AnyJoint):
             raise ValueError("V must be given for friction that depends on the sliding velocity")
         if self.tangential == self.normal:
             raise ValueError(f"tangential and normal must differ, both are {tangential!r}")
-        self.V = None if V is None else number("V", V, above=0)
+        self.V = None if V is None else belt_velocity(V)
         self.loss_factor = (
             None if loss_factor is None else number("loss_factor", loss_factor, at_least=0)
         )

@@ -1,11 +1,18 @@
 """The mass on the belt: two directions coupled by friction (Eq. 39)."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from .._base.parts import Numbers, Part, flag, number, quantity, require_kind
+from .._base.parts import Numbers, Part, concrete, flag, number, quantity, require_kind
 from .._friction import Friction
+
+
+def belt_velocity(V: Any) -> Numbers:
+    """A sliding velocity V of at least 0 as an array; one that is traced must be above 0."""
+    return number("V", V, above=0) if concrete(V) is None else number("V", V, at_least=0)
 
 
 class Oscillator(Part):
@@ -13,7 +20,10 @@ class Oscillator(Part):
 
     Without the contact, K_i = m omega_i^2 and C_i = 2 xi_i omega_i m.
 
-    **Raises:** `ValueError` unless m, omega_1, omega_2, V > 0, xi_1, xi_2 >= 0 and F is finite.
+    With V = 0 nothing slides by itself: there is no steady sliding, and motions need an excitation.
+
+    **Raises:** `ValueError` unless m, omega_1, omega_2 > 0, xi_1, xi_2, V >= 0 and F is finite. A V
+    that is traced becomes NaN unless it is above 0.
     """
 
     m: Numbers = quantity("kg", "mass", log=True)
@@ -44,7 +54,7 @@ class Oscillator(Part):
         self.xi_1 = number("xi_1", xi_1, at_least=0)
         self.xi_2 = number("xi_2", xi_2, at_least=0)
         self.F = number("F", F)
-        self.V = number("V", V, above=0)
+        self.V = belt_velocity(V)
 
 
 class Linearised(eqx.Module):
@@ -138,7 +148,7 @@ def linearise(
     is open, and c_1 is NaN.
     """
     m, V = oscillator.m, oscillator.V
-    mu = friction.mu(V) if friction.velocity_dependent else friction.mu_s
+    mu = friction.mu(V) if friction.velocity_dependent else friction.kinetic_limit()
     c_1 = 2 * oscillator.xi_1 * oscillator.omega_1
     c_2 = 2 * oscillator.xi_2 * oscillator.omega_2
     N = None if static is None else static[1]

@@ -19,7 +19,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from .._base.parts import Quantity, brief, is_traced, number, substitute
+from .._base.parts import Quantity, brief, concrete, is_traced, number, substitute
 from .._contact.fixed import FixedContact
 from .mechanism import Mechanism
 from .scene import FRICTION
@@ -30,6 +30,21 @@ def require_one(name: str, x: Any) -> None:
     if not isinstance(x, Mechanism):
         raise TypeError(f"{name} must be a Scene or a Structure, got {brief(x)}")
     x.require_one()
+
+
+def require_sliding(x: Any, where: str) -> Any:
+    """`x`, whose joints must have V above 0 `where` that is needed, or no V.
+
+    **Raises:** `ValueError` naming the joint, as far as V is known.
+    """
+    if not isinstance(x, Mechanism):
+        return x
+    for name, joint in x.joints_by_name().items():
+        stored = None if joint.V is None else concrete(joint.V)
+        if stored is not None and (stored == 0).any():
+            of = f" of joint {name}" if name else ""
+            raise ValueError(f"V{of} must be above 0 {where}, got 0.0: the joint only sticks")
+    return x
 
 
 def quantity_names(x: Mechanism) -> list[str]:
@@ -104,7 +119,10 @@ def replaced(x: Mechanism, values: Mapping[str, ArrayLike]) -> Any:
         name: value if name in stored else number(name, value, **derived[name].domain)
         for name, value in values.items()
     }
-    return x.replace(**_settings(x, checked))
+    new = x.replace(**_settings(x, checked))
+    if any(name.rpartition(".")[2] == "V" for name in values):
+        require_sliding(new, "where it is varied")
+    return new
 
 
 def require_inside(x: Mechanism, axes: Mapping[str, np.ndarray], batch: int = 2**16) -> None:

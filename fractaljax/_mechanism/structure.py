@@ -30,7 +30,7 @@ from .._base.parts import (
 )
 from .._base.programs import exported_jit
 from .._base.toml import naming, read_toml
-from .joint import Direction, Joint, stored_direction
+from .joint import Direction, Dof, Joint, stored_direction
 from .matrices import (
     MatrixLike,
     MatrixSum,
@@ -262,7 +262,7 @@ class Structure(Mechanism):
         """
         places = [self.index(dof) for dof in ([dofs] if isinstance(dofs, (int, str)) else dofs)]
         if len(set(places)) < len(places):
-            raise ValueError(f"dofs gives one degree of freedom twice: {_some(map(repr, dofs))}")
+            raise ValueError(f"dofs gives one degree of freedom twice: {some_of(map(repr, dofs))}")
         K, K_loss = separated(K, K_loss)
         added: dict[str, Any] = {}
         for name, X in {"M": M, "C": C, "K": K, "K_loss": K_loss}.items():

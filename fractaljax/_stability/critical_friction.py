@@ -23,7 +23,7 @@ from .._contact.contact import MU_M_MAX
 from .._mechanism.joint import Joint
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.oscillator import dimensionless, linearise, static_normal_force
-from .._mechanism.quantities import require_one, with_friction_times
+from .._mechanism.quantities import require_one, require_sliding, with_friction_times
 from .._mechanism.scene import Scene, stiffness
 from .critical_pair import least_test
 from .linearise import assembled, linearised
@@ -64,6 +64,7 @@ def critical_friction(
     a trace).
     """
     require_one("scene", scene)
+    scene = require_sliding(scene, "for steady sliding")
     sloping = flag("friction_slope", friction_slope)
     if scene.uncoupled:
         if joint is not None:

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Complex, Float, ScalarLike
 from .._base.parts import Record
 from .._base.programs import exported_jit
 from .._mechanism.mechanism import Mechanism
+from .._mechanism.quantities import require_sliding
 from .linearise import linearised, require_equilibrium
 from .margin import damping_ratios
 from .two_directions import two_directions
@@ -140,9 +141,9 @@ def growth_rate(scene: Mechanism, friction_slope: bool = True) -> Float[Array, "
     - `friction_slope`: False leaves out the slope of the friction law, as the source's Eq. 43 does.
 
     **Raises:** `ValueError` if the scene holds arrays: use `jax.vmap`; if a structure without F has
-    friction with a slope; and if one has no equilibrium.
+    friction with a slope; if one has no equilibrium; and for V = 0.
     """
-    growth = _growth_rate(scene, friction_slope)
+    growth = _growth_rate(require_sliding(scene, "for steady sliding"), friction_slope)
     require_equilibrium(scene, friction_slope, growth)
     return growth
 
@@ -178,7 +179,7 @@ def margin(
     kind = jnp.dtype(bool) if shift is None else jnp.result_type(shift)
     if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
         raise TypeError(f"shift must be a real number, got {kind}; friction_slope comes third")
-    value = _margin(scene, shift, friction_slope)
+    value = _margin(require_sliding(scene, "for steady sliding"), shift, friction_slope)
     require_equilibrium(scene, friction_slope, value)
     return value
 
@@ -199,7 +200,7 @@ def stability(scene: Mechanism, friction_slope: bool = True) -> Stability:
 
     **Raises:** as `growth_rate`.
     """
-    result = _stability(scene, friction_slope)
+    result = _stability(require_sliding(scene, "for steady sliding"), friction_slope)
     require_equilibrium(scene, friction_slope, result.growth_rate)
     return result
 

@@ -43,7 +43,7 @@ def test_every_value_is_read_back():
         ),
         ("[contact.material]", "[contact.matter]", "[contact] has the unknown key 'matter'"),
         ("[oscillator]", "[oscillators]", "the file has the unknown key 'oscillators'"),
-        ("V = 0.15", "V = -0.15", "[oscillator] V must be above 0, got -0.15"),
+        ("V = 0.15", "V = -0.15", "[oscillator] V must be at least 0, got -0.15"),
         ("V = 0.15", "V = 0.15 m/s", "not a TOML file: Expected newline"),
         (GOOD, "", "the table [contact] is missing"),
         (GOOD, "contact = 1", "[contact] must be a table, got 1"),

@@ -147,9 +147,9 @@ def test_vmapped_is_looped():
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        *((name, 0.0, "must be above 0, got 0.0") for name in ("m", "omega_1", "omega_2", "V")),
+        *((name, 0.0, "must be above 0, got 0.0") for name in ("m", "omega_1", "omega_2")),
         ("xi_1", -1e-9, "must be at least 0, got -1e-09"),
-        ("V", np.array([0.1, -0.2]), "must be above 0, got -0.2"),
+        ("V", np.array([0.1, -0.2]), "must be at least 0, got -0.2"),
     ],
 )
 def test_values_outside_the_domain_are_refused(name, value, message):

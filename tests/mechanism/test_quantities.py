@@ -93,7 +93,7 @@ def test_a_structure_has_the_numbers_of_its_joints():
     with pytest.raises(ValueError, match=r"must be independent, got V and left\.V"):
         require_independent(structure, ("V", "left.V"))
     require_independent(structure, ("left.V", "right.V"))
-    with pytest.raises(ValueError, match="V must be above 0"):
+    with pytest.raises(ValueError, match="V must be at least 0"):
         require_inside(structure, {"left.V": np.array([-0.1, 0.2])})
 
 

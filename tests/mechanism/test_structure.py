@@ -152,7 +152,7 @@ test_a_joint_refuses = refusals(
         ({"friction": 0.3}, "friction must be a Friction, got 0.3"),
         ({"normal": 0}, "tangential and normal must differ"),
         *(({"tangential": x}, "tangential must be a degree of") for x in ((0, 0), 0.5, True)),
-        ({"V": 0.0}, "V must be above 0, got 0.0"),
+        ({"V": -0.1}, "V must be at least 0, got -0.1"),
         ({"friction": fj.Stribeck(0.4, 0.3, 1)}, "V must be given for friction"),
         ({"contact": BRAKE, "friction": fj.Coulomb(0.95)}, "mu must be at most 0.9, got 0.95"),
     ],

@@ -284,7 +284,7 @@ BAD_JOINTS = [
     (JOINT.replace(CONTACT, ""), "the table [joints.pad.contact] is missing"),
     (JOINT.replace('"fixed"', '"glued"'), "[joints.pad.contact] law must be"),
     (JOINT.replace("mu = 0.4", "mu = -1"), "[joints.pad.friction] mu must be above 0, got -1.0"),
-    (JOINT.replace("V = 0.2", "V = 0"), "[joints.pad] V must be above 0, got 0.0"),
+    (JOINT.replace("V = 0.2", "V = -1"), "[joints.pad] V must be at least 0, got -1.0"),
     (JOINT.replace("joints.pad", 'joints."a b"'), "a joint's name must be of letters"),
     (JOINT + "[oscillator]\nm = 1", "the file has the unknown key 'oscillator'"),
 ]
