@@ -5,6 +5,7 @@ are; notebooks are executed, and the API is made of docstrings. The folder that 
 FRACTALJAX_EXECUTED names keeps executed notebooks, which are taken while their cells are the same.
 """
 
+import ast
 import base64
 import concurrent.futures
 import html.parser
@@ -27,7 +28,7 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 GROUPS = {  # of the API: title, and the modules whose public names it has
     "surface": ("Surfaces", ("_surface",)),
     "contact": ("Contact", ("_contact",)),
-    "friction": ("Friction", ("_friction",)),
+    "friction": ("Friction", ("_friction", "_tabulated_friction")),
     "mechanism": ("Scenes and structures", ("_mechanism",)),
     "stability": ("Stability", ("_stability",)),
     "dynamics": ("Motion and limit cycles", ("_dynamics",)),
@@ -47,6 +48,7 @@ def main() -> int:
     stage_notebooks()
     stage_api()
     stage_explore()
+    stage_gallery()
     settings()
     command = [sys.executable, "-m", "zensical", "build", "--strict", "--clean"]
     output: dict = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
@@ -196,6 +198,57 @@ def first_line(name: str) -> str:
     return ((value.__doc__ or "").strip().split("\n")[0]).replace("|", "\\|")
 
 
+# --- pictures -------------------------------------------------------------------------------
+
+
+def stage_gallery() -> None:
+    """A page of the pictures of docs, each with the page that shows it and the code that draws it.
+
+    The code is beside the page, to be read without a repository.
+    """
+    folder, text = (
+        SOURCE / "code",
+        ["# Gallery", "Every picture is drawn by code of the repository."],
+    )
+    folder.mkdir()
+    for picture in sorted((ROOT / "docs").glob("*.png")):
+        caption, page, code = pictured(picture.name)
+        cited = [f"[page]({page})"] if page else []
+        if code is not None:
+            shutil.copy(code, folder / f"{code.name}.txt")  # shown by a browser, not saved
+            cited.append(f"[code](code/{code.name}.txt)")
+        text.append(f"![{caption}](docs/{picture.name})")
+        text.append(f"*{caption}.* {', '.join(cited)}")
+    (SOURCE / "gallery.md").write_text("\n\n".join(text) + "\n", encoding="utf-8")
+
+
+def pictured(name: str) -> tuple[str, str, Path | None]:
+    """Caption of a picture of docs, the page that shows it, and the file of the code that draws it.
+
+    A picture of validation is drawn by the module of its case. The page is an empty text where none
+    shows the picture, and the code is None where the page has it, in a few lines or a command.
+    """
+    docs, code = ROOT / "docs", None
+    if name.startswith("validation_"):
+        case = f'"{name.removeprefix("validation_").removesuffix(".png")}"'
+        modules = sorted((docs / "gallery").glob("*.py"))
+        (code,) = [path for path in modules if re.search(rf"\bCase\(\s*{case}", text_of(path))]
+    makers = [path for path in sorted(docs.glob("make_*.py")) if f'"{name}"' in text_of(path)]
+    code = makers[0] if code is None and makers else code
+    for page in (ROOT / "README.md", *sorted(docs.glob("*.md")), *sorted(docs.rglob("*/*.md"))):
+        shown = re.search(rf"!\[([^\]]*)\]\([^)]*\b{re.escape(name)}\)", text_of(page))
+        if shown:
+            source = "index.md" if page.name == "README.md" else page.relative_to(ROOT).as_posix()
+            return shown[1], source.replace("docs/site/", ""), code
+    caption = (ast.get_docstring(ast.parse(text_of(code))) or "") if code else ""
+    caption = caption.split(": ", 1)[-1].split(",")[0]
+    return caption[:1].upper() + caption[1:], "", code
+
+
+def text_of(path: Path) -> str:
+    return path.read_text(encoding="utf-8")
+
+
 # --- the rest -------------------------------------------------------------------------------
 
 
@@ -217,6 +270,7 @@ def settings() -> None:
     text = (ROOT / "docs" / "site" / "zensical.toml").read_text(encoding="utf-8")
     for name, pages in lists.items():
         text = text.replace(f"@{name}@", "".join(f'"{page}",\n    ' for page in pages))
+    text = text.replace("@version@", importlib.metadata.version("fractaljax"))
     (SITE / "zensical.toml").write_text(text.replace("@root@", ROOT.as_posix()), encoding="utf-8")
 
 

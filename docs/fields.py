@@ -8,7 +8,14 @@ import griffe
 
 
 class Fields(griffe.Extension):
-    """The comment at the end of a field's lines or above it, or what `quantity` says of it."""
+    """The comment at the end of a field's lines or above it, or what `quantity` says of it.
+
+    A line of a docstring that begins with >= is no quotation.
+    """
+
+    def on_instance(self, *, obj: griffe.Object, **_: Any) -> None:
+        if obj.docstring:
+            obj.docstring.value = re.sub(r"(?m)^(\s*)(>=?) ", r"\1\\\2 ", obj.docstring.value)
 
     def on_attribute_instance(self, *, attr: griffe.Attribute, **_: Any) -> None:
         if attr.docstring or not isinstance(attr.parent, griffe.Class) or not attr.lineno:

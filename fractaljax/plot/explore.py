@@ -23,9 +23,11 @@ import numpy as np
 from .._base.files import write_whole
 from .._base.parts import require_kind, require_scalar, whole
 from .._base.programs import exported_jit
+from .._base.toml import part_table, write_toml
 from .._contact.contact import Regime
 from .._dynamics.cycle import CycleResult
 from .._dynamics.limit_cycle import limit_cycle
+from .._mechanism.joint import JOINT_LAWS
 from .._mechanism.quantities import (
     axis_values,
     label,
@@ -149,6 +151,8 @@ def page(
         "surface": _waves(scene) if scene.contact.has_surface else None,
         "cycles": None if cycles is False else _cycles(scene, axes, progress),
     }
+    data["file"], written = _scene_file(scene, names)
+    programs += javascript(written, len(axes), "written")
     text = {
         "title": html.escape(f"fractaljax: a scene over {', '.join(names)}"),
         "version": html.escape(__version__),
@@ -258,6 +262,33 @@ def _axis(scene: Scene, name: str, window: Any, count: int) -> Axis:
     refine = math.ceil(120 / (len(nodes) - 1))  # a slider has 120 positions, or a few more
     words = label(scene, name).rsplit(" [", 1)[0]
     return Axis(name, words, unit(scene, name), log, nodes, place, refine)
+
+
+def _scene_file(scene: Scene, names: Sequence[str]) -> tuple[list[Any], Any]:
+    """The text of the scene's TOML file with indices for its numbers, and a program for these.
+
+    There is no text for a law that no file holds.
+    """
+    leaves, tree = jax.tree.flatten(scene)
+    sizes = [np.size(leaf) for leaf in leaves]
+    places = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
+
+    def written(*q):
+        changed = jax.tree.leaves(substituted(scene, dict(zip(names, q, strict=True))))
+        return [each for leaf in changed for each in jnp.ravel(leaf)]
+
+    def marks(leaf, place):  # texts, which the file has in quotation marks
+        texts = [f"number {k}" for k in place]
+        return np.array(texts, object).reshape(np.shape(leaf)).tolist()
+
+    marked = jax.tree.unflatten(tree, map(marks, leaves, places))
+    try:
+        text = write_toml("A fractaljax scene, in SI units.", part_table(marked, JOINT_LAWS))
+    except ValueError:
+        return [], written
+    parts: list[Any] = re.split(r'"number (\d+)"', text)
+    parts[1::2] = map(int, parts[1::2])
+    return parts, written
 
 
 def _colours(name: str, start: float) -> list[str]:

@@ -133,6 +133,38 @@ def test_waves_sum_to_the_topography():
     np.testing.assert_allclose(z, expected, atol=1e-12 * np.abs(expected).max())
 
 
+@pytest.mark.parametrize(
+    ("scene", "windows"),
+    [
+        (SCENE, WINDOWS),
+        pytest.param(SCENE, {"D": (2.2, 2.6), "K_t/K_n": (0.2, 0.6)}, id="derived"),
+        pytest.param(DUSTY, {"mu": (0.1, 0.9), "omega_1/omega_2": (1, 2)}, id="preloaded"),
+    ],
+)
+def test_scene_of_the_page_is_that_of_python(scene, windows):
+    """The file that the page saves is read back as the scene with these numbers."""
+    if "K_t/K_n" in windows:
+        scene = scene.replace(stiffness_ratio=0.5)
+    text = page(scene, windows, cycles=False, progress=False)
+    names, ends = tuple(windows), np.array(list(windows.values()))
+    programs, functions = text.split("const data = ")
+    given = re.search(r"function sceneFile\(\) \{.*?\n\}", functions, re.DOTALL)
+    assert given is not None
+    program = programs.split('"use strict";')[1] + "let q; const values = () => q;"
+    program += "const data = " + functions.split(";\n")[0] + ";" + given[0]
+    for share in (0.0, 0.3, 0.7):
+        q = (ends[:, 0] * (1 - share) + ends[:, 1] * share).tolist()
+        ((file,),) = in_node(program, [f"(q = {q}, [sceneFile()])"])
+        saved, expected = (
+            fj.Scene.from_toml(file),
+            replaced(scene, dict(zip(names, q, strict=True))),
+        )
+        assert jax.tree.structure(saved) == jax.tree.structure(expected)
+        for one, other in zip(jax.tree.leaves(saved), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-15)
+        assert file.splitlines()[2:] != scene.to_toml().splitlines()[2:]
+
+
 def test_page_is_small_and_whole(tmp_path, capsys):
     """One file of less than a megabyte that names no other; the command writes it."""
     status, out, err = run(capsys, "explore", "--no-cycles", "--out", str(tmp_path))
@@ -205,6 +237,18 @@ def move(browser, name, index):
     )
 
 
+def enter(browser, name, text):
+    """Type into the field beside a slider; the field's validity and what it says."""
+    return browser.execute_script(
+        """const axis = axes.find(a => a.name === arguments[0]);
+        axis.entry.value = arguments[1];
+        axis.entry.dispatchEvent(new Event("input"));
+        return [axis.entry.ariaInvalid, axis.alert.textContent, +axis.input.value];""",
+        name,
+        text,
+    )
+
+
 def number_in(text):
     return float(text.split()[0])
 
@@ -226,6 +270,22 @@ def test_a_slider_moved_on_the_page_of_persson_s_law(tmp_path):
             ]:
                 assert number_in(cell(browser, name)) == float(f"{float(expected):.5g}")
         assert browser.execute_script("return shadeMap().kinds.size") == 1
+        # A number typed is taken to its last digit; what is outside is marked and not taken.
+        wrong, said, place = enter(browser, "D", "2.4123456")
+        assert (wrong, said) == ("false", "") and 0 < place < 120
+        exact = replaced(scene, {"D": 2.4123456})
+        expected = f"{float(fj.growth_rate(exact)):.5g}"
+        assert number_in(cell(browser, "growth_rate")) == float(expected)
+        for text in ("2.9", "two", " "):
+            wrong, said, _ = enter(browser, "D", text)
+            assert (wrong, said) == ("true", "a number from 2.3500 to 2.4500")
+        file = browser.execute_script("return sceneFile()")
+        assert fj.Scene.from_toml(file).to_toml() == exact.to_toml()
+        light = browser.execute_script("return getComputedStyle(document.body.parentNode).color")
+        feature = {"name": "prefers-color-scheme", "value": "dark"}
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})
+        dark = browser.execute_script("return getComputedStyle(document.body.parentNode).color")
+        assert (light, dark) == ("rgb(28, 36, 48)", "rgb(227, 231, 237)")
         assert not complaints(browser)
 
 
