@@ -261,7 +261,9 @@ def page(result: Result) -> list[str]:
 def picture(result: Result) -> bytes:
     """Residual over the time of a solution, a panel for each surface."""
     surfaces = result["surfaces"]
-    figure, panels = subplots(1, len(surfaces), figsize=(15, 4.8), sharex=True, sharey=True)
+    figure, panels = subplots(
+        len(surfaces), 1, figsize=(8.3, 4.4 * len(surfaces)), sharex=True, sharey=True
+    )
     for ax, surface in zip(panels, surfaces, strict=True):
         lines = []
         for name, style in {OWN: "C0o-", "Tamaas": "C1s-", "ContactMechanics": "C2^-"}.items():

@@ -383,13 +383,13 @@ LEAST_SHOWN = 1e-19  # of errors
 
 def picture(result: dict[str, Any]) -> bytes:
     """Systems a second over the batch; worst errors by distance from coalescence, and by family."""
-    figure, (left, middle, right) = subplots(1, 3, figsize=(19, 6.4))
+    figure, (top, middle, bottom) = subplots(3, 1, figsize=(8.3, 16))
     lines = []
     for name in TIMED:
         rows = [row for row in result["batches"] if name in row["methods"]]
         rates = [row["methods"][name]["systems_per_second"] for row in rows]
         lines.append((*column(rows, "systems"), rates, STYLES[name], name))
-    draw(left, lines, "systems in a batch [-]", "systems a second [1/s]")
+    draw(top, lines, "systems in a batch [-]", "systems a second [1/s]")
 
     def worst(rows, name):
         return [max(r["errors"][name]["worst"], LEAST_SHOWN) for r in rows if name in r["errors"]]
@@ -404,8 +404,8 @@ def picture(result: dict[str, Any]) -> bytes:
     families = result["families"]
     names = [row["family"].replace(" term", "\nterm") for row in families]
     for name in WITH_ERRORS:
-        right.plot(worst(families, name), names, STYLES[name][:3], mec="k", ms=9, label=name)
-    right.set(xscale="log", xlabel=error)
-    right.grid(True, which="major", alpha=0.4)
-    right.legend(loc="best", fontsize="small")
+        bottom.plot(worst(families, name), names, STYLES[name][:3], mec="k", ms=9, label=name)
+    bottom.set(xscale="log", xlabel=error)
+    bottom.grid(True, which="major", alpha=0.4)
+    bottom.legend(loc="best", fontsize="small")
     return png(figure, dpi=100)

@@ -206,8 +206,10 @@ def picture(result: Result) -> bytes:
     names, *bars = columns(rows, "name", "cold_s", "again_s", "scipy_s")
     places = np.arange(len(rows))
     for k, (seconds, label) in enumerate(zip(bars, ("first time", "again", "SciPy"), strict=True)):
-        ax.barh(places + 0.27 * (k - 1), [s or 0 for s in seconds], 0.25, label=label)
-    ax.set(yticks=places, yticklabels=names, xlabel="time [s]")
+        ax.barh(places + 0.27 * (k - 1), [s or np.nan for s in seconds], 0.25, label=label)
+    ax.set(xscale="log", yticks=places, yticklabels=names, xlabel="time [s]")
+    ax.grid(True, axis="x", which="major", alpha=0.4)
+    ax.set_axisbelow(True)
     ax.invert_yaxis()
     ax.legend()
     return png(figure)

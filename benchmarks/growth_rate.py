@@ -314,7 +314,7 @@ def page(result: dict[str, Any]) -> list[str]:
 
 def picture(result: dict[str, Any]) -> bytes:
     """Worst error over time a point; errors over the step; points a second over the batch."""
-    figure, (left, middle, right) = subplots(1, 3, figsize=(19, 6.4))
+    figure, (top, middle, bottom) = subplots(3, 1, figsize=(8.3, 16))
     methods, batches = result["methods"], result["batches"]
     own = next(row for row in methods if row["name"] == FORWARD)["error_to_40_digits"]["gradient"]
     lines = []
@@ -323,7 +323,7 @@ def picture(result: dict[str, Any]) -> bytes:
         style = ("C1" if row["compile_s"] is None else "C0") + marker
         lines.append((row["seconds_per_point"] * 1e6, error, style, row["name"]))
     title = "error of the gradient, of its length; of the value, of omega"
-    draw(left, lines, "time a point [us]", "worst error [-]", title)
+    draw(top, lines, "time a point [us]", "worst error [-]", title)
     lines = []
     for how, line in (("worst", "-"), ("median", "--")):
         for order, style in ((2, "C1s"), (4, "C3^")):
@@ -338,5 +338,5 @@ def picture(result: dict[str, Any]) -> bytes:
         x, y = [row["points"] for row in rows], [row["points_per_second"][name] for row in rows]
         style = f"{'C1' if name.startswith(ARRAYS) else 'C0'}{marker}"
         lines.append((x, y, f"{style}{'--' if name.endswith(VALUE) else '-'}", name))
-    draw(right, lines, "points in one call [-]", "points a second [1/s]")
+    draw(bottom, lines, "points in one call [-]", "points a second [1/s]")
     return png(figure, dpi=100)

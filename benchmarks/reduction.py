@@ -367,8 +367,9 @@ def page(result: Result) -> list[str]:
 
 def picture(result: Result) -> bytes:
     """Error over the time of a point."""
-    figure, panels = subplots(1, len(result["models"]), figsize=(20, 4.6), squeeze=False)
-    for ax, model in zip(panels[0], result["models"], strict=True):
+    pairs = -(-len(result["models"]) // 2)
+    figure, panels = subplots(pairs, 2, figsize=(8.3, 4 * pairs), squeeze=False)
+    for ax, model in zip(panels.flat, result["models"], strict=False):
         rows = model["rows"]
         lines = [
             (*columns(rows, "stability_s", "error"), "C0o", "reduced, all modes"),

@@ -593,12 +593,12 @@ def median_curve(curves: list[list[list[float]]]) -> tuple[np.ndarray, np.ndarra
 
 
 def picture(result: Result) -> bytes:
-    """Median gap to the optimum over time: a column for every task, below with compiling."""
+    """Median gap to the optimum over time: a row for every task, at the right with compiling."""
     tasks = result["tasks"]
-    figure, axes = subplots(2, len(tasks), figsize=(5.2 * len(tasks), 9.2), sharey=True)
+    figure, axes = subplots(len(tasks), 2, figsize=(8.3, 4.2 * len(tasks) + 1.2), sharey=True)
     handles = {}
-    for (column, task), cold in itertools.product(zip(axes.T, tasks, strict=True), (False, True)):
-        ax, drawn = column[int(cold)], []
+    for (row, task), cold in itertools.product(zip(axes, tasks, strict=True), (False, True)):
+        ax, drawn = row[int(cold)], []
         for run in (run for run in result["runs"] if run["task"] == task["name"]):
             colour, style, label = STYLES[run["family"]]
             t, gap = median_curve(run["curves"])
@@ -618,5 +618,5 @@ def picture(result: Result) -> bytes:
         }
     names = [label for _, _, label in STYLES.values() if label in handles]
     shown = [handles[name] for name in names]
-    figure.legend(shown, names, loc="outside lower center", ncols=4, fontsize="small")
+    figure.legend(shown, names, loc="outside lower center", ncols=3, fontsize="small")
     return png(figure, dpi=100)

@@ -44,12 +44,16 @@ def legend_above(ax: Axes, handles: Iterable[Artist]) -> None:
     ax.legend(handles=list(handles), ncols=3, fontsize="small", frameon=False, **place)
 
 
-def lines(ax: Axes, x: np.ndarray, rows: Iterable[np.ndarray], names: Sequence[str]) -> list[Any]:
-    """Draw rows (n,) or (n, k) over x, each in its colour and style; the first line of each."""
+def line_colours(count: int) -> np.ndarray:
+    """Colours (count, 4) of lines on white: viridis up to where the contrast falls to 3 : 1."""
     import matplotlib as mpl
 
-    colours = mpl.colormaps["viridis"](np.linspace(0, 0.85, len(names)))
-    handles = []
+    return mpl.colormaps["viridis"](np.linspace(0, 0.6, count))
+
+
+def lines(ax: Axes, x: np.ndarray, rows: Iterable[np.ndarray], names: Sequence[str]) -> list[Any]:
+    """Draw rows (n,) or (n, k) over x, each in its colour and style; the first line of each."""
+    colours, handles = line_colours(len(names)), []
     for i, (row, name) in enumerate(zip(rows, names, strict=True)):
         style = ("solid", "dashed", "dashdot", "dotted")[i % 4]
         drawn = ax.plot(x, row, color=colours[i], ls=style, lw=1.6)

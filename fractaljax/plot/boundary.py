@@ -6,7 +6,7 @@ import numpy as np
 
 from .._base.ranges import within
 from .._stability.boundary import Boundary, BoundaryEnd
-from .axes import Axes, ensure_axes, legend_above, set_quantity_axis
+from .axes import Axes, ensure_axes, legend_above, line_colours, set_quantity_axis
 
 
 def boundary(result: Boundary, ax: Axes | None = None) -> Axes:
@@ -18,6 +18,7 @@ def boundary(result: Boundary, ax: Axes | None = None) -> Axes:
     - `ax`: axes to draw in, by default those of a new figure.
     """
     from matplotlib.collections import LineCollection
+    from matplotlib.colors import ListedColormap
     from matplotlib.lines import Line2D
     from matplotlib.patheffects import withTickedStroke
 
@@ -38,7 +39,8 @@ def boundary(result: Boundary, ax: Axes | None = None) -> Axes:
         for point, end in ((points[0], branch.start), (points[-1], branch.end)):
             if not bool((end == BoundaryEnd.window) | (end == BoundaryEnd.closed)):
                 broken.append(point)
-    lines = LineCollection(segments, array=np.concatenate(frequencies), cmap="viridis", lw=2.6)
+    style: dict[str, Any] = {"cmap": ListedColormap(line_colours(256)), "lw": 2.6}
+    lines = LineCollection(segments, array=np.concatenate(frequencies), **style)
     ax.add_collection(lines, autolim=False)
     bar = ax.figure.colorbar(lines, ax=ax, pad=0.02)
     bar.set_label("frequency at the boundary [kHz]")

@@ -7,15 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._base.parts import whole
-from .._base.ranges import within
-from .._contact.contact import Regime
+from .._base.ranges import is_logarithmic, within
 from .._design.design import Design
 from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
 from .._stability.stability import growth_rate
 from .._sweep.sweep import sweep
 from .axes import Axes, ensure_axes, legend_above, set_quantity_axis
-from .maps import contact_regime, shade_regimes, shade_unsteady
+from .maps import regime_levels, shade_regimes, shade_unsteady
 
 
 def stability_map(
@@ -46,6 +45,7 @@ def stability_map(
     from matplotlib.colors import LogNorm
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
+    from scipy.ndimage import binary_dilation
 
     ax, window = ensure_axes(ax), dict(bounds or {})
     if len(window) < 2:
@@ -57,25 +57,27 @@ def stability_map(
 
     def measure(scene):
         K_n = jnp.nan if joint is None else scene.stiffness()[0]
-        return growth_rate(scene, friction_slope), K_n, contact_regime(scene) if fractal else None
+        return growth_rate(scene, friction_slope), K_n, regime_levels(scene) if fractal else None
 
-    growth, K_n, regime = sweep(measure, scene, progress=False, **axes).values
+    growth, K_n, levels = sweep(measure, scene, progress=False, **axes).values
     x, y = axes.values()
-    inelastic = (
-        np.asarray(regime != Regime.elastic_plastic) if fractal else np.zeros_like(K_n, bool)
-    )
-    # Outside the elastic-plastic regime the growth rate belongs to another mechanism.
+    inelastic = levels.inelastic if fractal else np.zeros_like(K_n, bool)
+    # Outside the elastic-plastic regime the growth rate belongs to another mechanism, and along its
+    # edges it changes within less than the points resolve.
+    inelastic = binary_dilation(inelastic, np.ones((3, 3)))
     none = np.isnan(growth)
     valid = np.ma.masked_where(inelastic | none, growth)
     if valid.count() and valid.max() > 0:
         top = 10 ** np.ceil(np.log10(valid.max()))
         norm = LogNorm(top / 1e4, top)  # four decades; less is as pale as stable
-        shown = np.ma.masked_where(inelastic | ~(growth > 0), np.clip(growth, norm.vmin, None))
+        # Hatches cover what is filled in, up to their smooth edges.
+        filled = _nearest(np.asarray(growth), inelastic)
+        shown = np.ma.masked_where(~(filled > 0), np.clip(filled, norm.vmin, None))
         mesh = ax.pcolormesh(x, y, shown.T, norm=norm, cmap="YlOrBr", shading="nearest")
         mesh.set_rasterized(True)
         bar = ax.figure.colorbar(mesh, ax=ax, extend="min", pad=0.02)
         bar.set_label("growth rate where it squeals [1/s]")
-    handles: list[Any] = shade_regimes(ax, x, y, regime) if fractal else []
+    handles: list[Any] = shade_regimes(ax, x, y, levels) if fractal else []
     handles += shade_unsteady(ax, x, y, none)
     handles.append(Patch(facecolor="white", edgecolor="0.3", label="stable"))
     limits = [(valid, 0.0, "solid", 1.6, "stability boundary")]
@@ -93,8 +95,19 @@ def stability_map(
     return ax
 
 
+def _nearest(values: np.ndarray, missing: np.ndarray) -> np.ndarray:
+    """Values (n, m) with those of the nearest points of the grid where they are missing."""
+    from scipy.ndimage import distance_transform_edt
+
+    places: Any = distance_transform_edt(missing, return_distances=False, return_indices=True)
+    return values[tuple(places)]
+
+
 def design(result: Design, ax: Axes | None = None) -> Axes:
     """The stability map of a design, and the path from the given scene to the designed one.
+
+    The path has those iterates of the best start that show the way: each comes at least twice as
+    near to the end, in the unit square of the bounds, as the one before.
 
     **Arguments:**
 
@@ -104,7 +117,9 @@ def design(result: Design, ax: Axes | None = None) -> Axes:
     limits: Any = {key: getattr(result, key) for key in ("target", "K_n_min", "friction_slope")}
     ax = stability_map(result.initial, result.bounds, ax, **limits)
     names = list(result.bounds)[:2]
-    path = [result.history[name] for name in names]
+    path = [np.asarray(result.history[name]) for name in names]
+    kept = _approach(path, [result.bounds[name] for name in names])
+    path = [values[kept] for values in path]
     handles = ax.plot(*path, "-", color="tab:blue", lw=1.3, label="path of the best start")
     final = "best found, not a solution" if result.violated else "designed surface"
     for scene, marker, size, colour, words in (
@@ -118,3 +133,16 @@ def design(result: Design, ax: Axes | None = None) -> Axes:
     old: Any = ax.get_legend()
     legend_above(ax, [*old.legend_handles, *handles])
     return ax
+
+
+def _approach(path: list[np.ndarray], bounds: list[tuple[float, float]]) -> list[int]:
+    """The iterates that each halve the distance to the last one, from the first to the last."""
+    rows = []
+    for values, (low, high) in zip(path, bounds, strict=True):
+        scale: Any = np.log if is_logarithmic(low, high) else np.asarray
+        rows.append((scale(values) - scale(values[-1])) / (scale(high) - scale(low)))
+    away, kept = np.hypot(*rows), [0]
+    for i, distance in enumerate(away):
+        if distance <= away[kept[-1]] / 2 and away[kept[-1]] > 0:
+            kept.append(i)
+    return kept

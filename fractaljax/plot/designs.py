@@ -57,7 +57,9 @@ def design_map(
             drawn.set_rasterized(True)
         else:
             at, over = (axis[met] for axis in axes)
-            drawn = ax.scatter(at, over, s=14, c=values[met], **how)
+            drawn = ax.scatter(
+                at, over, s=14, c=values[met], edgecolors="0.3", linewidths=0.4, **how
+            )
         ax.figure.colorbar(drawn, ax=ax, pad=0.02).set_label(words)
         ax.set_ylabel(label(designs.member, y))
         failed = [axis[~met] for axis in axes]

@@ -86,8 +86,9 @@ def explore(
     """Write a page with a slider for each of `windows`, in one .html file that needs no network.
 
     The page shows what `stability` and `stiffness` give at every position of the sliders, to
-    rounding: it runs the same program, translated. It also shows the mode in motion, a surface with
-    its D and G, and limit cycles from a small disturbance. Where the mechanism squeals between
+    rounding: it runs the same program, translated. Numbers may be typed, and the scene with them
+    saved as a TOML file. It also shows the mode in motion, a surface with its D and G, and limit
+    cycles from a small disturbance. Where the mechanism squeals between
     those that are computed, the page shows the nearest and says so.
 
     **Arguments:**

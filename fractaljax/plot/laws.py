@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from .._contact.compare import BOUNDARY_ELEMENTS, LawComparison
-from .axes import Axes, Figure, ensure_axes, new_figure
+from .axes import Axes, Figure, ensure_axes, line_colours, new_figure
 
 _PANELS = {
     "K_n": "normal stiffness K_n [N/m]",
@@ -29,10 +29,8 @@ def law_curves(result: LawComparison, ax: Axes | None = None, *, show: str = "K_
     """
     if show not in _PANELS:
         raise ValueError(f"show must be one of {', '.join(_PANELS)}, got {show!r}")
-    import matplotlib as mpl
-
     ax, loads = ensure_axes(ax), np.asarray(result.loads)
-    colours = mpl.colormaps["viridis"](np.linspace(0, 0.8, len(result.curves)))
+    colours = line_colours(len(result.curves))
     for i, (law, curve) in enumerate(result.curves.items()):
         values = _values(result, curve, show)
         if values is None:

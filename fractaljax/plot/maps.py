@@ -1,7 +1,8 @@
 """Maps of growth rate and frequency over two quantities, from a sweep of `stability`."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from .._contact.contact import Regime
@@ -10,10 +11,26 @@ from .._sweep.result import Sweep
 from .._sweep.sweep import sweep
 from .axes import Artist, Axes, ensure_axes, set_quantity_axis
 
-_SHADES = {
-    "fully plastic": (Regime.fully_plastic, "0.80", "//"),
-    "gross slip": (Regime.gross_slip, "0.92", ".."),
-}
+_PLASTIC, _SLIP = ("fully plastic", "0.80", "//"), ("gross slip", "0.92", "..")
+
+
+class RegimeLevels(NamedTuple):
+    """Continuous functions of a fractal contact; both are above 0 where it is elastic-plastic."""
+
+    plastic: Any  # ln(a_l/a_e), at most 0 where it is fully plastic
+    slip: Any  # 1 - Q_e/(mu_s P), at most 0 in gross slip; 1 with a given stiffness ratio
+
+    @property
+    def inelastic(self) -> np.ndarray:
+        """True where the contact is not elastic-plastic."""
+        return (np.asarray(self.plastic) <= 0) | (np.asarray(self.slip) <= 0)
+
+
+def regime_levels(scene: Scene) -> RegimeLevels:
+    """How far a fractal contact is from being fully plastic and from gross slip."""
+    state = scene.contact.state(scene.friction.mu_s, scene.friction.mu_m)
+    ratio = 0.0 if state.slip_ratio is None else state.slip_ratio
+    return RegimeLevels(state.log_area_ratio, jnp.ones_like(state.log_area_ratio) - ratio)
 
 
 def growth_map(result: Sweep, ax: Axes | None = None) -> Axes:
@@ -129,28 +146,29 @@ def vibration_modes(result: Sweep) -> tuple[np.ndarray, np.ndarray]:
     return s.real, s.imag / (2 * np.pi)
 
 
-def shade_regimes(ax: Axes, x: np.ndarray, y: np.ndarray, regime: Regime) -> list[Artist]:
-    """Hatch where a joint (n, m) is fully plastic or slips as a whole; the legend's handles."""
-    return [
-        handle
-        for words, (member, grey, hatch) in _SHADES.items()
-        for handle in _shade(ax, x, y, np.asarray(regime == member), words, grey, hatch)
-    ]
+def shade_regimes(ax: Axes, x: np.ndarray, y: np.ndarray, levels: RegimeLevels) -> list[Artist]:
+    """Hatch where a joint (n, m) is fully plastic or slips as a whole; the legend's handles.
+
+    The edges are contours of continuous functions, and have no stairs.
+    """
+    pairs = zip(levels, (_PLASTIC, _SLIP), strict=True)
+    return [h for level, style in pairs for h in _shade(ax, x, y, -np.asarray(level), *style)]
 
 
 def shade_unsteady(ax: Axes, x: np.ndarray, y: np.ndarray, none: np.ndarray) -> list[Artist]:
     """Hatch where there is no growth rate (n, m): neither stable nor squealing."""
-    return _shade(ax, x, y, none, "no steady sliding", "1.0", "xx")
+    # From each point half way to its neighbours.
+    return _shade(ax, x, y, none - 0.5, "no steady sliding", "1.0", "xx")
 
 
-def _shade(ax, x, y, inside, words: str, grey: str, hatch: str) -> list[Artist]:
-    """Hatch where `inside` (n, m) holds, from each point half way to its neighbours."""
+def _shade(ax, x, y, level, words: str, grey: str, hatch: str) -> list[Artist]:
+    """Hatch where `level` (n, m) is above 0."""
     from matplotlib.patches import Patch
 
-    if not inside.any():
+    if not (level > 0).any():
         return []
     style: dict[str, Any] = {"hatches": [hatch], "colors": [grey]}
-    ax.contourf(x, y, inside.T.astype(float), levels=[0.5, 1.5], **style)
+    ax.contourf(x, y, level.T, levels=[0, np.nanmax(level) + 1], **style)
     return [Patch(facecolor=grey, hatch=hatch, edgecolor="0.3", label=words)]
 
 
@@ -175,11 +193,10 @@ def _start(result, ax):
     if joint is None or not joint.contact.fractal:
         return ax, growth, shade_unsteady(ax, x, y, none)
     axes: Any = result.axes
-    regime = sweep(contact_regime, result.scene, progress=False, **axes).values
-    inelastic = np.asarray(regime != Regime.elastic_plastic)
-    if not inelastic.all():
-        growth = np.ma.masked_where(inelastic, growth)
-    return ax, growth, shade_regimes(ax, x, y, regime) + shade_unsteady(ax, x, y, none)
+    levels = sweep(regime_levels, result.scene, progress=False, **axes).values
+    if not levels.inelastic.all():
+        growth = np.ma.masked_where(levels.inelastic, growth)
+    return ax, growth, shade_regimes(ax, x, y, levels) + shade_unsteady(ax, x, y, none)
 
 
 def _no_number(result) -> np.ndarray:

@@ -38,6 +38,15 @@ def test_sources_name_what_there_is(path):
     assert f'"{page}"' in SETTINGS
 
 
+def test_every_picture_has_a_caption_a_page_or_the_code_that_draws_it():
+    for picture in sorted(DOCS.glob("*.png")):
+        caption, page, code = BUILD.pictured(picture.name)
+        assert caption and (page or code), picture.name
+        assert not page or f'"{page}"' in SETTINGS
+        if code is not None:
+            assert picture.stem.removeprefix("validation_") in code.read_text(encoding="utf-8")
+
+
 def test_notebooks_become_pages(tmp_path):
     """Text, code, what it printed and its pictures; links to notebooks lead to their pages."""
     code = new_code_cell("1 + 1", outputs=[new_output("stream", text="two\n")])

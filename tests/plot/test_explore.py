@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import subprocess
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -154,7 +155,7 @@ def test_scene_of_the_page_is_that_of_python(scene, windows):
     program += "const data = " + functions.split(";\n")[0] + ";" + given[0]
     for share in (0.0, 0.3, 0.7):
         q = (ends[:, 0] * (1 - share) + ends[:, 1] * share).tolist()
-        ((file,),) = in_node(program, [f"(q = {q}, [sceneFile()])"])
+        file: Any = in_node(program, [f"(q = {q}, [sceneFile()])"])[0][0]
         saved, expected = (
             fj.Scene.from_toml(file),
             replaced(scene, dict(zip(names, q, strict=True))),

@@ -281,8 +281,16 @@ test_refusals = refusals(
 
 def test_design_shows_its_path_and_whether_it_is_one():
     ax = plot.design(best())
-    path = [best().history["D"], best().history["G"]]
-    np.testing.assert_array_equal(drawn(ax, "path of the best start")[0], path)
+    D, G = (best().history[name] for name in "DG")
+    shown = drawn(ax, "path of the best start")[0]
+    at = [np.flatnonzero((x == D) & (y == G))[0] for x, y in shown.T]
+    assert at[0] == 0 and at == sorted(at) and (shown[:, -1] == [D[-1], G[-1]]).all()
+    ends = best().bounds
+    shares = (D - D[-1]) / np.ptp(ends["D"]), np.log(G / G[-1]) / np.ptp(np.log(ends["G"]))
+    away = np.hypot(*shares)
+    assert all(away[j] <= away[i] / 2 for i, j in itertools.pairwise(at))
+    for i, j in itertools.pairwise(at):  # the first that does
+        assert (away[i + 1 : j] > away[i] / 2).all()
     assert {"fully plastic", "gross slip", "stability boundary"} <= {*labels(ax)}
     assert ax.figure.axes[1].get_ylabel() == "growth rate where it squeals [1/s]"
     missed = dataclasses.replace(best(), violated=("K_n >= K_n_min",))
