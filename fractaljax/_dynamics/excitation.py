@@ -102,13 +102,15 @@ def _index(mechanism: Mechanism, dof: Dof) -> int:
     return dofs.index(dof)
 
 
-def excited_system(mechanism: Any, excitation: Excitation | None) -> HybridSystem:
+def excited_system(
+    mechanism: Any, excitation: Excitation | None, memory: bool = False
+) -> HybridSystem:
     """The scaled system of a scene or a structure, with the excitation if there is one.
 
     Its last degree of freedom is z, dimensionless and of order one. Its unit of time is the
     reciprocal of hypot(omega, Omega), so that no frequency exceeds 1.
     """
-    system = hybrid_system(mechanism)
+    system = hybrid_system(mechanism, memory)
     if excitation is None:
         return system
     require_kind("excitation", excitation, Excitation)

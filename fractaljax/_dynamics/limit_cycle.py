@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, ScalarLike
 
-from .._base.parts import concrete, number, raise_unless, require_kind, whole
+from .._base.parts import concrete, raise_unless, require_kind, whole
 from .._base.programs import exported_jit
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import joints_of
+from .._mechanism.quantities import has_memory, joints_of
 from .._mechanism.scene import Scene
 from .._stability.stability import growth_rate
 from .cycle import CycleResult, LimitCycle, Orbit
@@ -23,6 +23,7 @@ from .scaled import (
     check_rtol,
     degrees_of_freedom,
     scaled_start,
+    smoothing,
     start_state,
     steps_follow_motion,
 )
@@ -194,17 +195,23 @@ def limit_cycle(
     precision can hold, less than 16 segments or max_returns below 1; `RuntimeError` if `throw`.
     Under a trace (`jit`, `vmap`) everything is NaN instead.
     """
-    start = None if start is None else start_state(start, degrees_of_freedom(mechanism))
+    memory = has_memory(mechanism)
+    start = None if start is None else start_state(start, degrees_of_freedom(mechanism), memory)
     inputs = mechanism, start, excitation
     returns, count, static = check_arguments(*inputs, rtol, max_returns, search, segments)
+    if memory or regularisation is not None:
+        from .smooth import smooth_cycle
+
+        eps = smoothing(regularisation, memory)
+        steps = whole("max_steps", max_steps, 1)
+        options = solver, static["rtol"], steps, int(max_returns), static["of_scene"]
+    if memory:
+        cycle = smooth_cycle(*inputs, None, None, *options)
+        return raise_unless(CycleResult.converged, cycle) if throw else cycle
     arguments = *scale_problem(mechanism, excitation), start, returns
     cycle = find_cycle(*arguments, segments=count, **static)
     if segments is None:
         cycle = refine_cycle(cycle, arguments, count, static)
     if regularisation is not None:
-        from .regularised import regularised_cycle
-
-        eps = number("regularisation", regularisation, above=0)
-        steps = whole("max_steps", max_steps, 1)
-        cycle = regularised_cycle(*inputs, eps, cycle, solver, static["rtol"], steps)
+        cycle = smooth_cycle(*inputs, eps, cycle, *options)
     return raise_unless(CycleResult.converged, cycle) if throw else cycle

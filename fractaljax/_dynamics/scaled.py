@@ -14,6 +14,7 @@ from .._base.parts import concrete, number, require_kind, require_scalar
 from .._friction import Coulomb, Friction
 from .._mechanism.joint import Joint
 from .._mechanism.mechanism import Mechanism
+from .._mechanism.quantities import joints_of, require_no_memory
 from .._mechanism.scene import Scene, stiffness
 from .._mechanism.structure import Structure, require_single
 from .hybrid import HybridSystem
@@ -72,16 +73,42 @@ def _stick_as_one(structure: Structure, joint: Joint, other: Joint) -> bool:
     return K_t is not None and bool(K_t > 0)
 
 
-def hybrid_system(mechanism: Any) -> HybridSystem:
-    """The scaled system of a scene or a structure."""
+def hybrid_system(mechanism: Any, memory: bool = False) -> HybridSystem:
+    """The scaled system of a scene or a structure, whose laws all have a `memory` or all have none.
+
+    **Raises:** `ValueError` for other laws.
+    """
+    if memory:
+        _require_memory(mechanism)
+    else:
+        require_no_memory(mechanism)
     is_structure = isinstance(mechanism, Structure)
     system = _structure_system(mechanism) if is_structure else _scene_system(mechanism)
-    return replace(system, scales=law_scales(system))
+    return system if memory else replace(system, scales=law_scales(system))
+
+
+def _require_memory(mechanism: Mechanism) -> None:
+    for name, joint in joints_of(mechanism).items():
+        if not joint.friction.state_size:
+            raise ValueError(
+                f"friction of joint {name} must have memory, as that of another joint has, got "
+                f"{type(joint.friction).__name__}: Dahl or LuGre with stiff bristles come near it"
+            )
+
+
+def smoothing(regularisation: Any, memory: bool) -> Array | None:
+    """The checked `regularisation` of a motion, None for laws with memory."""
+    if regularisation is None:
+        return None
+    if memory:
+        raise ValueError(f"friction with memory takes no regularisation, got {regularisation!r}")
+    return number("regularisation", regularisation, above=0)
 
 
 def _scene_system(scene: Scene) -> HybridSystem:
     o = scene.oscillator
-    K_n, K_t = stiffness(scene)
+    K_n, spring = stiffness(scene)
+    K_t = jnp.zeros_like(spring) if scene.friction.in_series else spring
     a, b = o.omega_1**2 + K_t / o.m, o.omega_2**2 + K_n / o.m
     omega = jnp.sqrt(a + b)
     f = o.F / o.m / jnp.sqrt(2.0) / omega / o.V
@@ -89,7 +116,7 @@ def _scene_system(scene: Scene) -> HybridSystem:
     K = jnp.stack([a, b]) / omega**2
     P = zero if scene.normal_load is None else scene.normal_load / unit
     return HybridSystem(
-        laws=(scene.friction,),
+        laws=(scene.friction.at_joint(spring, 1 / omega),),
         speed=o.V,
         omega=omega,
         force_unit=unit,
@@ -113,10 +140,13 @@ def _structure_system(structure: Structure) -> HybridSystem:
     n, dtype = structure.n, structure.M.dtype
     K, rows, weights, offsets, speeds, faces = structure.K, [], [], [], [], []
     joint_forces: list[JointForce] = []
+    springs = []
     for name, joint in zip(structure.joint_names, structure.joints, strict=True):
         if joint.V is None:
             raise ValueError(f"joint {name}: V must be given, for the motion depends on it")
         K_n, K_t = joint.stiffness()
+        springs.append(K_t)
+        K_t = jnp.zeros_like(K_t) if joint.friction.in_series else K_t
         t = jnp.asarray(structure.direction(joint.tangential), dtype)
         K = K + K_t * jnp.outer(t, t)
         rows.append(t)
@@ -137,7 +167,7 @@ def _structure_system(structure: Structure) -> HybridSystem:
         speeds.append(joint.V)
         faces[-1] = (len(rows) - 2, len(rows) - 1)
     speed_unit = 1e-6  # m/s, of a structure without joints
-    laws, sharing = _shared([joint.friction for joint in structure.joints], faces)
+    laws, sharing = (), ()
     if not structure.joints:
         # A face without load, on a belt too fast for any motion: it never rubs or switches.
         unit = jnp.eye(n, dtype=dtype)[0]
@@ -154,6 +184,9 @@ def _structure_system(structure: Structure) -> HybridSystem:
     K, C, B, F = jnp.split(by_mass, [n, 2 * n, 2 * n + len(rows)], axis=1)
     # Between the highest eigenfrequency and n^(1/4) times it.
     omega = jnp.sum(K * K.T) ** 0.25
+    if structure.joints:
+        pairs = zip(structure.joints, springs, strict=True)
+        laws, sharing = _shared([j.friction.at_joint(K_t, 1 / omega) for j, K_t in pairs], faces)
     speed = V[0] if structure.joints else jnp.asarray(speed_unit, dtype)
     unit = omega * speed
     return HybridSystem(
@@ -203,9 +236,16 @@ def _shared(laws: Sequence[Friction], faces: Sequence[tuple[int, ...]]):
     return tuple(shared), tuple(map(tuple, kinds.values()))
 
 
-def start_state(start: ArrayLike | Sequence[float], n: int) -> Float[Array, " 2n"]:
-    """`start` as an array [x, v]; `ValueError` unless it has that shape."""
+def start_state(
+    start: ArrayLike | Sequence[float], n: int, memory: bool = False
+) -> Float[Array, " 2n"]:
+    """`start` as an array [x, v]; `ValueError` unless it has that shape.
+
+    With `memory` it may be longer.
+    """
     state = number("start", jnp.asarray(start))
+    if memory and state.ndim == 1 and len(state) > 2 * n:
+        return state
     if state.shape != (2 * n,):
         many = "; use jax.vmap for many" if state.ndim > 1 else ""
         raise ValueError(f"start must have shape ({2 * n},), got {state.shape}{many}")

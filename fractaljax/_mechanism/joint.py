@@ -26,6 +26,7 @@ from .._base.parts import (
 from .._base.toml import Laws
 from .._contact.contact import MU_M_MAX, Contact, refused_stiffness
 from .._contact.laws import CONTACTS
+from .. import _friction_memory  # noqa: F401  # registers its laws
 from .._friction import LAWS, Friction
 from .._surface.spectra import SPECTRA
 

@@ -56,6 +56,22 @@ def joints_of(x: Mechanism) -> dict[str, Any]:
     return {"": x}
 
 
+def has_memory(x: Mechanism) -> bool:
+    """True if the friction of any joint has internal states."""
+    return any(joint.friction.state_size > 0 for joint in joints_of(x).values())
+
+
+def require_no_memory(x: Mechanism) -> None:
+    """Refuse friction with memory, where its internal states are not followed."""
+    for joint in joints_of(x).values():
+        if joint.friction.state_size:
+            raise ValueError(
+                "friction must be without memory here, for its internal states are followed by "
+                "growth_rate, stability, margin, simulate and limit_cycle alone, got "
+                f"{type(joint.friction).__name__}"
+            )
+
+
 class Quantity(NamedTuple):
     """A number of a scene or structure."""
 

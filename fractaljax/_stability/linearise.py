@@ -13,7 +13,7 @@ from .._base.programs import exported_jit
 from .._base.rounding import rounding_error
 from .._contact.load_curve import LoadCurve, loaded_equilibrium
 from .._mechanism.oscillator import Linearised, linearise, static_normal_force
-from .._mechanism.quantities import sliding_friction
+from .._mechanism.quantities import require_no_memory, sliding_friction
 from .._mechanism.scene import Scene, stiffness
 from .._mechanism.structure import Structure, require_single
 
@@ -37,6 +37,7 @@ class Pressed(NamedTuple):
 
 def pressed(scene: Scene) -> Pressed:
     """Stiffness at the equilibrium: the contact's own, or on a load curve its slope there."""
+    require_no_memory(scene)
     (K_n, K_t), P = stiffness(scene), scene.normal_load
     if P is None or not scene.follows_load_curve:
         return Pressed(K_n, K_t, None)
@@ -173,6 +174,7 @@ class _Joint(NamedTuple):
 def attachments(structure: Structure, friction_slope: bool) -> Attachments:
     """What the joints add to the matrices at the sliding equilibrium."""
     require_single(structure)
+    require_no_memory(structure)
     sloping = flag("friction_slope", friction_slope)
     K = structure.K
     F = jnp.zeros(structure.n, K.dtype) if structure.F is None else structure.F

@@ -17,8 +17,10 @@ from jaxtyping import Array, Complex, Float, ScalarLike
 from .._base.singular import positive_sqrt
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.oscillator import Linearised, dimensionless
+from .._mechanism.quantities import has_memory
 from .._mechanism.structure import Structure
 from .band import among
+from .field_modes import field_modes
 from .linearise import assembled, linearised, require_equilibrium
 from .quadratic import solve
 
@@ -34,7 +36,7 @@ def margin(
     scene where modes coalesce and where they cross. Only without any damping is it not: there it is
     0 where stable and negative in flutter.
 
-    For a structure, it is the least damping ratio, which has kinks where modes cross: a smooth
+    For a structure, and with friction that has memory, it is the least damping ratio, which has kinks where modes cross: a smooth
     measure of n degrees of freedom takes a Lyapunov equation of size 2n. With a shift the ratios
     are those of the eigenvalues minus the shift. Rigid-body modes do not count without a shift.
 
@@ -56,6 +58,9 @@ def margin(
 
 @functools.partial(jax.jit, static_argnums=2)
 def _margin(scene, shift, friction_slope):
+    if has_memory(scene):
+        s = field_modes(scene, friction_slope).s
+        return least_damping_ratio(among(s - shift, getattr(scene, "band", None)))
     if isinstance(scene, Structure):
         s = solve(*assembled(scene, friction_slope).matrices).s
         return least_damping_ratio(among(s - shift, scene.band))

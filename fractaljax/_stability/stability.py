@@ -17,11 +17,12 @@ from .._base.parts import Record
 from .._base.programs import exported_jit
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.oscillator import Linearised
-from .._mechanism.quantities import sliding_friction
+from .._mechanism.quantities import has_memory, sliding_friction
 from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
 from . import quartic
 from .band import among, in_band
+from .field_modes import field_modes
 from .linearise import (
     assembled,
     linearised,
@@ -56,6 +57,8 @@ class Stability(Record):
     `normal_force` has one entry per joint: its normal force under preload, P without a normal
     direction, NaN in the source's form; None where no joint is preloaded. Where it is not above 0
     the joint is open: there is no steady sliding, and all numbers are NaN.
+
+    Friction with memory adds the eigenvalues of its internal states: there are 2n + s of them.
 
     For a structure that `reduce` made, only the eigenvalues in its band count: they come first, and
     the others are not eigenvalues of the structure.
@@ -163,6 +166,9 @@ def growth_rate(scene: Mechanism, friction_slope: bool = True) -> Float[Array, "
 
 @functools.partial(exported_jit, static_argnames="friction_slope")
 def _growth_rate(scene, friction_slope):
+    if has_memory(scene):
+        s, band = field_modes(scene, friction_slope).s, getattr(scene, "band", None)
+        return s[jnp.argmax(_rank(s, band))].real
     if isinstance(scene, Structure):
         attached = assembled(scene, friction_slope)
         return rightmost(attached.matrices[:3], scene.band, scene.coarse).real
@@ -195,13 +201,18 @@ def _solve_scene(scene, friction_slope):
 
 @functools.partial(exported_jit, static_argnames="friction_slope")
 def _stability(scene, friction_slope):
-    if isinstance(scene, Structure):
-        attached = assembled(scene, friction_slope)
-        forces, (s, x, error, _) = attached.normal_force, solve(*attached.matrices)
-        order = jnp.lexsort((-s.imag, -_rank(s, scene.band)))
+    memory = has_memory(scene)
+    if memory or isinstance(scene, Structure):
+        if memory:
+            s, x, error, forces = field_modes(scene, friction_slope)
+        else:
+            attached = assembled(scene, friction_slope)
+            forces, (s, x, error, _) = attached.normal_force, solve(*attached.matrices)
+        band, names = getattr(scene, "band", None), getattr(scene, "names", ("x1", "x2"))
+        order = jnp.lexsort((-s.imag, -_rank(s, band)))
         s, x, error = s[order], x[order], error[order]
-        counted = in_band(s, scene.band)
-        margin, names = least_damping_ratio(among(s, scene.band)), scene.names
+        counted = in_band(s, band)
+        margin = least_damping_ratio(among(s, band))
     else:
         s, x, error, margin, forces = _solve_scene(scene, friction_slope)
         counted, names = jnp.ones(s.shape, bool), ("x1", "x2")
