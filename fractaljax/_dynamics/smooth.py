@@ -18,6 +18,7 @@ import numpy as np
 import optimistix
 from jaxtyping import Array, Float
 
+from .._base.lapack import solve as solve_linear
 from .._friction import Friction
 from .._mechanism.mechanism import Mechanism
 from .contact_state import OPEN, STICK
@@ -127,14 +128,17 @@ class SmoothSystem(eqx.Module):
 
     def equilibrium(self) -> Float[Array, " 2n+s"]:
         """Steady sliding: by Newton's method from that of the law's `mu`; NaN if there is none."""
-        guess = jax.lax.stop_gradient(self.with_states(self.hybrid.equilibrium()))
-        tolerance = float(jnp.finfo(guess.dtype).eps) ** 0.75  # quadratic: the next is exact
-        newton = optimistix.Newton(rtol=tolerance, atol=tolerance)
-        root = optimistix.root_find(
-            lambda y, system: system.field(y), newton, guess, self, max_steps=64, throw=False
-        )
-        exists = root.result == optimistix.RESULTS.successful
-        return jnp.where(exists, root.value, jnp.nan)
+
+        def step(y, _):
+            change = solve_linear(jax.jacfwd(self.field)(y), self.field(y))
+            return y - change, jnp.max(jnp.abs(change))
+
+        # From the root, which laws of the package begin with, each step adds an order of
+        # derivatives.
+        start = jax.lax.stop_gradient(self.with_states(self.hybrid.equilibrium()))
+        y, changes = jax.lax.scan(step, start, length=8)
+        eps = float(jnp.finfo(y.dtype).eps)
+        return jnp.where(changes[-1] <= eps**0.5 * (1 + jnp.max(jnp.abs(y))), y, jnp.nan)
 
 
 def smooth_system(mechanism: Mechanism, excitation, eps=None) -> SmoothSystem:
@@ -308,6 +312,7 @@ def _settle(
     def again(carry):
         (y, _), _, followed, gap, k = carry
         size = jnp.max(jnp.abs(y - equilibrium))
+        # Small beside the motion, which itself is not lost in rounding.
         unsettled = (gap > 1e-4 * size) & ~(size < 1e-6)
         return unsettled & followed & (k * periods < most)
 
@@ -315,7 +320,9 @@ def _settle(
         (y, _), *_, k = carry
         return *settle(y), k + 1
 
-    return jax.lax.while_loop(again, once_more, (*settle(y), 1))[:3]
+    none = jnp.asarray(jnp.inf, y.dtype)
+    start = (y, jnp.zeros_like(none)), jnp.argmax(y[:1]), jnp.ones((), bool), none, 0
+    return jax.lax.while_loop(again, once_more, start)[:3]
 
 
 def _cubics(h, x, rate) -> Cubic:

@@ -37,7 +37,6 @@ class Pressed(NamedTuple):
 
 def pressed(scene: Scene) -> Pressed:
     """Stiffness at the equilibrium: the contact's own, or on a load curve its slope there."""
-    require_no_memory(scene)
     (K_n, K_t), P = stiffness(scene), scene.normal_load
     if P is None or not scene.follows_load_curve:
         return Pressed(K_n, K_t, None)
@@ -59,6 +58,7 @@ def linearised(scene: Scene, friction_slope: bool) -> Linearised:
 
 def linearised_at(scene: Scene, at: Pressed, friction_slope: bool) -> Linearised:
     """As `linearised`, with the joint `at` its equilibrium."""
+    require_no_memory(scene)
     load = scene.normal_load
     o, law = scene.oscillator, scene.friction
     return linearise(o, law, at.K_n, at.K_t, friction_slope, load, at.static)

@@ -112,7 +112,9 @@ def test_multipliers():
     y = found.orbit(4096)[1] / system.units[None]
 
     def divergence(y):
-        return jnp.trace(jax.jacfwd(lambda y: smooth.SmoothSystem(system, jnp.asarray(COARSE)).field(y))(y))
+        return jnp.trace(
+            jax.jacfwd(lambda y: smooth.SmoothSystem(system, jnp.asarray(COARSE)).field(y))(y)
+        )
 
     mean = float(jax.jit(jax.vmap(divergence))(y).mean())
     expected = np.exp(mean * float(found.period * system.omega))
