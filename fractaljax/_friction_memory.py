@@ -216,9 +216,9 @@ def _asinh_scaled(r, p) -> Numbers:
 
 
 class _Sliders(Friction):
-    """Springs in series with dry sliders, side by side; together as stiff as K_t, as strong as mu N.
+    """n springs in series with sliders, side by side, in all as stiff as K_t, as strong as mu N.
 
-    Slider i slips where its spring has the force (2 i - 1)/n^2 mu N, n in number.
+    Slider i slips where its spring has the force (2 i - 1)/n^2 mu N.
     """
 
     mu_s: Numbers = quantity("-", "friction coefficient of all sliders", name="mu")
@@ -291,8 +291,8 @@ class Jenkins(_Sliders, law="jenkins"):
 
     - `mu`: friction coefficient [-], above 0.
     - `stiffness`: tangential stiffness in series [N/m], above 0; by default K_t of the contact.
-    - `relaxation`: time in which the slider yields [s], above 0; by default a thousandth of 1/omega,
-      the unit of time of the motion.
+    - `relaxation`: time in which the slider yields [s], above 0; by default a thousandth of
+      1/omega, the unit of time of the motion.
 
     **Raises:** `ValueError` for others.
     """
@@ -328,7 +328,7 @@ class Iwan(_Sliders, law="iwan"):
     **Raises:** `ValueError` for others.
     """
 
-    elements: int = eqx.field(static=True)
+    elements: int = eqx.field(static=True, default=8)
 
     def __init__(
         self,

@@ -106,10 +106,10 @@ def verdict(
 
     Its growth rate [1/s] as it is; with the load P in the friction, or without it where it is
     there; with the tangential spring in series with the friction, as `Jenkins` has it, where K_t
-    has no part in steady sliding; under other contact laws; with K_t/K_n between its own, the fractal law's and Mindlin's,
-    the worst of 65 values, or 17 of a structure; the probability of squeal, quiet below 5 percent;
-    and the largest kick survived. What no argument asks for is named. The joints of a structure
-    change together.
+    has no part in steady sliding; under other contact laws; with K_t/K_n between its own, the
+    fractal law's and Mindlin's, the worst of 65 values, or 17 of a structure; the probability of
+    squeal, quiet below 5 percent; and the largest kick survived. What no argument asks for is
+    named. The joints of a structure change together.
 
     **Arguments:**
 

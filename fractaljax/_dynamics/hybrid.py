@@ -408,7 +408,7 @@ class HybridSystem(eqx.Module):
         return self._faces_at(y, jnp.where(self.open_faces(y), OPEN, FORWARD))
 
     def smooth_field(self, y, faces: FaceMotion, friction) -> Array:
-        """dy/dt under these forces of friction (f, ...) on the closed ones of its `smooth_faces`."""
+        """dy/dt under forces of friction (f, ...) on the closed ones of its `smooth_faces`."""
         forces = self._with_joint_forces(friction, faces)
         return jnp.concatenate([y[self.n :], self._driven(y, forces)])
 

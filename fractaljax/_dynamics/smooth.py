@@ -45,10 +45,12 @@ class SmoothSystem(eqx.Module):
             faces = [(i, i == h.faces[j][0]) for j in joints for i in h.faces[j]]
             # A spring in series rubs along t alone.
             rows = [k for k, (_, first) in enumerate(faces) if first or not law.in_series]
+            leaves, tree = jax.tree.flatten(law)
             if len(joints) > 1:
-                law = jax.tree.map(lambda leaf, rows=np.array(rows): leaf[rows], law)
+                leaves = [leaf[np.array(rows)] for leaf in leaves]
             else:
-                law = jax.tree.map(lambda leaf, k=len(rows): jnp.stack([leaf] * k), law)
+                leaves = [jnp.stack([leaf] * len(rows)) for leaf in leaves]
+            law = jax.tree.unflatten(tree, leaves)
             begin, end = end, end + len(rows) * law.state_size
             yield law, np.array([faces[k][0] for k in rows]), slice(begin, end)
 

@@ -11,6 +11,7 @@ from jax import Array
 from jax.core import Tracer
 from jaxtyping import ArrayLike
 
+from .. import _friction_memory  # noqa: F401  # registers its laws
 from .._base.laws import refused_where
 from .._base.parts import (
     Numbers,
@@ -26,7 +27,6 @@ from .._base.parts import (
 from .._base.toml import Laws
 from .._contact.contact import MU_M_MAX, Contact, refused_stiffness
 from .._contact.laws import CONTACTS
-from .. import _friction_memory  # noqa: F401  # registers its laws
 from .._friction import LAWS, Friction
 from .._surface.spectra import SPECTRA
 
