@@ -37,7 +37,7 @@ class LuGre(Friction, law="lugre"):
     sigma_0: Numbers = quantity("1/m", "stiffness of the bristles per normal load", log=True)
     sigma_1: Numbers = quantity("s/m", "damping of the bristles per normal load")
     viscous: Numbers = quantity("s/m", "viscous part of the friction coefficient")
-    exponent: int = eqx.field(static=True)
+    exponent: int = eqx.field(static=True, default=1)
 
     state_size: ClassVar[int] = 1
     amplitudes: ClassVar[tuple[str, ...]] = ("mu_s", "mu_d", "viscous", "sigma_0", "sigma_1")
@@ -189,7 +189,7 @@ class RateAndState(Friction, law="rate_and_state"):
         return self.force(self.steady(speed, 1.0)[0], speed, jnp.ones_like(speed))
 
     def rate(self, z, w, N):
-        return (self.v_ref * jnp.exp(-z) - jnp.abs(w)) / self.D_c
+        return (self.v_ref * jnp.exp(-jnp.asarray(z)) - jnp.abs(w)) / self.D_c
 
     def force(self, z, w, N):
         r, p = w / (2 * self.v_ref), (self.mu_0 + self.b * z) / self.a

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -159,6 +159,9 @@ def limit_cycle(
     respect to `start` are zero. An orbit that repels so weakly that the motion does not leave it is
     returned as `unstable`.
 
+    Friction with memory has no switches: the motion is diffrax's, the orbit y(T) = y, with the
+    states of the laws in y and, as `internal`, beside `state`.
+
     **Arguments:**
 
     - `mechanism`: a scene, or a structure of n degrees of freedom whose joints all have a V;
@@ -176,7 +179,8 @@ def limit_cycle(
       difference of period and amplitudes, and the result `depends_on_eps` where it is above
       1e-3. Derivatives differ by far more than values do.
     - `solver`: a diffrax solver for the regularised law, Tsit5 by default; an implicit one, such
-      as Kvaerno5, for a small eps.
+      as Kvaerno5, for a small eps. Friction with memory takes Kvaerno5 by default; with soft
+      bristles Tsit5 is quicker.
     - `max_steps`: most steps of that solver in one period, 4096 by default.
     - `rtol`: relative tolerance of period and states, 1e-9 by default and at least 9.1e-13; in
       float32 both are 4.9e-4. It sets the number of segments.
@@ -199,19 +203,19 @@ def limit_cycle(
     start = None if start is None else start_state(start, degrees_of_freedom(mechanism), memory)
     inputs = mechanism, start, excitation
     returns, count, static = check_arguments(*inputs, rtol, max_returns, search, segments)
-    if memory or regularisation is not None:
+    eps, steps = smoothing(regularisation, memory), whole("max_steps", max_steps, 1)
+    options: Any = solver, static["rtol"], steps, int(max_returns), static["of_scene"]
+    if memory:
         from .smooth import smooth_cycle
 
-        eps = smoothing(regularisation, memory)
-        steps = whole("max_steps", max_steps, 1)
-        options = solver, static["rtol"], steps, int(max_returns), static["of_scene"]
-    if memory:
         cycle = smooth_cycle(*inputs, None, None, *options)
         return raise_unless(CycleResult.converged, cycle) if throw else cycle
     arguments = *scale_problem(mechanism, excitation), start, returns
     cycle = find_cycle(*arguments, segments=count, **static)
     if segments is None:
         cycle = refine_cycle(cycle, arguments, count, static)
-    if regularisation is not None:
+    if eps is not None:
+        from .smooth import smooth_cycle
+
         cycle = smooth_cycle(*inputs, eps, cycle, *options)
     return raise_unless(CycleResult.converged, cycle) if throw else cycle

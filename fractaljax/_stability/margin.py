@@ -36,9 +36,10 @@ def margin(
     scene where modes coalesce and where they cross. Only without any damping is it not: there it is
     0 where stable and negative in flutter.
 
-    For a structure, and with friction that has memory, it is the least damping ratio, which has kinks where modes cross: a smooth
-    measure of n degrees of freedom takes a Lyapunov equation of size 2n. With a shift the ratios
-    are those of the eigenvalues minus the shift. Rigid-body modes do not count without a shift.
+    For a structure, and with friction that has memory, it is the least damping ratio, which has
+    kinks where modes cross: a smooth measure of n degrees of freedom takes a Lyapunov equation of
+    size 2n. With a shift the ratios are those of the eigenvalues minus the shift. Rigid-body modes
+    do not count without a shift.
 
     **Arguments:**
 
