@@ -188,9 +188,9 @@ def test_stiff_bristles_are_dry_friction():
     dry = float(fj.growth_rate(BRAKE.replace(friction=fj.ExponentialStribeck(0.4, 0.25, 0.3))))
     off = [
         float(fj.growth_rate(BRAKE.replace(friction=fj.LuGre(0.4, 0.25, 0.3, s, 0.0)))) - dry
-        for s in (1e6, 1e7)
+        for s in (1e7, 1e8)
     ]
-    assert 0 < off[0] < 1e-2
+    assert 0 < off[0] < 1e-3
     np.testing.assert_allclose(off[0] / off[1], 10, rtol=0.1)
 
 
@@ -207,7 +207,7 @@ def test_derivatives_of_the_growth_rate():
         return fj.growth_rate(BRAKE.replace(friction=law, D=x[3], G=jnp.exp(x[4])))
 
     _, forward, reverse = jax.jit(lambda x: both_modes(growth, x))(place)
-    steps = 1e-5 * np.array([1e6, 1.0, 0.25, 0.1, 1.0])
+    steps = np.array([1e4, 1e-2, 1e-4, 1e-5, 1e-4])  # above the rounding of the growth rate
     for i, h in enumerate(steps):
         d = h * np.eye(5)[i]
         ends = [float(growth(place + k * d)) for k in (-2, -1, 1, 2)]
