@@ -183,6 +183,7 @@ def test_eigenvalues(preload):
         np.testing.assert_allclose(measure(x), value, rtol=1e-8)
 
 
+@SLOW
 def test_stiff_bristles_are_dry_friction():
     """The growth rate nears that without memory as 1/sigma_0."""
     dry = float(fj.growth_rate(BRAKE.replace(friction=fj.ExponentialStribeck(0.4, 0.25, 0.3))))
@@ -263,6 +264,7 @@ def test_motion():
         fj.simulate(block(law), [1.5, 0.0, 0.0, 0.0], 8.0)
 
 
+@SLOW
 def test_cycle():
     """SciPy's motion from `state` is back after `period`; extremes are its own."""
     found = block_cycle()
