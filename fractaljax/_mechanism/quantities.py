@@ -58,12 +58,14 @@ def joints_of(x: Mechanism) -> dict[str, Any]:
 
 def has_memory(x: Mechanism) -> bool:
     """True if the friction of any joint has internal states."""
+    if not isinstance(x, Mechanism):  # refused, by its name, where it is used
+        return False
     return any(joint.friction.state_size > 0 for joint in joints_of(x).values())
 
 
 def require_no_memory(x: Mechanism) -> None:
     """Refuse friction with memory, where its internal states are not followed."""
-    for joint in joints_of(x).values():
+    for joint in joints_of(x).values() if has_memory(x) else ():
         if joint.friction.state_size:
             raise ValueError(
                 "friction must be without memory here, for its internal states are followed by "

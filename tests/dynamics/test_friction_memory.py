@@ -380,7 +380,10 @@ def test_a_users_law_is_the_shipped_one():
                      enumerate((fj.Dahl(0.4, 1e3), fj.Coulomb(0.4))))  # fmt: skip
     mixed = fj.Structure(np.eye(2), 0.1 * np.eye(2), np.eye(2), (first, second))
     for call, message in (
-        (lambda: fj.simulate(mixed, np.zeros(4), 1.0), "friction of joint 2 must have memory"),
+        (
+            lambda: fj.simulate(mixed, np.zeros(4), 1.0),
+            "friction of joint joint_2 must have memory",
+        ),
         (lambda: fj.growth_rate(dahl, friction_slope=False), "friction_slope must be True"),
         (
             lambda: fj.simulate(dahl, np.zeros(4), 1.0, regularisation=0.1),
