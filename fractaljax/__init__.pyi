@@ -78,6 +78,13 @@ from ._friction import (
     Stribeck as Stribeck,
 )
 from ._friction_laws import TabulatedFriction as TabulatedFriction
+from ._friction_memory import (
+    Dahl as Dahl,
+    Iwan as Iwan,
+    Jenkins as Jenkins,
+    LuGre as LuGre,
+    RateAndState as RateAndState,
+)
 from ._identify.analysis import SpectralAnalysis as SpectralAnalysis
 from ._identify.files import read_measurement as read_measurement
 from ._identify.identify import Identification as Identification, identify as identify

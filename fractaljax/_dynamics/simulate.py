@@ -28,12 +28,12 @@ from .._base.parts import (
 )
 from .._base.programs import exported_jit
 from .._mechanism.mechanism import Mechanism
-from .contact_state import OPEN, STICK
+from .._mechanism.quantities import has_memory
 from .exact_step import step_to_switch
 from .excitation import Excitation, excited_system
 from .guard import NONE
 from .hybrid import HybridSystem
-from .scaled import check_rtol, degrees_of_freedom, require_drive, start_state
+from .scaled import check_rtol, degrees_of_freedom, require_drive, smoothing, start_state
 from .segments import chosen_guard, flow
 from .transition import first_contact_state, switch
 
@@ -65,7 +65,9 @@ class Trajectory(Record):
     ]  # from each time on: +1, -1 slip forward, backward, 0 stick, 2 open
     result: SimulationResult  # a member of SimulationResult
     _system: HybridSystem | None = eqx.field(repr=False)  # None with `saveat`
-    _solution: Any = eqx.field(repr=False)  # diffrax's, of the regularised law
+    _solution: Any = eqx.field(repr=False)  # diffrax's, without an exact law
+    # The states of laws with memory at the times, law by law and face by face; else None
+    internal: Float[Array, "n s"] | None = eqx.field(default=None, repr=False)
 
     @property
     def end(self) -> Float[Array, " 2n"]:
@@ -98,7 +100,7 @@ class Trajectory(Record):
             y = jax.vmap(self._solution.evaluate, out_axes=1)(
                 (times - self.times[0]) * system.omega
             )
-            return (system.mechanism_state(y) * scale[:, None]).T
+            return (system.mechanism_state(y[: 2 * system.n]) * scale[:, None]).T
         k = self._step(times)
         after = (times - self.times[k]) * system.omega
         start = (self.states[k] / scale[None]).T
@@ -240,45 +242,6 @@ def _sampled(trajectory: Trajectory, saveat) -> Trajectory:
     )
 
 
-@eqx.filter_jit
-def _regularised(
-    system: HybridSystem, y, t0, end, saveat, eps, solver, rtol, max_steps: int
-) -> Trajectory:
-    from diffrax import RESULTS, SaveAt
-
-    from .regularised import DENSE, nodes, solve
-
-    options = {"solver": solver, "rtol": rtol, "max_steps": max_steps, "saveat": DENSE}
-    if saveat is not None:
-        options["saveat"] = SaveAt(ts=(saveat - t0) * system.omega, t1=True)
-    solution = solve(system, eps, y, end, **options)
-    if saveat is None:
-        times, states = nodes(solution)
-        last, times = states[-1], t0 + times / system.omega
-    else:
-        # What was not reached is infinite.
-        last = jnp.where(jnp.isfinite(solution.ys), solution.ys, 0)
-        times, states = saveat, jnp.where(jnp.isfinite(solution.ys), solution.ys, jnp.nan)[:-1]
-    sliding = system.speed * jax.vmap(lambda y: system.sliding(y[system.n :]))(states)
-    contact_states = jnp.where(jnp.abs(sliding) < eps, STICK, jnp.sign(sliding))
-    if any(system.opens):
-        contact_states = jnp.where(system.open_faces(states.T).T, OPEN, contact_states)
-    far = jnp.max(jnp.abs(last)) > system.bound(y, system.equilibrium())
-    reached = solution.result == RESULTS.successful
-    result = SimulationResult.where(
-        reached, SimulationResult.reached, SimulationResult.out_of_steps
-    )
-    result = SimulationResult.where(far, SimulationResult.diverged, result)
-    return Trajectory(
-        times=times,
-        states=(system.mechanism_state(states.T) * system.units[:, None]).T,
-        contact_states=contact_states,
-        result=result,
-        _system=system if saveat is None else None,
-        _solution=solution if saveat is None else None,
-    )
-
-
 def simulate(
     mechanism: Mechanism,
     start: ArrayLike | Sequence[float],
@@ -303,7 +266,8 @@ def simulate(
 
     - `mechanism`: a scene, or a structure of n degrees of freedom whose joints all have a V;
       `jax.vmap` takes many.
-    - `start`: (2n,), [x, v] in m and m/s.
+    - `start`: (2n,), [x, v] in m and m/s; with friction that has memory its states are those of
+      steady sliding, or follow as (2n + s,), as `internal` has them.
     - `t1`: end time [s], above `t0`.
     - `excitation`: a harmonic force, whose phase refers to the time 0.
     - `t0`: start time [s].
@@ -312,7 +276,8 @@ def simulate(
     - `regularisation`: eps [m/s], to replace sgn v by tanh(v/eps); a contact state is then 0 where
       abs(v) < eps. The motion depends on eps: `limit_cycle` compares with the exact law.
     - `solver`: a diffrax solver for the regularised law, Tsit5 by default; an implicit one, such
-      as Kvaerno5, for a small eps.
+      as Kvaerno5, for a small eps. Friction with memory takes Kvaerno5 by default; with soft
+      bristles Tsit5 is quicker.
     - `rtol`: relative tolerance of a step, 1e-9 by default and at least 9.1e-13; in float32 both
       are 4.9e-4. Errors grow with the distance between nearby motions.
     - `max_steps`: most steps; one oscillation takes about 30.
@@ -322,20 +287,22 @@ def simulate(
     rtol that the precision cannot hold; `RuntimeError` if `throw`. Under a trace (`jit`, `vmap`)
     everything is NaN instead.
     """
-    start = start_state(start, degrees_of_freedom(mechanism))
+    memory = has_memory(mechanism)
+    start = start_state(start, degrees_of_freedom(mechanism), memory)
     require_drive(mechanism, excitation)
     t0, t1 = _times(t0, t1)
-    system, y, t0, end = _scaled(mechanism, excitation, start, t0, t1)
     saveat = None if saveat is None else _checked(saveat, t0, t1)
     n = whole("max_steps", max_steps, 1)
-    rtol = check_rtol(rtol, y.dtype)
-    if regularisation is not None:
-        from .regularised import without_jump
+    rtol = check_rtol(rtol, jnp.result_type(*jax.tree.leaves((mechanism, start, excitation))))
+    if memory or regularisation is not None:
+        from .smooth import smooth_motion, without_jump
 
-        eps = number("regularisation", regularisation, above=0)
-        mechanism = without_jump(mechanism)
-        trajectory = _regularised(system, y, t0, end, saveat, eps, solver, rtol, n)
+        eps = smoothing(regularisation, memory)
+        mechanism = mechanism if memory else without_jump(mechanism)
+        times, options = (t0, t1, saveat), (eps, solver, rtol, n)
+        trajectory = smooth_motion(mechanism, excitation, start, *times, *options)
     else:
+        system, y, t0, end = _scaled(mechanism, excitation, start, t0, t1)
         h = jnp.asarray(min(0.25 * (rtol / 1e-9) ** 0.125, 0.5), y.dtype)
         frozen = jax.lax.stop_gradient((system, y, end))
         steps = _find_steps(*frozen, h, rtol, max_steps=n)
@@ -346,7 +313,7 @@ def simulate(
             steps = eqx.tree_at(lambda x: (x.duration, x.s, x.guard), steps, shorter)
         trajectory = _repeat(system, y, t0, end, steps)
         trajectory = trajectory if saveat is None else _sampled(trajectory, saveat)
-    if (bad := refused((mechanism, excitation, start, t0, end, saveat))) is not None:
+    if (bad := refused((mechanism, excitation, start, t0, t1, saveat))) is not None:
         trajectory = nan_where(bad, trajectory)  # contact states as well
     return raise_unless(SimulationResult.reached, trajectory) if throw else trajectory
 

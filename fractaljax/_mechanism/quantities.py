@@ -47,6 +47,24 @@ def require_sliding(x: Any, where: str) -> Any:
     return x
 
 
+def has_memory(x: Mechanism) -> bool:
+    """True if the friction of any joint has internal states."""
+    if not isinstance(x, Mechanism):  # refused, by its name, where it is used
+        return False
+    return any(joint.friction.state_size > 0 for joint in x.joints_by_name().values())
+
+
+def require_no_memory(x: Mechanism) -> None:
+    """Refuse friction with memory, where its internal states are not followed."""
+    for joint in x.joints_by_name().values():
+        if joint.friction.state_size:
+            raise ValueError(
+                "friction must be without memory here, for its internal states are followed by "
+                "growth_rate, stability, margin, simulate and limit_cycle alone, got "
+                f"{type(joint.friction).__name__}"
+            )
+
+
 def quantity_names(x: Mechanism) -> list[str]:
     """The names that `replaced` takes: stored quantities, then the derived ones of a scene."""
     return list(dict.fromkeys([*x.stored_quantities(), *x.derived_quantities()]))

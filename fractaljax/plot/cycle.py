@@ -107,7 +107,7 @@ def cycle(result: LimitCycle) -> Figure:
 
 def _sticking(cycle, face):
     """Yield times [s] at which sticking begins and ends; the last may end in the next period."""
-    if cycle.regularisation_error != 0:  # the regularised law creeps instead
+    if cycle.regularisation_error != 0 or cycle.internal is not None:  # it creeps instead
         return
     switches = [switch for switch in cycle.switches() if switch.direction == face + 1]
     for switch, following in zip(switches, switches[1:] + switches[:1], strict=True):
