@@ -81,10 +81,9 @@ def test_nothing_grows_at_the_critical_friction_whatever_the_quantities():
 
     @jax.jit
     def slopes(u):
-        value, *both, factor = both_modes(growth, u, has_aux=True)
-        return value, *both, jax.grad(lambda u: growth(u, factor)[0])(u)
+        total, factor = jax.grad(growth, has_aux=True)(u)
+        return growth(u, factor)[0], total, jax.grad(lambda u: growth(u, factor)[0])(u)
 
-    value, *both, partial = map(np.asarray, slopes(jnp.zeros(len(QUANTITIES))))
+    value, total, partial = map(np.asarray, slopes(jnp.zeros(len(QUANTITIES))))
     assert abs(value) < 1e-8 and (partial != 0).all()
-    for slope in both:
-        np.testing.assert_array_less(abs(slope), 1e-9 * abs(partial), err_msg=str(QUANTITIES))
+    np.testing.assert_array_less(abs(total), 1e-9 * abs(partial), err_msg=str(QUANTITIES))
