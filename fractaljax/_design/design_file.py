@@ -124,7 +124,7 @@ def read_tolerance(path: str | os.PathLike) -> Tolerance:
 
 def _tolerance_table(tolerance: Tolerance) -> dict[str, Any]:
     covariance = np.asarray(tolerance.covariance, float).tolist()
-    return {"names": tolerance.names, "covariance": covariance}
+    return {"names": tolerance.names, "covariance": covariance, "q": tolerance.q}
 
 
 def _with_arguments(kind: type, table: Mapping[str, Any], where: str) -> Any:
