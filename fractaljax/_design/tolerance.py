@@ -32,6 +32,7 @@ from .._mechanism.quantities import (
     value_of,
     with_optional,
 )
+from .._mechanism.scene import Scene, stiffness
 from .._mechanism.structure import Structure
 from .._stability.stability import growth_rate
 from .._surface.surface_scatter import HEIGHT, SurfaceScatter
@@ -59,13 +60,13 @@ class Tolerance(Record):
 
     names: tuple[str, ...] = eqx.field(static=True)  # of the quantities, or of their logarithms
     covariance: Float[Array, "k k"]  # of what is named, in SI units
-    q: float | None = eqx.field(static=True)  # rad/m: wavenumber of "ln m(q)"
+    q: Float[Array, ""] | None  # rad/m: wavenumber of "ln m(q)"
 
-    def __init__(self, names: Sequence[str], covariance: ArrayLike, q: float | None = None):
+    def __init__(self, names: Sequence[str], covariance: ArrayLike, q: ArrayLike | None = None):
         self.names = tuple(names)
         if (q is not None) != any(map(_is_height, self.names)):
             raise ValueError(f'tolerance takes q with "ln {HEIGHT}", got {self.names} and q = {q}')
-        self.q = None if q is None else float(scalar("q", q, above=0))
+        self.q = None if q is None else scalar("q", q, above=0)
         array = covariance if hasattr(covariance, "dtype") else np.asarray(covariance)
         self.covariance = number("covariance", array)
         if self.covariance.shape != (len(self.names),) * 2 or not self.names:
@@ -144,7 +145,8 @@ class Tolerance(Record):
                     most = min(REACH * sigma, _largest(value_of(x, each).dtype))
                     low, high = low * math.exp(-most), high * math.exp(most)
                 try:
-                    replaced(x, {each: np.array([low, high])})
+                    for end in (low, high):
+                        replaced(x, {each: end})
                 except ValueError as error:
                     raise ValueError(
                         f"tolerance of {label} leaves its domain within {REACH:g} deviations: "
@@ -252,9 +254,9 @@ def _with_height(D: Any, G: Any, scattered: Any, by: Any, q: Any) -> tuple[Any, 
     With f = q/(2 pi), ln m(q) = 2 (D - 2) (ln G + ln f) - 2 ln f - ln 2. Where G would leave the
     range of its precision, D comes no closer to 2: the height is kept.
     """
-    log_f = math.log(q / (2 * math.pi))
+    log_f = jnp.log(q / (2 * math.pi))
     slope = 2 * (D - 2) * (jnp.log(G) + log_f) + by
-    most = math.log(float(jnp.finfo(jnp.result_type(G)).max)) - abs(log_f) - 1
+    most = -math.log(float(jnp.finfo(jnp.result_type(G)).tiny)) - jnp.abs(log_f) - 2
     D = 2 + jnp.maximum(scattered - 2, jnp.abs(slope) / (2 * most))
     return D, jnp.exp(slope / (2 * (D - 2)) - log_f)
 
@@ -337,6 +339,41 @@ def _growth_rates(x, names, values, friction_slope):
         return growth_rate(substituted(x, dict(zip(names, row, strict=True))), friction_slope)
 
     return jax.vmap(one)(values)
+
+
+@eqx.filter_jit
+def _joints(x, names, values):
+    def one(row):
+        varied = substituted(x, dict(zip(names, row, strict=True)))
+        return jnp.stack([*stiffness(varied), growth_rate(varied)])
+
+    return jax.vmap(one)(values)
+
+
+def scattered_joint(
+    scene: Scene, scatter: Any, *, samples: int = 256, seed: int = 0
+) -> dict[str, tuple[float, float, float]]:
+    """K_n, K_t [N/m] and growth rate [1/s] of a scene, and the middle 68 % of each over a scatter.
+
+    By name: as it is, and the quantiles .16 and .84 of `samples` draws.
+    """
+    tolerance = Tolerance.of(scatter)
+    tolerance.check(scene, {})
+    shifts = tolerance.shifts(
+        np.random.default_rng(seed).standard_normal((samples - 1, len(tolerance.names)))
+    )
+    base = tolerance.base(scene)
+    scattered = tolerance.scattered(scene, base, shifts.T)
+    rows = np.stack(
+        [np.append(base[n], np.broadcast_to(v, samples - 1)) for n, v in scattered.items()], axis=1
+    )
+    values = np.asarray(_joints(scene, tuple(scattered), rows))
+    low, high = np.nanquantile(values[1:], [0.16, 0.84], axis=0)
+    names = ("K_n", "K_t", "growth rate")
+    return {
+        n: tuple(map(float, x))
+        for n, x in zip(names, zip(values[0], low, high, strict=True), strict=True)
+    }
 
 
 def squeal_probability(

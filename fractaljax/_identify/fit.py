@@ -211,7 +211,10 @@ def fit(
         at, ratios, slope = solve(at, bins.variance + estimated)
         if scatter is not None:
             break
-        before, estimated = estimated, residual_scatter(ratios - 1, bins.variance, ratios.size - 2.5)
+        before, estimated = (
+            estimated,
+            residual_scatter(ratios - 1, bins.variance, ratios.size - 2.5),
+        )
         if abs(before - estimated) <= 1e-3 * estimated:
             break
     variance = bins.variance + estimated

@@ -102,10 +102,8 @@ class Identification(Record):
         beyond = max(2 - self.D, self.D - 3) / max(self.D_standard_error, 1e-300)
         fit = self.self_affine
         if beyond <= 3 and not words and not (fit.fits and fit.has_rolloff):
-            covariance = np.diag([self.D_standard_error, self.log_height_error]) ** 2
-            height = self.log_height, self.q
             with contextlib.suppress(ValueError):  # D at 2: a Hurst exponent of 1
-                return fractal_scatter(self.D, *height, covariance, self.gamma)
+                return self.power_law_scatter
         if fit.fits:
             return fit.surface_scatter
         measured = self.measured_spectrum
@@ -117,6 +115,15 @@ class Identification(Record):
             )
         error = np.array([[self.level_error**2]])
         return SurfaceScatter(measured, ("ln height_factor",), error)
+
+    @property
+    def power_law_scatter(self) -> SurfaceScatter:
+        """The `Surface` of the power law with its errors, whatever the warnings say.
+
+        **Raises:** `ValueError` for D so close to 2 that G is 0 in double precision.
+        """
+        covariance = np.diag([self.D_standard_error, self.log_height_error]) ** 2
+        return fractal_scatter(self.D, self.log_height, self.q, covariance, self.gamma)
 
     @functools.cached_property
     def measured_spectrum(self) -> MeasuredSpectrum | None:
@@ -135,7 +142,8 @@ class Identification(Record):
             "D by structure function": f"{other.D:.4f} +- {other.D_standard_error:.4f}"
             if other.D == other.D
             else "none: no power law of a surface fits it",
-            "ln m(q)": f"{self.log_height:.4g} +- {self.log_height_error:.2g} at {self.q:.4g} rad/m",
+            "ln m(q) at q [rad/m]": f"{self.log_height:.4g} +- {self.log_height_error:.2g} at "
+            f"{self.q:.4g}",
             "self-affine": self.self_affine.description,
             "band [1/m]": f"{low:.4g} to {high:.4g}  ({self.decades:.2f} decades)",
             "wavelengths [m]": f"{1 / high:.4g} to {1 / low:.4g}",
@@ -258,10 +266,9 @@ def identify(
         end = min(end, limit)
     if noise.floor:
         end = min(end, noise.crossing)
-    if band is None:  # the roll-off of an instrument is far above the end of the chosen band
+    wide = ends
+    if band is None:  # without the longest waves, which the removed plane has part of
         wide = 3 / length, max(min(end, 2 * chosen.high), 9 / length)
-    else:
-        wide = ends
     if z.ndim == 1:
         cells = profile_cells(spectrum, wide)
     else:
@@ -270,9 +277,7 @@ def identify(
         change = np.log(spectrum.power / raw[0].power)
         by = np.interp(np.log(cells.f), np.log(spectrum.f), change)
         cells = cells._replace(height=cells.height * np.exp(by))
-    fit = fit_self_affine(
-        cells, wide, length, sigmas=analysis.sigmas, law=law, between=between
-    )
+    fit = fit_self_affine(cells, wide, length, sigmas=analysis.sigmas, law=law, between=between)
     log_height, height_error, q = _height(law)
     other = structure_function(
         lines,

@@ -6,13 +6,14 @@ cell is a gamma variable about the law, with as many degrees of freedom as it ha
 
     k^2 = f^2 [cosh s + sinh s cos 2(phi - psi)],
 
-a map has 2 pi C = the spectrum without lay at k, whose roll-off is the geometric mean of those along
-and across. It is regular in (s cos 2 psi, s sin 2 psi), which are fitted, also where there is no
-lay. A profile is a cut through a surface without lay, the integral over all waves that it crosses:
+C of a map is the spectrum without lay at k, whose roll-off is the geometric mean of those along and
+across. It is regular in (s cos 2 psi, s sin 2 psi), which are fitted, also where there is no lay. A
+profile is a cut through a surface without lay, the integral over all waves that it crosses:
 
     C_1(f) = 2/pi times the integral of S_r(f cosh t) over t > 0.
 """
 
+import dataclasses
 import functools
 import math
 from typing import NamedTuple
@@ -81,6 +82,24 @@ class SelfAffineFit(Record):
         lay = self.lay if has_lay else None
         surface = SelfAffine(Sq, H, self.rolloff, self.shortest, lay=lay)
         return SurfaceScatter(surface, tuple(names.tolist()), C[np.ix_(used, used)])
+
+    def pooled(
+        self, mean: np.ndarray, covariance: np.ndarray, has_rolloff: bool, shortest: list[float]
+    ) -> "SelfAffineFit":
+        """That of a process with this mean and covariance of (ln Sq, H, ln rolloff, ln lay)."""
+        errors = np.sqrt(np.diagonal(covariance))
+        return dataclasses.replace(
+            self,
+            Sq=math.exp(mean[0]),
+            H=float(mean[1]),
+            H_standard_error=float(errors[1]),
+            rolloff=math.exp(mean[2]),
+            ln_rolloff_error=float(errors[2]) if has_rolloff else math.inf,
+            lay=math.exp(mean[3]) if errors[3] > 0 else 1.0,
+            ln_lay_error=float(errors[3]),
+            shortest=min(math.exp(np.mean(np.log(shortest))), math.exp(mean[2])),
+            covariance=covariance,
+        )
 
     @property
     def description(self) -> str:
@@ -157,7 +176,7 @@ def _log_radial(log_k, log_Sq, H, log_rolloff, log_shortest):
 
 
 class _Law:
-    """The law of cells by ln Sq, H, ln(rolloff), and of a map the lay (s cos 2 psi, s sin 2 psi)."""
+    """The law of cells by ln Sq, H, ln(rolloff), of a map also s cos 2 psi and s sin 2 psi."""
 
     def __init__(self, cells: Cells, shortest: float):
         self.cells, self.log_shortest = cells, math.log(shortest)
