@@ -1,4 +1,4 @@
-"""`fractaljax identify`: a measured surface, as a scene to design and the tolerance of its errors."""
+"""`fractaljax identify`: a measured surface as a scene to design, and its errors as a tolerance."""
 
 import shlex
 from pathlib import Path

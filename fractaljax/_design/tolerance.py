@@ -371,8 +371,7 @@ def scattered_joint(
     low, high = np.nanquantile(values[1:], [0.16, 0.84], axis=0)
     names = ("K_n", "K_t", "growth rate")
     return {
-        n: tuple(map(float, x))
-        for n, x in zip(names, zip(values[0], low, high, strict=True), strict=True)
+        name: (float(values[0, i]), float(low[i]), float(high[i])) for i, name in enumerate(names)
     }
 
 

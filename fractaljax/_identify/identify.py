@@ -109,9 +109,9 @@ class Identification(Record):
         measured = self.measured_spectrum
         if measured is None:
             raise ValueError(
-                f"no surface fits this profile (H = {fit.H:.3g} +- {fit.H_standard_error:.2g}, the "
-                f"spectrum scatters by {fit.scatter:.0%}): measure a map, whose spectrum is taken "
-                "as it is"
+                f"no surface fits this profile (H = {fit.H:.3g} +- {fit.H_standard_error:.2g}, its "
+                f"spectrum scatters by {fit.scatter:.0%} about the law): measure a map, whose "
+                "spectrum is taken as it is"
             )
         error = np.array([[self.level_error**2]])
         return SurfaceScatter(measured, ("ln height_factor",), error)
@@ -130,7 +130,7 @@ class Identification(Record):
         """The spectrum of a map as it is, up to `end`; None of a profile."""
         if self.spectrum.kind == "profile":
             return None
-        table = spectrum_table(self.spectrum, 0.0, self.end)
+        table = spectrum_table(self.spectrum, 0.0, self.end, per_bin=1.4)
         return None if table is None else MeasuredSpectrum(*table, height_factor=1.0)
 
     def __repr__(self) -> str:

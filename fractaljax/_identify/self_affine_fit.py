@@ -254,23 +254,22 @@ def fit_self_affine(
     low, high = math.log(2 / band[1]), math.log(longest)
 
     def solve(weight, corners, used):
-        best = None
+        ends = []
         for corner in corners:
             at = np.zeros(free.size)
             at[1], at[2] = 0.7, corner
             at[0] = 0.5 * np.average(np.log(cells.height) - model(at)[0], weights=weight)
-            ended = _fisher(model, cells, weight, at, used, (low, high))
-            if best is None or ended[1] < best[1]:
-                best = ended
-        return best
+            ends.append(_fisher(model, cells, weight, at, used, (low, high)))
+        return min(ends, key=lambda end: end[1])
 
     weight, corners = cells.count, np.linspace(low + 0.5, high - 0.2, starts)
     at, _ = solve(weight, corners, free)
-    scatter = 0.0
+    scatter, used_rings = 0.0, 0
     for _ in range(3):
         ratio = cells.height / np.exp(model(at)[0])
         scatter, weight, used_rings = _weights(cells, ratio, rings, groups, free.size)
-        at, deviance = solve(weight, [*corners[::3], at[2]], free)
+        at, _ = solve(weight, [*corners[::3], at[2]], free)
+    at, deviance = solve(weight, [*corners, at[2]], free)
     without, deviance_without = solve(weight, [high], fixed)
     found = deviance_without - deviance > sigmas**2 and at[2] < high - 1e-6
     used = free if found else fixed

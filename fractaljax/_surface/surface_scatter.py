@@ -61,7 +61,7 @@ def truncated_mean(value: float, error: float, low: float, high: float) -> float
     if error == 0:
         return min(max(value, low), high)
     ends = [(end - value) / error for end in (low, high)]
-    return float(truncnorm.mean(*ends, loc=value, scale=error))
+    return float(np.asarray(truncnorm.mean(*ends, loc=value, scale=error)))
 
 
 def fractal_scatter(
