@@ -15,7 +15,7 @@ T = np.array([[0.04, 0.03], [0.03, 0.09]])
 
 
 def test_random_effects_recover_their_scatter():
-    """T on the mean of many processes, of measurements of unlike errors; the mean within its own."""
+    """T on average over many processes, of measurements with unlike errors; the mean too."""
     rng = np.random.default_rng(0)
     between, standardised = [], []
     for _ in range(60):

@@ -35,7 +35,8 @@ def standardised(surface, seeds):
         values = [fit.Sq**2, fit.H, fit.rolloff, fit.lay]
         expected = [float(surface.Sq) ** 2 * ratio, float(surface.H), float(surface.rolloff), lay]
         by = [
-            math.log(a / b) if i != 1 else a - b for i, (a, b) in enumerate(zip(values, expected))
+            math.log(a / b) if i != 1 else a - b
+            for i, (a, b) in enumerate(zip(values, expected, strict=True))
         ]
         by[0] /= 2
         errors = np.sqrt(np.diagonal(fit.covariance))
