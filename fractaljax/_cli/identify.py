@@ -79,8 +79,8 @@ def _run(arguments) -> int:
     from .._surface.surface import Surface
 
     base = load_mechanism(arguments.scene)
-    given = getattr(base.contact, "surface", None)
-    if not isinstance(given, Spectrum):
+    old_surface = getattr(base.contact, "surface", None)
+    if not isinstance(old_surface, Spectrum):
         raise ValueError(f"{arguments.scene}: the law of its contact takes no surface")
     if arguments.area is not None:
         scalar("--area", arguments.area, above=0)
@@ -100,7 +100,7 @@ def _run(arguments) -> int:
             read.dy,
             band=arguments.band,
             aliased=None if arguments.aliased is None else arguments.aliased == "yes",
-            gamma=float(given.gamma) if isinstance(given, Surface) else 1.5,
+            gamma=float(old_surface.gamma) if isinstance(old_surface, Surface) else 1.5,
             **{name: getattr(read, name) if x is None else x for name, x in instrument.items()},
         )
         files, failure = {"identification.png": picture(plot.identification(fit).figure)}, None

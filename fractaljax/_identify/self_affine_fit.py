@@ -271,14 +271,16 @@ def fit_self_affine(
         at, _ = solve(weight, [*corners[::3], at[2]], free)
     at, deviance = solve(weight, [*corners, at[2]], free)
     without, deviance_without = solve(weight, [high], fixed)
-    found = deviance_without - deviance > sigmas**2 and at[2] < high - 1e-6
-    used = free if found else fixed
-    at = at if found else without
+    is_reached = deviance_without - deviance > sigmas**2 and at[2] < high - 1e-6
+    used = free if is_reached else fixed
+    at = at if is_reached else without
     _, slope = model(at)
     covariance = np.zeros((free.size, free.size))
     some = slope[:, used]
     covariance[np.ix_(used, used)] = np.linalg.pinv(some.T @ (weight[:, None] * some))
-    return _conclude(at, covariance, found, 1 / band[1], scatter, used_rings, sigmas, law, between)
+    return _conclude(
+        at, covariance, is_reached, 1 / band[1], scatter, used_rings, sigmas, law, between
+    )
 
 
 def _fisher(model, cells, weight, at, used, ends, steps: int = 40):
@@ -329,7 +331,7 @@ def _weights(cells, ratio, rings, groups, parameters):
     return math.sqrt(max(scatters)), counted / less, int(np.unique(rings).size)
 
 
-def _conclude(at, covariance, found, shortest, scatter, rings, sigmas, law, between):
+def _conclude(at, covariance, is_reached, shortest, scatter, rings, sigmas, law, between):
     log_Sq, H, log_rolloff = at[:3]
     log_lay, direction, lay_error = 0.0, 0.0, math.nan
     if at.size == 5:
@@ -353,7 +355,7 @@ def _conclude(at, covariance, found, shortest, scatter, rings, sigmas, law, betw
         H=float(H),
         H_standard_error=math.sqrt(C[1, 1]),
         rolloff=math.exp(log_rolloff - log_lay / 2),
-        ln_rolloff_error=math.sqrt(C[2, 2]) if found else math.inf,
+        ln_rolloff_error=math.sqrt(C[2, 2]) if is_reached else math.inf,
         lay=math.exp(log_lay),
         ln_lay_error=lay_error,
         lay_direction=direction,

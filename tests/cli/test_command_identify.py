@@ -157,9 +157,10 @@ def test_bounds_for_the_design():
     )
 
 
+@pytest.mark.slow
 def test_a_roll_off_takes_an_area_and_its_tolerance_a_design(capsys):
     """The command ends in a design where the surface has a roll-off, with its errors."""
-    ground = fj.SelfAffine(1e-6, 0.7, 2e-5, 1e-6)
+    ground = fj.SelfAffine(1e-6, 0.7, 8e-6, 1e-6)
     z = fj.topography(ground, 96e-6, 96, key=jax.random.key(1))
     np.save("map.npy", np.asarray(z))
     arguments = ("identify", "map.npy", "--dx", DX, "--unit", "m", "--tolerance", "errors.toml")
