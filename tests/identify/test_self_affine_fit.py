@@ -1,15 +1,17 @@
 """Roll-off, lay, H and Sq of synthetic surfaces, the errors stated for them, and their slopes."""
 
+import dataclasses
 import math
 
 import jax
 import numpy as np
 import pytest
 from scipy.integrate import quad
+from scipy.stats import truncnorm
 
 import fractaljax as fj
 from fractaljax._identify.self_affine_fit import Cells, _Law
-from synthetic import gaussian_map
+from synthetic import gaussian_map, gaussian_profile
 
 N, DX = 192, 2e-6
 SURFACES = {
@@ -108,3 +110,22 @@ def test_law_is_that_of_the_surface_with_its_slopes(kind):
         step = 1e-6 * np.eye(at.size)[j]
         difference = (model(at + step)[0] - model(at - step)[0]) / 2e-6
         np.testing.assert_allclose(slope[:, j], difference, rtol=1e-5, atol=1e-6)
+
+
+def test_a_dimension_outside_is_refused_beyond_three_errors_only():
+    """D is then the mean of the truncated normal, at the same height; else another surface."""
+    found = fj.identify(gaussian_profile(np.random.default_rng(0)), 1e-6)
+    for D, is_fractal in ((1.93, True), (2.0001, True), (1.8, False), (3.1, True), (3.3, False)):
+        changed = dataclasses.replace(found, D=D, D_standard_error=0.05)
+        scatter = changed.scatter
+        assert isinstance(scatter.surface, fj.Surface) == is_fractal
+        if is_fractal:
+            mean = truncnorm.mean((2 - D) / 0.05, (3 - D) / 0.05, D, 0.05)
+            assert float(scatter.surface.D) == pytest.approx(float(mean), rel=1e-9)
+            log_m = math.log(float(scatter.surface.m(changed.q)))
+            assert log_m == pytest.approx(changed.log_height, rel=1e-9)
+    few = dataclasses.replace(found, warnings=("too few levels: heights have only 4 levels",))
+    with pytest.raises(
+        ValueError, match=r"^too few levels: .*: measure with finer steps of height"
+    ):
+        few.scatter  # noqa: B018
