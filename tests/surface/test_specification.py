@@ -1,6 +1,7 @@
 """The surfaces of a drawing: the height that it states, with its scatter, at every H."""
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ import pytest
 import fractaljax as fj
 from tools import refusals
 
-FILTERS = {"cutoff": 8e-4, "shortest": 2.5e-6}
+FILTERS: dict[str, Any] = {"cutoff": 8e-4, "shortest": 2.5e-6}
 STATED = {"Ra": 4e-7, "scatter": 0.15}
 
 
@@ -33,7 +34,8 @@ def test_a_roughness_leaves_G_open_but_not_the_joint():
     found = fj.specify_surface(**STATED, H=0.85, H_scatter=0.15)
     expected = fj.profile_parameters(found.surface, **FILTERS, L=1e-3, L_s=1e-6)
     assert float(expected.Ra) == pytest.approx(4e-7, rel=1e-9)
-    assert float(found.surface.D) == pytest.approx(2.15)
+    surface: Any = found.surface
+    assert float(surface.D) == pytest.approx(2.15)
     scene, shifts, values = draws(found)
     D, G = np.asarray(values["D"]), np.asarray(values["G"])
     assert ((D > 2) & (D < 3) & (G > 0)).all()
@@ -78,7 +80,8 @@ def test_no_scatter_of_H():
     found = fj.specify_surface(Sq=5e-7, scatter=0.2, H=0.7, H_scatter=0.0)
     assert found.names == ("ln m(q)",)
     assert found.standard_deviations["ln m(q)"] == pytest.approx(0.4)
-    assert math.isfinite(float(found.surface.G))
+    surface: Any = found.surface
+    assert math.isfinite(float(surface.G))
 
 
 test_refused = refusals(
