@@ -120,7 +120,8 @@ def read_tolerance(path: str | os.PathLike) -> Tolerance:
 
 def _tolerance_table(tolerance: Tolerance) -> dict[str, Any]:
     covariance = np.asarray(tolerance.covariance, float).tolist()
-    return {"names": tolerance.names, "covariance": covariance}
+    q = None if tolerance.q is None else float(tolerance.q)
+    return {"names": tolerance.names, "covariance": covariance, "q": q}
 
 
 def _with_arguments(kind: type, table: Mapping[str, Any], where: str) -> Any:
