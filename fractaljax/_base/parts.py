@@ -6,7 +6,7 @@ import functools
 import math
 import operator
 from collections.abc import Iterator, Mapping
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -179,6 +179,12 @@ def raise_unless(expected: Any, outcome: Any) -> Any:
 
 def brief(value: Any) -> str:
     """`value` as messages show it: one line of at most 80 characters."""
+    if isinstance(value, Tracer):
+        return f"a traced array of shape {value.shape}" if value.ndim else "a traced number"
+    if isinstance(value, type) or callable(value) and hasattr(value, "__name__"):
+        return f"the {'class' if isinstance(value, type) else 'function'} {value.__name__}"
+    if not isinstance(value, Record) and is_traced(value):
+        return f"a {type(value).__name__} with traced numbers"
     try:
         text = " ".join(repr(value).split())
     except ValueError:  # Python refuses to print integers of thousands of digits
@@ -235,12 +241,27 @@ class Record(eqx.Module):
     def __repr__(self) -> str:
         return f"{type(self).__name__}({', '.join(self._shown())})"
 
+    if not TYPE_CHECKING:  # a checker shall go on refusing assignments
+
+        def __setattr__(self, name: str, value: Any) -> None:
+            try:
+                super().__setattr__(name, value)
+            except dataclasses.FrozenInstanceError:
+                message = f"a {type(self).__name__} is frozen: {self._instead_of_setting(name)}"
+                raise dataclasses.FrozenInstanceError(message) from None
+
+    def _instead_of_setting(self, name: str) -> str:
+        return f"make another one for another {name}"
+
     def _shown(self) -> Iterator[str]:
         for field in dataclasses.fields(self):
             if not field.repr:
                 continue
             value = getattr(self, field.name)
-            if isinstance(value, jax.Array) and not isinstance(value, Tracer):
+            if isinstance(value, Tracer):
+                yield f"{argument_name(field)}=traced"
+                continue
+            if isinstance(value, jax.Array):
                 value = value.item() if value.ndim == 0 else np.asarray(value)
             yield f"{argument_name(field)}={value!r}"
 

@@ -212,17 +212,19 @@ def start_state(start: ArrayLike | Sequence[float], n: int) -> Float[Array, " 2n
     return state
 
 
+def displaced_equilibrium(system: HybridSystem) -> Float[Array, " 2n"]:
+    """The sliding equilibrium displaced by V/omega along the first joint's t, in scaled units."""
+    kick = system.section_direction
+    kick = jnp.concatenate([kick / jnp.sum(kick**2), jnp.zeros_like(kick)])
+    return system.mechanism_state(system.equilibrium() + kick)
+
+
 def scaled_start(system: HybridSystem, start: Array | None) -> Float[Array, " 2n"]:
     """The start in scaled units, constant: by default the displaced equilibrium.
 
     It is displaced by V/omega along the first joint's t. An excitation begins at t = 0.
     """
-    if start is None:
-        kick = system.section_direction
-        kick = jnp.concatenate([kick / jnp.sum(kick**2), jnp.zeros_like(kick)])
-        y = system.mechanism_state(system.equilibrium() + kick)
-    else:
-        y = start / system.units
+    y = displaced_equilibrium(system) if start is None else start / system.units
     return jax.lax.stop_gradient(system.with_excitation(y, 0.0))
 
 

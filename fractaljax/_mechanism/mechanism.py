@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from .._base.files import read_bounded
-from .._base.parts import Part
+from .._base.parts import Part, brief
 from .._base.toml import naming, read_toml
 
 
@@ -29,7 +29,8 @@ class Mechanism(Part):
 
         **Arguments:**
 
-        - `changes`: new values in SI units, by the names of quantities. Whole parts have names as
+        - `changes`: new values in SI units, by the names of quantities, also of those that follow
+          from others: `replace(**{"K_t/K_n": 0.5})` (`quantities.py`). Whole parts have names as
           well: `replace(friction=Coulomb(0.4))`. A quantity passed together with the part that
           holds it is changed in the new part. For a structure, M, C, K and F can be replaced;
           `replace(D=2.5)` changes every joint that has a D, and `replace(**{"left.D": 2.5})` the
@@ -39,11 +40,32 @@ class Mechanism(Part):
         for concrete values outside their domain.
         """
         new = self._rebuilt(changes)
-        for name in changes:
-            if name not in new._quantity_names():
-                kind, listed = type(self).__name__.lower(), ", ".join(new._quantity_names())
-                raise ValueError(f"{kind} has no quantity {name!r}; it has {listed}")
+        others = changes.keys() - {*new._quantity_names()}
+        if others:
+            from .attributes import with_derived
+
+            return with_derived(new, {name: changes[name] for name in changes if name in others})
         return new
+
+    def _instead_of_setting(self, name: str) -> str:
+        return f"type x = x.replace({name}=...), which makes a changed copy"
+
+    def __getattr__(self, name: str) -> Any:
+        """A named quantity as `replace` sets it. Python calls this for missing attributes only."""
+        from .attributes import attribute
+
+        return attribute(self, name)
+
+    def __getitem__(self, name: str) -> Any:
+        """The quantity of this name, also of one that is no attribute's: `scene["K_t/K_n"]`."""
+        if not isinstance(name, str):
+            raise TypeError(f"a quantity has a name, such as 'D', got {brief(name)}")
+        return getattr(self, name)
+
+    def __dir__(self) -> list[str]:
+        from .quantities import quantity_names
+
+        return [*super().__dir__(), *filter(str.isidentifier, quantity_names(self))]
 
     @classmethod
     @abc.abstractmethod

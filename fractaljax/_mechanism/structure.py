@@ -58,7 +58,7 @@ class Structure(Mechanism):
       None.
     - `K`: stiffness matrix (n, n) [N/m] without the joints, which need not be symmetric.
     - `joints`: one `Joint`, a sequence of them (named joint_1, joint_2, ...) or a mapping from
-      names.
+      names; by default none.
     - `F`: (n,) [N], or a mapping from degrees of freedom to forces, by default none. It presses the
       joints together: the slope of a friction law acts through the static equilibrium under it.
     - `names`: names of the n degrees of freedom, by default none.
@@ -84,7 +84,7 @@ class Structure(Mechanism):
         M: MatrixLike,
         C: MatrixLike | None,
         K: MatrixLike,
-        joints: Joint | Sequence[Joint] | Mapping[str, Joint],
+        joints: Joint | Sequence[Joint] | Mapping[str, Joint] = (),
         F: ArrayLike | Sequence[float] | Mapping[Any, ArrayLike] | None = None,
         names: Iterable[str] | None = None,
         mesh: Mesh | None = None,

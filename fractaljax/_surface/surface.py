@@ -4,6 +4,8 @@ import math
 from typing import final
 
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import ArrayLike
 
 from .._base.parts import Numbers, number, quantity
@@ -26,7 +28,7 @@ class Surface(Spectrum):
     gamma: Numbers = quantity("-", "ratio of successive spatial frequencies, above 1")
 
     def __init__(self, D: ArrayLike, G: ArrayLike, gamma: ArrayLike = 1.5):
-        self.D = number("D", D, above=2, below=3)
+        self.D = _dimension(D, G)
         self.G = number("G", G, above=0)
         self.gamma = number("gamma", gamma, above=1)
 
@@ -42,6 +44,22 @@ class Surface(Spectrum):
         width = frequency_count(self.gamma, L / L_s) * log_gamma
         edges = jnp.stack([q, q * jnp.exp(width)])
         return Pieces(edges, self.m(q)[None], 2 * (self.D - 2)[None])
+
+
+def _dimension(D, G) -> Numbers:
+    """A checked D; errors say what to type for the D of a profile, and for D and G in turn."""
+    try:
+        return number("D", D, above=2, below=3)
+    except ValueError as error:
+        values = [np.asarray(x) for x in (D, G) if not isinstance(x, Tracer)]
+        if len(values) == 2 and all(x.ndim == 0 for x in values):
+            first, second = map(float, values)
+            if 1 < first < 2:
+                hint = f"this is a profile's D, which is one less: type D = {first + 1:.10g}"
+                raise ValueError(f"{error}: {hint}") from None
+            if 2 < second < 3:
+                raise ValueError(f"{error}: the order is Surface(D, G)") from None
+        raise
 
 
 def frequency_count(gamma, ratio, xp=jnp):
