@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import math
 import operator
+import warnings
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -119,6 +120,13 @@ def flag(name: str, value: Any) -> bool:
     return bool(value)
 
 
+def doubt_unit(name: str, value: Numbers, least: float, most: float, hint: str) -> None:
+    """Warn where a concrete number is outside of what its quantity ever is in its unit."""
+    values = concrete(value)
+    if values is not None and values.size and not (least <= values.min() <= values.max() <= most):
+        warnings.warn(f"{name} = {values.flat[0]:g}: {hint}", stacklevel=4)
+
+
 def require_kind(name: str, value: Any, kind: type) -> None:
     """Refuse a value that is not an instance of `kind`."""
     if not isinstance(value, kind):
@@ -181,7 +189,7 @@ def brief(value: Any) -> str:
     """`value` as messages show it: one line of at most 80 characters."""
     if isinstance(value, Tracer):
         return f"a traced array of shape {value.shape}" if value.ndim else "a traced number"
-    if isinstance(value, type) or callable(value) and hasattr(value, "__name__"):
+    if isinstance(value, type) or (callable(value) and hasattr(value, "__name__")):
         return f"the {'class' if isinstance(value, type) else 'function'} {value.__name__}"
     if not isinstance(value, Record) and is_traced(value):
         return f"a {type(value).__name__} with traced numbers"
@@ -253,6 +261,18 @@ class Record(eqx.Module):
     def _instead_of_setting(self, name: str) -> str:
         return f"make another one for another {name}"
 
+    def _repr_html_(self) -> str:
+        """What Jupyter shows: a table of quantity, value, unit and meaning."""
+        from . import html
+
+        rows = html.record_rows(self, self._table_names())
+        return html.table(f"fractaljax.{type(self).__name__}", rows)
+
+    def _table_names(self) -> list[str]:
+        """The attributes in the table of a notebook."""
+        fields = dataclasses.fields(self)
+        return [x.name for x in fields if x.repr and not x.name.startswith("_")]
+
     def _shown(self) -> Iterator[str]:
         for field in dataclasses.fields(self):
             if not field.repr:
@@ -268,6 +288,25 @@ class Record(eqx.Module):
 
 class Part(Record):
     """A part of a scene: its numeric leaves are named quantities in SI units."""
+
+    def _repr_html_(self) -> str:
+        from . import html
+
+        return html.table(f"fractaljax.{type(self).__name__}", part_rows(self))
+
+
+def part_rows(part: Part) -> list[tuple[str, Any, str, str]]:
+    """The rows of a table: each part by its class, below it its numbers with unit and meaning."""
+    rows: list[tuple[str, Any, str, str]] = []
+    for field in dataclasses.fields(part):
+        value, name, meant = getattr(part, field.name), quantity_name(field), field.metadata
+        if isinstance(value, Part):
+            rows += [(name, type(value).__name__, "", ""), *part_rows(value)]
+        elif "unit" in meant and value is not None:
+            rows.append((name, value, meant["unit"], meant["meaning"]))
+        elif meant.get("static"):
+            rows.append((name, value, "", ""))
+    return rows
 
 
 def quantities(part: Part) -> dict[str, tuple[str, ...]]:

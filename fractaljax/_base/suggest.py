@@ -20,6 +20,6 @@ def close(word: str, words: Iterable[str]) -> list[str]:
 
 
 def did_you_mean(word: str, words: Iterable[str]) -> str:
-    """": did you mean ...?" with the words most like `word`, or nothing."""
+    """ ": did you mean ...?" with the words most like `word`, or nothing."""
     near = close(word, words)
     return f": did you mean {' or '.join(near)}?" if near else ""

@@ -108,7 +108,9 @@ def usage(name: str, signature: inspect.Signature) -> str:
             texts.append(f"{parameter.name}=...")
         else:
             texts.append(parameter.name)
-    return f"{name}({', '.join([*texts, *['...'] * (more and 'axes' not in signature.parameters)])})"
+    return (
+        f"{name}({', '.join([*texts, *['...'] * (more and 'axes' not in signature.parameters)])})"
+    )
 
 
 # --- arguments that do not fit ---------------------------------------------------------------

@@ -3,8 +3,9 @@
 from pathlib import Path
 from typing import Any
 
+from .json_text import cycle_content, files as paths, quantities, show, stability_content
 from .output import csv_text, import_pictures, output, picture
-from .parsing import add_constant_friction, add_out, add_scene_file, load_mechanism
+from .parsing import add_constant_friction, add_out, add_scene_file, add_set, load_mechanism
 
 _FOLDER = "fractaljax-stability"  # of the pictures of modes
 
@@ -36,19 +37,24 @@ def _stability(arguments) -> int:
     from .._stability.summary import stability_table, structure_table
 
     subject, slope = (
-        load_mechanism(arguments.scene, structures=True),
+        load_mechanism(arguments.scene, structures=True, changes=arguments.set),
         not arguments.constant_friction,
     )
     table: Any = structure_table if isinstance(subject, Structure) else stability_table
     if getattr(subject, "mesh", None) is None:
         if arguments.out is not None:
             raise ValueError("--out needs a structure whose file names a mesh, to draw its modes")
-        print(table(subject, slope))
+        show(arguments, table(subject, slope), lambda: stability_content(subject, slope))
         return 0
     with output(arguments.out or Path(_FOLDER)) as write:
-        written = write(_mode_pictures(subject, slope))
-    print(table(subject, slope))
-    print(written)
+        files = _mode_pictures(subject, slope)
+        written = write(files)
+    folder = arguments.out or Path(_FOLDER)
+    show(
+        arguments,
+        f"{table(subject, slope)}\n{written}",
+        lambda: stability_content(subject, slope) | {"files": paths(folder, files)},
+    )
     return 0
 
 
@@ -114,7 +120,8 @@ def _cycle(arguments) -> int:
     from .._mechanism.structure import Structure
     from .._stability.stability import require_computable
 
-    scene = load_mechanism(arguments.scene, structures=True)
+    scene = load_mechanism(arguments.scene, structures=True, changes=arguments.set)
+    files: dict[str, bytes] = {}
     if isinstance(scene, Scene):
         require_computable(scene)
     options = {name: getattr(arguments, name) for name in ("start", "rtol", "max_returns")}
@@ -130,9 +137,11 @@ def _cycle(arguments) -> int:
             if isinstance(scene, Structure) and scene.mesh is not None:
                 files["motion.png"] = picture(plot.cycle_motion(cycle, scene))
             written = write(files)
-    print(cycle_table(scene, cycle))
-    if has_cycle:
-        print(written)
+    show(
+        arguments,
+        lambda: "\n".join([cycle_table(scene, cycle), *([written] if has_cycle else [])]),
+        lambda: cycle_content(scene, cycle) | {"files": paths(arguments.out, files)},
+    )
     return 0 if has_cycle else 1
 
 
@@ -149,12 +158,12 @@ def add_scene(commands) -> None:
     parser = commands.add_parser(
         "scene", help="print a scene file to start from", description=_scene.__doc__
     )
+    add_set(parser)
     parser.set_defaults(run=_scene)
 
 
 def _scene(arguments) -> int:
     """Print the reference brake as a scene file."""
-    from .._mechanism.scene import brake_scene
-
-    print(brake_scene().to_toml(), end="")
+    scene = load_mechanism(None, changes=arguments.set)
+    show(arguments, scene.to_toml().removesuffix("\n"), lambda: {"quantities": quantities(scene)})
     return 0

@@ -3,8 +3,9 @@
 import shlex
 from pathlib import Path
 
+from .json_text import files as paths, identification_content, show
 from .output import output, picture
-from .parsing import add_out, load_mechanism, parse_envelope, parse_pairs
+from .parsing import add_out, add_set, load_mechanism, parse_envelope, parse_pairs
 
 _OPTIONS = {
     "--dx": {"type": float, "help": "step between heights [m], if not in the file"},
@@ -58,6 +59,7 @@ def add_identify(commands) -> None:
     parser.add_argument("file", type=Path, help="heights: CSV, NPY or an instrument's own format")
     for name, options in _OPTIONS.items():
         parser.add_argument(name, **options)
+    add_set(parser)
     add_out(parser, "fractaljax-identification")
     parser.set_defaults(run=_run)
 
@@ -69,7 +71,7 @@ def _run(arguments) -> int:
     from .._identify.files import read_measurement
     from .._identify.identify import identify
 
-    base = load_mechanism(arguments.scene)
+    base = load_mechanism(arguments.scene, changes=arguments.set)
     if not base.contact.has_surface:
         raise ValueError(f"{arguments.scene}: the law of its contact takes no surface")
     if arguments.area is not None:
@@ -102,8 +104,13 @@ def _run(arguments) -> int:
         except ValueError as error:
             failure = error
         written = write(files)
-    print("\n".join([read.source, read.description, "", str(fit), "", *joint_lines, written]))
     path = arguments.out / "scene.toml"
+    content = {"source": read.source, "failure": None if failure is None else str(failure)}
+    content["files"] = paths(arguments.out, files)
+    if arguments.json:
+        show(arguments, "", lambda: identification_content(fit) | content)
+        return 0 if failure is None else 1
+    print("\n".join([read.source, read.description, "", str(fit), "", *joint_lines, written]))
     if failure is not None:
         if path.exists():
             print(f"{path} is from an earlier run")

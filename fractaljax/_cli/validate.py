@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from .json_text import add_json, files as paths, show, table_content
 from .output import csv_text, output, picture
 
 
@@ -17,6 +18,7 @@ def add_validate(commands) -> None:
         metavar="FOLDER",
         help="the folder for a picture of each case and validation.csv; default none",
     )
+    add_json(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.set_defaults(run=_run)
 
@@ -31,7 +33,7 @@ def _run(arguments) -> int:
 
     if arguments.out is None:
         validation = validate(*arguments.cases, progress=not arguments.quiet)
-        print(validation)
+        show(arguments, repr(validation), lambda: table_content(*validation.rows()))
         return 0 if validation.agrees else 1
     from .. import plot
 
@@ -43,5 +45,7 @@ def _run(arguments) -> int:
             if case.panels
         }
         written = write(files | {"validation.csv": csv_text(*validation.rows()).encode()})
-    print(f"{validation!r}\n{written}")
+    content = {"files": paths(arguments.out, [*files, "validation.csv"])}
+    text = f"{validation!r}\n{written}"
+    show(arguments, text, lambda: table_content(*validation.rows()) | content)
     return 0 if validation.agrees else 1

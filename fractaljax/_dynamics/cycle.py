@@ -200,6 +200,10 @@ class LimitCycle(Record):
     _system: HybridSystem = eqx.field(repr=False)
     _orbit: Any = eqx.field(repr=False)  # Orbit, or regularised.SmoothOrbit
 
+    def _table_names(self):
+        derived = "frequency amplitude velocity_min velocity_max normal_force stick_fraction"
+        return [*super()._table_names(), *f"{derived} open_fraction multipliers".split()]
+
     def _shown(self) -> Iterator[str]:
         yield from super()._shown()
         if concrete(self.period) is not None:

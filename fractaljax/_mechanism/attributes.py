@@ -5,12 +5,11 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-import jax
-
-from .._base.parts import leaf, quantities
+from .._base import html
+from .._base.parts import leaf, part_rows, quantities
 from .._base.suggest import close
 from .mechanism import Mechanism
-from .quantities import quantity_names, replaced, stored_quantities, value_of
+from .quantities import meaning, quantity_names, replaced, stored_quantities, value_of
 
 
 def with_derived(x: Mechanism, values: Mapping[str, Any]) -> Any:
@@ -38,6 +37,20 @@ def similar(x: Mechanism, name: str) -> str:
     return " or ".join((near or close(name, names))[:3])
 
 
+def mechanism_table(x: Mechanism) -> str:
+    """The quantities of a scene or structure as a table of HTML."""
+    title = f"fractaljax.{type(x).__name__}"
+    if "contact" in {field.name for field in dataclasses.fields(x)}:
+        names = [name for name in quantity_names(x) if name not in stored_quantities(x)]
+        rows = part_rows(x) + [(each, value_of(x, each), "-", meaning(x, each)) for each in names]
+        return html.table(title, rows)
+    rows: list[html.Row] = [("n", x.n, "-", "degrees of freedom")]
+    for name, about in stored_quantities(x).items():
+        if "." in name or about.meaning == "parameter":
+            rows.append((name, about.value, about.unit, about.meaning))
+    return html.table(title, [row for row in rows if row[1] is not None], getattr(x, "notes", ()))
+
+
 def attribute(x: Mechanism, name: str) -> Any:
     """The value of a quantity of `x`, or of a scene's part, that has no attribute of this name.
 
@@ -59,19 +72,7 @@ def attribute(x: Mechanism, name: str) -> Any:
             raise AttributeError(str(error)) from None
     if "contact" in fields and name in (paths := quantities(x)):  # a part of a scene
         return leaf(x, paths[name])
-    raise _Unknown(x, name)
-
-
-class _Unknown(AttributeError):
-    """Finds what to type instead only where its message is read: libraries ask by `hasattr`."""
-
-    def __init__(self, x: Mechanism, name: str):
-        super().__init__(name)
-        self._of, self._missing = x, name
-
-    def __str__(self):
-        x, name = self._of, self._missing
-        return f"a {type(x).__name__} has no {name}{_instead(x, name)}"
+    raise AttributeError(f"a {kind} has no {name}{_instead(x, name)}")
 
 
 def _instead(x: Mechanism, name: str) -> str:

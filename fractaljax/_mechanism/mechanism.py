@@ -62,6 +62,11 @@ class Mechanism(Part):
             raise TypeError(f"a quantity has a name, such as 'D', got {brief(name)}")
         return getattr(self, name)
 
+    def _repr_html_(self) -> str:
+        from .attributes import mechanism_table
+
+        return mechanism_table(self)
+
     def __dir__(self) -> list[str]:
         from .quantities import quantity_names
 

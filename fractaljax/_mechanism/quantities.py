@@ -30,6 +30,7 @@ from .._base.parts import (
     require_scalar,
     substitute,
 )
+from .._base.suggest import did_you_mean
 from .mechanism import Mechanism
 from .scene import Scene, stiffness
 from .structure import Structure, require_single, too_large
@@ -101,7 +102,8 @@ def require_quantity(x: Mechanism, name: str) -> None:
     names = quantity_names(x)
     if name not in names:
         kind = "structure" if isinstance(x, Structure) else "scene"
-        raise ValueError(f"{kind} has no quantity {name!r}; it has {', '.join(names)}")
+        near = did_you_mean(str(name), names)
+        raise ValueError(f"{kind} has no quantity {name!r}; it has {', '.join(names)}{near}")
 
 
 def require_independent(x: Mechanism, names: Sequence[str]) -> None:
@@ -249,7 +251,8 @@ def axis_values(x: Mechanism, name: str, values: ArrayLike | Sequence[float]) ->
     # Lists are read by NumPy; arrays may be traced and are kept.
     values = number(name, values if isinstance(values, (Array, np.ndarray)) else np.array(values))
     if values.ndim != 1 or not values.size:
-        raise ValueError(f"the values of {name} must be a list, got shape {values.shape}")
+        got = f"shape {values.shape}" if values.ndim else brief(values.tolist())
+        raise ValueError(f"the values of {name} must be a list such as [2.3, 2.4], got {got}")
     return values
 
 

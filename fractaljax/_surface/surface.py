@@ -8,7 +8,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import ArrayLike
 
-from .._base.parts import Numbers, number, quantity
+from .._base.parts import Numbers, doubt_unit, number, quantity
 from .spectrum import Pieces, Spectrum
 
 
@@ -30,6 +30,8 @@ class Surface(Spectrum):
     def __init__(self, D: ArrayLike, G: ArrayLike, gamma: ArrayLike = 1.5):
         self.D = _dimension(D, G)
         self.G = number("G", G, above=0)
+        # A tenth of a millimetre: that of machined surfaces is a nanometre or less.
+        doubt_unit("G", self.G, 0, 1e-4, "G is in m: 0.1342 nm are 1.342e-10")
         self.gamma = number("gamma", gamma, above=1)
 
     def m(self, q):

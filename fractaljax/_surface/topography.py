@@ -151,7 +151,9 @@ def _require_key(key) -> None:
         many = getattr(key, "ndim", 0) > 0
         got = f"an array of shape {key.shape}" if many else repr(key)
         kind = ValueError if many else TypeError
-        raise kind(f"key must be one key of jax.random, got {got}: type seed=0 in its place") from None
+        raise kind(
+            f"key must be one key of jax.random, got {got}: type seed=0 in its place"
+        ) from None
 
 
 def _require_concrete(name: str, value: jax.Array) -> np.ndarray:
