@@ -20,7 +20,9 @@ Row = tuple[str, Any, str, str]  # quantity, value, unit and meaning
 def table(title: str, rows: Iterable[Row], notes: Iterable[str] = ()) -> str:
     """Rows as a table of HTML under a title, with lines below; all text is escaped."""
     lines = [_line("th", ("quantity", "value", "unit", "meaning"))]
-    lines += [_line("td", (name, shown(value), unit, words)) for name, value, unit, words in rows]
+    for name, value, unit, words in rows:
+        numeric = hasattr(value, "__array__") or isinstance(value, float)
+        lines.append(_line("td", (name, shown(value), unit or "-" * numeric, words)))
     below = "".join(f"<div>{html.escape(note)}</div>" for note in notes)
     return (
         f"<div><div><b>{html.escape(title)}</b></div>"
@@ -120,4 +122,4 @@ def _split(words: str) -> tuple[str, str]:
     if not units:
         return "", words
     rest = " ".join(words.replace(f"[{units[0]}]", "").split())
-    return units[0], re.sub(r" +([,;.:])", r"\1", rest)
+    return units[0], re.sub(r" +([,;.:])", r"\1", rest).lstrip(",;.: ")

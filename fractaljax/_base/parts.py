@@ -5,7 +5,6 @@ import dataclasses
 import functools
 import math
 import operator
-import warnings
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -15,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
+
+from .warn import warn_user
 
 Numbers = Float[Array, "..."]  # for one scene, or for a batch of any shape
 _PartT = TypeVar("_PartT", bound="Part")
@@ -124,7 +125,7 @@ def doubt_unit(name: str, value: Numbers, least: float, most: float, hint: str) 
     """Warn where a concrete number is outside of what its quantity ever is in its unit."""
     values = concrete(value)
     if values is not None and values.size and not (least <= values.min() <= values.max() <= most):
-        warnings.warn(f"{name} = {values.flat[0]:g}: {hint}", stacklevel=4)
+        warn_user(f"{name} = {values.flat[0]:g}: {hint}")
 
 
 def require_kind(name: str, value: Any, kind: type) -> None:

@@ -66,10 +66,10 @@ class Parser(argparse.ArgumentParser):
         words = list(sys.argv[1:] if args is None else args)
         for k in reversed(range(len(words))):
             option, equals, value = words[k].partition("=")
-            if option in self.pairs and not equals and k + 1 < len(words):
-                words[k + 1 : k + 2] = words[k + 1].split(":")
-            elif option in self.pairs and equals:
+            if option in self.pairs and equals and value.count(":") == 1:
                 words[k : k + 1] = [option, *value.split(":")]
+            elif option in self.pairs and words[k + 1 : k + 2] and words[k + 1].count(":") == 1:
+                words[k + 1 : k + 2] = words[k + 1].split(":")
         namespace, unknown = super().parse_known_args(words, namespace)
         options = [word.partition("=")[0] for word in unknown if word.startswith("--")]
         if options and not self.commands:

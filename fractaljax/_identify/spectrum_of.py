@@ -2,12 +2,12 @@
 
 import math
 import os
-import warnings
 from typing import Any
 
 import numpy as np
 from jaxtyping import ArrayLike
 
+from .._base.warn import warn_user
 from .._surface.heights import height_statistics
 from .._surface.measured_spectrum import MeasuredSpectrum
 from .measurement import Measurement
@@ -75,8 +75,7 @@ def _warn_unless_gaussian(z: np.ndarray, largest_skewness: float, largest_kurtos
     heights = height_statistics(remove_plane(z))
     Ssk, Sku = float(heights.skewness), float(heights.kurtosis)
     if abs(Ssk) > largest_skewness or Sku > largest_kurtosis:
-        warnings.warn(
+        warn_user(
             f"heights are far from Gaussian (Ssk {Ssk:.2g}, Sku {Sku:.2g}): a law that has only"
             " their spectrum can be off by several times; use MeasuredContact.from_heights",
-            stacklevel=3,
         )

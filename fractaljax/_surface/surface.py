@@ -4,11 +4,9 @@ import math
 from typing import final
 
 import jax.numpy as jnp
-import numpy as np
-from jax.core import Tracer
 from jaxtyping import ArrayLike
 
-from .._base.parts import Numbers, doubt_unit, number, quantity
+from .._base.parts import Numbers, concrete, doubt_unit, number, quantity
 from .spectrum import Pieces, Spectrum
 
 
@@ -53,8 +51,8 @@ def _dimension(D, G) -> Numbers:
     try:
         return number("D", D, above=2, below=3)
     except ValueError as error:
-        values = [np.asarray(x) for x in (D, G) if not isinstance(x, Tracer)]
-        if len(values) == 2 and all(x.ndim == 0 for x in values):
+        values = [concrete(jnp.asarray(x)) for x in (D, G)]
+        if all(x is not None and x.ndim == 0 for x in values):
             first, second = map(float, values)
             if 1 < first < 2:
                 hint = f"this is a profile's D, which is one less: type D = {first + 1:.10g}"

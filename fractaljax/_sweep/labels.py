@@ -29,10 +29,24 @@ def measure_words(measure: Callable) -> tuple[str, str, str]:
     return measure_name(measure), *attribute_words(doc)
 
 
-def leaves_by_name(values: Any) -> dict[str, Any]:
-    """The arrays of a pytree by the path that leads to each; "" for a single one."""
-    leaves = jax.tree_util.tree_leaves_with_path(values)
-    return {jax.tree_util.keystr(p, simple=True, separator="."): leaf for p, leaf in leaves}
+def leaf_names(measure: str, values: Any) -> list[str]:
+    """The names of the arrays of a pytree that a measure of this name gives.
+
+    Each is the path that leads to it; a single array has the name of the measure, and those of a
+    tuple have it with a number, but K_n and K_t of `stiffness`.
+    """
+    places = [place for place, _ in jax.tree_util.tree_leaves_with_path(values)]
+    names = [jax.tree_util.keystr(place, simple=True, separator=".") for place in places]
+    if names == [""]:
+        return [measure]
+    if measure == "stiffness" and names == ["0", "1"]:
+        return ["K_n", "K_t"]
+    return [f"{measure}_{name}" if name.isdigit() else name for name in names]
+
+
+def leaves_by_name(measure: str, values: Any) -> dict[str, Any]:
+    """The arrays of a pytree by `leaf_names`."""
+    return dict(zip(leaf_names(measure, values), jax.tree.leaves(values), strict=True))
 
 
 def dimensions(shapes: Mapping[str, Sequence[int]]) -> dict[str, list[str]]:
@@ -50,10 +64,12 @@ def dimensions(shapes: Mapping[str, Sequence[int]]) -> dict[str, list[str]]:
     return named
 
 
-def leaf_words(values: Any, name: str) -> tuple[str, str]:
-    """Unit and meaning of an array of `values`, where its class states them."""
-    about = meanings(type(values)) if dataclasses.is_dataclass(values) else {}
-    return about.get(name, ("", ""))
+def leaf_words(measured: tuple[str, str, str], values: Any, name: str) -> tuple[str, str]:
+    """Unit and meaning of an array of `values`: of its field, or of the measure that gives it."""
+    if dataclasses.is_dataclass(values):
+        return meanings(type(values)).get(name, ("", ""))
+    single = isinstance(values, tuple) or hasattr(values, "shape")
+    return (measured[1], measured[2]) if single else ("", "")
 
 
 def attributes(unit: str, meaning: str) -> dict[str, str]:

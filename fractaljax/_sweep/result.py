@@ -38,6 +38,10 @@ class Sweep(Record):
     def _single(self) -> bool:
         return jax.tree_util.all_leaves([self.values])
 
+    def _leaves(self) -> dict[str, Any]:
+        """The arrays of the measure by name."""
+        return labels.leaves_by_name(self.measured[0], self.values)
+
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> np.ndarray:
         if not self._single:
             raise TypeError("the measure gives several arrays: take them from sweep.values")
@@ -56,12 +60,8 @@ class Sweep(Record):
         size = " x ".join(f"{name}: {len(x)}" for name, x in self.axes.items())
         x = self.scene
         rows = [(name, v, unit(x, name), meaning(x, name)) for name, v in self.axes.items()]
-        if self._single:
-            name, *words = self.measured
-            rows.append((name, self.values, *words))
-        else:
-            for name, leaf in labels.leaves_by_name(self.values).items():
-                rows.append((name, leaf, *labels.leaf_words(self.values, name)))
+        for name, leaf in self._leaves().items():
+            rows.append((name, leaf, *labels.leaf_words(self.measured, self.values, name)))
         return html.table(f"fractaljax.Sweep ({size})", rows)
 
     def to_xarray(self) -> "DataArray | Dataset":
@@ -81,15 +81,14 @@ class Sweep(Record):
             coords[name] = name, values, {"units": unit(x, name), "long_name": meaning(x, name)}
 
         grid = len(self.names)
-        single = {self.measured[0]: self.values}
-        leaves = single if self._single else labels.leaves_by_name(self.values)
+        leaves = self._leaves()
         dims = labels.dimensions({name: np.shape(x)[grid:] for name, x in leaves.items()})
         arrays = {}
         for name, leaf in leaves.items():
-            words = self.measured[1:] if self._single else labels.leaf_words(self.values, name)
-            about = labels.attributes(*words)
-            arrays[name] = xarray.DataArray(leaf, coords, [*self.names, *dims[name]], name, about)
-        return arrays[self.measured[0]] if self._single else xarray.Dataset(arrays)
+            key = name + "_" * (name in coords)  # an axis may have the name already
+            about = labels.attributes(*labels.leaf_words(self.measured, self.values, name))
+            arrays[key] = xarray.DataArray(leaf, coords, [*self.names, *dims[name]], key, about)
+        return next(iter(arrays.values())) if self._single else xarray.Dataset(arrays)
 
     def plot(self, ax: Any = None, **options: Any) -> Any:
         """A picture of the sweep: a map of growth rates, the stiffness, or curves of a scalar.
@@ -118,7 +117,7 @@ class Sweep(Record):
         if not self._single:
             if ax is None and (isinstance(self.values, tuple) or hasattr(self.values, "K_n")):
                 return plot.stiffness(self, **options)
-            names = ", ".join(labels.leaves_by_name(self.values))
+            names = ", ".join(self._leaves())
             raise ValueError(f"the sweep holds several arrays: plot one of {names}")
         name, unit_text, _ = self.measured
         options = {"label": f"{name} [{unit_text}]" if unit_text else name} | options

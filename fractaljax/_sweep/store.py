@@ -23,9 +23,10 @@ import numpy as np
 
 from .._base.parts import one_line
 from .._base.versions import versions, versions_differ
+from .._base.warn import warn_user
 from .._mechanism.quantities import meaning, quantity_names, unit
 from .blocks import Blocks
-from .labels import dimensions, measure_name
+from .labels import dimensions, leaf_names as names_of_leaves, measure_name
 from .program import Program, array_digest
 
 _ABOUT = "fractaljax"  # the attribute that describes the sweep
@@ -125,7 +126,7 @@ class Store:
             note = f" (it was {others})" if others else ""
             raise ValueError(f"out {path} holds another sweep: {', '.join(differs)} differ{note}")
         if others:
-            warnings.warn(f"out {path} was {others}: digits may differ", stacklevel=4)
+            warn_user(f"out {path} was {others}: digits may differ")
         return stored[_NAMES]
 
     def there(self) -> set[int]:
@@ -275,10 +276,7 @@ def axis_names(axes: Mapping[str, Any]) -> list[str]:
 
 def leaf_names(measure: Any, shapes: Any, axes: Mapping[str, Any]) -> list[str]:
     """The names of the arrays of a measure: its own, or for several those of `Sweep.to_xarray`."""
-    leaves = jax.tree_util.tree_leaves_with_path(shapes)
-    names = [jax.tree_util.keystr(place, simple=True, separator=".") for place, _ in leaves]
-    if names == [""]:
-        names = [measure_name(measure)]
+    names = names_of_leaves(measure_name(measure), shapes)
     return _distinct(names, ["zarr.json", _COMPUTED, *axis_names(axes)])
 
 

@@ -7,14 +7,15 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from .._dynamics.cycle import LimitCycle
-from .axes import Axes, Figure, ensure_axes, legend_above, new_figure
+from .axes import Axes, ensure_axes, legend_above, new_figure
 from .cycle import phase_portrait, spectrum
+from .panels import Panels
 
 
 def cycles(
     results: Mapping[str, LimitCycle], *, direction: int = 1, joint: int | None = None
-) -> Figure:
-    """Phase portrait and spectrum of one displacement, a row for each cycle; returns the figure.
+) -> Panels:
+    """Phase portrait and spectrum of one displacement, a row for each cycle; returns their axes.
 
     All rows have the same axes.
 
@@ -44,7 +45,7 @@ def cycles(
         (stems,) = ax.collections
         bottom, _ = ax.get_ylim()
         stems.set_segments([[(f, bottom), (f, a)] for (f, _), (_, a) in stems.get_segments()])
-    return figure
+    return Panels(figure)
 
 
 def amplitudes(

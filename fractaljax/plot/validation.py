@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .axes import Figure, new_figure
+from .axes import new_figure
+from .panels import Panels
 
 if TYPE_CHECKING:
     from .._validate.validate import ValidatedCase
@@ -16,7 +17,7 @@ _MARKS = "osD^v<"
 _STYLES = "solid", "dashed", "dashdot", "dotted"
 
 
-def validation(case: ValidatedCase) -> Figure:
+def validation(case: ValidatedCase) -> Panels:
     """The curves of a published case: theirs as marks or dashed, ours as lines; the figure.
 
     **Arguments:**
@@ -54,4 +55,4 @@ def validation(case: ValidatedCase) -> Figure:
             ax.plot(curve.x, curve.y, **style)
         ax.set(xlabel=panel.xlabel, ylabel=panel.ylabel, **panel.options)
         ax.legend(fontsize="x-small", frameon=False)
-    return figure
+    return Panels(figure)
