@@ -4,6 +4,7 @@ import copy
 import inspect
 import pickle
 import re
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -187,7 +188,7 @@ def test_numbers_of_any_kind():
 @pytest.fixture(scope="module")
 def sweeps():
     fixed = scene.replace(contact=fj.FixedContact(4e8, 2e8))
-    axes = dict(K_n=[2e8, 4e8], V=[0.1, 0.15, 0.2], progress=False)
+    axes: Any = dict(K_n=[2e8, 4e8], V=[0.1, 0.15, 0.2], progress=False)
     return {
         "modes": fj.sweep(fj.stability, fixed, **axes),
         "growth": fj.sweep(fj.growth_rate, fixed, V=[0.1, 0.15], progress=False),

@@ -65,10 +65,9 @@ def explained(function: Callable, name: str, module: str) -> Callable:
 def explain_class(kind: type) -> None:
     """Let a class explain calls that do not fit its `__init__`."""
     init = vars(kind).get("__init__")
-    if not inspect.isfunction(init) or hasattr(init, "_explains"):
+    if not inspect.isfunction(init) or init.__name__ == "_explained_init":
         return
 
-    @functools.wraps(init)
     def construct(self, *args, **kwargs):
         try:
             return init(self, *args, **kwargs)
@@ -78,8 +77,9 @@ def explain_class(kind: type) -> None:
                 raise
         raise TypeError(message)
 
-    construct._explains = True
-    kind.__init__ = construct
+    wrapped = functools.wraps(init)(construct)
+    wrapped.__name__ = "_explained_init"
+    kind.__init__ = wrapped
 
 
 def misuse(function: Callable, name: str, args: tuple, kwargs: Mapping[str, Any]) -> str | None:

@@ -195,11 +195,9 @@ def load_mechanism(
 
     with remarks():
         if path is None:
-            mechanism = brake_scene()
-        else:
-            _require_scene_file(path)
-            mechanism = load_noted(path) if structures else Scene.load(path)
-        mechanism = changed(mechanism, changes)
+            return changed(brake_scene(), changes)
+        _require_scene_file(path)
+        mechanism = changed(load_noted(path) if structures else Scene.load(path), changes)
     if isinstance(mechanism, Scene) or not mechanism.is_sparse:
         return mechanism
     from .._stability.reduction import reduce

@@ -77,11 +77,11 @@ def attribute(x: Mechanism, name: str) -> Any:
 
 def _instead(x: Mechanism, name: str) -> str:
     """What to type for an attribute that is none."""
-    import fractaljax
+    import fractaljax as public
 
     if name in ("K_n", "K_t"):
         return ": K_n, K_t = fractaljax.stiffness(scene)"
-    if name in fractaljax.__all__:
+    if name in vars(public)["__all__"]:
         return f": type fractaljax.{name}(...), a function of it"
     near = similar(x, name)
     return f": did you mean {near}?" if near else ""

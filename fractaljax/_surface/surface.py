@@ -52,8 +52,9 @@ def _dimension(D, G) -> Numbers:
         return number("D", D, above=2, below=3)
     except ValueError as error:
         values = [concrete(jnp.asarray(x)) for x in (D, G)]
-        if all(x is not None and x.ndim == 0 for x in values):
-            first, second = map(float, values)
+        plain = [float(x) for x in values if x is not None and x.ndim == 0]
+        if len(plain) == 2:
+            first, second = plain
             if 1 < first < 2:
                 hint = f"this is a profile's D, which is one less: type D = {first + 1:.10g}"
                 raise ValueError(f"{error}: {hint}") from None
