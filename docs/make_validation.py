@@ -90,7 +90,7 @@ def main() -> None:
     print(found)
     contents = {PAGE: lambda: page(found).encode()}
     for name, case in found.cases.items():
-        contents[picture_of(name)] = lambda case=case: small_png(fj.plot.validation(case))
+        contents[picture_of(name)] = lambda case=case: small_png(fj.plot.validation(case).figure)
     run(contents)
 
 

@@ -17,7 +17,8 @@ class _Lazy(ModuleType):
 
     def __getattr__(self, name: str) -> Any:
         if name not in self._places:
-            raise AttributeError(f"{self.__name__} has no {name}{did_you_mean(name, self._places)}")
+            hint = did_you_mean(name, self._places)
+            raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}{hint}")
         place, there = self._places[name]
         home = importlib.import_module(place, self.__name__)
         attributes = vars(home)

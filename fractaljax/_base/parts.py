@@ -122,10 +122,10 @@ def flag(name: str, value: Any) -> bool:
 
 
 def doubt_unit(name: str, value: Numbers, least: float, most: float, hint: str) -> None:
-    """Warn where a concrete number is outside of what its quantity ever is in its unit."""
-    values = concrete(value)
-    if values is not None and values.size and not (least <= values.min() <= values.max() <= most):
-        warn_user(f"{name} = {values.flat[0]:g}: {hint}")
+    """Warn where a concrete single number is outside of what its quantity ever is in its unit."""
+    number = concrete(value)
+    if number is not None and number.ndim == 0 and not least <= number <= most:
+        warn_user(f"{name} = {number:g}: {hint}")
 
 
 def require_kind(name: str, value: Any, kind: type) -> None:
@@ -192,8 +192,9 @@ def brief(value: Any) -> str:
         return f"a traced array of shape {value.shape}" if value.ndim else "a traced number"
     if isinstance(value, type) or (callable(value) and hasattr(value, "__name__")):
         return f"the {'class' if isinstance(value, type) else 'function'} {value.__name__}"
-    if not isinstance(value, Record) and is_traced(value):
-        return f"a {type(value).__name__} with traced numbers"
+    with contextlib.suppress(TypeError, ValueError):  # a dictionary whose keys have no order
+        if not isinstance(value, Record) and is_traced(value):
+            return f"a {type(value).__name__} with traced numbers"
     try:
         text = " ".join(repr(value).split())
     except ValueError:  # Python refuses to print integers of thousands of digits
@@ -280,7 +281,8 @@ class Record(eqx.Module):
                 continue
             value = getattr(self, field.name)
             if isinstance(value, Tracer):
-                yield f"{argument_name(field)}=traced"
+                shape = ",".join(map(str, value.shape))
+                yield f"{argument_name(field)}=traced {value.dtype}[{shape}]"
                 continue
             if isinstance(value, jax.Array):
                 value = value.item() if value.ndim == 0 else np.asarray(value)

@@ -9,8 +9,12 @@ def close(word: str, words: Iterable[str]) -> list[str]:
     spellings: dict[str, list[str]] = {}
     for each in words:
         spellings.setdefault(each.lower(), []).append(each)
-    near = difflib.get_close_matches(word.lower(), spellings)
-    same = sorted(near, key=lambda each: each != word.lower())  # only the case differs
+    low = word.lower()
+    inside = [x for x in spellings if min(len(low), len(x)) > 1 and (low in x or x in low)]
+    # Below this share of equal letters words have little in common: nonsense and scene.
+    near = difflib.get_close_matches(low, spellings, cutoff=0.65)
+    near = list(dict.fromkeys([*near, *inside]))
+    same = sorted(near, key=lambda each: each != low)  # only the case differs
     # Beside a function comes the class of what it returns: first the one in the case of the word.
     return [
         each

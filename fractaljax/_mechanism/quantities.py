@@ -251,8 +251,8 @@ def axis_values(x: Mechanism, name: str, values: ArrayLike | Sequence[float]) ->
     # Lists are read by NumPy; arrays may be traced and are kept.
     values = number(name, values if isinstance(values, (Array, np.ndarray)) else np.array(values))
     if values.ndim != 1 or not values.size:
-        got = f"shape {values.shape}" if values.ndim else brief(values.tolist())
-        raise ValueError(f"the values of {name} must be a list such as [2.3, 2.4], got {got}")
+        got = f"shape {values.shape}" + ": type [2.3, 2.4]" * (not values.ndim)
+        raise ValueError(f"the values of {name} must be a list, got {got}")
     return values
 
 

@@ -32,16 +32,10 @@ def measure_words(measure: Callable) -> tuple[str, str, str]:
 def leaf_names(measure: str, values: Any) -> list[str]:
     """The names of the arrays of a pytree that a measure of this name gives.
 
-    Each is the path that leads to it; a single array has the name of the measure, and those of a
-    tuple have it with a number, but K_n and K_t of `stiffness`.
+    Each is the path that leads to it; a single array has the name of the measure.
     """
     places = [place for place, _ in jax.tree_util.tree_leaves_with_path(values)]
-    names = [jax.tree_util.keystr(place, simple=True, separator=".") for place in places]
-    if names == [""]:
-        return [measure]
-    if measure == "stiffness" and names == ["0", "1"]:
-        return ["K_n", "K_t"]
-    return [f"{measure}_{name}" if name.isdigit() else name for name in names]
+    return [jax.tree_util.keystr(x, simple=True, separator=".") or measure for x in places]
 
 
 def leaves_by_name(measure: str, values: Any) -> dict[str, Any]:
