@@ -21,7 +21,7 @@ class Mechanism(Part):
     def _quantity_names(self) -> list[str]:
         """The names that `replace` takes."""
 
-    def replace(self, **changes: Any) -> Self:
+    def replace(self, *unnamed: Any, **changes: Any) -> Self:
         """A copy with named quantities of any part changed: `replace(D=2.5, mu_s=0.3)`.
 
         Under a trace (`jit`, `vmap`) a value outside its domain becomes NaN, and so do all results
@@ -29,6 +29,7 @@ class Mechanism(Part):
 
         **Arguments:**
 
+        - `unnamed`: refused, since every quantity has a name.
         - `changes`: new values in SI units, by the names of quantities, also of those that follow
           from others: `replace(**{"K_t/K_n": 0.5})` (`quantities.py`). Whole parts have names as
           well: `replace(friction=Coulomb(0.4))`. A quantity passed together with the part that
@@ -37,8 +38,13 @@ class Mechanism(Part):
           joint named left, also together with a D for all.
 
         **Raises:** `ValueError` for a name unknown after the change, listing the known ones, and
-        for concrete values outside their domain.
+        for concrete values outside their domain; `TypeError` for values without a name.
         """
+        if unnamed:
+            raise TypeError(
+                "replace takes quantities by name: type replace(D=2.4), or "
+                'replace(**{"left.D": 2.4})'
+            )
         new = self._rebuilt(changes)
         others = changes.keys() - {*new._quantity_names()}
         if others:
