@@ -88,7 +88,7 @@ REFUSED = {
     "fj.Envelope(mu=(0.2, 0.5))": 'type Envelope({"mu": (0.2, 0.5)})',
     "scene.replace(d=2.4)": "did you mean D?",
     "scene.replace({'D': 2.4})": "replace takes quantities by name: type replace(D=2.4)",
-    "plot.cycles(scene)": "results must be a mapping, got a Scene",
+    "plot.cycles(scene)": "results must be a mapping such as {'name': limit_cycle(scene)}",
     "scene.replace(load=1000)": "did you mean P?",
     "scene.replace(mu=-1)": "mu must be above 0, got -1.0",
     "scene.replace(friction=0.4)": "friction must be a Friction, got 0.4: make one by Coulomb(0.4)",

@@ -199,15 +199,12 @@ def _fits(parameter: inspect.Parameter, value: Any) -> bool:
     """False where an argument is not of the class of its annotation."""
     if typing.get_origin(parameter.annotation) is Callable:
         return callable(value)
-    if typing.get_origin(parameter.annotation) is Mapping:
-        return isinstance(value, Mapping)
     kinds = _kinds(parameter)
     return not kinds or isinstance(value, kinds) or value is parameter.default
 
 
 def _allowed(parameter: inspect.Parameter) -> str:
-    other = "mapping" if typing.get_origin(parameter.annotation) is Mapping else "function"
-    names = [kind.__name__ for kind in _kinds(parameter)] or [other]
+    names = [kind.__name__ for kind in _kinds(parameter)] or ["function"]
     if names == ["Mechanism"]:
         names = ["Scene", "Structure"]
     return " or ".join(f"an {x}" if x[0] in "AEIOU" else f"a {x}" for x in names)
@@ -222,8 +219,6 @@ def _described(value: Any) -> str:
 def _hint(parameter: inspect.Parameter, value: Any) -> str | None:
     """What to pass instead of `value`."""
     kinds = _kinds(parameter)
-    if not kinds and typing.get_origin(parameter.annotation) is Mapping:
-        return None
     if not kinds:
         if isinstance(value, str) and value.isidentifier():
             return f"type fractaljax.{value} without quotes, the function itself"

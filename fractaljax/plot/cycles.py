@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import ArrayLike
 
+from .._base.parts import brief
 from .._dynamics.cycle import LimitCycle
 from .axes import Axes, ensure_axes, legend_above, new_figure
 from .cycle import phase_portrait, spectrum
@@ -24,8 +25,14 @@ def cycles(
     - `results`: {name of the row: limit cycle}.
     - `direction`, `joint`: as in `phase_portrait`.
 
-    **Raises:** `ValueError` if there are no cycles, and as `phase_portrait`.
+    **Raises:** `TypeError` unless there is a name for each; `ValueError` if there are no cycles,
+    and as `phase_portrait`.
     """
+    if not isinstance(results, Mapping):
+        raise TypeError(
+            "results must be a mapping such as {'name': limit_cycle(scene)}, "
+            f"got {brief(results)}"
+        )
     if not results:
         raise ValueError("there must be at least one limit cycle to draw")
     figure = new_figure(10.4, 0.5 + 3.6 * len(results))
