@@ -3,8 +3,9 @@
 import shlex
 from pathlib import Path
 
+from .json_text import files as paths, identification_content, show
 from .output import output, picture
-from .parsing import add_out, load_mechanism, parse_envelope, parse_pairs
+from .parsing import add_out, add_set, load_mechanism, parse_envelope, parse_pairs
 
 _OPTIONS = {
     "--dx": {"type": float, "help": "step between heights [m], if not in the file"},
@@ -64,6 +65,7 @@ def add_identify(commands) -> None:
     parser.add_argument("file", type=Path, help="heights: CSV, NPY or an instrument's own format")
     for name, options in _OPTIONS.items():
         parser.add_argument(name, **options)
+    add_set(parser)
     add_out(parser, "fractaljax-identification")
     parser.set_defaults(run=_run)
 
@@ -78,7 +80,7 @@ def _run(arguments) -> int:
     from .._surface.spectrum import Spectrum
     from .._surface.surface import Surface
 
-    base = load_mechanism(arguments.scene)
+    base = load_mechanism(arguments.scene, changes=arguments.set)
     old_surface = getattr(base.contact, "surface", None)
     if not isinstance(old_surface, Spectrum):
         raise ValueError(f"{arguments.scene}: the law of its contact takes no surface")
@@ -117,8 +119,13 @@ def _run(arguments) -> int:
         written = write(files)
         if arguments.tolerance is not None and "tolerance.toml" in files:
             write_together({arguments.tolerance: files["tolerance.toml"]})
-    print("\n".join([read.source, read.description, "", str(fit), "", *joint_lines, written]))
     path = arguments.out / "scene.toml"
+    content = {"source": read.source, "failure": None if failure is None else str(failure)}
+    content["files"] = paths(arguments.out, files)
+    if arguments.json:
+        show(arguments, "", lambda: identification_content(fit) | content)
+        return 0 if failure is None and scatter is not None else 1
+    print("\n".join([read.source, read.description, "", str(fit), "", *joint_lines, written]))
     if failure is not None or scatter is None:
         if path.exists():
             print(f"{path} is from an earlier run")

@@ -21,6 +21,7 @@ from jaxtyping import Array, ArrayLike, Float
 from .._base.batches import in_batches
 from .._base.parts import Record, brief, is_traced, number, scalar
 from .._base.ranges import low_discrepancy
+from .._base.suggest import did_you_mean
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import (
     quantity_names,
@@ -131,7 +132,8 @@ class Tolerance(Record):
             self.quantities, self.standard_deviations.items(), strict=True
         ):
             if name not in names:
-                raise ValueError(f"tolerance names {label!r}; there are {', '.join(names)}")
+                near = did_you_mean(name, names)
+                raise ValueError(f"tolerance names {label!r}; there are {', '.join(names)}{near}")
             for each in [] if is_traced(x) else _scattered_names(x, name):
                 ends = ranges.get(each, ranges.get(name, (float(value_of(x, each)),)))
                 low, high = min(ends), max(ends)

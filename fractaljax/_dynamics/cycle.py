@@ -208,6 +208,10 @@ class LimitCycle(Record):
     # The states of the laws at `state`: of law by law, face by face; None of a law without
     internal: Float[Array, " s"] | None = eqx.field(default=None, repr=False)
 
+    def _table_names(self):
+        derived = "frequency amplitude velocity_min velocity_max normal_force stick_fraction"
+        return [*super()._table_names(), *f"{derived} open_fraction multipliers".split()]
+
     def _shown(self) -> Iterator[str]:
         yield from super()._shown()
         if concrete(self.period) is not None:

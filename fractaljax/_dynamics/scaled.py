@@ -272,24 +272,28 @@ def start_state(
     return state
 
 
+def displaced_equilibrium(system: HybridSystem) -> Float[Array, " 2n"]:
+    """The sliding equilibrium displaced by V/omega along the first joint's t, in scaled units.
+
+    A law with a jump begins with V along t instead. Where the joint has V = 0 it begins at rest.
+    """
+    kick = system.section_direction
+    kick = jnp.concatenate([kick / jnp.sum(kick**2), jnp.zeros_like(kick)])
+    if system.has_jump:
+        # Steady sliding may well attract, and this start sticks.
+        jumps = system.static_excess()[0] > 64 * jnp.finfo(kick.dtype).eps
+        kick = jnp.where(jumps, jnp.roll(kick, system.n), kick)
+    if system.excited:
+        kick = kick * jnp.sign(system.V[0])
+    return system.mechanism_state(system.equilibrium() + kick)
+
+
 def scaled_start(system: HybridSystem, start: Array | None) -> Float[Array, " 2n"]:
     """The start in scaled units, constant: by default the displaced equilibrium.
 
-    It is displaced by V/omega along the first joint's t, or for a law with a jump begins with V
-    along t. Where that joint has V = 0 it begins at rest. An excitation begins at t = 0.
+    An excitation begins at t = 0.
     """
-    if start is None:
-        kick = system.section_direction
-        kick = jnp.concatenate([kick / jnp.sum(kick**2), jnp.zeros_like(kick)])
-        if system.has_jump:
-            # Steady sliding may well attract, and this start sticks.
-            jumps = system.static_excess()[0] > 64 * jnp.finfo(kick.dtype).eps
-            kick = jnp.where(jumps, jnp.roll(kick, system.n), kick)
-        if system.excited:
-            kick = kick * jnp.sign(system.V[0])
-        y = system.mechanism_state(system.equilibrium() + kick)
-    else:
-        y = start / system.units
+    y = displaced_equilibrium(system) if start is None else start / system.units
     return jax.lax.stop_gradient(system.with_excitation(y, 0.0))
 
 

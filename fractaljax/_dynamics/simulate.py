@@ -33,7 +33,14 @@ from .exact_step import step_to_switch
 from .excitation import Excitation, excited_system
 from .guard import NONE
 from .hybrid import HybridSystem
-from .scaled import check_rtol, degrees_of_freedom, require_drive, smoothing, start_state
+from .scaled import (
+    check_rtol,
+    degrees_of_freedom,
+    displaced_equilibrium,
+    require_drive,
+    smoothing,
+    start_state,
+)
 from .segments import chosen_guard, flow
 from .transition import first_contact_state, switch
 
@@ -244,8 +251,8 @@ def _sampled(trajectory: Trajectory, saveat) -> Trajectory:
 
 def simulate(
     mechanism: Mechanism,
-    start: ArrayLike | Sequence[float],
-    t1: ScalarLike,
+    start: ArrayLike | Sequence[float] | None = None,
+    t1: ScalarLike | None = None,
     *,
     excitation: Excitation | None = None,
     t0: ScalarLike = 0.0,
@@ -260,15 +267,16 @@ def simulate(
 
     Eighth-order steps of equal length, each cut where the contact state changes. Derivatives with
     respect to the mechanism, the excitation, `start`, `t0` and `t1` are those of the motion with
-    its switches.
+    its switches; a start or an end by default depends on the mechanism.
 
     **Arguments:**
 
     - `mechanism`: a scene, or a structure of n degrees of freedom whose joints all have a V;
       `jax.vmap` takes many.
-    - `start`: (2n,), [x, v] in m and m/s; with friction that has memory its states are those of
-      steady sliding, or follow as (2n + s,), as `internal` has them.
-    - `t1`: end time [s], above `t0`.
+    - `start`: (2n,), [x, v] in m and m/s; by default as in `limit_cycle`, near the sliding
+      equilibrium. With friction that has memory its states are those of steady sliding, or follow
+      as (2n + s,), as `internal` has them.
+    - `t1`: end time [s], above `t0`; by default 50 periods 2 pi/omega later, omega as there.
     - `excitation`: a harmonic force, whose phase refers to the time 0.
     - `t0`: start time [s].
     - `saveat`: (k,), times [s] in order from `t0` to `t1`, at which alone states are returned. The
@@ -288,9 +296,12 @@ def simulate(
     everything is NaN instead.
     """
     memory = has_memory(mechanism)
-    start = start_state(start, degrees_of_freedom(mechanism), memory)
+    n = degrees_of_freedom(mechanism)
+    start = None if start is None else start_state(start, n, memory)
     require_drive(mechanism, excitation)
     t0, t1 = _times(t0, t1)
+    if t1 is None:
+        t1 = _default_end(mechanism, excitation, t0, memory)
     saveat = None if saveat is None else _checked(saveat, t0, t1)
     n = whole("max_steps", max_steps, 1)
     rtol = check_rtol(rtol, jnp.result_type(*jax.tree.leaves((mechanism, start, excitation))))
@@ -318,18 +329,26 @@ def simulate(
     return raise_unless(SimulationResult.reached, trajectory) if throw else trajectory
 
 
+@functools.partial(exported_jit, static_argnames="memory")
+def _default_end(mechanism, excitation, t0, memory):
+    """A time 50 periods after t0, so few that max_steps allows far more than the 30 of each."""
+    return t0 + 100 * jnp.pi / excited_system(mechanism, excitation, memory).omega
+
+
 @exported_jit
 def _scaled(mechanism, excitation, start, t0, t1):
-    """The system, its state at t0, t0 itself, and the duration in scaled time."""
+    """The system, its state at t0, t0, and the duration in scaled time."""
     system = excited_system(mechanism, excitation)
-    y, duration = start / system.units, (t1 - t0) * system.omega
+    y = displaced_equilibrium(system) if start is None else start / system.units
     y = system.with_excitation(y, t0 * system.omega)
-    return system, y, jnp.asarray(t0, y.dtype), jnp.asarray(duration, y.dtype)
+    return system, y, *(jnp.asarray(t, y.dtype) for t in (t0, (t1 - t0) * system.omega))
 
 
-def _times(t0, t1) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """t0 and t1 as numbers, t1 above t0."""
+def _times(t0, t1) -> tuple[Float[Array, ""], Float[Array, ""] | None]:
+    """t0 and t1, if it is stated, as numbers, t1 above t0."""
     t0 = scalar("t0", t0)
+    if t1 is None:
+        return t0, None
     start = concrete(t0)
     if start is not None:
         return t0, scalar("t1", t1, above=float(start))

@@ -2,13 +2,13 @@
 
 import math
 import os
-import warnings
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from jaxtyping import ArrayLike
 
+from .._base.warn import warn_user
 from .._surface.heights import height_statistics
 from .._surface.measured_spectrum import MeasuredSpectrum
 from .measurement import Measurement
@@ -61,7 +61,7 @@ def spectrum_of(
     if table is None:
         raise ValueError(f"shortest must leave two points or more of {longest:g} m, got {shortest}")
     for words in gaussian_warnings(heights, largest_skewness, largest_kurtosis):
-        warnings.warn(words, stacklevel=2)
+        warn_user(words)
     return MeasuredSpectrum(*table)
 
 
