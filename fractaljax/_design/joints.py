@@ -98,7 +98,7 @@ def with_contacts(x: Mechanism, contacts: Mapping[str, Contact]) -> Any:
     """
     if isinstance(x, Scene):
         return eqx.tree_at(lambda scene: scene.contact, x, contacts.get("", x.contact))
-    joints = x.joints_by_name()
+    joints: dict[str, Any] = x.joints_by_name()
     for name, contact in contacts.items():
         joint = joints[name]
         rest = joint.friction, joint.tangential, joint.normal, joint.V, joint.preload
