@@ -19,7 +19,7 @@ from .._mechanism.reduced import CoarseSpace
 from .._mechanism.structure import Structure, require_single
 from .band import among, in_band, leading
 from .critical_pair import CriticalPair, critical_pair
-from .field_modes import LinearisedField, linearised_with_memory
+from .field_modes import linearised_with_memory
 from .margin import least_damping_ratio
 from .quadratic import Modes, solve
 from .rightmost import rightmost
@@ -95,14 +95,17 @@ class Assembled(eqx.Module):
 
 def linearised(
     x: Any, friction_slope: bool, refuse: bool = True
-) -> TwoDirections | Assembled | LinearisedField:
+) -> TwoDirections | Assembled:
     """The linearised equations of a mechanism, in closed form where there is one.
 
     `refuse` as in `assembled`.
     """
     require_one("scene", x)
     if has_memory(x):
-        return linearised_with_memory(x, friction_slope)
+        if not refuse:  # onsets are sought, which the Jacobian alone does not tell
+            require_no_memory(x)
+        field: Any = linearised_with_memory(x, friction_slope)
+        return field
     if x.uncoupled:
         return two_directions(x, friction_slope)
     return assembled(x, friction_slope, refuse)

@@ -8,7 +8,7 @@ import pytest
 import scipy.optimize
 
 import fractaljax as fj
-from fractaljax._stability.linearise import pressed
+from fractaljax._stability.two_directions import two_directions
 
 P, K_N = 500.0, 4e8
 LOADS = np.array([P / 10, 10 * P])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
-from fractaljax._mechanism.quantities import sliding_friction, value_of, with_friction_times
+from fractaljax._mechanism.quantities import value_of, with_friction_times
 from fractaljax._stability import quadratic
 from fractaljax._stability.rightmost import rightmost
 from tools import both_modes, reference_scene
