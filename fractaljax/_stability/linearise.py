@@ -93,9 +93,7 @@ class Assembled(eqx.Module):
         return critical_pair(*self.matrices, self.C_error, rigid, self.band)
 
 
-def linearised(
-    x: Any, friction_slope: bool, refuse: bool = True
-) -> TwoDirections | Assembled:
+def linearised(x: Any, friction_slope: bool, refuse: bool = True) -> TwoDirections | Assembled:
     """The linearised equations of a mechanism, in closed form where there is one.
 
     `refuse` as in `assembled`.

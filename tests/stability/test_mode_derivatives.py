@@ -76,7 +76,7 @@ def test_nothing_grows_at_the_critical_friction_whatever_the_quantities():
     def growth(u, factor=None):
         x = scene.replace(**dict(zip(QUANTITIES, values * jnp.exp(u), strict=True)))
         if factor is None:
-            factor = fj.critical_friction(x) / sliding_friction(x)
+            factor = fj.critical_friction(x) / x.coefficient()
         return fj.growth_rate(with_friction_times(x, factor)), factor
 
     @jax.jit
