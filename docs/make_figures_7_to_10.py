@@ -297,7 +297,7 @@ and kappa go up to 1 in the first two, and omega to 6 and kappa to 1.6 in the ot
 def figure(number: int, points: int = POINTS):
     """Fig. 7, 8, 9 or 10 as maps."""
     if number < 9:
-        return fj.plot.modes(modes_of(str(number), points))
+        return fj.plot.modes(modes_of(str(number), points)).figure
     drawn = fj.plot.new_figure(11.2, 9.2 if number == 9 else 17)
     rows = drawn.subplots(2, 2).reshape(4, 1) if number == 9 else drawn.subplots(4, 2)
     for letter, row in zip("abcd", rows, strict=True):

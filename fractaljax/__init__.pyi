@@ -78,10 +78,18 @@ from ._friction import (
     Stribeck as Stribeck,
 )
 from ._friction_laws import TabulatedFriction as TabulatedFriction
+from ._friction_memory import (
+    Dahl as Dahl,
+    Iwan as Iwan,
+    Jenkins as Jenkins,
+    LuGre as LuGre,
+    RateAndState as RateAndState,
+)
 from ._identify.analysis import SpectralAnalysis as SpectralAnalysis
 from ._identify.files import read_measurement as read_measurement
 from ._identify.identify import Identification as Identification, identify as identify
 from ._identify.measurement import Measurement as Measurement
+from ._identify.pool import pool_surfaces as pool_surfaces
 from ._identify.preparation import Preprocessing as Preprocessing
 from ._identify.spectrum_of import spectrum_of as spectrum_of
 from ._identify.warnings import WarningThresholds as WarningThresholds
@@ -133,8 +141,10 @@ from ._surface.roughness import (
     spectral_moments as spectral_moments,
 )
 from ._surface.self_affine import SelfAffine as SelfAffine
+from ._surface.specification import specify_surface as specify_surface
 from ._surface.spectrum import Spectrum as Spectrum
 from ._surface.surface import Surface as Surface
+from ._surface.surface_scatter import SurfaceScatter as SurfaceScatter
 from ._surface.topography import topography as topography
 from ._sweep.result import Sweep as Sweep
 from ._sweep.sweep import sweep as sweep

@@ -48,7 +48,12 @@ def main(argv: list[str] | None = None) -> int:
         add_scene,
     ):
         add(commands)
-    arguments = parser.parse_args(argv)
+    parser.commands = tuple(commands.choices)
+    words = sys.argv[1:] if argv is None else argv
+    if not words:
+        parser.print_help()
+        return 0
+    arguments = parser.parse_args(words)
     # Garbage collection among the modules, which stay, took a tenth of a command's time.
     gc.set_threshold(50_000, 20, 50)
     import jax

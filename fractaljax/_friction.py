@@ -53,6 +53,23 @@ class Friction(Part):
     files, without which it cannot be written to one; `fj.quantity` adds unit and meaning there and
     makes a number available to sweeps and designs.
 
+    A law with memory has `state_size` internal states z, of its own units, on each face of a joint
+    on which it acts, and defines `rate` and `force` as well; `mu` is then its steady sliding:
+
+        class Bristles(fj.Friction):
+            state_size = 1
+            mu_s: jax.Array = fj.quantity("-", "friction coefficient")
+            sigma: jax.Array = fj.quantity("1/m", "stiffness of the bristles per normal load")
+
+            def mu(self, speed):
+                return self.mu_s + 0 * speed
+
+            def rate(self, z, w, N):
+                return w - self.sigma * abs(w) / self.mu_s * z
+
+            def force(self, z, w, N):
+                return self.sigma * z * N
+
     mu_s is mu(0). mu_m, which Eq. 19 takes as dynamic friction, is the least value of mu up to
     100 m/s, and at least 0; the source means the minimum of its Eq. 38. A field or a property of
     either name replaces it.
@@ -67,6 +84,9 @@ class Friction(Part):
 
     velocity_dependent: ClassVar[bool] = True  # if False, neither slope nor speed is traced
     lowest: ClassVar[str] = "mu_m"  # the quantity that holds mu_m
+    # Internal states of one face: where there are any, `rate` and `force` say how it rubs.
+    state_size: ClassVar[int] = 0
+    in_series: ClassVar[bool] = False  # whether the contact's K_t acts in it alone, in series
     # Fields that scale the law as a whole; a law without them is wrapped in `Scaled`.
     amplitudes: ClassVar[tuple[str, ...]] = ()
 
@@ -131,6 +151,43 @@ class Friction(Part):
 
     def in_motion(self) -> "Friction":
         """The law in the form that is evaluated at every step of a motion, by default itself."""
+        return self
+
+    def rate(self, z: ArrayLike, w: ArrayLike, N: ArrayLike) -> Numbers:
+        """dz/dt (state_size,) of a law with memory.
+
+        **Arguments:**
+
+        - `z`: internal states (state_size,).
+        - `w`: sliding velocity [m/s], of either sign.
+        - `N`: normal load [N] of the face.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no internal states")
+
+    def force(self, z: ArrayLike, w: ArrayLike, N: ArrayLike) -> Numbers:
+        """Friction force [N] of a law with memory, along w; arguments as `rate`."""
+        raise NotImplementedError(f"{type(self).__name__} has no internal states")
+
+    def steady(self, w: ArrayLike, N: ArrayLike) -> Numbers:
+        """States (state_size,) with rate 0; arguments as `rate`. By default by Newton's method."""
+
+        def step(_, z):
+            slope = jax.jacfwd(rate)(z)
+            change = jnp.linalg.solve(slope, rate(z))
+            return z - jnp.where(jnp.isfinite(change), change, 0)
+
+        def rate(z):
+            return jnp.reshape(self.rate(z, w, N), (self.state_size,))
+
+        start = jnp.zeros(self.state_size, jnp.result_type(float, w))
+        return jax.lax.fori_loop(0, 16, step, start)
+
+    def state_unit(self, length: ArrayLike) -> ArrayLike:
+        """The size of the states, in which motions carry them; by default the unit of `length`."""
+        return length
+
+    def at_joint(self, K_t: ArrayLike, time: ArrayLike) -> "Friction":
+        """The law in a joint of tangential stiffness K_t [N/m], in motion with a unit of `time`."""
         return self
 
     def times(self, factor: ArrayLike) -> "Friction":
@@ -345,8 +402,31 @@ class Scaled(Friction, law="scaled"):
     def mu_m(self):
         return self.factor * self.of.mu_m
 
+    @property
+    def state_size(self):
+        return self.of.state_size
+
+    @property
+    def in_series(self):
+        return self.of.in_series
+
     def mu(self, speed):
         return self.factor * self.of.mu(speed)
 
     def in_motion(self):
         return Scaled(self.of.in_motion(), self.factor)
+
+    def rate(self, z, w, N):
+        return self.of.rate(z, w, N)
+
+    def force(self, z, w, N):
+        return self.factor * self.of.force(z, w, N)
+
+    def steady(self, w, N):
+        return self.of.steady(w, N)
+
+    def state_unit(self, length):
+        return self.of.state_unit(length)
+
+    def at_joint(self, K_t, time):
+        return Scaled(self.of.at_joint(K_t, time), self.factor)

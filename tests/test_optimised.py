@@ -125,6 +125,12 @@ CALLS: dict[str, Callable[[], Any]] = {
     "run_in": lambda: fj.run_in(rough((16, 16)), 1e-6, MATERIAL, 1e8, 1e-8).heights,
     "simulate": lambda: fj.simulate(BRAKE, [1e-5, 0.0, 0.0, 0.0], 1e-3).end,
     "spectral_moments": lambda: fj.spectral_moments(fj.SelfAffine(1e-6, 0.8, 1e-4, 1e-5)).m4,
+    "pool_surfaces": lambda: (
+        fj.pool_surfaces(
+            [fj.identify(gaussian_profile(np.random.default_rng(i)), DX) for i in (1, 2)]
+        ).covariance
+    ),
+    "specify_surface": lambda: fj.specify_surface(Ra=4e-7, scatter=0.15).covariance,
     "spectrum_of": lambda: fj.roughness(fj.spectrum_of(rough((64, 64)), 1e-6)).Sdq,
     "squeal_probability": lambda: fj.squeal_probability(BRAKE, {"D": 0.01}, samples=64).value,
     "stability": lambda: fj.stability(PRESSED).eigenvalues,

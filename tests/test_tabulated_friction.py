@@ -86,7 +86,8 @@ def test_pressure_and_temperature():
     np.testing.assert_allclose(value, truth(7e5, 400.0, SAMPLES), rtol=1e-13)
     h = np.array([10.0, 0.01])
     for i in range(2):
-        ends = [truth(*(np.array(x) + s * h * (np.arange(2) == i)), SAMPLES) for s in (1, -1)]
+        steps = [np.array(x) + s * h * (np.arange(2) == i) for s in (1, -1)]
+        ends = [truth(p, T, SAMPLES) for p, T in steps]
         for slope in slopes:
             np.testing.assert_allclose(slope[:, i], (ends[0] - ends[1]) / (2 * h[i]), rtol=1e-6)
     np.testing.assert_allclose(of([1e9, 1.0]).mu(SAMPLES), truth(1e9, 1.0, SAMPLES), rtol=1e-13)

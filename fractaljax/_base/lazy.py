@@ -7,6 +7,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from .suggest import did_you_mean
+
 
 class _Lazy(ModuleType):
     """A package whose stub tells where each of its names is defined."""
@@ -15,7 +17,8 @@ class _Lazy(ModuleType):
 
     def __getattr__(self, name: str) -> Any:
         if name not in self._places:
-            raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
+            hint = did_you_mean(name, self._places)
+            raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}{hint}")
         place, there = self._places[name]
         home = importlib.import_module(place, self.__name__)
         attributes = vars(home)
@@ -25,6 +28,12 @@ class _Lazy(ModuleType):
             if there in attributes
             else importlib.import_module(f".{there}", home.__name__)
         )
+        from .usage import explain_class, explained  # they load JAX
+
+        if isinstance(value, type):
+            explain_class(value)
+        elif callable(value) and not isinstance(value, ModuleType):
+            value = explained(value, name, self.__name__)
         self.__dict__[name] = value
         return value
 

@@ -6,7 +6,7 @@ import functools
 import math
 import operator
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
+
+from .warn import warn_user
 
 Numbers = Float[Array, "..."]  # for one scene, or for a batch of any shape
 _PartT = TypeVar("_PartT", bound="Part")
@@ -119,6 +121,13 @@ def flag(name: str, value: Any) -> bool:
     return bool(value)
 
 
+def doubt_unit(name: str, value: Numbers, least: float, most: float, hint: str) -> None:
+    """Warn where a concrete single number is outside of what its quantity ever is in its unit."""
+    number = concrete(value)
+    if number is not None and number.ndim == 0 and not least <= number <= most:
+        warn_user(f"{name} = {number:g}: {hint}")
+
+
 def require_kind(name: str, value: Any, kind: type) -> None:
     """Refuse a value that is not an instance of `kind`."""
     if not isinstance(value, kind):
@@ -179,6 +188,13 @@ def raise_unless(expected: Any, outcome: Any) -> Any:
 
 def brief(value: Any) -> str:
     """`value` as messages show it: one line of at most 80 characters."""
+    if isinstance(value, Tracer):
+        return f"a traced array of shape {value.shape}" if value.ndim else "a traced number"
+    if isinstance(value, type) or (callable(value) and hasattr(value, "__name__")):
+        return f"the {'class' if isinstance(value, type) else 'function'} {value.__name__}"
+    with contextlib.suppress(TypeError, ValueError):  # a dictionary whose keys have no order
+        if not isinstance(value, Record) and is_traced(value):
+            return f"a {type(value).__name__} with traced numbers"
     try:
         text = " ".join(repr(value).split())
     except ValueError:  # Python refuses to print integers of thousands of digits
@@ -242,6 +258,30 @@ class Record(eqx.Module):
     def __repr__(self) -> str:
         return f"{type(self).__name__}({', '.join(self._shown())})"
 
+    if not TYPE_CHECKING:  # a checker shall go on refusing assignments
+
+        def __setattr__(self, name: str, value: Any) -> None:
+            try:
+                super().__setattr__(name, value)
+            except dataclasses.FrozenInstanceError:
+                message = f"a {type(self).__name__} is frozen: {self._instead_of_setting(name)}"
+                raise dataclasses.FrozenInstanceError(message) from None
+
+    def _instead_of_setting(self, name: str) -> str:
+        return f"make another one for another {name}"
+
+    def _repr_html_(self) -> str:
+        """What Jupyter shows: a table of quantity, value, unit and meaning."""
+        from . import html
+
+        rows = html.record_rows(self, self._table_names())
+        return html.table(f"fractaljax.{type(self).__name__}", rows)
+
+    def _table_names(self) -> list[str]:
+        """The attributes in the table of a notebook."""
+        fields = dataclasses.fields(self)
+        return [x.name for x in fields if x.repr and not x.name.startswith("_")]
+
     def _shown(self) -> Iterator[str]:
         for field in dataclasses.fields(self):
             if not field.repr:
@@ -249,7 +289,11 @@ class Record(eqx.Module):
             value = getattr(self, field.name)
             if is_absent(field, value):
                 continue
-            if isinstance(value, jax.Array) and not isinstance(value, Tracer):
+            if isinstance(value, Tracer):
+                shape = ",".join(map(str, value.shape))
+                yield f"{argument_name(field)}=traced {value.dtype}[{shape}]"
+                continue
+            if isinstance(value, jax.Array):
                 value = value.item() if value.ndim == 0 else np.asarray(value)
             yield f"{argument_name(field)}={value!r}"
 
@@ -278,6 +322,25 @@ class Part(Record):
                     value, meant["unit"], meant["meaning"], meant.get("log", False)
                 )
         return stored
+
+    def _repr_html_(self) -> str:
+        from . import html
+
+        return html.table(f"fractaljax.{type(self).__name__}", part_rows(self))
+
+
+def part_rows(part: Part) -> list[tuple[str, Any, str, str]]:
+    """The rows of a table: each part by its class, below it its numbers with unit and meaning."""
+    rows: list[tuple[str, Any, str, str]] = []
+    for field in dataclasses.fields(part):
+        value, name, meant = getattr(part, field.name), quantity_name(field), field.metadata
+        if isinstance(value, Part):
+            rows += [(name, type(value).__name__, "", ""), *part_rows(value)]
+        elif "unit" in meant and value is not None:
+            rows.append((name, value, meant["unit"], meant["meaning"]))
+        elif meant.get("static"):
+            rows.append((name, value, "", ""))
+    return rows
 
 
 def quantities(part: Part) -> dict[str, tuple[str, ...]]:

@@ -116,7 +116,12 @@ def read_toml(content: bytes) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def naming(path: str | os.PathLike) -> Iterator[None]:
-    """Turn errors in the content of a file into one `ValueError` that begins with its name."""
+    """Turn errors in the content of a file into one `ValueError` that begins with its name.
+
+    **Raises:** `TypeError` for what is not the name of a file.
+    """
+    if not isinstance(path, (str, bytes, os.PathLike)):
+        raise TypeError(f"path must be the name of a file, got {brief(path)}")
     try:
         yield
     except RecursionError:

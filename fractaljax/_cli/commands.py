@@ -2,8 +2,9 @@
 
 from pathlib import Path
 
+from .json_text import cycle_content, files as paths, quantities, show, stability_content
 from .output import csv_text, import_pictures, output, picture
-from .parsing import add_constant_friction, add_out, add_scene_file, load_mechanism
+from .parsing import add_constant_friction, add_out, add_scene_file, add_set, load_mechanism
 
 _FOLDER = "fractaljax-stability"  # of the pictures of modes
 
@@ -34,18 +35,23 @@ def _stability(arguments) -> int:
     from .._stability.summary import stability_table
 
     subject, slope = (
-        load_mechanism(arguments.scene, structures=True),
+        load_mechanism(arguments.scene, structures=True, changes=arguments.set),
         not arguments.constant_friction,
     )
     if subject.mesh is None:
         if arguments.out is not None:
             raise ValueError("--out needs a structure whose file names a mesh, to draw its modes")
-        print(stability_table(subject, slope))
+        show(arguments, stability_table(subject, slope), lambda: stability_content(subject, slope))
         return 0
     with output(arguments.out or Path(_FOLDER)) as write:
-        written = write(_mode_pictures(subject, slope))
-    print(stability_table(subject, slope))
-    print(written)
+        files = _mode_pictures(subject, slope)
+        written = write(files)
+    folder = arguments.out or Path(_FOLDER)
+    show(
+        arguments,
+        f"{stability_table(subject, slope)}\n{written}",
+        lambda: stability_content(subject, slope) | {"files": paths(folder, files)},
+    )
     return 0
 
 
@@ -105,7 +111,8 @@ def _cycle(arguments) -> int:
     from .._dynamics.summary import cycle_table
     from .._stability.stability import require_computable
 
-    scene = load_mechanism(arguments.scene, structures=True)
+    scene = load_mechanism(arguments.scene, structures=True, changes=arguments.set)
+    files: dict[str, bytes] = {}
     require_computable(scene)
     options = {name: getattr(arguments, name) for name in ("start", "rtol", "max_returns")}
     options = {name: value for name, value in options.items() if value is not None}
@@ -120,9 +127,11 @@ def _cycle(arguments) -> int:
             if scene.mesh is not None:
                 files["motion.png"] = picture(plot.cycle_motion(cycle, scene))
             written = write(files)
-    print(cycle_table(scene, cycle))
-    if has_cycle:
-        print(written)
+    show(
+        arguments,
+        lambda: "\n".join([cycle_table(scene, cycle), *([written] if has_cycle else [])]),
+        lambda: cycle_content(scene, cycle) | {"files": paths(arguments.out, files)},
+    )
     return 0 if has_cycle else 1
 
 
@@ -139,12 +148,12 @@ def add_scene(commands) -> None:
     parser = commands.add_parser(
         "scene", help="print a scene file to start from", description=_scene.__doc__
     )
+    add_set(parser)
     parser.set_defaults(run=_scene)
 
 
 def _scene(arguments) -> int:
     """Print the reference brake as a scene file."""
-    from .._mechanism.scene import brake_scene
-
-    print(brake_scene().to_toml(), end="")
+    scene = load_mechanism(None, changes=arguments.set)
+    show(arguments, scene.to_toml().removesuffix("\n"), lambda: {"quantities": quantities(scene)})
     return 0

@@ -3,8 +3,9 @@
 from pathlib import Path
 from typing import Any
 
+from .json_text import comparison_content, files as paths, show
 from .output import csv_text, output, picture
-from .parsing import add_out, load_mechanism, numbers
+from .parsing import add_out, add_set, load_mechanism, numbers
 
 _OPTIONS: dict[str, dict[str, Any]] = {
     "--area": {"type": float, "help": "nominal area of the joint [m^2], if not in the scene"},
@@ -44,6 +45,7 @@ def add_contact(commands) -> None:
     )
     for name, options in _OPTIONS.items():
         parser.add_argument(name, **options)
+    add_set(parser)
     add_out(parser, "fractaljax-contact")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.set_defaults(run=_run)
@@ -65,7 +67,7 @@ def _run(arguments) -> int:
     from .. import plot
     from .._contact.compare import compare_laws
 
-    scene = load_mechanism(arguments.scene)
+    scene = load_mechanism(arguments.scene, changes=arguments.set)
     law, friction = scene.contact, scene.friction
     if not law.has_surface:
         if hasattr(law, "surface"):
@@ -103,5 +105,10 @@ def _run(arguments) -> int:
         )
         files = {"contact.png": picture(plot.laws(comparison))}
         written = write(files | {"contact.csv": csv_text(*comparison.rows()).encode()})
-    print(f"{comparison!r}\n{written}")
+    names = [*files, "contact.csv"]
+    show(
+        arguments,
+        f"{comparison!r}\n{written}",
+        lambda: comparison_content(comparison) | {"files": paths(arguments.out, names)},
+    )
     return 0

@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 
+from .json_text import files as paths, show
 from .output import csv_text, output
 from .parsing import load_mechanism
 
@@ -19,7 +20,7 @@ def run_map(arguments) -> int:
     from .._identify.spectrum import remove_plane
     from .._identify.spectrum_of import spectrum_of
 
-    scene = load_mechanism(arguments.joint)
+    scene = load_mechanism(arguments.joint, changes=arguments.set)
     contact, friction = scene.contact, scene.friction
     material, P = getattr(contact, "material", None), getattr(contact, "P", None)
     if material is None or P is None:
@@ -53,5 +54,17 @@ def run_map(arguments) -> int:
         files = {"scene.toml": scene.replace(contact=law).to_toml().encode()}
         written = write(files | {"contact.csv": csv_text(titles, rows).encode()})
     lines = [f"warning: {each.message}" for each in caught]
-    print("\n".join([read.source, read.description, "", aligned([titles, *rows]), *lines, written]))
+    text = [read.source, read.description, "", aligned([titles, *rows]), *lines, written]
+    show(
+        arguments,
+        "\n".join(text),
+        lambda: {
+            "source": read.source,
+            "loads": loads,
+            "K_n": law.stiffnesses,
+            "K_n_by_spectrum": by_spectrum,
+            "warnings": [str(each.message) for each in caught],
+            "files": paths(arguments.out, [*files, "contact.csv"]),
+        },
+    )
     return 0

@@ -4,6 +4,7 @@ import inspect
 from pathlib import Path
 from typing import Any
 
+from .json_text import design_content, files as paths, show
 from .output import csv_text, import_pictures, npy, output, picture
 from .parsing import (
     add_constant_friction,
@@ -65,6 +66,7 @@ def add_design(commands) -> None:
     add_scene_file(parser)
     add_constant_friction(parser)
     add_out(parser, "fractaljax-design")
+    parser.pairs = "--D", "--G"
     for name, unit in (("D", ""), ("G", " [m]")):
         ends = ("LOW", "HIGH")
         parser.add_argument(
@@ -72,7 +74,7 @@ def add_design(commands) -> None:
             type=float,
             nargs=2,
             metavar=ends,
-            help=f"as --bounds {name}=LOW:HIGH{unit}",
+            help=f"as --bounds {name}=LOW:HIGH{unit}; LOW:HIGH is one word too",
         )
     for name, (form, meaning) in _SEVERAL.items():
         parser.add_argument(f"--{name}", action="extend", nargs="+", metavar=form, help=meaning)
@@ -105,7 +107,7 @@ def add_design(commands) -> None:
         "--repeat", type=Path, metavar="FILE", help="run again what a run.toml holds, nothing else"
     )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
-    allowed = {"repeat", "quiet", "out", "area", "help"}  # beside --repeat
+    allowed = {"repeat", "quiet", "out", "area", "json", "help"}  # beside --repeat
     design_options = [action.dest for action in parser._actions if action.dest not in allowed]
     parser.set_defaults(run=_run, design_options=design_options)
 
@@ -125,7 +127,8 @@ def _run(arguments) -> int:
 
     if arguments.repeat is None:
         options = _options(arguments)
-        x = load_mechanism(arguments.scene, True, options["bounds"], arguments.quiet)
+        how = {"quiet": arguments.quiet, "changes": arguments.set}
+        x = load_mechanism(arguments.scene, True, options["bounds"], **how)
     else:
         names = arguments.design_options
         conflicting = [name for name in names if getattr(arguments, name) not in (None, False)]
@@ -161,7 +164,9 @@ def _run(arguments) -> int:
         written = write(files)
     *table, promise = str(best).splitlines()
     verdict_lines = [] if x.sole_joint is None else _verdict(x, best, arguments.area)
-    print("\n".join([*table, *_remarks(x, options), *verdict_lines, written, *heights, promise]))
+    lines = [*table, *_remarks(x, options), *verdict_lines, written, *heights, promise]
+    content = {"promise": promise, "files": paths(arguments.out, files)}
+    show(arguments, "\n".join(lines), lambda: design_content(best) | content)
     return 1 if best.violated else 0
 
 

@@ -1,5 +1,6 @@
 """`fractaljax explore`: a page with sliders over the quantities of a scene."""
 
+from .json_text import files as paths, show
 from .output import output
 from .parsing import add_out, add_scene_file, load_mechanism, parse_windows
 
@@ -34,10 +35,10 @@ def _run(arguments) -> int:
     """
     from ..plot.explore import page
 
-    scene = load_mechanism(arguments.scene)
+    scene = load_mechanism(arguments.scene, changes=arguments.set)
     windows = parse_windows("--over", arguments.over, _FORM)
     with output(arguments.out) as write:
         text = page(scene, windows, not arguments.no_cycles, not arguments.quiet)
         written = write({"explore.html": text.encode()})
-    print(written)
+    show(arguments, written, lambda: {"files": paths(arguments.out, ["explore.html"])})
     return 0

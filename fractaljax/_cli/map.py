@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from .json_text import files as paths, map_content, show
 from .output import csv_text, output, picture
 from .parsing import add_out, add_scene_file, kick_size, load_mechanism, parse_windows
 
@@ -40,7 +41,8 @@ def _run(arguments) -> int:
     from .. import plot
     from .._dynamics.bifurcation import bifurcation_map
 
-    x = load_mechanism(arguments.scene, structures=True, quiet=arguments.quiet)
+    how = {"quiet": arguments.quiet, "changes": arguments.set}
+    x = load_mechanism(arguments.scene, structures=True, **how)
     windows = [_window(x, which, getattr(arguments, which)) for which in ("x", "y")]
     options: dict[str, Any] = {}
     if arguments.radius is not None:
@@ -50,8 +52,13 @@ def _run(arguments) -> int:
     with output(arguments.out) as write:
         bifurcations = bifurcation_map(x, *windows, **options, progress=not arguments.quiet)
         figure = picture(plot.bifurcation_map(bifurcations).figure)
-        written = write({"map.png": figure, "map.csv": _text(bifurcations).encode()})
-    print(f"{bifurcations!r}\n{written}")
+        files = {"map.png": figure, "map.csv": _text(bifurcations).encode()}
+        written = write(files)
+    show(
+        arguments,
+        f"{bifurcations!r}\n{written}",
+        lambda: map_content(bifurcations) | {"files": paths(arguments.out, files)},
+    )
     return 0
 
 

@@ -9,7 +9,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from .._base.suggest import did_you_mean
 from .._version import __version__
+from .json_text import add_json
 
 
 class Version(argparse.Action):
@@ -45,7 +47,13 @@ class _Help(argparse.HelpFormatter):
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that reports an error in one line and takes negative numbers of any form."""
+    """A parser that reports an error in one line and takes negative numbers of any form.
+
+    `commands` are those of the whole command; `pairs` are options that take LOW:HIGH as two words.
+    """
+
+    commands: Sequence[str] = ()
+    pairs: Sequence[str] = ()
 
     def __init__(self, *arguments, **options):
         super().__init__(*arguments, formatter_class=_Help, **options)
@@ -53,9 +61,41 @@ class Parser(argparse.ArgumentParser):
         # Older Pythons take -1e-5 for an option.
         self._negative_number_matcher = re.compile(r"-\.?\d")
 
+    def parse_known_args(self, args=None, namespace=None):
+        """As argparse does, with LOW:HIGH of `pairs` in two, and options that are like others."""
+        words = list(sys.argv[1:] if args is None else args)
+        for k in reversed(range(len(words))):
+            option, equals, value = words[k].partition("=")
+            if option in self.pairs and equals and value.count(":") == 1:
+                words[k : k + 1] = [option, *value.split(":")]
+            elif option in self.pairs and words[k + 1 : k + 2] and words[k + 1].count(":") == 1:
+                words[k + 1 : k + 2] = words[k + 1].split(":")
+        namespace, unknown = super().parse_known_args(words, namespace)
+        options = [word.partition("=")[0] for word in unknown if word.startswith("--")]
+        if options and not self.commands:
+            name = options[0].lstrip("-")
+            near = did_you_mean(name, (x.lstrip("-") for x in self._option_string_actions))
+            near = near.replace("mean ", "mean --").replace(" or ", " or --")
+            if not near and "--bounds" in self._option_string_actions and name.isidentifier():
+                near = f": did you mean --bounds {name}=LOW:HIGH or --set {name}=VALUE?"
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{near or self._see}")
+        return namespace, unknown
+
+    @property
+    def _see(self) -> str:
+        return f"; see {self.prog} --help"
+
     def error(self, message):
-        missing = message.startswith("the following arguments are required")
-        refuse(f"{message}; see {self.prog} --help" if missing else message)
+        if message.startswith("the following arguments are required"):
+            message += self._see
+        wrong = re.search(r"argument COMMAND: invalid choice: '(.*?)'", message)
+        if wrong:
+            word = wrong[1]
+            near = did_you_mean(word, self.commands)
+            if Path(word).suffix:
+                near = f": a command comes before its file, fractaljax stability {word}"
+            message = f"invalid choice: {word!r}, not one of {', '.join(self.commands)}{near}"
+        refuse(message)
 
 
 def add_out(parser, folder: str) -> None:
@@ -113,6 +153,19 @@ def add_scene_file(parser) -> None:
     parser.add_argument(
         "scene", nargs="?", type=Path, help="a scene file; else the reference brake"
     )
+    add_set(parser)
+
+
+def add_set(parser) -> None:
+    """Add `--set`, and `--json`, which every command has that takes a scene."""
+    parser.add_argument(
+        "--set",
+        action="extend",
+        nargs="+",
+        metavar="NAME=VALUE",
+        help="change quantities of the scene for this run, in SI units: --set D=2.5 P=1500",
+    )
+    add_json(parser)
 
 
 def add_constant_friction(parser) -> None:
@@ -129,19 +182,22 @@ def load_mechanism(
     structures: bool = False,
     over: Mapping[str, Sequence[float]] | None = None,
     quiet: bool = False,
+    changes: Sequence[str] | None = None,
 ) -> Any:
     """The scene in a file, with `structures` also a structure; without a file the reference brake.
 
     A large sparse structure is reduced as the table [reduction] of its file says, also over the
-    ranges of quantities in `over`.
+    ranges of quantities in `over`. `changes` are those of --set, NAME=VALUE each.
 
-    **Raises:** `ValueError` if it has no such table.
+    **Raises:** `ValueError` if it has no such table, and for a file that holds no scene.
     """
     from .._mechanism.scene import Scene, brake_scene
 
-    if path is None:
-        return brake_scene()
-    mechanism: Any = load_noted(path) if structures else Scene.load(path)
+    with remarks():
+        if path is None:
+            return changed(brake_scene(), changes)
+        _require_scene_file(path)
+        mechanism = changed(load_noted(path) if structures else Scene.load(path), changes)
     if not mechanism.is_sparse:
         return mechanism
     from .._stability.reduction import reduce
@@ -154,6 +210,30 @@ def load_mechanism(
         )
     options["over"] = options.get("over", {}) | dict(over or {})
     return reduce(mechanism, **options, progress=not quiet)
+
+
+def changed(mechanism: Any, changes: Sequence[str] | None) -> Any:
+    """The scene or structure with the quantities of --set, NAME=VALUE each."""
+    if not changes:
+        return mechanism
+    stray = [text for text in changes if text.endswith(".toml") and "=" not in text]
+    if stray:
+        raise ValueError(f"--set must be NAME=VALUE, got {stray[0]!r}: the file comes before it")
+    pairs = parse_pairs("--set", list(changes), "NAME=VALUE")
+    return mechanism.replace(**{name: number(f"--set {name}", x) for name, x in pairs.items()})
+
+
+def _require_scene_file(path: Path) -> None:
+    """Refuse a file of matrices or heights, and say which command or file takes it."""
+    kind = path.suffix.lower()
+    if kind in ("", ".toml", ".txt"):
+        return
+    if kind in (".mtx", ".mat", ".npz", ".npy", ".pch", ".bdf", ".csv", ".inp"):
+        raise ValueError(
+            f"{path}: a scene or structure is a TOML file; one with [structure], M = "
+            f'"{path.name}" and K = "another file", and its joints, takes matrices '
+            "(docs/model.md); fractaljax identify takes heights"
+        )
 
 
 def load_noted(path: Path) -> Any:

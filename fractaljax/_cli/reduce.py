@@ -3,8 +3,9 @@
 from pathlib import Path
 from typing import Any
 
+from .json_text import files as paths, show, stability_content
 from .output import output
-from .parsing import add_out, load_noted, numbers, parse_pairs, parse_reduction
+from .parsing import add_out, add_set, changed, load_noted, numbers, parse_pairs, parse_reduction
 
 _FORM = "NAME=LOW:HIGH"
 _FILE = "reduced.toml"
@@ -33,6 +34,7 @@ def add_reduce(commands) -> None:
     parser.add_argument(
         "--tol", type=float, help="largest error of an eigenvalue s, relative to |s|; default 1e-8"
     )
+    add_set(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.set_defaults(run=_run)
 
@@ -61,6 +63,7 @@ def _run(arguments) -> int:
     structure = load_noted(arguments.structure)
     if structure.sole_joint is not None:
         raise ValueError(f"{arguments.structure}: a scene has two directions, which are few enough")
+    structure = changed(structure, arguments.set)
     with output(arguments.out) as write:
         reduced = reduce(structure, **options, progress=not arguments.quiet)
         files = reduced._files(arguments.out / _FILE)
@@ -73,7 +76,17 @@ def _run(arguments) -> int:
         "largest error, of |s|": f"{reduction.error:.2g}",
         "points with eigenvectors": f"{len(reduction.points)}",
     }
-    print(
-        f"{table([''], [rows])}\n\n{stability_table(reduced, reduction.friction_slope)}\n{written}"
+    slope = reduction.friction_slope
+    about = {
+        "degrees_of_freedom": {"before": structure.n, "after": reduced.n},
+        "band": reduction.band,
+        "over": reduction.over,
+        "error": reduction.error,
+        "files": paths(arguments.out, [path.name for path in files]),
+    }
+    show(
+        arguments,
+        f"{table([''], [rows])}\n\n{stability_table(reduced, slope)}\n{written}",
+        lambda: about | stability_content(reduced, slope),
     )
     return 0

@@ -1,5 +1,7 @@
 """`fractaljax validate`: check the installation."""
 
+from .json_text import add_json, show, table_content
+
 
 def add_validate(commands) -> None:
     """Add `fractaljax validate`."""
@@ -7,6 +9,7 @@ def add_validate(commands) -> None:
         "validate", help="check this installation", description=_run.__doc__
     )
     parser.add_argument("cases", nargs="*", metavar="CASE", help="cases to compute; default all")
+    add_json(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.set_defaults(run=_run)
 
@@ -19,5 +22,5 @@ def _run(arguments) -> int:
     from .._validate.validate import validate
 
     validation = validate(*arguments.cases, progress=not arguments.quiet)
-    print(validation)
+    show(arguments, repr(validation), lambda: table_content(*validation.rows()))
     return 0 if validation.agrees else 1

@@ -16,13 +16,14 @@ import jax
 import numpy as np
 from jaxtyping import ScalarLike
 
+from .._base import html
 from .._base.files import write_together
 from .._base.parts import Record, brief, flag, require_kind, whole
 from .._base.table import table
 from .._contact.contact import Contact
 from .._contact.persson import PerssonContact
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import replaced
+from .._mechanism.quantities import meaning, replaced, unit, value_of
 from .._stability.stability import growth_rate, require_computable
 from .._stability.summary import stiffness_remarks
 from .._surface.roughness import Roughness, roughness
@@ -206,6 +207,17 @@ class Design(Record):
         **Raises:** `OSError` if a file cannot be written.
         """
         write_together(design_files(self, Path(path)))
+
+    def _repr_html_(self) -> str:
+        rows: list[html.Row] = [("outcome", self.outcome, "", "")]
+        for name, ends in self.bounds.items():
+            before, after = (float(value_of(x, name)) for x in (self.initial, self.scene))
+            low, high = ends
+            words = f"{meaning(self.scene, name)}, from {low:g} to {high:g}"
+            rows.append((name, f"{before:.6g} -> {after:.6g}", unit(self.scene, name), words))
+        aside = {"scene", "initial", "bounds", "result", "history", "options"}
+        names = [name for name in self._table_names() if name not in aside]
+        return html.table("fractaljax.Design", rows + html.record_rows(self, names))
 
     def __repr__(self) -> str:
         shown = self.initial, self.scene, self.friction_slope, self.active, self.wavelengths

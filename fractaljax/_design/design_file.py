@@ -4,7 +4,6 @@ import dataclasses
 import importlib
 import inspect
 import os
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ from .._base.toml import (
     write_toml,
 )
 from .._base.versions import versions, versions_differ
+from .._base.warn import warn_user
 from .._mechanism.joint import JOINT_LAWS
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.scene import Scene
@@ -101,7 +101,7 @@ def read_design(
         except KeyError as error:
             raise ValueError(f"not a design file, it lacks {error}") from None
     if others := versions_differ(document):
-        warnings.warn(f"{path} was {others}: digits may differ", stacklevel=3)
+        warn_user(f"{path} was {others}: digits may differ")
     return inputs
 
 
@@ -120,7 +120,8 @@ def read_tolerance(path: str | os.PathLike) -> Tolerance:
 
 def _tolerance_table(tolerance: Tolerance) -> dict[str, Any]:
     covariance = np.asarray(tolerance.covariance, float).tolist()
-    return {"names": tolerance.names, "covariance": covariance}
+    q = None if tolerance.q is None else float(tolerance.q)
+    return {"names": tolerance.names, "covariance": covariance, "q": q}
 
 
 def _with_arguments(kind: type, table: Mapping[str, Any], where: str) -> Any:

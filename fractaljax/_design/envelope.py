@@ -15,6 +15,7 @@ import numpy as np
 
 from .._base.parts import Record, brief, scalar
 from .._base.ranges import within
+from .._base.suggest import did_you_mean
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import quantity_names, replaced
 
@@ -126,7 +127,8 @@ class Envelope(Record):
         ]
         for name in self.names:
             if name not in available:
-                raise ValueError(f"envelope names {name!r}; there are {', '.join(available)}")
+                near = did_you_mean(name, available)
+                raise ValueError(f"envelope names {name!r}; there are {', '.join(available)}{near}")
             if name in designed:
                 raise ValueError(f"{name} cannot be both designed and in the envelope")
         # Domains are intervals: where all corners are inside, everything is.

@@ -181,6 +181,8 @@ class DesignProblem(eqx.Module):
 
     def _named_row(self, u) -> Float[Array, " k"]:
         """Objective and residuals, the largest of those at all conditions."""
+        if isinstance(u, Mapping):
+            raise TypeError("u must be an array of numbers from 0 to 1, as problem.start is")
         u = jnp.asarray(u, self.low.dtype)
         if u.shape != self.low.shape:
             raise ValueError(f"u must have the shape {self.low.shape}, got {u.shape}")

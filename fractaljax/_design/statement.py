@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._base.parts import brief, flag, is_traced, nan_where, require_kind, require_scalar, scalar
+from .._base.suggest import did_you_mean
 from .._contact.contact import Contact
 from .._dynamics.scaled import degrees_of_freedom, hybrid_system
 from .._mechanism.mechanism import Mechanism
@@ -159,11 +160,14 @@ def _make_cycles(x, objective, constraints, robust: bool) -> FollowedCycles | No
 def checked_bounds(x: Mechanism, bounds: Mapping[str, Sequence[float]]) -> dict[str, tuple]:
     """Bounds by name, each (lower, upper), in their domain and around the value that `x` has."""
     if not isinstance(bounds, Mapping):
-        raise TypeError(f"bounds must be a mapping, got {brief(bounds)}")
+        raise TypeError(
+            f'bounds must be a mapping such as {{"D": (2.3, 2.8)}}, got {brief(bounds)}'
+        )
     names = quantity_names(x)
     for name in bounds:
         if name not in names:
-            raise ValueError(f"bounds on {brief(name)}: there are {', '.join(names)}")
+            near = did_you_mean(str(name), names)
+            raise ValueError(f"bounds on {brief(name)}: there are {', '.join(names)}{near}")
     if not bounds:
         raise ValueError("bounds must name a quantity, got none")
     checked = {}

@@ -1,7 +1,9 @@
 """Scatter of quantities as machined: quantiles over a fixed quadrature, and draws at random.
 
-The scatter is normal, with any covariance; that of a fractal dimension is truncated where it would
-leave (2, 3), and what is correlated with it follows. The nodes of the quadrature are a lattice of a
+The scatter is normal, with any covariance; that of a fractal dimension, a Hurst exponent or a
+roll-off is truncated where it would leave its domain, and what is correlated with it follows. The
+height of a fractal surface scatters as ln m(q) at one wavenumber, from which ln G follows at each D
+(`surface_scatter.py`). The nodes of the quadrature are a lattice of a
 normal distribution twice as wide, weighted back, so that the tails which decide a quantile are well
 resolved. The same nodes serve every design, so that a quantile is continuous in the design.
 """
@@ -19,6 +21,7 @@ from jaxtyping import Array, ArrayLike, Float
 from .._base.batches import in_batches
 from .._base.parts import Record, brief, is_traced, number, scalar
 from .._base.ranges import low_discrepancy
+from .._base.suggest import did_you_mean
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import (
     quantity_names,
@@ -29,30 +32,40 @@ from .._mechanism.quantities import (
     value_of,
     with_optional,
 )
+from .._mechanism.scene import Scene, stiffness
 from .._stability.stability import growth_rate
+from .._surface.surface_scatter import HEIGHT, SurfaceScatter
 from .envelope import Envelope
-from .truncated import REACH, is_fractal_dimension, truncated
+from .truncated import REACH, ends_of, truncated
 
 
 class Tolerance(Record):
     """Scatter of named quantities: `Tolerance(("D", "ln G"), covariance)`, covariance (k, k).
 
-    "ln G" scatters ln G. `Tolerance.of` takes a mapping of independent standard deviations and an
-    `Identification`, whose D and ln G are strongly correlated.
+    "ln G" scatters ln G. "ln m(q)" scatters the height of a fractal surface at the wavenumber `q`
+    [rad/m], where the error of a measured height is uncorrelated with D; G follows from it and D.
+    `Tolerance.of` takes a mapping of independent standard deviations, a `SurfaceScatter`, and what
+    has one, as an `Identification` does.
 
     Scatter is normal. A fractal dimension D whose six standard deviations would leave (2, 3) has
-    the normal distribution truncated to it, at any standard deviation; ln G and whatever else is
-    correlated with D keeps its normal distribution at each D. Others must stay inside their domains
+    the normal distribution truncated to it, at any standard deviation; whatever is correlated with
+    D keeps its normal distribution at each D. A Hurst exponent is truncated to (0, 1) and a
+    roll-off to the wavelengths of its spectrum likewise. Others must stay inside their domains
     within six standard deviations.
 
-    **Raises:** `ValueError` unless the covariance is symmetric, positive semidefinite and not 0.
+    **Raises:** `ValueError` unless the covariance is symmetric, positive semidefinite and not 0,
+    and for a q without "ln m(q)" or that without a q above 0.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)  # of the quantities, or of their logarithms
     covariance: Float[Array, "k k"]  # of what is named, in SI units
+    q: Float[Array, ""] | None  # rad/m: wavenumber of "ln m(q)"
 
-    def __init__(self, names: Sequence[str], covariance: ArrayLike):
+    def __init__(self, names: Sequence[str], covariance: ArrayLike, q: ArrayLike | None = None):
         self.names = tuple(names)
+        if (q is not None) != any(map(_is_height, self.names)):
+            raise ValueError(f'tolerance takes q with "ln {HEIGHT}", got {self.names} and q = {q}')
+        self.q = None if q is None else scalar("q", q, above=0)
         array = covariance if hasattr(covariance, "dtype") else np.asarray(covariance)
         self.covariance = number("covariance", array)
         if self.covariance.shape != (len(self.names),) * 2 or not self.names:
@@ -76,10 +89,14 @@ class Tolerance(Record):
     def of(cls, scatter: Any) -> "Tolerance":
         """A tolerance from `scatter`.
 
-        It is a tolerance, a mapping of names to standard deviations, or an identification.
+        It is a tolerance, a mapping of names to standard deviations, a `SurfaceScatter` or what
+        has one as `scatter`: an identification.
         """
+        scatter = getattr(scatter, "scatter", scatter)
         if isinstance(scatter, Tolerance):
             return scatter
+        if isinstance(scatter, SurfaceScatter):
+            return cls(scatter.names, scatter.covariance, scatter.q)
         if hasattr(scatter, "D_standard_error") and hasattr(scatter, "covariance"):
             return cls(("D", "ln G"), scatter.covariance)
         if not isinstance(scatter, Mapping):
@@ -100,13 +117,14 @@ class Tolerance(Record):
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """The names without "ln "."""
-        return tuple(name.removeprefix("ln ") for name in self.names)
+        """What scatters: the names without "ln ", and G for "ln m(q)"."""
+        plain = [name.removeprefix("ln ") for name in self.names]
+        return tuple(n.removesuffix(HEIGHT) + "G" if n.endswith(HEIGHT) else n for n in plain)
 
     def check(self, x: Mechanism, ranges: Mapping[str, Sequence[float]]) -> None:
         """Refuse names that `x` lacks, and a scatter that leaves a domain within six deviations.
 
-        That of a fractal dimension is truncated instead. `ranges` are those inside which a quantity
+        What is truncated to its domain cannot leave it. `ranges` are those inside which a quantity
         varies otherwise.
         """
         names = quantity_names(x)
@@ -114,11 +132,12 @@ class Tolerance(Record):
             self.quantities, self.standard_deviations.items(), strict=True
         ):
             if name not in names:
-                raise ValueError(f"tolerance names {label!r}; there are {', '.join(names)}")
+                near = did_you_mean(name, names)
+                raise ValueError(f"tolerance names {label!r}; there are {', '.join(names)}{near}")
             for each in [] if is_traced(x) else _scattered_names(x, name):
                 ends = ranges.get(each, ranges.get(name, (float(value_of(x, each)),)))
                 low, high = min(ends), max(ends)
-                if is_fractal_dimension(x, each):
+                if self._ends(x, each) is not None or _is_height(label):
                     pass
                 elif name == label:
                     low, high = low - REACH * sigma, high + REACH * sigma
@@ -126,7 +145,8 @@ class Tolerance(Record):
                     most = min(REACH * sigma, _largest(value_of(x, each).dtype))
                     low, high = low * math.exp(-most), high * math.exp(most)
                 try:
-                    replaced(x, {each: np.array([low, high])})
+                    for end in (low, high):
+                        replaced(x, {each: end})
                 except ValueError as error:
                     raise ValueError(
                         f"tolerance of {label} leaves its domain within {REACH:g} deviations: "
@@ -162,33 +182,57 @@ class Tolerance(Record):
 
         `values` holds a plain name, "D", where it stands for all joints at once.
         """
-        values_at = {}
+        values_at, heights = {}, []
         shifts = self._truncate(x, values, shift)
         for name, label, by in zip(self.quantities, self.names, shifts, strict=True):
+            if _is_height(label):
+                heights.append((name, by))
+                continue
             for each, value in _values(x, name, values).items():
                 if name == label:
                     values_at[each] = value + by
                 else:
                     most = _largest(jnp.result_type(value))
                     values_at[each] = value * jnp.exp(jnp.clip(by, -most, most))
+        for name, by in heights:
+            for each, G in _values(x, name, values).items():
+                dimension = f"{each[:-1]}D"
+                D = self._value(x, values, dimension)
+                scattered = values_at.get(dimension, D)
+                scattered, values_at[each] = _with_height(D, G, scattered, by, self.q)
+                if dimension in values_at:
+                    values_at[dimension] = scattered
         return values_at
 
-    def _truncate(self, x: Mechanism, values: Mapping[str, Any], shift: Any) -> list[Any]:
-        """The shifts with those of fractal dimensions truncated, and of all that is correlated.
+    def _value(self, x: Mechanism, values: Mapping[str, Any], name: str) -> Any:
+        """The value of a quantity of `x`, of those at `values` if it is among them."""
+        plain = name.rpartition(".")[2]
+        stored = x.stored_quantities()[name].value
+        return values.get(name, values.get(plain, stored))
 
-        A second dimension is truncated by itself: it does not shift the first.
+    def _ends(self, x: Mechanism, name: str, values: Mapping[str, Any] = {}) -> Any:
+        """The ends to which a quantity is truncated, or None."""
+        joint = name.rpartition(".")[0]
+        prefix = f"{joint}." if joint else ""
+        return ends_of(x, name, lambda plain: self._value(x, values, prefix + plain))
+
+    def _truncate(self, x: Mechanism, values: Mapping[str, Any], shift: Any) -> list[Any]:
+        """The shifts with those that have ends truncated, and of all that is correlated.
+
+        A second one is truncated by itself: it does not shift the first.
         """
         shifts, fixed = [*shift], set()
         for i, (name, label) in enumerate(zip(self.quantities, self.names, strict=True)):
-            if not is_fractal_dimension(x, name):
-                continue
             low, high = -math.inf, math.inf  # all joints shift by the same amount
-            for value in _values(x, name, values).values():
+            for each, value in _values(x, name, values).items():
+                if _is_height(label) or (ends := self._ends(x, each, values)) is None:
+                    continue
                 below, above = (
-                    end - value if name == label else jnp.log(end / value)
-                    for end in (2.0, 3.0)  # of fractal dimensions
+                    end - value if name == label else jnp.log(end / value) for end in ends
                 )
                 low, high = jnp.maximum(low, below), jnp.minimum(high, above)
+            if isinstance(low, float):
+                continue
             variance = self.covariance[i, i]
             more = truncated(shifts[i], jnp.sqrt(variance), low, high) - shifts[i]
             share = self.covariance[i] / jnp.where(variance > 0, variance, 1)
@@ -197,6 +241,24 @@ class Tolerance(Record):
                 if j == i or j not in fixed:
                     shifts[j] = shifts[j] + (more if j == i else share[j] * more)
         return shifts
+
+
+def _is_height(label: str) -> bool:
+    """True if a label is "ln m(q)", of all joints or of one."""
+    return label.startswith("ln ") and label.removeprefix("ln ").rpartition(".")[2] == HEIGHT
+
+
+def _with_height(D: Any, G: Any, scattered: Any, by: Any, q: Any) -> tuple[Any, Any]:
+    """D and G of a surface whose D is `scattered` and whose ln m(q) is shifted `by`.
+
+    With f = q/(2 pi), ln m(q) = 2 (D - 2) (ln G + ln f) - 2 ln f - ln 2. Where G would leave the
+    range of its precision, D comes no closer to 2: the height is kept.
+    """
+    log_f = jnp.log(q / (2 * math.pi))
+    slope = 2 * (D - 2) * (jnp.log(G) + log_f) + by
+    most = -math.log(float(jnp.finfo(jnp.result_type(G)).tiny)) - jnp.abs(log_f) - 2
+    D = 2 + jnp.maximum(scattered - 2, jnp.abs(slope) / (2 * most))
+    return D, jnp.exp(slope / (2 * (D - 2)) - log_f)
 
 
 def _values(x: Mechanism, name: str, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -279,6 +341,40 @@ def _growth_rates(x, names, values, friction_slope):
     return jax.vmap(one)(values)
 
 
+@eqx.filter_jit
+def _joints(x, names, values):
+    def one(row):
+        varied = substituted(x, dict(zip(names, row, strict=True)))
+        return jnp.stack([*stiffness(varied), growth_rate(varied)])
+
+    return jax.vmap(one)(values)
+
+
+def scattered_joint(
+    scene: Scene, scatter: Any, *, samples: int = 256, seed: int = 0
+) -> dict[str, tuple[float, float, float]]:
+    """K_n, K_t [N/m] and growth rate [1/s] of a scene, and the middle 68 % of each over a scatter.
+
+    By name: as it is, and the quantiles .16 and .84 of `samples` draws.
+    """
+    tolerance = Tolerance.of(scatter)
+    tolerance.check(scene, {})
+    shifts = tolerance.shifts(
+        np.random.default_rng(seed).standard_normal((samples - 1, len(tolerance.names)))
+    )
+    base = tolerance.base(scene)
+    scattered = tolerance.scattered(scene, base, shifts.T)
+    rows = np.stack(
+        [np.append(base[n], np.broadcast_to(v, samples - 1)) for n, v in scattered.items()], axis=1
+    )
+    values = np.asarray(_joints(scene, tuple(scattered), rows))
+    low, high = np.nanquantile(values[1:], [0.16, 0.84], axis=0)
+    names = ("K_n", "K_t", "growth rate")
+    return {
+        name: (float(values[0, i]), float(low[i]), float(high[i])) for i, name in enumerate(names)
+    }
+
+
 def squeal_probability(
     x: Mechanism,
     tolerance: Any,
@@ -296,7 +392,8 @@ def squeal_probability(
     **Arguments:**
 
     - `x`: a scene or structure of scalars.
-    - `tolerance`: an `Identification`, a `Tolerance` or a mapping of standard deviations. A name
+    - `tolerance`: an `Identification`, a `SurfaceScatter`, a `Tolerance` or a mapping of standard
+      deviations. A name
       without a joint, "D", of a structure moves all joints that have one by the same amount.
     - `envelope`: an `Envelope` or a mapping; every draw is at a condition drawn evenly from it. By
       default there is none.

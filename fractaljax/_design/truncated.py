@@ -1,4 +1,4 @@
-"""Normal scatter of a fractal dimension, which has to stay above 2 and below 3.
+"""Normal scatter of what has to stay between two ends: D, a Hurst exponent, a roll-off wavelength.
 
 Where six standard deviations stay inside, nothing is changed. Elsewhere the normal distribution is
 cut off at the ends and scaled up to a total of 1, as a measured D is known with nothing else known
@@ -7,6 +7,8 @@ that they follow the design continuously. The mass beyond six deviations, 1e-9, 
 """
 
 import dataclasses
+import math
+from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
@@ -14,16 +16,33 @@ from jax.scipy.special import ndtr, ndtri
 from jaxtyping import Array
 
 from .._mechanism.mechanism import Mechanism
+from .._surface.self_affine import SelfAffine
 from .._surface.surface import Surface
 
 REACH = 6.0  # standard deviations that must stay inside the domain of a quantity
 
 
-def is_fractal_dimension(x: Mechanism, name: str) -> bool:
-    """True if a quantity is the D of a surface, of all joints or of one."""
+def ends_of(x: Mechanism, name: str, value_at: Callable[[str], Any]) -> tuple[Any, Any] | None:
+    """The ends of a quantity that is truncated to them, of all joints or of one; None of others.
+
+    `value_at` returns the value of another quantity of the same joint, by its plain name.
+    """
     quantities = x.stored_quantities()
-    fields = {field.name: field for field in dataclasses.fields(Surface)}
-    return name in quantities and quantities[name].meaning == fields["D"].metadata["meaning"]
+    if name not in quantities:
+        return None
+    for kind, field, ends in (
+        (Surface, "D", lambda: (2.0, 3.0)),
+        (SelfAffine, "H", lambda: (0.0, 1.0)),
+        (SelfAffine, "rolloff", lambda: (value_at("shortest"), _longest(value_at("longest")))),
+    ):
+        meaning = {each.name: each for each in dataclasses.fields(kind)}[field].metadata["meaning"]
+        if quantities[name].meaning == meaning:
+            return ends()
+    return None
+
+
+def _longest(value: Any) -> Any:
+    return math.inf if value is None else value
 
 
 def truncated(shift: Any, sigma: Array, low: Any, high: Any) -> Array:

@@ -105,10 +105,11 @@ def verdict(
     """Ask of a scene or a structure whether it stays quiet where an assumption is another.
 
     Its growth rate [1/s] as it is; with the load P in the friction, or without it where it is
-    there; under other contact laws; with K_t/K_n between its own, the fractal law's and Mindlin's,
-    the worst of 65 values, or 17 of a structure; the probability of squeal, quiet below 5 percent;
-    the largest kick survived; and while its surfaces run in. What no argument asks for is named.
-    The joints of a structure change together.
+    there; with the tangential spring in series with the friction, as `Jenkins` has it, where K_t
+    has no part in steady sliding; under other contact laws; with K_t/K_n between its own, the
+    fractal law's and Mindlin's, the worst of 65 values, or 17 of a structure; the probability of
+    squeal, quiet below 5 percent; the largest kick survived; and while its surfaces run in. What
+    no argument asks for is named. The joints of a structure change together.
 
     **Arguments:**
 
@@ -143,6 +144,8 @@ def verdict(
     for i, law in enumerate(laws):
         require_kind(f"laws[{i}]", law, Contact)
     cases = [("", f"as it is ({laws_in_use})", x), *_other_load(x, friction_slope)]
+    in_series = "K_t beside the friction", "tangential spring in series"
+    cases.append((*in_series, _with_springs_in_series(x)))
     by = [(type(law).__name__, with_contact_law(x, law)) for law in laws]
     if area is not None:
         by += [(kind.__name__, with_contacts(x, laws)) for kind, laws in _laws_of(x, area)]
@@ -220,6 +223,20 @@ def _laws_of(x: Mechanism, area: Any) -> list[tuple[type[Contact], dict[str, Con
         asperity[name] = AsperityContact(*arguments, L_s)
         persson[name] = PerssonContact(*arguments, A, L, L_s)
     return [(AsperityContact, asperity), (PerssonContact, persson)]
+
+
+def _with_springs_in_series(x: Mechanism) -> Mechanism:
+    """`x` with each tangential spring in series with the friction of its joint.
+
+    In steady sliding the slider slips: the spring holds mu N, and K_t is in no matrix.
+    """
+    contacts = {}
+    for name, part in x.joints_by_name().items():
+        K_n, _ = part.contact.stiffness(part.friction.mu_s, part.friction.mu_m)
+        load = getattr(part.contact, "P", None)
+        contact = FixedContact(1.0, 0.0, None if load is None else 1.0)
+        contacts[name] = substitute(contact, {"K_n": K_n} | ({} if load is None else {"P": load}))
+    return with_contacts(x, contacts)
 
 
 class _GrowthRates(NamedTuple):

@@ -204,7 +204,13 @@ class LimitCycle(Record):
     result: CycleResult  # a member of CycleResult
     of_scene: bool = eqx.field(static=True, repr=False)  # fractions are of directions, not joints
     _system: HybridSystem = eqx.field(repr=False)
-    _orbit: Any = eqx.field(repr=False)  # Orbit, or regularised.SmoothOrbit
+    _orbit: Any = eqx.field(repr=False)  # Orbit, or smooth.SmoothOrbit
+    # The states of the laws at `state`: of law by law, face by face; None of a law without
+    internal: Float[Array, " s"] | None = eqx.field(default=None, repr=False)
+
+    def _table_names(self):
+        derived = "frequency amplitude velocity_min velocity_max normal_force stick_fraction"
+        return [*super()._table_names(), *f"{derived} open_fraction multipliers".split()]
 
     def _shown(self) -> Iterator[str]:
         yield from super()._shown()
@@ -248,7 +254,8 @@ class LimitCycle(Record):
     def stick_fraction(self) -> Float[Array, " m"]:
         """The share of the period in stick: of a scene's two directions, or of each joint.
 
-        For a regularised cycle, it is the share with abs(v) < eps.
+        For a regularised cycle, it is the share with abs(v) < eps. NaN for laws with memory, which
+        creep instead.
         """
         stick = self._fractions.stick
         return stick if self.of_scene else stick[..., _tangential(self._system)]
@@ -339,7 +346,7 @@ class LimitCycle(Record):
         **Raises:** `ValueError` for the regularised law, which has none.
         """
         if not isinstance(self._orbit, Orbit):
-            raise ValueError("a regularised cycle has no contact states: leave regularisation out")
+            raise ValueError("a regularised cycle, or one with memory, has no contact states")
         system, share = self._system, jnp.arange(n) / n
         states = self._orbit.states_at(share * self.period * system.omega).T
         return jnp.where(jnp.isfinite(self.period), states, jnp.nan)
@@ -353,7 +360,7 @@ class LimitCycle(Record):
         if concrete(self.period) is None or self.period.ndim:
             raise ValueError("switches() needs one cycle, outside of jit: index the batch first")
         if not isinstance(self._orbit, Orbit):
-            raise ValueError("a regularised cycle has no switches")
+            raise ValueError("a regularised cycle has no switches, nor has one with memory")
         segments = self._orbit.segments
         used = np.asarray(segments.guard) != UNUSED
         states = np.asarray(segments.s)[:, used].astype(int)

@@ -91,7 +91,9 @@ def _numbers(name: str, values: Any) -> Numbers:
     return number(name, values)
 
 
-def excited_system(mechanism: Any, excitation: Excitation | None) -> HybridSystem:
+def excited_system(
+    mechanism: Any, excitation: Excitation | None, memory: bool = False
+) -> HybridSystem:
     """The scaled system of a scene or a structure, with the excitation if there is one.
 
     Its last degree of freedom is z, dimensionless and of order one. Its unit of time is the
@@ -99,7 +101,7 @@ def excited_system(mechanism: Any, excitation: Excitation | None) -> HybridSyste
     0, the unit of velocity is the amplitude of the acceleration times that of time.
     """
     if excitation is None:
-        return hybrid_system(mechanism)
+        return hybrid_system(mechanism, memory=memory)
     require_kind("excitation", excitation, Excitation)
     cosine, sine = excitation.parts(mechanism)
     cosine, sine = mechanism.over_mass(jnp.stack([cosine, sine], axis=1)).T
@@ -110,7 +112,7 @@ def excited_system(mechanism: Any, excitation: Excitation | None) -> HybridSyste
         largest = jax.lax.stop_gradient(jnp.where(largest > 0, largest, 1))
         return jnp.where(V > 0, V, largest)
 
-    system = hybrid_system(mechanism, unit_speed)
+    system = hybrid_system(mechanism, unit_speed, memory)
     omega = jnp.hypot(system.omega, Omega)
     r, unit, n = system.omega / omega, omega * system.speed, system.n
     Omega = Omega / omega

@@ -428,13 +428,14 @@ class HybridSystem(eqx.Module):
         holding = self.holding_forces(rate, self.is_held(s))
         return rate + self.along(self.acceleration(holding)), holding
 
-    def regularised_field(self, y, signs) -> Array:
-        """dy/dt where friction has smoothed `signs` (f, ...) between -1 and 1."""
-        faces = self._faces_at(y, jnp.where(self.open_faces(y), OPEN, FORWARD))
-        friction = self.friction(faces.w, faces.loads, signs)
-        return jnp.concatenate(
-            [y[self.n :], self._driven(y, self._with_joint_forces(friction, faces))]
-        )
+    def smooth_faces(self, y) -> FaceMotion:
+        """The faces where no friction force jumps: they slip, or are open."""
+        return self._faces_at(y, jnp.where(self.open_faces(y), OPEN, FORWARD))
+
+    def smooth_field(self, y, faces: FaceMotion, friction) -> Array:
+        """dy/dt under forces of friction (f, ...) on the closed ones of its `smooth_faces`."""
+        forces = self._with_joint_forces(friction, faces)
+        return jnp.concatenate([y[self.n :], self._driven(y, forces)])
 
     def open_faces(self, y) -> Array:
         """True for faces (f, ...) of joints that can open and whose normal force would pull."""

@@ -2,15 +2,16 @@
 
 import functools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, ScalarLike
 
-from .._base.parts import concrete, number, raise_unless, require_kind, whole
+from .._base.parts import concrete, raise_unless, require_kind, whole
 from .._base.programs import exported_jit
 from .._mechanism.mechanism import Mechanism
+from .._mechanism.quantities import has_memory
 from .._stability.stability import growth_rate
 from .cycle import CycleResult, LimitCycle, Orbit
 from .cycle_search import CycleSearch
@@ -22,6 +23,7 @@ from .scaled import (
     degrees_of_freedom,
     require_drive,
     scaled_start,
+    smoothing,
     start_state,
     steps_follow_motion,
 )
@@ -158,6 +160,9 @@ def limit_cycle(
     respect to `start` are zero. An orbit that repels so weakly that the motion does not leave it is
     returned as `unstable`.
 
+    Friction with memory has no switches: the motion is diffrax's, the orbit y(T) = y, with the
+    states of the laws in y and, as `internal`, beside `state`.
+
     **Arguments:**
 
     - `mechanism`: a scene, or a structure of n degrees of freedom whose joints all have a V;
@@ -180,7 +185,8 @@ def limit_cycle(
       largest relative difference of period and amplitudes, and the result `depends_on_eps` where it
       is above 1e-3. Derivatives differ by far more than values do.
     - `solver`: a diffrax solver for the regularised law, Tsit5 by default; an implicit one, such
-      as Kvaerno5, for a small eps.
+      as Kvaerno5, for a small eps. Friction with memory takes Kvaerno5 by default; with soft
+      bristles Tsit5 is quicker.
     - `max_steps`: most steps of that solver in one period, 4096 by default.
     - `rtol`: relative tolerance of period and states, 1e-9 by default and at least 9.1e-13; in
       float32 both are 4.9e-4. It sets the number of segments.
@@ -200,19 +206,23 @@ def limit_cycle(
     friction with a jump; `RuntimeError` if `throw`.
     Under a trace (`jit`, `vmap`) everything is NaN instead.
     """
-    start = None if start is None else start_state(start, degrees_of_freedom(mechanism))
+    memory = has_memory(mechanism)
+    start = None if start is None else start_state(start, degrees_of_freedom(mechanism), memory)
     inputs = mechanism, start, excitation
     returns, count, static = check_arguments(*inputs, rtol, max_returns, search, segments)
+    eps, steps = smoothing(regularisation, memory), whole("max_steps", max_steps, 1)
+    options: Any = solver, static["rtol"], steps, int(max_returns), static["of_scene"]
+    if memory:
+        from .smooth import smooth_cycle
+
+        cycle = smooth_cycle(*inputs, None, None, *options)
+        return raise_unless(CycleResult.converged, cycle) if throw else cycle
     arguments = *scale_problem(mechanism, excitation), start, returns
     cycle = find_cycle(*arguments, segments=count, **static)
     if segments is None:
         cycle = refine_cycle(cycle, arguments, count, static)
-    if regularisation is not None:
-        from .regularised import regularised_cycle, without_jump
+    if eps is not None:
+        from .smooth import smooth_cycle, without_jump
 
-        eps = number("regularisation", regularisation, above=0)
-        steps = whole("max_steps", max_steps, 1)
-        cycle = regularised_cycle(
-            without_jump(mechanism), start, excitation, eps, cycle, solver, static["rtol"], steps
-        )
+        cycle = smooth_cycle(without_jump(mechanism), start, excitation, eps, cycle, *options)
     return raise_unless(CycleResult.converged, cycle) if throw else cycle

@@ -14,7 +14,7 @@ from .._base.parts import concrete, number
 from .._friction import Coulomb, Friction
 from .._mechanism.joint import AnyJoint
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import require_one, require_sliding
+from .._mechanism.quantities import require_no_memory, require_one, require_sliding
 from .._mechanism.scene import Scene, stiffness
 from .._mechanism.structure import Structure
 from .hybrid import HybridSystem
@@ -74,13 +74,23 @@ def _stick_as_one(structure: Any, joint: AnyJoint, other: AnyJoint) -> bool:
     return K_t is not None and bool(K_t > 0)
 
 
-def hybrid_system(mechanism: Any, unit_speed: Callable | None = None) -> HybridSystem:
-    """The scaled system of a scene or a structure.
+def hybrid_system(
+    mechanism: Any, unit_speed: Callable | None = None, memory: bool = False
+) -> HybridSystem:
+    """The scaled system of a scene or a structure, whose laws all have a `memory` or all have none.
 
     The unit of velocity is the V of the first joint, or unit_speed(V, omega).
+
+    **Raises:** `ValueError` for other laws.
     """
+    if memory:
+        _require_memory(mechanism)
+    else:
+        require_no_memory(mechanism)
     scaled = _uncoupled_system if mechanism.uncoupled else _structure_system
     system = scaled(mechanism, unit_speed)
+    if memory:
+        return system
     laws = zip(system.laws, system.sharing, strict=True)
     prepared = tuple(
         law.in_motion() if len(joints) == 1 else jax.vmap(lambda law: law.in_motion())(law)
@@ -90,9 +100,28 @@ def hybrid_system(mechanism: Any, unit_speed: Callable | None = None) -> HybridS
     return replace(system, scales=law_scales(system))
 
 
+def _require_memory(mechanism: Mechanism) -> None:
+    for name, joint in mechanism.joints_by_name().items():
+        if not joint.friction.state_size:
+            raise ValueError(
+                f"friction of joint {name} must have memory, as that of another joint has, got "
+                f"{type(joint.friction).__name__}: Dahl or LuGre with stiff bristles come near it"
+            )
+
+
+def smoothing(regularisation: Any, memory: bool) -> Array | None:
+    """The checked `regularisation` of a motion, None for laws with memory."""
+    if regularisation is None:
+        return None
+    if memory:
+        raise ValueError(f"friction with memory takes no regularisation, got {regularisation!r}")
+    return number("regularisation", regularisation, above=0)
+
+
 def _uncoupled_system(scene: Scene, unit_speed: Callable | None) -> HybridSystem:
     o = scene.oscillator
-    K_n, K_t = stiffness(scene)
+    K_n, spring = stiffness(scene)
+    K_t = jnp.zeros_like(spring) if scene.friction.in_series else spring
     a, b = o.omega_1**2 + K_t / o.m, o.omega_2**2 + K_n / o.m
     omega = jnp.sqrt(a + b)
     speed = o.V if unit_speed is None else unit_speed(o.V, omega)
@@ -101,7 +130,7 @@ def _uncoupled_system(scene: Scene, unit_speed: Callable | None) -> HybridSystem
     K = jnp.stack([a, b]) / omega**2
     P = zero if scene.normal_load is None else scene.normal_load / unit
     return HybridSystem(
-        laws=(scene.friction,),
+        laws=(scene.friction.at_joint(spring, 1 / omega),),
         speed=speed,
         omega=omega,
         force_unit=unit,
@@ -130,10 +159,13 @@ def _structure_system(structure: Structure, unit_speed: Callable | None) -> Hybr
     n, dtype = structure.n, structure.M.dtype
     K, rows, weights, offsets, speeds, faces = structure.K, [], [], [], [], []
     joint_forces: list[JointForce] = []
+    springs = []
     for name, joint in zip(structure.joint_names, structure.joints, strict=True):
         if joint.V is None:
             raise ValueError(f"joint {name}: V must be given, for the motion depends on it")
         K_n, K_t = joint.stiffness()
+        springs.append(K_t)
+        K_t = jnp.zeros_like(K_t) if joint.friction.in_series else K_t
         t = jnp.asarray(structure.direction(joint.tangential), dtype)
         K = K + K_t * jnp.outer(t, t)
         rows.append(t)
@@ -154,7 +186,7 @@ def _structure_system(structure: Structure, unit_speed: Callable | None) -> Hybr
         speeds.append(joint.V)
         faces[-1] = (len(rows) - 2, len(rows) - 1)
     speed_unit = 1e-6  # m/s, of a structure without joints
-    laws, sharing = _shared([joint.friction for joint in structure.joints], faces)
+    laws, sharing = (), ()
     if not structure.joints:
         # A face without load, on a belt too fast for any motion: it never rubs or switches.
         unit = jnp.eye(n, dtype=dtype)[0]
@@ -171,6 +203,9 @@ def _structure_system(structure: Structure, unit_speed: Callable | None) -> Hybr
     K, C, B, F = jnp.split(by_mass, [n, 2 * n, 2 * n + len(rows)], axis=1)
     # Between the highest eigenfrequency and n^(1/4) times it.
     omega = jnp.sum(K * K.T) ** 0.25
+    if structure.joints:
+        pairs = zip(structure.joints, springs, strict=True)
+        laws, sharing = _shared([j.friction.at_joint(K_t, 1 / omega) for j, K_t in pairs], faces)
     speed = V[0] if structure.joints else jnp.asarray(speed_unit, dtype)
     speed = speed if unit_speed is None else unit_speed(speed, omega)
     unit = omega * speed
@@ -221,33 +256,44 @@ def _shared(laws: Sequence[Friction], faces: Sequence[tuple[int, ...]]):
     return tuple(shared), tuple(map(tuple, kinds.values()))
 
 
-def start_state(start: ArrayLike | Sequence[float], n: int) -> Float[Array, " 2n"]:
-    """`start` as an array [x, v]; `ValueError` unless it has that shape."""
+def start_state(
+    start: ArrayLike | Sequence[float], n: int, memory: bool = False
+) -> Float[Array, " 2n"]:
+    """`start` as an array [x, v]; `ValueError` unless it has that shape.
+
+    With `memory` it may be longer.
+    """
     state = number("start", jnp.asarray(start))
+    if memory and state.ndim == 1 and len(state) > 2 * n:
+        return state
     if state.shape != (2 * n,):
         many = "; use jax.vmap for many" if state.ndim > 1 else ""
         raise ValueError(f"start must have shape ({2 * n},), got {state.shape}{many}")
     return state
 
 
+def displaced_equilibrium(system: HybridSystem) -> Float[Array, " 2n"]:
+    """The sliding equilibrium displaced by V/omega along the first joint's t, in scaled units.
+
+    A law with a jump begins with V along t instead. Where the joint has V = 0 it begins at rest.
+    """
+    kick = system.section_direction
+    kick = jnp.concatenate([kick / jnp.sum(kick**2), jnp.zeros_like(kick)])
+    if system.has_jump:
+        # Steady sliding may well attract, and this start sticks.
+        jumps = system.static_excess()[0] > 64 * jnp.finfo(kick.dtype).eps
+        kick = jnp.where(jumps, jnp.roll(kick, system.n), kick)
+    if system.excited:
+        kick = kick * jnp.sign(system.V[0])
+    return system.mechanism_state(system.equilibrium() + kick)
+
+
 def scaled_start(system: HybridSystem, start: Array | None) -> Float[Array, " 2n"]:
     """The start in scaled units, constant: by default the displaced equilibrium.
 
-    It is displaced by V/omega along the first joint's t, or for a law with a jump begins with V
-    along t. Where that joint has V = 0 it begins at rest. An excitation begins at t = 0.
+    An excitation begins at t = 0.
     """
-    if start is None:
-        kick = system.section_direction
-        kick = jnp.concatenate([kick / jnp.sum(kick**2), jnp.zeros_like(kick)])
-        if system.has_jump:
-            # Steady sliding may well attract, and this start sticks.
-            jumps = system.static_excess()[0] > 64 * jnp.finfo(kick.dtype).eps
-            kick = jnp.where(jumps, jnp.roll(kick, system.n), kick)
-        if system.excited:
-            kick = kick * jnp.sign(system.V[0])
-        y = system.mechanism_state(system.equilibrium() + kick)
-    else:
-        y = start / system.units
+    y = displaced_equilibrium(system) if start is None else start / system.units
     return jax.lax.stop_gradient(system.with_excitation(y, 0.0))
 
 

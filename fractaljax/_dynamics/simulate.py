@@ -28,12 +28,19 @@ from .._base.parts import (
 )
 from .._base.programs import exported_jit
 from .._mechanism.mechanism import Mechanism
-from .contact_state import OPEN, STICK
+from .._mechanism.quantities import has_memory
 from .exact_step import step_to_switch
 from .excitation import Excitation, excited_system
 from .guard import NONE
 from .hybrid import HybridSystem
-from .scaled import check_rtol, degrees_of_freedom, require_drive, start_state
+from .scaled import (
+    check_rtol,
+    degrees_of_freedom,
+    displaced_equilibrium,
+    require_drive,
+    smoothing,
+    start_state,
+)
 from .segments import chosen_guard, flow
 from .transition import first_contact_state, switch
 
@@ -65,7 +72,9 @@ class Trajectory(Record):
     ]  # from each time on: +1, -1 slip forward, backward, 0 stick, 2 open
     result: SimulationResult  # a member of SimulationResult
     _system: HybridSystem | None = eqx.field(repr=False)  # None with `saveat`
-    _solution: Any = eqx.field(repr=False)  # diffrax's, of the regularised law
+    _solution: Any = eqx.field(repr=False)  # diffrax's, without an exact law
+    # The states of laws with memory at the times, law by law and face by face; else None
+    internal: Float[Array, "n s"] | None = eqx.field(default=None, repr=False)
 
     @property
     def end(self) -> Float[Array, " 2n"]:
@@ -98,7 +107,7 @@ class Trajectory(Record):
             y = jax.vmap(self._solution.evaluate, out_axes=1)(
                 (times - self.times[0]) * system.omega
             )
-            return (system.mechanism_state(y) * scale[:, None]).T
+            return (system.mechanism_state(y[: 2 * system.n]) * scale[:, None]).T
         k = self._step(times)
         after = (times - self.times[k]) * system.omega
         start = (self.states[k] / scale[None]).T
@@ -240,49 +249,10 @@ def _sampled(trajectory: Trajectory, saveat) -> Trajectory:
     )
 
 
-@eqx.filter_jit
-def _regularised(
-    system: HybridSystem, y, t0, end, saveat, eps, solver, rtol, max_steps: int
-) -> Trajectory:
-    from diffrax import RESULTS, SaveAt
-
-    from .regularised import DENSE, nodes, solve
-
-    options = {"solver": solver, "rtol": rtol, "max_steps": max_steps, "saveat": DENSE}
-    if saveat is not None:
-        options["saveat"] = SaveAt(ts=(saveat - t0) * system.omega, t1=True)
-    solution = solve(system, eps, y, end, **options)
-    if saveat is None:
-        times, states = nodes(solution)
-        last, times = states[-1], t0 + times / system.omega
-    else:
-        # What was not reached is infinite.
-        last = jnp.where(jnp.isfinite(solution.ys), solution.ys, 0)
-        times, states = saveat, jnp.where(jnp.isfinite(solution.ys), solution.ys, jnp.nan)[:-1]
-    sliding = system.speed * jax.vmap(lambda y: system.sliding(y[system.n :]))(states)
-    contact_states = jnp.where(jnp.abs(sliding) < eps, STICK, jnp.sign(sliding))
-    if any(system.opens):
-        contact_states = jnp.where(system.open_faces(states.T).T, OPEN, contact_states)
-    far = jnp.max(jnp.abs(last)) > system.bound(y, system.equilibrium())
-    reached = solution.result == RESULTS.successful
-    result = SimulationResult.where(
-        reached, SimulationResult.reached, SimulationResult.out_of_steps
-    )
-    result = SimulationResult.where(far, SimulationResult.diverged, result)
-    return Trajectory(
-        times=times,
-        states=(system.mechanism_state(states.T) * system.units[:, None]).T,
-        contact_states=contact_states,
-        result=result,
-        _system=system if saveat is None else None,
-        _solution=solution if saveat is None else None,
-    )
-
-
 def simulate(
     mechanism: Mechanism,
-    start: ArrayLike | Sequence[float],
-    t1: ScalarLike,
+    start: ArrayLike | Sequence[float] | None = None,
+    t1: ScalarLike | None = None,
     *,
     excitation: Excitation | None = None,
     t0: ScalarLike = 0.0,
@@ -297,14 +267,16 @@ def simulate(
 
     Eighth-order steps of equal length, each cut where the contact state changes. Derivatives with
     respect to the mechanism, the excitation, `start`, `t0` and `t1` are those of the motion with
-    its switches.
+    its switches; a start or an end by default depends on the mechanism.
 
     **Arguments:**
 
     - `mechanism`: a scene, or a structure of n degrees of freedom whose joints all have a V;
       `jax.vmap` takes many.
-    - `start`: (2n,), [x, v] in m and m/s.
-    - `t1`: end time [s], above `t0`.
+    - `start`: (2n,), [x, v] in m and m/s; by default as in `limit_cycle`, near the sliding
+      equilibrium. With friction that has memory its states are those of steady sliding, or follow
+      as (2n + s,), as `internal` has them.
+    - `t1`: end time [s], above `t0`; by default 50 periods 2 pi/omega later, omega as there.
     - `excitation`: a harmonic force, whose phase refers to the time 0.
     - `t0`: start time [s].
     - `saveat`: (k,), times [s] in order from `t0` to `t1`, at which alone states are returned. The
@@ -312,7 +284,8 @@ def simulate(
     - `regularisation`: eps [m/s], to replace sgn v by tanh(v/eps); a contact state is then 0 where
       abs(v) < eps. The motion depends on eps: `limit_cycle` compares with the exact law.
     - `solver`: a diffrax solver for the regularised law, Tsit5 by default; an implicit one, such
-      as Kvaerno5, for a small eps.
+      as Kvaerno5, for a small eps. Friction with memory takes Kvaerno5 by default; with soft
+      bristles Tsit5 is quicker.
     - `rtol`: relative tolerance of a step, 1e-9 by default and at least 9.1e-13; in float32 both
       are 4.9e-4. Errors grow with the distance between nearby motions.
     - `max_steps`: most steps; one oscillation takes about 30.
@@ -322,20 +295,25 @@ def simulate(
     rtol that the precision cannot hold; `RuntimeError` if `throw`. Under a trace (`jit`, `vmap`)
     everything is NaN instead.
     """
-    start = start_state(start, degrees_of_freedom(mechanism))
+    memory = has_memory(mechanism)
+    n = degrees_of_freedom(mechanism)
+    start = None if start is None else start_state(start, n, memory)
     require_drive(mechanism, excitation)
     t0, t1 = _times(t0, t1)
-    system, y, t0, end = _scaled(mechanism, excitation, start, t0, t1)
+    if t1 is None:
+        t1 = _default_end(mechanism, excitation, t0, memory)
     saveat = None if saveat is None else _checked(saveat, t0, t1)
     n = whole("max_steps", max_steps, 1)
-    rtol = check_rtol(rtol, y.dtype)
-    if regularisation is not None:
-        from .regularised import without_jump
+    rtol = check_rtol(rtol, jnp.result_type(*jax.tree.leaves((mechanism, start, excitation))))
+    if memory or regularisation is not None:
+        from .smooth import smooth_motion, without_jump
 
-        eps = number("regularisation", regularisation, above=0)
-        mechanism = without_jump(mechanism)
-        trajectory = _regularised(system, y, t0, end, saveat, eps, solver, rtol, n)
+        eps = smoothing(regularisation, memory)
+        mechanism = mechanism if memory else without_jump(mechanism)
+        times, options = (t0, t1, saveat), (eps, solver, rtol, n)
+        trajectory = smooth_motion(mechanism, excitation, start, *times, *options)
     else:
+        system, y, t0, end = _scaled(mechanism, excitation, start, t0, t1)
         h = jnp.asarray(min(0.25 * (rtol / 1e-9) ** 0.125, 0.5), y.dtype)
         frozen = jax.lax.stop_gradient((system, y, end))
         steps = _find_steps(*frozen, h, rtol, max_steps=n)
@@ -346,23 +324,31 @@ def simulate(
             steps = eqx.tree_at(lambda x: (x.duration, x.s, x.guard), steps, shorter)
         trajectory = _repeat(system, y, t0, end, steps)
         trajectory = trajectory if saveat is None else _sampled(trajectory, saveat)
-    if (bad := refused((mechanism, excitation, start, t0, end, saveat))) is not None:
+    if (bad := refused((mechanism, excitation, start, t0, t1, saveat))) is not None:
         trajectory = nan_where(bad, trajectory)  # contact states as well
     return raise_unless(SimulationResult.reached, trajectory) if throw else trajectory
 
 
+@functools.partial(exported_jit, static_argnames="memory")
+def _default_end(mechanism, excitation, t0, memory):
+    """A time 50 periods after t0, so few that max_steps allows far more than the 30 of each."""
+    return t0 + 100 * jnp.pi / excited_system(mechanism, excitation, memory).omega
+
+
 @exported_jit
 def _scaled(mechanism, excitation, start, t0, t1):
-    """The system, its state at t0, t0 itself, and the duration in scaled time."""
+    """The system, its state at t0, t0, and the duration in scaled time."""
     system = excited_system(mechanism, excitation)
-    y, duration = start / system.units, (t1 - t0) * system.omega
+    y = displaced_equilibrium(system) if start is None else start / system.units
     y = system.with_excitation(y, t0 * system.omega)
-    return system, y, jnp.asarray(t0, y.dtype), jnp.asarray(duration, y.dtype)
+    return system, y, *(jnp.asarray(t, y.dtype) for t in (t0, (t1 - t0) * system.omega))
 
 
-def _times(t0, t1) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """t0 and t1 as numbers, t1 above t0."""
+def _times(t0, t1) -> tuple[Float[Array, ""], Float[Array, ""] | None]:
+    """t0 and t1, if it is stated, as numbers, t1 above t0."""
     t0 = scalar("t0", t0)
+    if t1 is None:
+        return t0, None
     start = concrete(t0)
     if start is not None:
         return t0, scalar("t1", t1, above=float(start))

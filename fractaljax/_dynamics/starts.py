@@ -21,7 +21,9 @@ def starts_of(system, n, low, high, starts, seed, radius) -> Float[np.ndarray, "
     """The starts [m, m/s] in a box, in a ball, or as listed."""
     box, listed = low is not None or high is not None, np.ndim(starts) > 0
     if box + listed + (radius is not None) != 1:
-        raise ValueError("give one of: low and high, radius, or starts of shape (k, 2n)")
+        raise ValueError(
+            "give one of: low and high, radius, or starts of shape (k, 2n); radius=5 is usual"
+        )
     if listed:
         points = np.asarray(number("starts", jnp.asarray(starts, dtype=float)))
         if points.ndim != 2 or points.shape[1] != 2 * n or not len(points):

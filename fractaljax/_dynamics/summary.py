@@ -60,7 +60,7 @@ def cycle_table(mechanism: Any, cycle: LimitCycle, most: int = 12) -> str:
         direction["sticks"] = f"{share:.2%} of the period"
     tables = ["\n".join(lacking)] if lacking else []
     tables += [table([""], [whole]), table(["x1, along the belt", "x2, normal to it"], directions)]
-    switches = [] if regularised else cycle.switches()
+    switches = [] if regularised or cycle.internal is not None else cycle.switches()
     if switches:
         tables.append(_switching(switches, cycle.period))
     ends = np.stack([cycle.velocity_min, cycle.velocity_max])

@@ -211,7 +211,10 @@ def fit(
         at, ratios, slope = solve(at, bins.variance + estimated)
         if scatter is not None:
             break
-        before, estimated = estimated, _scatter(ratios - 1, bins.variance, ratios.size - 2.5)
+        before, estimated = (
+            estimated,
+            residual_scatter(ratios - 1, bins.variance, ratios.size - 2.5),
+        )
         if abs(before - estimated) <= 1e-3 * estimated:
             break
     variance = bins.variance + estimated
@@ -240,7 +243,7 @@ def fit(
     )
 
 
-def _scatter(residual, variance, freedom) -> float:
+def residual_scatter(residual, variance, freedom) -> float:
     """Common variance, added to `variance`, that explains the size of the residuals."""
     from scipy.optimize import root_scalar
 
@@ -266,6 +269,6 @@ def curvature(law: PowerLaw) -> tuple[float, float]:
         weighted = columns.T / (variance + scatter)
         normal = np.linalg.inv(weighted @ columns)
         coefficients = normal @ weighted @ residual
-        scatter = _scatter(residual - columns @ coefficients, variance, residual.size - 3)
+        scatter = residual_scatter(residual - columns @ coefficients, variance, residual.size - 3)
     left = float(normal[2, 2])  # not positive by rounding where bins are few
     return float(coefficients[2]), float(np.sqrt(left)) if left > 0 else np.inf

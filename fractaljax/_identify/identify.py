@@ -1,5 +1,7 @@
-"""D and G of a measured profile or map, with standard errors."""
+"""The surface of a measured profile or map, with standard errors."""
 
+import contextlib
+import functools
 import math
 import os
 from typing import Any
@@ -11,7 +13,10 @@ from numpy.typing import ArrayLike
 
 from .._base.parts import Record, require_kind
 from .._base.table import table
+from .._surface.measured_spectrum import MeasuredSpectrum
+from .._surface.spectrum import Spectrum
 from .._surface.surface import Surface
+from .._surface.surface_scatter import SurfaceScatter, fractal_scatter
 from .analysis import SpectralAnalysis
 from .band import check_band, choose_band, highest_frequency
 from .fit import PowerLaw
@@ -20,11 +25,14 @@ from .measurement import Measurement
 from .patches import patch_covariance
 from .preparation import Preprocessing, prepare_heights, spacing
 from .quantisation import quantisation_limit
+from .self_affine_fit import SelfAffineFit, fit_self_affine, map_cells, profile_cells
 from .source import read_heights
 from .spectrum import PowerSpectrum, log_mean_cosine_power, map_spectra, profile_spectrum
+from .spectrum_of import gaussian_warnings, spectrum_table
 from .structure_function import StructureFunction, structure_function
 from .stylus import tip_limit
 from .warnings import (
+    DISQUALIFYING,
     WarningThresholds,
     height_warnings,
     quantisation_warnings,
@@ -34,9 +42,12 @@ from .warnings import (
 
 
 class Identification(Record):
-    """The fractal parameters of a measurement, with their standard errors.
+    """The surface of a measurement, with standard errors.
 
-    G is that of Eq. 13, which the contact law uses.
+    D and G are those of the power law, G that of Eq. 13, which the contact law uses. `surface` is a
+    `Surface` where the spectrum is such a law and D is at most three standard errors outside (2,
+    3); otherwise a `SelfAffine` with the roll-off and the lay of the measurement; and the
+    `MeasuredSpectrum` of a map that neither describes. `scatter` has their errors, as a tolerance.
     """
 
     D: float  # fractal dimension
@@ -44,6 +55,9 @@ class Identification(Record):
     D_standard_error: float  # of D
     ln_G_standard_error: float  # of ln G
     covariance: Float[np.ndarray, "2 2"]  # of (D, ln G)
+    log_height: float  # ln m(q) of the power law, m in m^2: the mean square height per ln q
+    log_height_error: float  # its standard error
+    q: float  # rad/m: wavenumber at which ln m(q) is uncorrelated with D
     G_profile: float  # m: by Majumdar's and Bhushan's formula
     gamma: float  # that of Eq. 13
     band: tuple[float, float]  # 1/m
@@ -53,6 +67,9 @@ class Identification(Record):
     law: PowerLaw  # the fitted power law
     spectrum: PowerSpectrum  # what is fitted
     structure_function: StructureFunction  # an independent estimate
+    self_affine: SelfAffineFit  # a self-affine surface with roll-off and lay
+    end: float  # 1/m: up to which the spectrum is that of the surface
+    level_error: float  # standard error of the logarithm of the heights as a whole
     missing: int  # number of missing heights
     outliers: int  # number of heights taken out as spikes
     unused: int  # number of heights in segments that are too short
@@ -69,9 +86,52 @@ class Identification(Record):
         return self.G * self.ln_G_standard_error
 
     @property
-    def surface(self) -> Surface:
-        """The surface, as a part of a scene. **Raises:** `ValueError` unless 2 < D < 3."""
-        return Surface(self.D, self.G, self.gamma)
+    def surface(self) -> Spectrum:
+        """The surface, as a part of a scene. **Raises:** `ValueError` as `scatter`."""
+        return self.scatter.surface
+
+    @functools.cached_property
+    def scatter(self) -> SurfaceScatter:
+        """The surface with the errors of its numbers, which are a tolerance of a design.
+
+        **Raises:** `ValueError` with what to measure instead, where no surface describes it.
+        """
+        words = [word for word in self.warnings if word.startswith(DISQUALIFYING)]
+        if any(word.startswith("too few levels") for word in words):
+            raise ValueError(f"{words[0]}: measure with finer steps of height")
+        beyond = max(2 - self.D, self.D - 3) / max(self.D_standard_error, 1e-300)
+        fit = self.self_affine
+        if beyond <= 3 and not words and not (fit.fits and fit.has_rolloff):
+            with contextlib.suppress(ValueError):  # D at 2: a Hurst exponent of 1
+                return self.power_law_scatter
+        if fit.fits:
+            return fit.surface_scatter
+        measured = self.measured_spectrum
+        if measured is None:
+            raise ValueError(
+                f"no surface fits this profile (H = {fit.H:.3g} +- {fit.H_standard_error:.2g}, its "
+                f"spectrum scatters by {fit.scatter:.0%} about the law): measure a map, whose "
+                "spectrum is taken as it is"
+            )
+        error = np.array([[self.level_error**2]])
+        return SurfaceScatter(measured, ("ln height_factor",), error)
+
+    @property
+    def power_law_scatter(self) -> SurfaceScatter:
+        """The `Surface` of the power law with its errors, whatever the warnings say.
+
+        **Raises:** `ValueError` for D so close to 2 that G is 0 in double precision.
+        """
+        covariance = np.diag([self.D_standard_error, self.log_height_error]) ** 2
+        return fractal_scatter(self.D, self.log_height, self.q, covariance, self.gamma)
+
+    @functools.cached_property
+    def measured_spectrum(self) -> MeasuredSpectrum | None:
+        """The spectrum of a map as it is, up to `end`; None of a profile."""
+        if self.spectrum.kind == "profile":
+            return None
+        table = spectrum_table(self.spectrum, 0.0, self.end, per_bin=1.4)
+        return None if table is None else MeasuredSpectrum(*table, height_factor=1.0)
 
     def __repr__(self) -> str:
         other, (low, high) = self.structure_function, self.band
@@ -82,6 +142,9 @@ class Identification(Record):
             "D by structure function": f"{other.D:.4f} +- {other.D_standard_error:.4f}"
             if other.D == other.D
             else "none: no power law of a surface fits it",
+            "ln m(q) at q [rad/m]": f"{self.log_height:.4g} +- {self.log_height_error:.2g} at "
+            f"{self.q:.4g}",
+            "self-affine": self.self_affine.description,
             "band [1/m]": f"{low:.4g} to {high:.4g}  ({self.decades:.2f} decades)",
             "wavelengths [m]": f"{1 / high:.4g} to {1 / low:.4g}",
             "finer waves": "aliased" if self.aliased else "not aliased",
@@ -89,6 +152,10 @@ class Identification(Record):
             "outliers": f"{self.outliers}",
             "unused heights": f"{self.unused}",
         }
+        try:
+            rows["surface"] = type(self.surface).__name__
+        except ValueError as error:
+            rows["surface"] = f"none: {error}"
         return "\n".join([table([""], [rows]), *(f"warning: {each}" for each in self.warnings)])
 
 
@@ -106,9 +173,11 @@ def identify(
     analysis: SpectralAnalysis = SpectralAnalysis(),
     thresholds: WarningThresholds = WarningThresholds(),
 ) -> Identification:
-    """D and G of a measured profile or map, from its power spectrum.
+    """The surface of a measured profile or map, from its power spectrum.
 
-    The surface is assumed to be that of Eq. 13, a profile a cut through it. Standard errors of a
+    D and G are those of Eq. 13, a profile is a cut through it. Beside them a self-affine surface
+    with a roll-off, and of a map a lay, is fitted; `Identification.surface` is the simplest that
+    describes the measurement. Standard errors of a
     map include its variation from place to place; those of a profile assume that there is none. The
     effect of filled gaps on the spectrum is estimated on surrogates and removed.
 
@@ -161,7 +230,7 @@ def identify(
             return (profile_spectrum(segments, dx, analysis.tapers),)
         return map_spectra(segments[0], dx, dy)
 
-    spectra = estimate_spectra(heights.segments)
+    raw = spectra = estimate_spectra(heights.segments)
     if any(gap.any() for gap in heights.gaps):
         spectra = correct_for_gaps(spectra, heights.gaps, steps, estimate_spectra)
     spectrum = spectra[0]
@@ -186,11 +255,30 @@ def identify(
         )
     noise, ends = chosen.noise, (chosen.low, chosen.high)
     law = noise.fit(spectrum, ends, ratio)
+    between = None
     if z.ndim == 2:
         between = patch_covariance(heights.segments[0], dx, dy, spectrum, law, ends, ratio)
         covariance = law.covariance + np.pad(between, (0, 1))
         law = eqx.tree_at(lambda law: law.covariance, law, covariance)
     log_G, log_G_profile, covariance = _parameters(law, ratio)
+    end = min(top, highest_frequency(spectrum))
+    if limit >= least:
+        end = min(end, limit)
+    if noise.floor:
+        end = min(end, noise.crossing)
+    wide = ends
+    if band is None:  # without the longest waves, which the removed plane has part of
+        wide = 3 / length, max(min(end, 2 * chosen.high), 9 / length)
+    if z.ndim == 1:
+        cells = profile_cells(spectrum, wide)
+    else:
+        cells = map_cells(heights.segments[0], dx, dy, wide)
+        # What the gaps do to the mean over directions.
+        change = np.log(spectrum.power / raw[0].power)
+        by = np.interp(np.log(cells.f), np.log(spectrum.f), change)
+        cells = cells._replace(height=cells.height * np.exp(by))
+    fit = fit_self_affine(cells, wide, length, sigmas=analysis.sigmas, law=law, between=between)
+    log_height, height_error, q = _height(law)
     other = structure_function(
         lines,
         dx,
@@ -205,6 +293,7 @@ def identify(
         *height_warnings(heights.despiked, steps, thresholds),
         *quantisation_warnings(heights.despiked, limit, chosen.high, reach, least, thresholds.held),
         *result_warnings(law.D, errors, other, heights, thresholds),
+        *(gaussian_warnings(heights.segments[0]) if z.ndim == 2 else ()),
     ]
     with np.errstate(over="ignore"):
         G, G_profile = map(float, np.exp([log_G, log_G_profile]))
@@ -214,6 +303,9 @@ def identify(
         D_standard_error=float(errors[0]),
         ln_G_standard_error=float(errors[1]),
         covariance=covariance,
+        log_height=log_height,
+        log_height_error=height_error,
+        q=q,
         G_profile=G_profile,
         gamma=ratio,
         band=ends,
@@ -223,6 +315,9 @@ def identify(
         law=law,
         spectrum=spectrum,
         structure_function=other,
+        self_affine=fit,
+        end=end,
+        level_error=_level_error(spectrum, end, height_error),
         missing=heights.missing,
         outliers=heights.outliers,
         unused=heights.unused,
@@ -245,3 +340,28 @@ def _parameters(law: PowerLaw, gamma: float) -> tuple[float, float, np.ndarray]:
     slope = np.array([[0.0, -0.5], [1 / (3 - p), by_p]])
     covariance = slope @ law.covariance[:2, :2] @ slope.T
     return log_G, log_G + (log_m + math.log(math.log(gamma))) / (3 - p), covariance
+
+
+def _height(law: PowerLaw) -> tuple[float, float, float]:
+    """ln m(q), its standard error, and the wavenumber q at which it is uncorrelated with p.
+
+    ln m = ln A - p ln(f/f_N) + ln f, minus ln m(p) of a profile.
+    """
+    from scipy.special import digamma
+
+    p, C, profile = law.p, law.covariance, law.kind == "profile"
+    by_p = -profile * (digamma(p / 2) - digamma((p + 1) / 2)) / 2
+    log_ratio = C[0, 1] / C[1, 1] + by_p
+    log_f = log_ratio + math.log(law.nyquist)
+    height = law.log_A - p * log_ratio + log_f - profile * log_mean_cosine_power(p)
+    left = C[0, 0] - C[0, 1] ** 2 / C[1, 1]
+    return float(height), math.sqrt(max(left, 0)), 2 * math.pi * math.exp(log_f)
+
+
+def _level_error(spectrum: PowerSpectrum, end: float, height_error: float) -> float:
+    """Standard error of ln Sq: of the waves that are measured, and half that of ln m(q)."""
+    inside = spectrum.f <= end * (1 + 1e-9)
+    # Shares in the mean square: the ordinates of a map are evenly spaced in f until merged.
+    share = (spectrum.power * spectrum.weight * spectrum.f)[inside]
+    chance = np.sum(share**2 / spectrum.count[inside]) / np.sum(share) ** 2
+    return float(np.hypot(math.sqrt(chance) / 2, height_error / 2))

@@ -2,18 +2,19 @@
 
 import math
 import os
-import warnings
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from jaxtyping import ArrayLike
 
+from .._base.warn import warn_user
 from .._surface.heights import height_statistics
 from .._surface.measured_spectrum import MeasuredSpectrum
 from .measurement import Measurement
 from .preparation import prepare_heights
 from .source import read_heights
-from .spectrum import map_spectra, remove_plane
+from .spectrum import PowerSpectrum, map_spectra, remove_plane
 
 
 def spectrum_of(
@@ -56,27 +57,43 @@ def spectrum_of(
     spectrum = map_spectra(heights, read.dx, read.dy)[0]
     longest = min(read.z.shape[0] * read.dx, read.z.shape[1] * read.dy)
     top = spectrum.nyquist if shortest is None else 1 / shortest
-    inside = (spectrum.f >= 0.999 / longest) & (spectrum.f <= top * (1 + 1e-9))
+    table = spectrum_table(spectrum, 0.999 / longest, top, per_bin)
+    if table is None:
+        raise ValueError(f"shortest must leave two points or more of {longest:g} m, got {shortest}")
+    for words in gaussian_warnings(heights, largest_skewness, largest_kurtosis):
+        warn_user(words)
+    return MeasuredSpectrum(*table)
+
+
+def spectrum_table(
+    spectrum: PowerSpectrum, low: float, high: float, per_bin: float = 1.15
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """q [rad/m], C [m^4] and the errors of ln C of a map from `low` to `high` [1/m].
+
+    None where fewer than two points are left.
+    """
+    inside = (spectrum.f >= low) & (spectrum.f <= high * (1 + 1e-9))
     f, power, count = spectrum.f[inside], spectrum.power[inside], spectrum.count[inside]
     groups = np.floor(np.log(f / f[:1]) / math.log(per_bin) + 0.5)
     start = np.flatnonzero(np.diff(groups, prepend=-1))
     if start.size < 2:
-        raise ValueError(f"shortest must leave two points or more of {longest:g} m, got {shortest}")
+        return None
     weight = np.add.reduceat(count, start)
     # The mean of ln f, and of the power times f^3, which is nearly flat.
     f_mean = np.exp(np.add.reduceat(count * np.log(f), start) / weight)
     flat = np.add.reduceat(count * power * f**3, start) / weight
-    _warn_unless_gaussian(heights, largest_skewness, largest_kurtosis)
     C = flat / f_mean**3 / (2 * math.pi * f_mean)
-    return MeasuredSpectrum(2 * math.pi * f_mean, C, 1 / np.sqrt(weight))
+    return 2 * math.pi * f_mean, C, 1 / np.sqrt(weight)
 
 
-def _warn_unless_gaussian(z: np.ndarray, largest_skewness: float, largest_kurtosis: float) -> None:
+def gaussian_warnings(
+    z: np.ndarray, largest_skewness: float = 1.0, largest_kurtosis: float = 8.0
+) -> Iterator[str]:
+    """A warning about the heights of a map that are far from Gaussian."""
     heights = height_statistics(remove_plane(z))
     Ssk, Sku = float(heights.skewness), float(heights.kurtosis)
     if abs(Ssk) > largest_skewness or Sku > largest_kurtosis:
-        warnings.warn(
+        yield (
             f"heights are far from Gaussian (Ssk {Ssk:.2g}, Sku {Sku:.2g}): a law that has only"
-            " their spectrum can be off by several times; use MeasuredContact.from_heights",
-            stacklevel=3,
+            " their spectrum can be off by several times; use MeasuredContact.from_heights"
         )

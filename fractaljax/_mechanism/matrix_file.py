@@ -160,7 +160,7 @@ def _check_matrix(name: str, value: Any, any_shape: bool, largest: int):
     check_size(name, value.shape, largest)
     with np.errstate(over="ignore"):  # numbers may be longer than 64 bits
         kind = np.complex128 if value.dtype.kind == "c" else np.float64
-        matrix = scipy.sparse.csr_array(value, dtype=kind)
+        matrix: Any = scipy.sparse.csr_array(value, dtype=kind)
     if kind is np.complex128 and not matrix.data.imag.any():
         matrix = matrix.real.tocsr()
     if not np.isfinite(matrix.data).all():

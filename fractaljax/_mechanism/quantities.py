@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from .._base.parts import Quantity, brief, concrete, is_traced, number, substitute
+from .._base.suggest import did_you_mean
 from .._contact.fixed import FixedContact
 from .mechanism import Mechanism
 from .scene import FRICTION
@@ -47,6 +48,24 @@ def require_sliding(x: Any, where: str) -> Any:
     return x
 
 
+def has_memory(x: Mechanism) -> bool:
+    """True if the friction of any joint has internal states."""
+    if not isinstance(x, Mechanism):  # refused, by its name, where it is used
+        return False
+    return any(joint.friction.state_size > 0 for joint in x.joints_by_name().values())
+
+
+def require_no_memory(x: Mechanism) -> None:
+    """Refuse friction with memory, where its internal states are not followed."""
+    for joint in x.joints_by_name().values():
+        if joint.friction.state_size:
+            raise ValueError(
+                "friction must be without memory here, for its internal states are followed by "
+                "growth_rate, stability, margin, simulate and limit_cycle alone, got "
+                f"{type(joint.friction).__name__}"
+            )
+
+
 def quantity_names(x: Mechanism) -> list[str]:
     """The names that `replaced` takes: stored quantities, then the derived ones of a scene."""
     return list(dict.fromkeys([*x.stored_quantities(), *x.derived_quantities()]))
@@ -56,7 +75,8 @@ def require_quantity(x: Mechanism, name: str) -> None:
     """Refuse a name that is neither a stored nor a derived quantity, and list the valid names."""
     names = quantity_names(x)
     if name not in names:
-        raise ValueError(f"{x.kind} has no quantity {name!r}; it has {', '.join(names)}")
+        near = did_you_mean(str(name), names)
+        raise ValueError(f"{x.kind} has no quantity {name!r}; it has {', '.join(names)}{near}")
 
 
 def require_independent(x: Mechanism, names: Sequence[str]) -> None:
@@ -195,7 +215,8 @@ def axis_values(x: Mechanism, name: str, values: ArrayLike | Sequence[float]) ->
     # Lists are read by NumPy; arrays may be traced and are kept.
     values = number(name, values if isinstance(values, (Array, np.ndarray)) else np.array(values))
     if values.ndim != 1 or not values.size:
-        raise ValueError(f"the values of {name} must be a list, got shape {values.shape}")
+        got = f"shape {values.shape}" + ": type [2.3, 2.4]" * (not values.ndim)
+        raise ValueError(f"the values of {name} must be a list, got {got}")
     return values
 
 

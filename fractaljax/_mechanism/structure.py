@@ -234,7 +234,7 @@ class Structure(Mechanism):
             if joint.loss_factor is None:
                 continue
             for d, k in zip(self._directions(joint), reversed(joint.stiffness()), strict=False):
-                damping.append((None, joint.loss_factor * k / omega * jnp.outer(d, d)))
+                damping.append((None, joint.loss_factor * k / omega * np.outer(d, d)))
         return self._with_terms({"C": damping, "K_loss": None}, joints, self.F, self.parameters)
 
     def add(

@@ -46,7 +46,8 @@ class _Source:
     """Matrices that the file of a structure names, and the names of degrees of freedom."""
 
     def __init__(self, table: dict[str, Any], folder: Path):
-        self.folder, self.names = folder, table.get("names")
+        self.folder = folder
+        self.names: Any = table.get("names")
         self.names_of_files = False
         self.held: dict[str, Any] = {}
         self.unread: dict[str, str] = {}  # reasons by name, for the file of matrices

@@ -18,6 +18,12 @@ def in_band(s: Complex[Array, " k"], band: tuple[float, float] | None) -> Bool[A
     return (frequency > band[0]) & (frequency <= band[1]) & sought
 
 
+def leading(s: Complex[Array, " k"], band: tuple[float, float] | None) -> Array:
+    """The order (k,) of the eigenvalues: those in the band first, the largest real part first."""
+    rank = s.real if band is None else jnp.where(in_band(s, band), s.real, -jnp.inf)
+    return jnp.lexsort((-s.imag, -rank))
+
+
 def among(s: Complex[Array, " k"], band: tuple[float, float] | None) -> Complex[Array, " k"]:
     """The eigenvalues in the band, and -1, critically damped, in the place of the others."""
     return s if band is None else jnp.where(in_band(s, band) | jnp.isnan(s), s, -1)

@@ -174,7 +174,9 @@ def hopf_boundary(
 def _check_window(scene, which, window) -> Window:
     """The validated range, not yet checked against the domain of the scene."""
     if not (isinstance(window, (tuple, list)) and len(window) == 3 and isinstance(window[0], str)):
-        raise ValueError(f"{which} must be (name, low, high), got {window!r}")
+        raise ValueError(
+            f'{which} must be (name, low, high), such as ("D", 2.3, 2.8), got {window!r}'
+        )
     name, *ends = window
     require_quantity(scene, name)
     low, high = (float(scalar(f"{which} limit", end)) for end in ends)

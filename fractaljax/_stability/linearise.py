@@ -14,11 +14,12 @@ from .._base.parts import concrete, flag
 from .._base.programs import exported_jit
 from .._base.rounding import rounding_error
 from .._contact.load_curve import loaded_equilibrium
-from .._mechanism.quantities import require_one
+from .._mechanism.quantities import has_memory, require_no_memory, require_one
 from .._mechanism.reduced import CoarseSpace
 from .._mechanism.structure import Structure, require_single
-from .band import among, in_band
+from .band import among, in_band, leading
 from .critical_pair import CriticalPair, critical_pair
+from .field_modes import linearised_with_memory
 from .margin import least_damping_ratio
 from .quadratic import Modes, solve
 from .rightmost import rightmost
@@ -76,8 +77,7 @@ class Assembled(eqx.Module):
     def modes(self) -> Eigensolution:
         """All modes, those in the band first, the largest real part first."""
         s, x, error, _ = self.solve()
-        rank = s.real if self.band is None else jnp.where(in_band(s, self.band), s.real, -jnp.inf)
-        order = jnp.lexsort((-s.imag, -rank))
+        order = leading(s, self.band)
         s, x, error = s[order], x[order], error[order]
         margin, counted = least_damping_ratio(among(s, self.band)), in_band(s, self.band)
         if jnp.iscomplexobj(self.K):  # structural damping: some places may be left over
@@ -99,6 +99,11 @@ def linearised(x: Any, friction_slope: bool, refuse: bool = True) -> TwoDirectio
     `refuse` as in `assembled`.
     """
     require_one("scene", x)
+    if has_memory(x):
+        if not refuse:  # onsets are sought, which the Jacobian alone does not tell
+            require_no_memory(x)
+        field: Any = linearised_with_memory(x, friction_slope)
+        return field
     if x.uncoupled:
         return two_directions(x, friction_slope)
     return assembled(x, friction_slope, refuse)
@@ -169,6 +174,7 @@ class _Joint(NamedTuple):
 def attachments(structure: Structure, friction_slope: bool) -> Attachments:
     """What the joints add to the matrices at the sliding equilibrium."""
     require_single(structure)
+    require_no_memory(structure)
     sloping = flag("friction_slope", friction_slope)
     K = structure.K
     F = jnp.zeros(structure.n, K.dtype) if structure.F is None else structure.F

@@ -44,6 +44,8 @@ class Stability(Record):
     direction, NaN in the source's form; None where no joint is preloaded. Where it is not above 0
     the joint is open: there is no steady sliding, and all numbers are NaN.
 
+    Friction with memory adds the eigenvalues of its internal states: there are 2n + s of them.
+
     For a structure that `reduce` made, only the eigenvalues in its band count: they come first, and
     the others are not eigenvalues of the structure.
     """
@@ -164,9 +166,10 @@ def margin(
     scene where modes coalesce and where they cross. Only without any damping is it not: there it is
     0 where stable and negative in flutter.
 
-    For a structure, it is the least damping ratio, which has kinks where modes cross: a smooth
-    measure of n degrees of freedom takes a Lyapunov equation of size 2n. With a shift the ratios
-    are those of the eigenvalues minus the shift. Rigid-body modes do not count without a shift.
+    For a structure, and with friction that has memory, it is the least damping ratio, which has
+    kinks where modes cross: a smooth measure of n degrees of freedom takes a Lyapunov equation of
+    size 2n. With a shift the ratios are those of the eigenvalues minus the shift. Rigid-body modes
+    do not count without a shift.
 
     **Arguments:**
 

@@ -10,6 +10,7 @@ from .._base.singular import positive_sqrt, safe_divide
 from .._contact.load_curve import LoadCurve, loaded_equilibrium
 from .._mechanism.joint import AnyJoint
 from .._mechanism.oscillator import Linearised, dimensionless, linearise, static_normal_force
+from .._mechanism.quantities import require_no_memory
 from .._mechanism.scene import Scene
 from . import quartic
 from .critical_pair import CriticalPair
@@ -99,6 +100,7 @@ class TwoDirections(NamedTuple):
 
 def two_directions(scene: Scene, friction_slope: bool) -> TwoDirections:
     """The linearised equations of a scene (Eq. 43), with the stiffness of its contact."""
+    require_no_memory(scene)
     K_n, K_t, static = _pressed(scene)
     o, law, P = scene.oscillator, scene.friction, scene.normal_load
     lin = linearise(o, law, K_n, K_t, friction_slope, P, static)

@@ -1,8 +1,7 @@
 """The part of the heights that is evaluated: sections of a profile, area of a map."""
 
-import warnings
-
 from .._base.parts import Numbers, whole
+from .._base.warn import warn_user
 from .gaussian_filter import length_in_metres
 
 
@@ -33,7 +32,7 @@ def section_bounds(
     if most < max(count, 1):
         raise ValueError(f"{held} (half of it is dropped at both ends), fewer than {max(count, 1)}")
     if count < 5 and sections is None:
-        warnings.warn(f"{held} (half of it is dropped at both ends), fewer than 5", stacklevel=3)
+        warn_user(f"{held} (half of it is dropped at both ends), fewer than 5")
     start = (n - round(count * length / step)) // 2
     return tuple(start + round(k * length / step) for k in range(count + 1))
 
@@ -60,10 +59,9 @@ def evaluation_area(
             for (start, end), step in zip(area, steps, strict=True)
         ]
         if min(sides) < length * (1 - 1e-6):
-            warnings.warn(
+            warn_user(
                 f"z holds an area of {sides[0]:.6g} m x {sides[1]:.6g} m (half of cutoff = "
                 f"{length:.6g} m is dropped at all edges), less than the cutoff squared",
-                stacklevel=3,
             )
     return area
 

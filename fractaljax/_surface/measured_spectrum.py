@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from .._base.parts import Numbers, brief, concrete, number
+from .._base.parts import Numbers, brief, concrete, number, quantity
 from .spectrum import Pieces, Spectrum, fit_roll_off
 
 
@@ -24,6 +24,8 @@ class MeasuredSpectrum(Spectrum):
     - `C`: (k,) two-sided power spectrum of the heights [m^4] there, the mean over directions, above
       0: the integral of C q/(2 pi) over q is Sq^2. Differentiable by every entry.
     - `ln_C_error`: (k,) standard errors of ln C, if they are known; None by default.
+    - `height_factor`: factor of all heights, above 0, which scatters and can be designed; None
+      (default) is 1.
 
     **Raises:** `ValueError` for a table that is not so; `TypeError` for traced wavenumbers.
     """
@@ -36,12 +38,14 @@ class MeasuredSpectrum(Spectrum):
     ln_C_error: tuple[float, ...] | None = eqx.field(
         static=True, metadata={"note": "standard errors of ln C"}
     )
+    height_factor: Numbers | None = quantity("-", "factor of all heights", log=True)
 
     def __init__(
         self,
         q: Sequence[float] | ArrayLike,
         C: Sequence[ArrayLike] | ArrayLike,
         ln_C_error: Sequence[float] | ArrayLike | None = None,
+        height_factor: ArrayLike | None = None,
     ):
         rows = [number(f"q[{i}]", x, above=0) for i, x in enumerate(_entries("q", q))]
         if any(concrete(x) is None for x in rows):
@@ -57,12 +61,17 @@ class MeasuredSpectrum(Spectrum):
             if len(ln_C_error) != len(self.q):
                 raise ValueError(f"ln_C_error must be {len(self.q)}, got {len(ln_C_error)}")
         self.ln_C_error = ln_C_error
+        if height_factor is not None:
+            height_factor = number("height_factor", height_factor, above=0)
+        self.height_factor = height_factor
         if not (np.diff(self.q) > 0).all():
             raise ValueError(f"q must rise, got {brief(self.q)}")
 
     def _logs(self):
-        """ln q and ln C of the table."""
+        """ln q and ln C of the table, with the factor of the heights."""
         log_C = jnp.log(jnp.stack(self.C_table, axis=-1))
+        if self.height_factor is not None:
+            log_C = log_C + 2 * jnp.log(self.height_factor)
         return np.log(self.q), log_C
 
     def m(self, q):

@@ -116,9 +116,10 @@ class Spectrum(Part):
 
         **Raises:** `ValueError` for a custom spectrum without a number Sq.
         """
-        if not hasattr(self, "Sq"):
+        Sq: Any = getattr(self, "Sq", None)
+        if Sq is None:
             raise ValueError(f"{type(self).__name__} must have a number Sq, or a method times")
-        return eqx.tree_at(lambda x: x.Sq, self, factor * self.Sq)
+        return eqx.tree_at(lambda x: x.Sq, self, factor * Sq)
 
     def _ends(self) -> tuple[Any, Any]:
         """The longest and the shortest wavelength of a custom spectrum [m]."""

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import ArrayLike
 
-from .._base.parts import Numbers, number, quantity
+from .._base.parts import Numbers, concrete, doubt_unit, number, quantity
 from .spectrum import Pieces, Spectrum
 
 
@@ -27,8 +27,10 @@ class Surface(Spectrum):
     gamma: Numbers = quantity("-", "ratio of successive spatial frequencies, above 1")
 
     def __init__(self, D: ArrayLike, G: ArrayLike, gamma: ArrayLike = 1.5):
-        self.D = number("D", D, above=2, below=3)
+        self.D = _dimension(D, G)
         self.G = number("G", G, above=0)
+        # A tenth of a millimetre: that of machined surfaces is a nanometre or less.
+        doubt_unit("G", self.G, 0, 1e-4, "G is in m: 0.1342 nm are 1.342e-10")
         self.gamma = number("gamma", gamma, above=1)
 
     def m(self, q):
@@ -46,6 +48,23 @@ class Surface(Spectrum):
         width = frequency_count(self.gamma, L / L_s) * log_gamma
         edges = jnp.stack([q, q * jnp.exp(width)])
         return Pieces(edges, self.m(q)[None], 2 * (self.D - 2)[None])
+
+
+def _dimension(D, G) -> Numbers:
+    """A checked D; errors say what to type for the D of a profile, and for D and G in turn."""
+    try:
+        return number("D", D, above=2, below=3)
+    except ValueError as error:
+        values = [concrete(jnp.asarray(x)) for x in (D, G)]
+        plain = [float(x) for x in values if x is not None and x.ndim == 0]
+        if len(plain) == 2:
+            first, second = plain
+            if 1 < first < 2:
+                hint = f"this is a profile's D, which is one less: type D = {first + 1:.10g}"
+                raise ValueError(f"{error}: {hint}") from None
+            if 2 < second < 3:
+                raise ValueError(f"{error}: the order is Surface(D, G)") from None
+        raise
 
 
 def frequency_count(gamma, ratio, xp=jnp):

@@ -49,7 +49,8 @@ def topography(
     L: ScalarLike,
     n: int,
     *,
-    key: PRNGKeyArray,
+    key: PRNGKeyArray | None = None,
+    seed: int | None = None,
     L_s: ScalarLike | None = None,
     M: int = 10,
     periodic: bool = False,
@@ -66,6 +67,7 @@ def topography(
     - `L`: side of the square [m]; of a `Surface` also its longest wavelength.
     - `n`: points along a side.
     - `key`: of `jax.random`, which draws the phases: the same key gives the same surface.
+    - `seed`: a whole number in place of the key, `jax.random.key(seed)`.
     - `L_s`: shortest wavelength [m] of a `Surface`, by default 2 L/n, the shortest that the grid
       resolves. A smaller one adds waves without moving the others.
     - `M`: directions of each frequency of a `Surface`, 10 by default.
@@ -87,6 +89,7 @@ def topography(
     """
     require_kind("surface", surface, Spectrum)
     require_scalar(surface)
+    key = _key(key, seed)
     n, M, periodic = whole("n", n, 2), whole("M", M, 1), flag("periodic", periodic)
     if not isinstance(surface, Surface):
         if L_s is not None:
@@ -134,6 +137,13 @@ def random_phases(key: PRNGKeyArray, count: int, M: int) -> Float[Array, "count 
     return bits[:count].astype(float) * 2.0**-32  # of 32 bits: one surface in every precision
 
 
+def _key(key, seed) -> PRNGKeyArray:
+    """The key, or that of a seed, of which there must be one."""
+    if (key is None) == (seed is None):
+        raise TypeError("topography needs a key or a seed, and not both: type seed=0")
+    return key if seed is None else jax.random.key(whole("seed", seed, 0, 2**63 - 1))
+
+
 def _require_key(key) -> None:
     try:
         jax.eval_shape(jax.random.bits, key)
@@ -141,7 +151,9 @@ def _require_key(key) -> None:
         many = getattr(key, "ndim", 0) > 0
         got = f"an array of shape {key.shape}" if many else repr(key)
         kind = ValueError if many else TypeError
-        raise kind(f"key must be one key of jax.random, got {got}") from None
+        raise kind(
+            f"key must be one key of jax.random, got {got}: type seed=0 in its place"
+        ) from None
 
 
 def _require_concrete(name: str, value: jax.Array) -> np.ndarray:

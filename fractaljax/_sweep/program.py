@@ -149,6 +149,8 @@ class Digest:
         """x, a parameter of the operation `name`, as tuples of text and bytes unique to it."""
         if isinstance(x, _PLAIN):
             return repr(x)
+        if isinstance(x, jax.core.Tracer):  # of a rule for derivatives of an implicit solver
+            return "traced", *_aval(x.aval)
         if hasattr(x, "dtype") and hasattr(x, "__array__"):  # an array of NumPy or JAX, or similar
             return array_digest(x)
         if isinstance(x, ClosedJaxpr):

@@ -7,8 +7,10 @@ import jax
 import numpy as np
 from jaxtyping import DTypeLike, Float
 
+from .._base import html
 from .._base.parts import Record
-from .._mechanism.quantities import unit
+from .._mechanism.quantities import meaning, unit
+from . import labels
 
 if TYPE_CHECKING:
     from xarray import DataArray, Dataset  # pyright: ignore[reportMissingImports]
@@ -24,6 +26,8 @@ class Sweep(Record):
     points: tuple[Float[np.ndarray, " _"], ...]  # the values of each quantity
     names: tuple[str, ...] = eqx.field(static=True)
     scene: Any = eqx.field(repr=False)  # the Scene or Structure that was swept
+    # Name, unit and meaning of what a measure with a single array gives.
+    measured: tuple[str, str, str] = eqx.field(static=True, repr=False, default=("value", "", ""))
 
     @property
     def axes(self) -> dict[str, np.ndarray]:
@@ -33,6 +37,10 @@ class Sweep(Record):
     @property
     def _single(self) -> bool:
         return jax.tree_util.all_leaves([self.values])
+
+    def _leaves(self) -> dict[str, Any]:
+        """The arrays of the measure by name."""
+        return labels.leaves_by_name(self.measured[0], self.values)
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> np.ndarray:
         if not self._single:
@@ -47,8 +55,20 @@ class Sweep(Record):
             raise AttributeError(f"a Sweep has no attribute {name!r}")
         return getattr(self.values, name)
 
+    def _repr_html_(self) -> str:
+        """What Jupyter shows: the axes of the grid, then the arrays of the measure."""
+        size = " x ".join(f"{name}: {len(x)}" for name, x in self.axes.items())
+        x = self.scene
+        rows = [(name, v, unit(x, name), meaning(x, name)) for name, v in self.axes.items()]
+        for name, leaf in self._leaves().items():
+            rows.append((name, leaf, *labels.leaf_words(self.measured, self.values, name)))
+        return html.table(f"fractaljax.Sweep ({size})", rows)
+
     def to_xarray(self) -> "DataArray | Dataset":
         """A `DataArray` with units on its axes; for a pytree a `Dataset`, one variable per leaf.
+
+        It has the name of the measure. Units and meanings of axes and arrays are in their `attrs`,
+        and dimensions beyond the grid have names, such as mode and dof.
 
         **Raises:** `ImportError` unless xarray is installed.
         """
@@ -56,17 +76,49 @@ class Sweep(Record):
             import xarray  # pyright: ignore[reportMissingImports]
         except ImportError:
             raise ImportError("to_xarray needs xarray: python -m pip install xarray") from None
-        coords = {
-            name: (name, values, {"units": unit(self.scene, name)})
-            for name, values in self.axes.items()
-        }
+        x, coords = self.scene, {}
+        for name, values in self.axes.items():
+            coords[name] = name, values, {"units": unit(x, name), "long_name": meaning(x, name)}
 
-        def labelled(name, leaf):
-            dimensions = [f"{name}_{i}" for i in range(np.ndim(leaf) - len(self.names))]
-            return xarray.DataArray(leaf, coords, [*self.names, *dimensions])
+        grid = len(self.names)
+        leaves = self._leaves()
+        dims = labels.dimensions({name: np.shape(x)[grid:] for name, x in leaves.items()})
+        arrays = {}
+        for name, leaf in leaves.items():
+            key = name + "_" * (name in coords)  # an axis may have the name already
+            about = labels.attributes(*labels.leaf_words(self.measured, self.values, name))
+            arrays[key] = xarray.DataArray(leaf, coords, [*self.names, *dims[name]], key, about)
+        return next(iter(arrays.values())) if self._single else xarray.Dataset(arrays)
 
-        if self._single:
-            return labelled("dim", self.values)
-        leaves = jax.tree_util.tree_leaves_with_path(self.values)
-        named = [(jax.tree_util.keystr(p, simple=True, separator="."), leaf) for p, leaf in leaves]
-        return xarray.Dataset({name: labelled(name, leaf) for name, leaf in named})
+    def plot(self, ax: Any = None, **options: Any) -> Any:
+        """A picture of the sweep: a map of growth rates, the stiffness, or curves of a scalar.
+
+        **Arguments:**
+
+        - `ax`: axes to draw in, by default those of a new figure.
+        - `options`: those of the function of `fractaljax.plot` that draws it: `growth_map` over
+          two quantities, `stability_chart` over one, `stiffness`, or `curves`.
+
+        **Returns:** the Axes; of a stiffness, both.
+
+        **Raises:** `ValueError` for more than two axes, and for arrays that no picture shows.
+        """
+        from .. import plot
+
+        own = {} if ax is None else {"ax": ax}
+        maps = len(self.names) == 2 and min(map(len, self.points)) > 1
+        grows = hasattr(self.values, "growth_rate") or self.measured[0] == "growth_rate"
+        if len(self.names) > 2:
+            raise ValueError(f"a picture has one or two axes, the sweep {len(self.names)}")
+        if grows and maps:
+            return plot.growth_map(self, **own, **options)
+        if hasattr(self.values, "eigenvalues") and not maps:
+            return plot.stability_chart(self, **own, **options)
+        if not self._single:
+            if ax is None and (isinstance(self.values, tuple) or hasattr(self.values, "K_n")):
+                return plot.stiffness(self, **options)
+            names = ", ".join(self._leaves())
+            raise ValueError(f"the sweep holds several arrays: plot one of {names}")
+        name, unit_text, _ = self.measured
+        options = {"label": f"{name} [{unit_text}]" if unit_text else name} | options
+        return plot.curves(self, **own, **options)

@@ -23,8 +23,10 @@ import numpy as np
 
 from .._base.parts import one_line
 from .._base.versions import versions, versions_differ
+from .._base.warn import warn_user
 from .._mechanism.quantities import meaning, quantity_names, unit
 from .blocks import Blocks
+from .labels import dimensions, leaf_names as names_of_leaves, measure_name
 from .program import Program, array_digest
 
 _ABOUT = "fractaljax"  # the attribute that describes the sweep
@@ -94,11 +96,11 @@ class Store:
                         words["units"] = unit(scene, quantity)
                     _add(group, name, values.dtype, values.shape, values.shape, [name], words)
                     group[name][:] = values
+                beyond = dimensions({name: leaf.shape for name, leaf in leaves.items()})
                 for name, leaf in leaves.items():
-                    dimensions = [f"{name}_{i}" for i in range(len(leaf.shape))]
-                    dimensions = _distinct(dimensions, [*names, *leaves])
+                    more = _distinct(beyond[name], [*names, *leaves])
                     shape, chunks = (first + leaf.shape for first in (blocks.shape, blocks.block))
-                    _add(group, name, leaf.dtype, shape, chunks, [*names, *dimensions])
+                    _add(group, name, leaf.dtype, shape, chunks, [*names, *more])
                 words = {"long_name": "checksum of the batch of the point; 0: not computed yet"}
                 _add(group, _COMPUTED, np.uint64, blocks.shape, blocks.block, names, words)
                 with warnings.catch_warnings():
@@ -124,7 +126,7 @@ class Store:
             note = f" (it was {others})" if others else ""
             raise ValueError(f"out {path} holds another sweep: {', '.join(differs)} differ{note}")
         if others:
-            warnings.warn(f"out {path} was {others}: digits may differ", stacklevel=4)
+            warn_user(f"out {path} was {others}: digits may differ")
         return stored[_NAMES]
 
     def there(self) -> set[int]:
@@ -274,11 +276,7 @@ def axis_names(axes: Mapping[str, Any]) -> list[str]:
 
 def leaf_names(measure: Any, shapes: Any, axes: Mapping[str, Any]) -> list[str]:
     """The names of the arrays of a measure: its own, or for several those of `Sweep.to_xarray`."""
-    leaves = jax.tree_util.tree_leaves_with_path(shapes)
-    names = [jax.tree_util.keystr(place, simple=True, separator=".") for place, _ in leaves]
-    if names == [""]:
-        function_name = getattr(getattr(measure, "func", measure), "__name__", "").strip("_")
-        names = [function_name if function_name.isidentifier() else "value"]
+    names = names_of_leaves(measure_name(measure), shapes)
     return _distinct(names, ["zarr.json", _COMPUTED, *axis_names(axes)])
 
 

@@ -26,6 +26,7 @@ from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
 from .batches import Batches, mesh_of
 from .blocks import blocks
+from .labels import measure_words
 from .program import Program
 from .result import Sweep
 from .store import Store, describe, description, leaf_names, zarr
@@ -96,7 +97,7 @@ def sweep(
         each=_points_each(x), batch_size=batch_size, progress=progress, out=out
     )
     values = run(program, whole, grid, x, measure, **how, devices=devices, executor=executor)
-    return Sweep(values, tuple(grid.values()), names, x)
+    return Sweep(values, tuple(grid.values()), names, x, measure_words(measure))
 
 
 def run(

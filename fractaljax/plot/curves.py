@@ -8,7 +8,6 @@ from .._contact.contact import Regime
 from .._sweep.result import Sweep
 from .axes import (
     Axes,
-    Figure,
     ensure_axes,
     format_value,
     legend_above,
@@ -16,6 +15,7 @@ from .axes import (
     new_figure,
     set_quantity_axis,
 )
+from .panels import Panels
 
 _STIFFNESS = {"K_n": "normal stiffness K_n", "K_t": "tangential stiffness K_t"}
 
@@ -86,8 +86,8 @@ def stiffness_curves(
     return ax
 
 
-def stiffness(result: Sweep) -> Figure:
-    """K_n and K_t side by side; returns the figure.
+def stiffness(result: Sweep) -> Panels:
+    """K_n and K_t side by side; returns their axes.
 
     **Arguments:**
 
@@ -96,7 +96,7 @@ def stiffness(result: Sweep) -> Figure:
     figure = new_figure(11.2, 5.2)
     for ax, which in zip(figure.subplots(1, 2), ("K_n", "K_t"), strict=True):
         stiffness_curves(result, ax, stiffness=which)
-    return figure
+    return Panels(figure)
 
 
 def _draw(result, values, ax):

@@ -6,7 +6,8 @@ import numpy as np
 
 from .._base.parts import whole
 from .._dynamics.cycle import CycleResult, LimitCycle
-from .axes import Axes, Figure, coordinate, ensure_axes, legend_above, new_figure
+from .axes import Axes, coordinate, ensure_axes, legend_above, new_figure
+from .panels import Panels
 
 
 def phase_portrait(
@@ -84,8 +85,8 @@ def spectrum(
     return ax
 
 
-def cycle(result: LimitCycle) -> Figure:
-    """Phase portraits and spectra; returns the figure.
+def cycle(result: LimitCycle) -> Panels:
+    """Phase portraits and spectra; returns their axes.
 
     A row for each direction of a scene, and for t.x of each joint of a structure.
 
@@ -102,12 +103,12 @@ def cycle(result: LimitCycle) -> Figure:
     for pair, chosen in zip(figure.subplots(len(rows), 2, squeeze=False), rows, strict=True):
         phase_portrait(result, pair[0], **chosen)
         spectrum(result, pair[1], **chosen)
-    return figure
+    return Panels(figure)
 
 
 def _sticking(cycle, face):
     """Yield times [s] at which sticking begins and ends; the last may end in the next period."""
-    if cycle.regularisation_error != 0:  # the regularised law creeps instead
+    if cycle.regularisation_error != 0 or cycle.internal is not None:  # it creeps instead
         return
     switches = [switch for switch in cycle.switches() if switch.direction == face + 1]
     for switch, following in zip(switches, switches[1:] + switches[:1], strict=True):

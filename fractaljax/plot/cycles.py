@@ -6,15 +6,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import ArrayLike
 
+from .._base.parts import brief
 from .._dynamics.cycle import LimitCycle
-from .axes import Axes, Figure, ensure_axes, legend_above, new_figure
+from .axes import Axes, ensure_axes, legend_above, new_figure
 from .cycle import phase_portrait, spectrum
+from .panels import Panels
 
 
 def cycles(
     results: Mapping[str, LimitCycle], *, direction: int = 1, joint: int | None = None
-) -> Figure:
-    """Phase portrait and spectrum of one displacement, a row for each cycle; returns the figure.
+) -> Panels:
+    """Phase portrait and spectrum of one displacement, a row for each cycle; returns their axes.
 
     All rows have the same axes.
 
@@ -23,8 +25,14 @@ def cycles(
     - `results`: {name of the row: limit cycle}.
     - `direction`, `joint`: as in `phase_portrait`.
 
-    **Raises:** `ValueError` if there are no cycles, and as `phase_portrait`.
+    **Raises:** `TypeError` unless there is a name for each; `ValueError` if there are no cycles,
+    and as `phase_portrait`.
     """
+    if not isinstance(results, Mapping):
+        raise TypeError(
+            "results must be a mapping such as {'name': limit_cycle(scene)}, "
+            f"got {brief(results)}"
+        )
     if not results:
         raise ValueError("there must be at least one limit cycle to draw")
     figure = new_figure(10.4, 0.5 + 3.6 * len(results))
@@ -44,7 +52,7 @@ def cycles(
         (stems,) = ax.collections
         bottom, _ = ax.get_ylim()
         stems.set_segments([[(f, bottom), (f, a)] for (f, _), (_, a) in stems.get_segments()])
-    return figure
+    return Panels(figure)
 
 
 def amplitudes(

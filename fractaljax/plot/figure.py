@@ -1,6 +1,7 @@
 """The figure that every picture is drawn on."""
 
 import io
+from typing import Any
 
 import matplotlib.figure
 
@@ -13,6 +14,12 @@ class Figure(matplotlib.figure.Figure):
 
     def __init__(self, size: tuple[float, float]) -> None:
         super().__init__(figsize=size, layout="constrained")
+
+    def add_subplot(self, *args: Any, **options: Any) -> Any:
+        """As matplotlib does; a notebook shows the figure of axes, too."""
+        ax: Any = super().add_subplot(*args, **options)
+        ax._repr_png_ = self._repr_png_
+        return ax
 
     def png(self, dpi: float) -> bytes:
         """The pixels of `savefig` as a PNG file, in less time: `savefig` draws everything twice."""

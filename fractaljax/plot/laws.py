@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 
 from .._contact.compare import BOUNDARY_ELEMENTS, LawComparison
-from .axes import Axes, Figure, ensure_axes, line_colours, new_figure
+from .axes import Axes, ensure_axes, line_colours, new_figure
+from .panels import Panels
 
 _PANELS = {
     "K_n": "normal stiffness K_n [N/m]",
@@ -62,8 +63,8 @@ def law_curves(result: LawComparison, ax: Axes | None = None, *, show: str = "K_
     return ax
 
 
-def laws(result: LawComparison) -> Figure:
-    """K_n, its exponent, K_t/K_n and the real area by every law; returns the figure.
+def laws(result: LawComparison) -> Panels:
+    """K_n, its exponent, K_t/K_n and the real area by every law; returns their axes.
 
     **Arguments:**
 
@@ -72,7 +73,7 @@ def laws(result: LawComparison) -> Figure:
     figure = new_figure(11.2, 8.4)
     for ax, show in zip(figure.subplots(2, 2).ravel(), _PANELS, strict=True):
         law_curves(result, ax, show=show)
-    return figure
+    return Panels(figure)
 
 
 def _values(result, curve, show):

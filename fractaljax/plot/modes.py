@@ -9,7 +9,6 @@ from .._mechanism.quantities import label
 from .._sweep.result import Sweep
 from .axes import (
     Axes,
-    Figure,
     ensure_axes,
     format_value,
     legend_above,
@@ -18,6 +17,7 @@ from .axes import (
     set_quantity_axis,
 )
 from .maps import frequency_map, growth_map, vibration_modes
+from .panels import Panels
 
 _LABELS = {"real": "real part [1/s]", "frequency": "frequency [kHz]"}
 _COLOURS = "#9ecae1", "#d95f0e", "#31a354", "#756bb1"
@@ -97,8 +97,8 @@ def mode_surfaces(
     return ax
 
 
-def modes(result: Sweep) -> Figure:
-    """Growth rate, real parts, and the frequencies of modes 1 and 2; returns the figure.
+def modes(result: Sweep) -> Panels:
+    """Growth rate, real parts, and the frequencies of modes 1 and 2; returns their axes.
 
     **Arguments:**
 
@@ -110,7 +110,7 @@ def modes(result: Sweep) -> Figure:
     mode_lines(result, upper[1])
     frequency_map(result, lower[0], mode=1)
     frequency_map(result, lower[1], mode=2)
-    return figure
+    return Panels(figure)
 
 
 def _layers(result, quantity):

@@ -15,6 +15,7 @@ from .._mechanism.structure import Structure
 from .animation import animated, animation_path
 from .axes import Axes, Figure, frequency_unit, legend_above, new_figure
 from .mesh import draw_mesh, mesh_height, mesh_scale, projection
+from .panels import Panels
 
 if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
@@ -29,7 +30,7 @@ def cycle_motion(
     cells: ArrayLike | None = None,
     at: float = 0.0,
     scale: float | None = None,
-) -> Figure:
+) -> Panels:
     """A limit cycle at one time: the deformed mesh, and what each joint does over the period.
 
     The colour is the largest displacement of each node over the period. A mark on the mesh is at
@@ -50,7 +51,7 @@ def cycle_motion(
     at = float(scalar("at", at, at_least=0, below=1))
     figure, draw = _picture(_motion(cycle, structure, points, dofs, cells, 1), scale)
     draw(at)
-    return figure
+    return Panels(figure)
 
 
 def animate_cycle(

@@ -7,7 +7,8 @@ from jaxtyping import ArrayLike, Float
 
 from .._design.design import Design
 from .._surface.topography import Topographies
-from .axes import Axes, Figure, ensure_axes, new_figure
+from .axes import Axes, ensure_axes, new_figure
+from .panels import Panels
 
 
 def topography(
@@ -36,8 +37,8 @@ def topography(
     return ax
 
 
-def topographies(design: Design, **options: Any) -> Figure:
-    """The given and the designed surface side by side, at one colour scale; returns the figure.
+def topographies(design: Design, **options: Any) -> Panels:
+    """The given and the designed surface side by side, at one colour scale; returns their axes.
 
     **Arguments:**
 
@@ -47,7 +48,7 @@ def topographies(design: Design, **options: Any) -> Figure:
     return drawn_topographies(design, design.topographies(**options))
 
 
-def drawn_topographies(design: Design, surfaces: Topographies) -> Figure:
+def drawn_topographies(design: Design, surfaces: Topographies) -> Panels:
     """As `topographies`, of surfaces that are computed already."""
     heights = [_subtract_mean(z) for z in (surfaces.before, surfaces.after)]
     low, high = min(z.min() for z in heights), max(z.max() for z in heights)
@@ -62,7 +63,7 @@ def drawn_topographies(design: Design, surfaces: Topographies) -> Figure:
         ax.set_title(f"{name}: D = {surface.D:.5g}, G = {surface.G:.4g} m", fontsize="medium")
         ax.label_outer()
     figure.colorbar(image, ax=axes, pad=0.02).set_label("height about the mean [µm]")
-    return figure
+    return Panels(figure)
 
 
 def _subtract_mean(z):

@@ -3,11 +3,12 @@
 import numpy as np
 
 from .._stability.tracks import ModeTracks
-from .axes import Figure, frequency_unit, legend_above, lines, new_figure, set_quantity_axis
+from .axes import frequency_unit, legend_above, lines, new_figure, set_quantity_axis
+from .panels import Panels
 
 
-def mode_tracks(tracks: ModeTracks, *, most: int = 9) -> Figure:
-    """Growth rate [1/s] and frequency of all modes over the quantity; returns the figure.
+def mode_tracks(tracks: ModeTracks, *, most: int = 9) -> Panels:
+    """Growth rate [1/s] and frequency of all modes over the quantity; returns their axes.
 
     A mode is drawn thick where it is unstable. If there are more than `most`, only modes that are
     unstable somewhere have a colour, and the axes show their range; the others are grey.
@@ -43,4 +44,4 @@ def mode_tracks(tracks: ModeTracks, *, most: int = 9) -> Figure:
     if handles:
         legend_above(panels[0], handles[:most])
     figure.align_ylabels()
-    return figure
+    return Panels(figure)

@@ -22,6 +22,7 @@ _ROWS += ["What this design hangs on:", " ", "sigma_y [Pa] = 3.55e+08", "gamma =
 _ROWS += ["E [Pa] = 1.154e+11", "mu_m = 0.25", "H [Pa] = 9.94e+08"]
 _ROWS += ["multipliers: growth_rate <= target: ", "", "found: "]
 _ROWS += ["", " ", "as it is (FractalContact)", "friction on P + K_n x2"]
+_ROWS += ["tangential spring in series"]
 _ROWS += ["K_t/K_n from 0.355 to 0.824"]
 _ROWS += ["Quiet, but it rests on: friction on K_n x2; K_t/K_n = 0.355."]
 _ROWS += ["Not asked: other contact laws (area), scatter (tolerance), kicks (quiet_within), wear "]

@@ -1,9 +1,9 @@
 """`fractaljax identify`: from a file of heights to a scene that can be designed."""
 
-import dataclasses
 import math
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -50,8 +50,9 @@ def test_identify_a_profile(capsys):
     found, scene = fj.identify(z, DX), fj.Scene.load(SCENE)
     assert f"{found}" in out
     errors = read_tolerance(SCENE.parent / "tolerance.toml")
-    assert errors.names == ("D", "ln G")
-    np.testing.assert_allclose(errors.covariance, found.covariance, rtol=1e-9)
+    assert errors.names == ("D", "ln m(q)") and errors.q is not None
+    assert errors.q == pytest.approx(found.q)
+    np.testing.assert_allclose(errors.covariance, found.scatter.covariance, rtol=1e-9)
     surface = scene.contact.surface
     np.testing.assert_allclose([surface.D, surface.G], [found.D, found.G], rtol=1e-9)
     assert abs(found.D - D) < 3 * found.D_standard_error
@@ -112,8 +113,8 @@ WAVY += 1e-9 * np.random.default_rng(1).normal(size=4096)
 @pytest.mark.parametrize(
     ("z", "message"),
     [
-        (profile(1024, 3.25), "D must be above 2 and below 3"),
-        (WAVY, DISQUALIFYING[0]),
+        (profile(1024, 3.4), "no surface fits this profile (H = "),
+        (WAVY, "measure a map, whose spectrum is taken as it is"),
         (1e-8 * np.round(4 * profile(1024) / np.ptp(profile(1024))), DISQUALIFYING[1]),
     ],
 )
@@ -132,24 +133,14 @@ def test_no_scene(capsys, z, message):
 
 
 @pytest.mark.slow
-def test_force_writes_a_scene_all_the_same(capsys, monkeypatch):
-    """Of a surface that is not fractal, and of one with five warnings."""
+def test_force_writes_a_scene_all_the_same(capsys):
+    """The power law of a surface that is none."""
     ripple = 3e-7 * np.sin(2 * np.pi * DX * np.arange(4096) / 3e-5)
     np.save("z.npy", profile(4096) + ripple)
     arguments = ("identify", "z.npy", "--dx", DX, "--unit", "m")
     assert run(capsys, *arguments)[0] == 1
     status, out, _ = run(capsys, *arguments, "--force")
     assert status == 0 and DISQUALIFYING[0] in SCENE.read_text() and "no scene" not in out
-    write_profile("mine.csv", profile(4096))
-    found = fj.identify(profile(4096), DX)
-    for count, expected in ((4, 0), (5, 1)):
-        warned = dataclasses.replace(found, warnings=tuple("abcde"[:count]))
-        monkeypatch.setattr("fractaljax._identify.identify.identify", lambda *_, **__: warned)  # noqa: B023
-        status, out, _ = run(capsys, "identify", "mine.csv")
-        assert status == expected
-        if expected:
-            assert "no scene: 5 warnings (--force writes one all the same)" in out
-            assert run(capsys, "identify", "mine.csv", "--force")[0] == 0
 
 
 def test_bounds_for_the_design():
@@ -160,6 +151,34 @@ def test_bounds_for_the_design():
         (2.95, 1e-7, " --D 2.85 2.975 --G 1e-08 1e-06"),
     ):
         assert _bounds(fj.Surface(D, G)) == options
+    ground = fj.SelfAffine(1e-6, 0.8, 1e-4, 1e-6)
+    assert _bounds(ground) == " --bounds Sq=1e-07:1e-05 hurst=0.3:1"
+    assert _bounds(fj.MeasuredSpectrum([1e4, 1e5], [1e-20, 1e-24])) == (
+        " --bounds height_factor=0.1:10"
+    )
+
+
+@pytest.mark.slow
+def test_a_roll_off_takes_an_area_and_its_tolerance_a_design(capsys):
+    """The command ends in a design where the surface has a roll-off, with its errors."""
+    ground = fj.SelfAffine(1e-6, 0.7, 8e-6, 1e-6)
+    z = fj.topography(ground, 96e-6, 96, key=jax.random.key(1))
+    np.save("map.npy", np.asarray(z))
+    arguments = ("identify", "map.npy", "--dx", DX, "--unit", "m", "--tolerance", "errors.toml")
+    status, out, _ = run(capsys, *arguments)
+    assert status == 1 and out.splitlines()[-1].startswith("no scene: a SelfAffine takes Persson")
+    assert not Path("errors.toml").exists()
+    status, out, err = run(capsys, *arguments, "--area", 1e-6)
+    assert (status, err) == (0, "") and "K_n = " in out and "squeals with probability" in out
+    scene, errors = fj.Scene.load(SCENE), read_tolerance("errors.toml")
+    assert isinstance(scene.contact.surface, fj.SelfAffine) and errors.names[:2] == (
+        "ln Sq",
+        "hurst",
+    )
+    words = out.splitlines()[-1].removeprefix("next: fractaljax design ").split()
+    options = ["--tolerance", "errors.toml", "--starts", 1, "--lattice", 2, "--quiet"]
+    status, out, err = run(capsys, "design", *words, *options)
+    assert err == "" and status in (0, 1) and "probability of squeal" in out and "Ra [m]" in out
 
 
 @pytest.mark.parametrize(
@@ -206,24 +225,23 @@ def test_the_joint_of_the_measured_surface_and_what_it_rests_on(capsys):
     scene = fj.Scene.load(SCENE)
     found = fj.identify(np.load("map.npy"), DX)
     assert status == 0 and str(fj.verdict(scene, tolerance=found, area=1e-4)) in out
-    assert "by PerssonContact" in out and "D and ln G scatter" in out
+    assert "by PerssonContact" in out and "D and ln m(q) scatter" in out
     over = ("--envelope", "P=1500:2500", "V=0.1,0.15")
     status, ranged, _ = run(capsys, "identify", *arguments, *over)
     envelope = fj.Envelope({"P": (1500, 2500)}, {"V": (0.1, 0.15)})
     assert status == 0 and str(fj.verdict(scene, tolerance=found, envelope=envelope)) in ranged
-    assert "D and ln G scatter over P" in ranged
+    assert "D and ln m(q) scatter over P" in ranged
     (line,) = (line for line in out.splitlines() if line.startswith("K_n = "))
-    shown, _, _ = line.removeprefix("K_n = ").partition(" N/m")
-    value, error = map(float, shown.split("+-"))
-    h, surface = 1e-6, scene.contact.surface
-    slopes = [
-        np.diff([float(fj.stiffness(scene.replace(D=a, G=b))[0]) for a, b in pair])[0] / (2 * h)
-        for pair in (
-            [(surface.D - h, surface.G), (surface.D + h, surface.G)],
-            [(surface.D, surface.G * math.exp(-h)), (surface.D, surface.G * math.exp(h))],
-        )
-    ]
+    shown, _, ends = line.removeprefix("K_n = ").partition(" N/m (")
+    value, low, high = map(float, [shown, *ends.partition(")")[0].split(" to ")])
     assert value == pytest.approx(float(fj.stiffness(scene)[0]), rel=1e-3)
-    assert error == pytest.approx(math.sqrt(slopes @ found.covariance @ slopes), rel=0.05)
+    drawn = fj.Tolerance.of(found)
+    shifts = drawn.shifts(np.random.default_rng(1).standard_normal((400, 2)))
+    at = drawn.scattered(scene, drawn.base(scene), shifts.T)
+    K_n = [
+        float(fj.stiffness(scene.replace(D=a, G=b))[0])
+        for a, b in zip(at["D"], at["G"], strict=True)
+    ]
+    np.testing.assert_allclose([low, high], np.quantile(K_n, [0.16, 0.84]), rtol=0.1)
     status, _, err = run(capsys, "identify", *arguments, "--area", 0)
     assert status == 2 and "--area must be above 0, got 0.0" in err

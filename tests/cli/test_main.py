@@ -182,7 +182,6 @@ def test_bad_scene_files(capsys, tmp_path, command, old, new, message):
         (["map", "--x", "speed=1:2"], "no quantity 'speed'"),
         (["cycle", "--constant-friction"], "unrecognized arguments: --constant-friction"),
         (["polish"], "invalid choice: 'polish'"),
-        ([], "required: COMMAND; see fractaljax --help"),
     ],
 )
 def test_bad_arguments(capsys, tmp_path, arguments, message):

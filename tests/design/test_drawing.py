@@ -23,7 +23,7 @@ MEASURES = {
 }
 
 
-def pressed(surface=GROUND):
+def pressed(surface: fj.Spectrum = GROUND):
     """The brake with this surface under Persson's law."""
     brake = fj.brake_scene()
     law = fj.PerssonContact(surface, brake.contact.material, P=1907.3, area=1e-3)

@@ -343,3 +343,47 @@ def test_probability_of_squeal_of_a_structure_by_a_loop():
 
     assert found.value == np.mean([float(growth(by)) > 0 for by in shifts])
     assert 0.1 < found.value < 0.9
+
+
+@pytest.mark.parametrize(("D", "sigma"), [(2.4, 0.02), (2.1, 0.15), (2.9, 0.3)])
+def test_heights_at_one_wavenumber(D, sigma):
+    """D is the truncated normal of SciPy, ln m(q) normal and independent of it, at every draw."""
+    q, log_error, G = 1e5, 0.2, 1e-9
+    scene = fj.brake_scene().replace(D=D, G=G)
+    tolerance = Tolerance(("D", "ln m(q)"), np.diag([sigma**2, log_error**2]), q)
+    tolerance.check(scene, {"D": (2.001, 2.999)})
+    shifts = tolerance.shifts(np.random.default_rng(5).standard_normal((20000, 2)))
+    values = tolerance.scattered(scene, tolerance.base(scene), shifts.T)
+    drawn, log_G = np.asarray(values["D"]), np.log(np.asarray(values["G"]))
+    expected = truncnorm((2 - D) / sigma, (3 - D) / sigma, D, sigma)
+    assert drawn.mean() == pytest.approx(expected.mean(), abs=0.02 * sigma)
+    assert drawn.std() == pytest.approx(expected.std(), rel=0.03)
+    log_f = math.log(q / (2 * math.pi))
+
+    def log_m(D, log_G):
+        return (2 * D - 4) * log_G + (2 * D - 6) * log_f - math.log(2)
+
+    by = log_m(drawn, log_G) - log_m(D, math.log(G))
+    np.testing.assert_allclose(by, shifts[:, 1], atol=1e-9)
+    assert abs(np.corrcoef(drawn, by)[0, 1]) < 0.02
+    q_of = fj.Surface(D, G)
+    assert log_m(D, math.log(G)) == pytest.approx(float(jnp.log(q_of.m(q))), rel=1e-12)
+
+
+def test_a_hurst_exponent_and_a_roll_off_stay_inside():
+    """Their distributions are cut off, at any error; q belongs to ln m(q)."""
+    material = fj.brake_scene().contact.material
+    ground = fj.SelfAffine(1e-6, 0.9, 2e-6, 1e-6, longest=1e-3)
+    scene = fj.brake_scene().replace(contact=fj.PerssonContact(ground, material, 2e3, 1e-4))
+    tolerance = Tolerance.of({"ln Sq": 0.3, "hurst": 0.3, "ln rolloff": 1.0})
+    tolerance.check(scene, {})
+    shifts = tolerance.shifts(np.random.default_rng(6).standard_normal((20000, 3)))
+    values = tolerance.scattered(scene, tolerance.base(scene), shifts.T)
+    expected = truncnorm(-3, 1 / 3, 0.9, 0.3)
+    H, rolloff = np.asarray(values["hurst"]), np.asarray(values["rolloff"])
+    assert H.mean() == pytest.approx(expected.mean(), abs=0.01) and 0 < H.min() < H.max() < 1
+    assert 1e-6 < rolloff.min() < rolloff.max() <= 1e-3
+    with pytest.raises(ValueError, match=r"^tolerance takes q with .ln m\(q\)"):
+        Tolerance(("D",), np.eye(1), 1e5)
+    with pytest.raises(ValueError, match="q = None"):
+        Tolerance(("ln m(q)",), np.eye(1))

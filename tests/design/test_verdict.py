@@ -31,7 +31,7 @@ def growth(scene):
 
 @pytest.mark.slow
 def test_every_question_and_what_it_rests_on(found):
-    as_is, loaded, revised, law, ratio, scatter = found.questions
+    as_is, loaded, _, revised, law, ratio, scatter = found.questions
     assert float(as_is.answer) == pytest.approx(growth(DESIGNED), rel=1e-5) and as_is.quiet
     preloaded = fj.Scene(DESIGNED.contact, DESIGNED.friction, DESIGNED.oscillator, preload=True)
     assert float(loaded.answer) == pytest.approx(growth(preloaded), rel=1e-5)
@@ -66,8 +66,8 @@ def test_every_question_and_what_it_rests_on(found):
     law = fj.PerssonContact(
         law.surface, fj.Material(1e10, 0.1, 1e8, 1e9), 1.0, 1e-4, law.L, law.L_s
     )
-    (_, _, asked, _) = fj.verdict(DESIGNED, laws=[law]).questions
-    assert asked == found.questions[3]
+    (*_, asked, _) = fj.verdict(DESIGNED, laws=[law]).questions
+    assert asked == found.questions[4]
 
 
 def test_quiet_in_all():
@@ -81,8 +81,12 @@ def test_quiet_in_all():
     assert fj.verdict(quiet).omitted[0] == "other contact laws (laws)"
     assert [question.name for question in found.questions] == [
         "as it is (FixedContact)",
+        "tangential spring in series",
         "by FixedContact",
     ]
+    K_n, _ = fj.stiffness(quiet)
+    in_series = growth(quiet.replace(contact=fj.FixedContact(K_n, 0.0)))
+    assert float(found.questions[1].answer) == pytest.approx(in_series, rel=1e-5)
 
 
 @pytest.mark.slow

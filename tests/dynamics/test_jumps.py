@@ -5,6 +5,7 @@ slip agree with the state.
 """
 
 import itertools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,8 +25,8 @@ TABLE = {"speeds": (0.0, 0.05, 0.2, 0.5, 1.5), "coefficients": (0.42, 0.33, 0.27
 class Jump(fj.Friction):
     """A user's law with a jump, constant below it."""
 
-    mu_s: jax.Array = fj.quantity("-", "static friction coefficient")
-    mu_d: jax.Array = fj.quantity("-", "friction coefficient of sliding")
+    mu_s: Any = fj.quantity("-", "static friction coefficient")
+    mu_d: Any = fj.quantity("-", "friction coefficient of sliding")
 
     def mu(self, speed):
         return self.mu_d * jnp.ones_like(speed)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
-from fractaljax._dynamics import regularised
+from fractaljax._dynamics import smooth
 from fractaljax._dynamics.scaled import hybrid_system
 from tools import both_modes, motionless_scene, reference_cycle, reference_scene
 
@@ -112,7 +112,9 @@ def test_multipliers():
     y = found.orbit(4096)[1] / system.units[None]
 
     def divergence(y):
-        return jnp.trace(jax.jacfwd(lambda y: regularised.field(0.0, y, (system, COARSE)))(y))
+        return jnp.trace(
+            jax.jacfwd(lambda y: smooth.SmoothSystem(system, jnp.asarray(COARSE)).field(y))(y)
+        )
 
     mean = float(jax.jit(jax.vmap(divergence))(y).mean())
     expected = np.exp(mean * float(found.period * system.omega))
@@ -157,7 +159,7 @@ def test_field():
 
     def found(u):
         y[2:] = u
-        return np.asarray(regularised.field(0.0, jnp.asarray(y), (system, 1e-3)))
+        return np.asarray(smooth.SmoothSystem(system, jnp.asarray(1e-3)).field(jnp.asarray(y)))
 
     slip = np.where(abs(y[2:] - 1) < 0.1, 0.5, y[2:])
     exact = found(slip), system.field(y, np.sign(1 - slip))
@@ -187,13 +189,13 @@ def test_extremes_and_share_below_zero():
     t, x, rate = cosine(40)
     factors = np.array([1.0, -2.0, 0.0, 3.0])
     states, rates = (jnp.asarray(c[:, None] * factors) for c in (x, rate))
-    found = jax.jit(regularised.extremes)(jnp.asarray(t), states, rates)
+    found = jax.jit(smooth.extremes)(jnp.asarray(t), states, rates)
     np.testing.assert_allclose(found, [-abs(factors), abs(factors)], rtol=0, atol=1e-5)
     # With its derivative in both modes, also where it is 0 or 1.
     t, x, rate = (jnp.asarray(c) for c in cosine(60))
 
     def share(level):
-        return regularised.share_below_zero(t, x - level, rate)
+        return smooth.share_below_zero(t, x - level, rate)
 
     levels = np.array([-0.7, 0.0, 0.99, -2.0, 2.0])
     functions = share, jax.jacfwd(share), jax.jacrev(share)

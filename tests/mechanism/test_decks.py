@@ -49,7 +49,7 @@ def assert_right(structure: Any):
     np.testing.assert_allclose(structure.K, K, rtol=1e-15)
     np.testing.assert_allclose(structure.K_loss, K_LOSS, rtol=1e-15)
     assert structure.joints[0].loss_factor == 0.05
-    ours = np.asarray(fj.stability(structure).eigenvalues)
+    ours: Any = np.asarray(fj.stability(structure).eigenvalues)
     np.testing.assert_allclose(np.sort_complex(ours[ours.imag > 0]), eigenvalues(), rtol=1e-11)
 
 

@@ -73,7 +73,7 @@ test_replacing_checks_like_constructing = refusals(
         ({"mu_m": 0.5}, "mu_s must be at least mu_m = 0.5, got 0.4"),
         ({"friction": fj.Coulomb(0.95)}, "mu must be at most 0.9, got 0.95"),
         ({"V": math.nan}, "V must be at least 0, got nan"),
-        ({"mu": 0.3}, "scene has no quantity 'mu'; it has contact, surface, D, G"),
+        ({"nu_s": 0.3}, "scene has no quantity 'nu_s'; it has contact, surface, D, G"),
         ({"friction": fj.Coulomb(0.3), "mu_s": 0.5}, "scene has no quantity 'mu_s'; it has"),
         ({"contact": FIXED, "G": 0.5}, "scene has no quantity 'G'; it has"),
         *(({name: 1.0}, f"{name} must be a") for name in ("contact", "friction", "oscillator")),

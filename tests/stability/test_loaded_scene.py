@@ -8,7 +8,7 @@ import pytest
 import scipy.optimize
 
 import fractaljax as fj
-from fractaljax._stability.linearise import pressed
+from fractaljax._stability.two_directions import two_directions
 
 P, K_N = 500.0, 4e8
 LOADS = np.array([P / 10, 10 * P])
@@ -39,7 +39,7 @@ def test_static_forces_balance(mu, F):
     root: Any = scipy.optimize.root(forces, [0.0, 0.0], tol=1e-15)
     x_1, x_2 = root.x
     assert abs(load(x_2) / P - 1) > 0.05  # or a straight line would do
-    at = jax.jit(pressed)(scene)
+    at = jax.jit(two_directions, static_argnums=1)(scene, True)
     assert at.static is not None
     np.testing.assert_allclose(at.static, [x_1, load(x_2)], rtol=1e-8)
     slope = K_N * (load(x_2) / P) ** (1 / 3)

@@ -23,7 +23,7 @@ def definite(n, least=0.5, rng=RNG):
     return A @ A.T / n + least * np.eye(n)
 
 
-def solutions(M, C, K) -> np.ndarray:
+def solutions(M, C, K) -> Any:
     """All 2n numbers s with det(s^2 M + s C + K) = 0, by SciPy; K may be complex."""
     n = len(M)
     return scipy.linalg.eigvals(
@@ -87,11 +87,11 @@ def structure(mu: Any = MU, eta: Any = ETA[1], loss: Any = ETA[0], **more):
     return fj.Structure(M, C, K, {"pad": joint}, K_loss=loss * PART, **more)
 
 
-def rightmost_in_digits(mu=MU, eta=ETA[1], loss=ETA[0]):
+def rightmost_in_digits(mu: Any, eta: Any, loss: Any) -> Any:
     """The eigenvalue with Im s > 0 that grows most, from the definitions."""
     matrix = [mp.matrix(X.tolist()) for X in (M, C, K)]
     stiffness = matrix[2] + mp.mpc(0, 1) * loss * mp.matrix(PART.tolist())
-    k_n, k_t = (k * mp.mpc(1, eta) for k in (mp.mpf(K_N), mp.mpf(K_T)))
+    k_n, k_t = (k * (1 + mp.mpc(0, 1) * eta) for k in (mp.mpf(K_N), mp.mpf(K_T)))
     stiffness[0, 0] += k_t
     stiffness[1, 1] += k_n
     stiffness[0, 1] -= mu * k_n
@@ -207,7 +207,8 @@ def test_reduction_keeps_structural_damping():
     small = fj.reduce(x, {"eta": (0.0, 0.2)}, (0.0, 0.8), tol=1e-7)
     assert small.n < n and small.K_loss is not None
     for eta in (0.03, 0.17):
-        whole, few = (np.asarray(fj.stability(y.replace(eta=eta)).eigenvalues) for y in (x, small))
+        ends: Any = (np.asarray(fj.stability(y.replace(eta=eta)).eigenvalues) for y in (x, small))
+        whole, few = ends
         whole = whole[(whole.imag > 0.05) & (whole.imag < 0.75)]
         assert np.abs(whole[:, None] - few[None]).min(axis=1).max() < 1e-7
     assert (fj.reduction_errors(small)[: len(whole)] < 1e-6).all()
@@ -218,14 +219,15 @@ def test_reduction_keeps_structural_damping():
 def test_shares_sum_to_growth_rates():
     shares = fj.energy_shares(structure())
     assert shares.parts == ("M", "C", "K", "K_loss", "pad")
-    np.testing.assert_allclose(shares.growth.sum(axis=1), shares.eigenvalues.real, atol=1e-14)
+    rates = np.real(shares.eigenvalues)
+    np.testing.assert_allclose(shares.growth.sum(axis=1), rates, atol=1e-14)
     np.testing.assert_allclose(shares.strain.sum(axis=1), 1)
     assert (shares.growth[:, 3] < 0).all() and np.abs(shares.strain[:, 3]).max() < 1e-15
     # With K_loss = eta K and nothing else, s^2 = -omega^2 (1 + i eta).
     x = fj.Structure(M, None, K, K_loss=0.05 * K)
     omega = np.sqrt(scipy.linalg.eigvalsh(K, M))
-    ours = np.asarray(fj.stability(x).eigenvalues)
-    right = 1j * omega * np.sqrt(1 + 0.05j)
+    ours: Any = np.asarray(fj.stability(x).eigenvalues)
+    right: Any = 1j * omega * np.sqrt(1 + 0.05j)
     np.testing.assert_allclose(np.sort_complex(ours[ours.imag > 0]), np.sort_complex(right))
 
 
