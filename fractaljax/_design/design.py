@@ -28,6 +28,7 @@ from .._stability.stability import growth_rate, require_computable
 from .._stability.summary import stiffness_remarks
 from .._surface.roughness import Roughness, roughness
 from .._surface.spectrum import Spectrum
+from .._surface.surface import Surface
 from .._surface.topography import Topographies, topography
 from . import constraints as limits
 from .descent import descend, select_distinct
@@ -135,12 +136,14 @@ class Design(Record):
 
         **Arguments:**
 
-        - `L`, `L_s`: longest and shortest wavelength [m], by default those of `wavelengths`.
+        - `L`, `L_s`: longest and shortest wavelength [m] of a `Surface`, by default those of
+          `wavelengths`; the other spectra have their own.
         """
-        longest, shortest = self.wavelengths
-        band = longest if L is None else L, shortest if L_s is None else L_s
-        before, after = (roughness(surface, *band) for surface in self._surfaces())
-        return before, after
+        before, after = self._surfaces()
+        if isinstance(before, Surface):
+            longest, shortest = self.wavelengths
+            L, L_s = longest if L is None else L, shortest if L_s is None else L_s
+        return roughness(before, L, L_s), roughness(after, L, L_s)
 
     def drawing(self, cutoff: ScalarLike = 8e-4, shortest: ScalarLike = 2.5e-6) -> Drawing:
         """Ra, Rz [m] of a profile, Sq [m] and Sdq of a map, of both surfaces behind the filters.
@@ -156,12 +159,9 @@ class Design(Record):
 
         **Raises:** as `profile_parameters`; `ValueError` without a surface.
         """
-        spectra = self._spectra()
-        if spectra is None:
-            raise ValueError("a drawing needs a scene whose contact has a surface")
         scene: Any = self.scene
         bands = cutoff, shortest, self.wavelengths
-        return compare_drawings(scene, spectra[0], *bands, self.friction_slope)
+        return compare_drawings(scene, self._surfaces()[0], *bands, self.friction_slope)
 
     def topographies(self, n: int = 1024, *, L=None, L_s=None, M=10, key=None) -> Topographies:
         """Both surfaces on a grid of n x n points with the same phases, to see the difference.
@@ -169,21 +169,21 @@ class Design(Record):
         **Arguments:**
 
         - `n`: points along each side, 1024 by default.
-        - `L`, `L_s`: longest and shortest wavelength [m], by default those of `wavelengths`, but
-          L_s no less than 2 L/n.
-        - `M`: directions of waves, as in `topography`; 10 by default.
+        - `L`, `L_s`: side of the square, which is the longest wavelength of a `Surface`, and the
+          shortest one of a `Surface` [m]: by default those of `wavelengths`, but L_s no less than
+          2 L/n.
+        - `M`: directions of waves of a `Surface`, as in `topography`; 10 by default.
         - `key`: JAX random key of the phases, by default that of the design's seed.
 
         **Raises:** as `topography`.
         """
-        longest, shortest = self.wavelengths
+        surfaces, (longest, shortest) = self._surfaces(), self.wavelengths
         L = longest if L is None else L
         key = jax.random.key(self.options["seed"]) if key is None else key
-        if L_s is None and 2 * L / n < shortest:
+        if isinstance(surfaces[0], Surface) and L_s is None and 2 * L / n < shortest:
             L_s = shortest
         before, after = (
-            np.asarray(topography(surface, L, n, key=key, L_s=L_s, M=M))
-            for surface in self._surfaces()
+            np.asarray(topography(surface, L, n, key=key, L_s=L_s, M=M)) for surface in surfaces
         )
         return Topographies(before, after, float(L) / n)
 
@@ -194,10 +194,13 @@ class Design(Record):
             return before, after
         return None
 
-    def _surfaces(self):
-        if not self.has_surface:
-            raise ValueError("roughness and topographies need a scene whose contact has a surface")
-        return self.initial.contact.surface, self.scene.contact.surface
+    def _surfaces(self) -> tuple[Spectrum, Spectrum]:
+        spectra = self._spectra()
+        if spectra is None:
+            raise ValueError(
+                "a drawing, roughness and topographies need a scene whose contact has a surface"
+            )
+        return spectra
 
     def save(self, path: str | os.PathLike) -> None:
         """Write scenes, options, results and history to the TOML file `path`, for `repeat_design`.

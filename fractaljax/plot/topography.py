@@ -6,6 +6,8 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from .._design.design import Design
+from .._surface.roughness import roughness
+from .._surface.surface import Surface
 from .._surface.topography import Topographies
 from .axes import Axes, ensure_axes, new_figure
 from .panels import Panels
@@ -60,7 +62,11 @@ def drawn_topographies(design: Design, surfaces: Topographies) -> Panels:
     for ax, z, name, scene in zip(axes, heights, names, scenes, strict=True):
         image = _draw(ax, z, (surfaces.dx, surfaces.dx), low, high)
         surface = scene.contact.surface
-        ax.set_title(f"{name}: D = {surface.D:.5g}, G = {surface.G:.4g} m", fontsize="medium")
+        if isinstance(surface, Surface):
+            about = f"D = {surface.D:.5g}, G = {surface.G:.4g} m"
+        else:
+            about = f"Sq = {roughness(surface).Sq:.4g} m"
+        ax.set_title(f"{name}: {about}", fontsize="medium")
         ax.label_outer()
     figure.colorbar(image, ax=axes, pad=0.02).set_label("height about the mean [µm]")
     return Panels(figure)

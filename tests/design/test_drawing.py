@@ -114,7 +114,7 @@ def test_drawing(best):
     p = fj.profile_parameters(surface, L=1e-3, L_s=1e-6, **FILTERS)
     assert fractal.drawing().Rz == (p.Rz, p.Rz)
     fixed = fj.brake_scene().replace(contact=fj.FixedContact(1e8, 1e8))
-    with pytest.raises(ValueError, match="a drawing needs"):
+    with pytest.raises(ValueError, match="a drawing, roughness and topographies need"):
         dataclasses.replace(best, scene=fixed).drawing()
 
 
