@@ -65,8 +65,9 @@ Written by `python docs/make_contact_laws.py`.
 
 def surface(D: float) -> fj.Surface:
     """The surface of this D that is as high as the others."""
-    unit = fj.Surface(D, L)
-    G = L * (SQ / float(fj.roughness(unit, L, 4 * L / N).Sq)) ** (1 / (D - 2))
+    contact: Any = fj.brake_scene().contact
+    Sq = float(fj.roughness(fj.Surface(D, contact.surface.G), L, 4 * L / N).Sq)
+    G = float(contact.surface.G) * (SQ / Sq) ** (1 / (D - 2))
     return fj.Surface(D, G)
 
 
