@@ -40,8 +40,9 @@ def case(D: float, P: float, n: int, waves: int) -> dict[str, Any]:
     contact: Any = fj.brake_scene().contact
     L_s = SIDE / waves
     Sq = fj.roughness(contact.surface, SIDE, L_s).Sq
-    unit = fj.roughness(fj.Surface(D, SIDE), SIDE, L_s).Sq
-    surface = fj.Surface(D, SIDE * (Sq / unit) ** (1 / (D - 2)))
+    G = contact.surface.G
+    unit = fj.roughness(fj.Surface(D, G), SIDE, L_s).Sq
+    surface = fj.Surface(D, G * (Sq / unit) ** (1 / (D - 2)))
     key = jax.random.key(0)
     heights = fj.topography(surface, SIDE, n, key=key, L_s=L_s, periodic=True)
     return {

@@ -28,7 +28,7 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 GROUPS = {  # of the API: title, and the modules whose public names it has
     "surface": ("Surfaces", ("_surface",)),
     "contact": ("Contact", ("_contact",)),
-    "friction": ("Friction", ("_friction", "_tabulated_friction")),
+    "friction": ("Friction", ("_friction", "_friction_memory", "_tabulated_friction")),
     "mechanism": ("Scenes and structures", ("_mechanism",)),
     "stability": ("Stability", ("_stability",)),
     "dynamics": ("Motion and limit cycles", ("_dynamics",)),
@@ -177,7 +177,8 @@ def public_names() -> dict[str, list[str]]:
     for prefix, module in modules.items():
         for name in getattr(module, "__all__", vars(module)):
             value = getattr(module, name)
-            home = getattr(value, "__module__", None) or ""
+            # A function says that it is of the package that exports it.
+            home = getattr(getattr(value, "__wrapped__", value), "__module__", None) or ""
             local = prefix != "constraints." or home == module.__name__
             if name.startswith("_") or not home.startswith("fractaljax.") or not local:
                 continue

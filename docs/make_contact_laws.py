@@ -65,8 +65,9 @@ Written by `python docs/make_contact_laws.py`.
 
 def surface(D: float) -> fj.Surface:
     """The surface of this D that is as high as the others."""
-    unit = fj.Surface(D, L)
-    G = L * (SQ / float(fj.roughness(unit, L, 4 * L / N).Sq)) ** (1 / (D - 2))
+    contact: Any = fj.brake_scene().contact
+    Sq = float(fj.roughness(fj.Surface(D, contact.surface.G), L, 4 * L / N).Sq)
+    G = float(contact.surface.G) * (SQ / Sq) ** (1 / (D - 2))
     return fj.Surface(D, G)
 
 
@@ -97,14 +98,16 @@ def anchors(**options) -> list[str]:
 
 def picture(**options):
     """The figure: K_n over the load, a panel for each D."""
-    figure = fj.plot.new_figure(13, 4.2)
-    panels = figure.subplots(1, len(DIMENSIONS), sharey=True)
-    for ax, D in zip(panels, DIMENSIONS, strict=True):
+    figure = fj.plot.new_figure(9.8, 6.8)
+    *panels, last = figure.subplots(-(-(len(DIMENSIONS) + 1) // 3), 3, sharey=True).flat
+    for i, (ax, D) in enumerate(zip(panels, DIMENSIONS, strict=True)):
         fj.plot.law_curves(comparison(D, **options), ax)
         ax.set_title(f"D = {D}, G = {float(surface(D).G):.2g} m", fontsize="medium")
-        if ax is not panels[0]:
+        ax.get_legend().remove()
+        if i % 3:
             ax.set_ylabel("")
-            ax.get_legend().remove()
+    last.legend(*panels[0].get_legend_handles_labels(), loc="center", frameon=False)
+    last.set_axis_off()
     return figure
 
 
