@@ -270,17 +270,21 @@ def _scene_file(scene: Scene, names: Sequence[str]) -> tuple[list[Any], Any]:
 
     There is no text for a law that no file holds.
     """
-    leaves, tree = jax.tree.flatten(scene)
-    sizes = [np.size(leaf) for leaf in leaves]
-    places = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
+
+    def changed(*q):
+        return substituted(scene, dict(zip(names, q, strict=True)))
 
     def written(*q):
-        changed = jax.tree.leaves(substituted(scene, dict(zip(names, q, strict=True))))
-        return [each for leaf in changed for each in jnp.ravel(leaf)]
+        return [each for leaf in jax.tree.leaves(changed(*q)) for each in jnp.ravel(leaf)]
+
+    # A friction law may have become a scaled one.
+    leaves, tree = jax.tree.flatten(jax.eval_shape(changed, *[0.0] * len(names)))
+    sizes = [math.prod(leaf.shape) for leaf in leaves]
+    places = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
 
     def marks(leaf, place):  # texts, which the file has in quotation marks
         texts = [f"number {k}" for k in place]
-        return np.array(texts, object).reshape(np.shape(leaf)).tolist()
+        return np.array(texts, object).reshape(leaf.shape).tolist()
 
     marked = jax.tree.unflatten(tree, map(marks, leaves, places))
     try:

@@ -15,7 +15,7 @@ from scipy.special import erf
 import fractaljax as fj
 from browser import chromium, complaints
 from fractaljax._mechanism.quantities import replaced, substituted, with_optional
-from fractaljax.plot.explore import page, point, points_at, slider_axes, surface_waves
+from fractaljax.plot.explore import _scene_file, page, point, points_at, slider_axes, surface_waves
 from fractaljax.plot.javascript import javascript
 from tools import refused_command, run_command as run
 
@@ -164,6 +164,17 @@ def test_scene_of_the_page_is_that_of_python(scene, windows):
         for one, other in zip(jax.tree.leaves(saved), jax.tree.leaves(expected), strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-15)
         assert file.splitlines()[2:] != scene.to_toml().splitlines()[2:]
+
+
+def test_file_of_a_law_that_is_scaled_as_a_whole():
+    """The program's numbers, in the places of the text."""
+    scene = SCENE.replace(friction=fj.TabulatedFriction([0.0, 0.1, 0.5], [0.4, 0.35, 0.3]))
+    parts, written = _scene_file(scene, ["D", "mu"])
+    numbers = written(2.41, 0.3)
+    parts[1::2] = [repr(float(numbers[i])) for i in parts[1::2]]
+    saved = fj.Scene.from_toml("".join(parts))
+    expected = replaced(scene, {"D": 2.41, "mu": 0.3})
+    assert saved.to_toml() == expected.to_toml() != scene.to_toml()
 
 
 def test_page_is_small_and_whole(tmp_path, capsys):
