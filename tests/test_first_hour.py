@@ -49,10 +49,8 @@ REFUSED = {
     "fj.load({'a': 1})": "path must be the name of a file, got {'a': 1}",
     "fj.Oscillator(1.0, 6283, 5026)": "Oscillator needs xi_1, xi_2, F, V: type Oscillator(m, ",
     "fj.Material(E=2.1e11)": "Material needs nu, sigma_y, H: type Material(E, nu, sigma_y, H)",
-    "fj.Material(210, 0.3, 350, 900)": "E = 210: E is in Pa: 210 GPa are 2.1e11",
-    "fj.Surface(2.4, 0.1342)": "G = 0.1342: G is in m: 0.1342 nm are 1.342e-10",
     "fj.FractalContact(2.4, 1e-10, 1900)": "surface must be a Surface, got 2.4: make one by",
-    "fj.Coulomb(mu_s=0.4)": "Coulomb has no argument 'mu_s': did you mean mu?",
+    "fj.Coulomb(mu_s=0.4)": "Coulomb needs mu: type Coulomb(mu, ...)",
     "fj.Structure('M.mtx', None, 'K.mtx')": "M must be an array of real numbers, got str",
     "fj.Structure(np.eye(2), np.eye(2), np.eye(3))": "K must have shape (2, 2) as M demands",
     "fj.reduce(scene)": "fractaljax.Structure.from_scene(scene) makes one",
@@ -181,9 +179,6 @@ def test_numbers_of_any_kind():
     for D in (np.float64(2.4), np.array(2.4), jnp.float32(2.4), 2.4):
         np.testing.assert_allclose(fj.Surface(D, 1e-10).D, 2.4, rtol=1e-7)
     assert fj.Coulomb(1).mu_s == 1.0
-    with pytest.warns(UserWarning, match="G is in m") as caught:
-        fj.Surface(2.4, 1342)
-    assert caught[0].filename == __file__  # the line of the user
 
 
 @pytest.fixture(scope="module")

@@ -15,8 +15,6 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from .warn import warn_user
-
 Numbers = Float[Array, "..."]  # for one scene, or for a batch of any shape
 _PartT = TypeVar("_PartT", bound="Part")
 
@@ -119,13 +117,6 @@ def flag(name: str, value: Any) -> bool:
     if not isinstance(value, (bool, np.bool_)):
         raise TypeError(f"{name} must be True or False, got {brief(value)}")
     return bool(value)
-
-
-def doubt_unit(name: str, value: Numbers, least: float, most: float, hint: str) -> None:
-    """Warn where a concrete single number is outside of what its quantity ever is in its unit."""
-    number = concrete(value)
-    if number is not None and number.ndim == 0 and not least <= number <= most:
-        warn_user(f"{name} = {number:g}: {hint}")
 
 
 def require_kind(name: str, value: Any, kind: type) -> None:

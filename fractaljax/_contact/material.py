@@ -1,10 +1,8 @@
 """Materials of the joint."""
 
-import math
-
 from jaxtyping import ArrayLike
 
-from .._base.parts import Numbers, Part, doubt_unit, number, ordered, quantity
+from .._base.parts import Numbers, Part, number, ordered, quantity
 
 
 class Material(Part):
@@ -23,7 +21,6 @@ class Material(Part):
     def __init__(self, E: ArrayLike, nu: ArrayLike, sigma_y: ArrayLike, H: ArrayLike):
         self.E = number("E", E, above=0)
         # Below rubber's, which is some MPa.
-        doubt_unit("E", self.E, 1e6, math.inf, "E is in Pa: 210 GPa are 2.1e11")
         self.nu = number("nu", nu, at_least=0, at_most=0.5)
         self.sigma_y = number("sigma_y", sigma_y, above=0)
         self.H = ordered("H", number("H", H, above=0), "sigma_y", self.sigma_y)

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import ArrayLike
 
-from .._base.parts import Numbers, concrete, doubt_unit, number, quantity
+from .._base.parts import Numbers, concrete, number, quantity
 from .spectrum import Pieces, Spectrum
 
 
@@ -30,7 +30,6 @@ class Surface(Spectrum):
         self.D = _dimension(D, G)
         self.G = number("G", G, above=0)
         # A tenth of a millimetre: that of machined surfaces is a nanometre or less.
-        doubt_unit("G", self.G, 0, 1e-4, "G is in m: 0.1342 nm are 1.342e-10")
         self.gamma = number("gamma", gamma, above=1)
 
     def m(self, q):

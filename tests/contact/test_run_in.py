@@ -253,7 +253,7 @@ test_refusals = refusals(
         ({"z": np.zeros(8)}, r"^z must have shape \(nx, ny\), got \(8,\)$"),
         ({"z": np.full((8, 8), np.nan)}, r"^z must be finite, got nan$"),
         ({"dx": 0}, r"^dx must be above 0, got 0\.0$"),
-        ({"material": 1.0}, r"^material must be a Material, got 1\.0$"),
+        ({"material": 1.0}, r"^material must be a Material, got 1\.0"),
         ({"pressure": 0}, r"^pressure must be above 0, got 0\.0$"),
         ({"pressure": np.ones(2)}, r"^pressure must be a single number, got shape \(2,\)$"),
         ({"depth": -1.0}, r"^depth must be at least 0, got -1\.0$"),

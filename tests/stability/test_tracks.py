@@ -265,7 +265,7 @@ test_refusals = refusals(
         ("brake", "mu", [1.0], "x must be a Scene or a Struct"),
         (hoffmann(), "nu", [1.0], "no quantity 'nu'"),
         (hoffmann(), "mu", [[1.0]], "mu must be a list"),
-        (two_joints(4), "V", [0.1, -1], "V must be above 0"),
+        (two_joints(4), "V", [0.1, -1], "V must be at least 0"),
         (hoffmann(), "mu", [1.0], 1, "friction_slope must be True or False"),
     ],
     lambda x, name, values, slope=True: track(x, name, values, friction_slope=slope),

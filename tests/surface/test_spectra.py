@@ -203,7 +203,7 @@ def test_a_file_without_the_name_of_its_surface_has_a_fractal_one():
     text = scene.replace(contact=law).to_toml()
     older = "\n".join(line for line in text.splitlines() if 'law = "fractal"' not in line)
     assert fj.Scene.from_toml(older).to_toml() == text
-    with pytest.raises(TypeError, match="surface must be a Surface, got SelfAffine"):
+    with pytest.raises(TypeError, match="surface must be a Surface, got a SelfAffine"):
         other = 'law = "self-affine"\nSq = 1e-6\nhurst = 0.8\nrolloff = 1e-4\nshortest = 1e-5\n'
         fj.Scene.from_toml(re.sub(r"D = .*\nG = .*\ngamma = .*\n", other, scene.to_toml()))
 
