@@ -48,7 +48,10 @@ class CycleResult(eqx.Enumeration):
         "the regularised law takes more than max_steps steps: allow more, choose a solver such as "
         "diffrax.Kvaerno5, or leave the regularisation out"
     )
-    jumps = "a joint with K_t opens, where the regularised law jumps: leave the regularisation out"
+    jumps = (
+        "a joint with K_t opens, where friction that is smooth jumps: "
+        "take a law without memory and without regularisation"
+    )
     exhausted = (
         "the motion nearly repeats, but has not settled within max_returns: allow more of them"
     )

@@ -312,12 +312,12 @@ def test_derivatives_of_the_cycle():
 @SLOW
 def test_cycle_of_the_brake():
     """Two faces with bristles, against SciPy on the same equations."""
-    law = fj.LuGre(0.4, 0.25, 0.3, 1e6, 3.0)
-    scene = fj.Scene(fj.FixedContact(4e8, 2e8), law, BRAKE.oscillator)
+    law, P = fj.LuGre(0.4, 0.25, 0.3, 1e5, 3.0), 2e4  # pressed so that the joint stays closed
+    scene = fj.Scene(fj.FixedContact(4e8, 2e8, P), law, BRAKE.oscillator, preload="linear")
     found = fj.limit_cycle(scene, max_steps=20_000)
     start = np.array([*found.state, *np.asarray(found.internal)])
     unit = np.array([1e-6, 1e-6, 0.1, 0.1, 1e-7, 1e-7])
-    field = lambda t, y: np.array(lugre_field(list(y * unit), law, 4e8, 2e8)) / unit  # noqa: E731
+    field = lambda t, y: np.array(lugre_field(list(y * unit), law, 4e8, 2e8, P)) / unit  # noqa: E731
     end = scipy_end(field, float(found.period), start / unit)
     np.testing.assert_allclose(end, start / unit, rtol=0, atol=2e-5)
 
