@@ -303,21 +303,26 @@ class Part(Record):
 
     def stored_quantities(self) -> dict[str, Quantity]:
         """The numbers stored here and in the parts below, by name."""
-        stored = {}
-        for field in dataclasses.fields(self):
-            value, meant = getattr(self, field.name), field.metadata
-            if isinstance(value, Part):
-                stored |= value.stored_quantities()
-            elif "unit" in meant and not is_absent(field, value):
-                stored[quantity_name(field)] = Quantity(
-                    value, meant["unit"], meant["meaning"], meant.get("log", False)
-                )
-        return stored
+        return _stored_quantities(self)
 
     def _repr_html_(self) -> str:
         from . import html
 
         return html.table(f"fractaljax.{type(self).__name__}", part_rows(self))
+
+
+def _stored_quantities(part: Part) -> dict[str, Quantity]:
+    # A function: equinox makes an object of each method that is looked up.
+    stored = {}
+    for field in dataclasses.fields(part):
+        value, meant = getattr(part, field.name), field.metadata
+        if isinstance(value, Part):
+            stored |= _stored_quantities(value)
+        elif "unit" in meant and not is_absent(field, value):
+            stored[quantity_name(field)] = Quantity(
+                value, meant["unit"], meant["meaning"], meant.get("log", False)
+            )
+    return stored
 
 
 def part_rows(part: Part) -> list[tuple[str, Any, str, str]]:
