@@ -226,8 +226,26 @@ def _least_coefficient(law: Friction) -> Numbers:
     return jnp.maximum(law.mu(at - jnp.where(jnp.abs(step) < 1e-6 * at, step, 0)), 0)
 
 
+class WithStatic(Friction):
+    """A law that stores its static coefficient apart, None where it is mu(0)."""
+
+    static: eqx.AbstractVar[Numbers | None]
+
+    @property
+    def has_jump(self):
+        return self.static is not None
+
+    @property
+    def mu_s(self):
+        """The largest friction coefficient in stick."""
+        return self.kinetic_limit() if self.static is None else self.static
+
+    def kinetic_limit(self):
+        return self.mu(jnp.zeros((), _dtype(self)))
+
+
 @final
-class Coulomb(Friction, law="coulomb"):
+class Coulomb(WithStatic, law="coulomb"):
     """Constant friction, perhaps with a higher static coefficient.
 
     **Arguments:**
@@ -255,15 +273,6 @@ class Coulomb(Friction, law="coulomb"):
     @property
     def amplitudes(self):
         return ("kinetic", "static") if self.has_jump else ("kinetic",)
-
-    @property
-    def has_jump(self):
-        return self.static is not None
-
-    @property
-    def mu_s(self):
-        """The largest friction coefficient in stick."""
-        return self.kinetic if self.static is None else self.static
 
     @property
     def mu_m(self):

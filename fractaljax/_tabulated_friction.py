@@ -25,7 +25,7 @@ from ._base.parts import (
 )
 from ._base.singular import safe_divide
 from ._base.toml import naming
-from ._friction import Friction
+from ._friction import WithStatic
 
 
 def _table_field(note: str) -> Any:
@@ -34,7 +34,7 @@ def _table_field(note: str) -> Any:
 
 
 @final
-class TabulatedFriction(Friction, law="tabulated"):
+class TabulatedFriction(WithStatic, law="tabulated"):
     """Measured friction: mu(speed) through the points of a table, as a dynamometer gives it.
 
     Between the points it is a monotone cubic (Fritsch and Carlson, SIAM J. Numer. Anal. 17, 238,
@@ -132,23 +132,11 @@ class TabulatedFriction(Friction, law="tabulated"):
             return cls(speeds * _speed_unit(text), coefficients, mu_s)
 
     @property
-    def has_jump(self):
-        return self.static is not None
-
-    @property
-    def mu_s(self):
-        """The largest friction coefficient in stick."""
-        return self.kinetic_limit() if self.static is None else self.static
-
-    @property
     def mu_m(self):
         """The least friction coefficient of the table, at its pressure and temperature."""
         if not self._conditions:
             return jnp.min(self.coefficients)
         return jnp.vectorize(lambda *at: jnp.min(self._column(*at)))(*self._conditions)
-
-    def kinetic_limit(self):
-        return self.mu(jnp.zeros((), self.coefficients.dtype))
 
     def mu(self, speed):
         speed = jnp.asarray(speed, jnp.result_type(speed, self.coefficients))
@@ -160,7 +148,8 @@ class TabulatedFriction(Friction, law="tabulated"):
 
     def in_motion(self):
         column = self._column(*self._conditions)
-        return _Cubics(self.speeds, column, monotone_slopes(self.speeds, column), self.static)
+        slopes = monotone_slopes(self.speeds, column)
+        return _Cubics(speeds=self.speeds, column=column, slopes=slopes, static=self.static)
 
     @property
     def _conditions(self) -> list[Numbers]:
@@ -180,24 +169,13 @@ class TabulatedFriction(Friction, law="tabulated"):
 
 
 @final
-class _Cubics(Friction):
+class _Cubics(WithStatic):
     """A table at one pressure and temperature, with the slopes that each step of a motion needs."""
 
     speeds: Float[Array, " n"]
     column: Float[Array, " n"]
     slopes: Float[Array, " n"]
     static: Numbers | None
-
-    @property
-    def has_jump(self):
-        return self.static is not None
-
-    @property
-    def mu_s(self):
-        return self.kinetic_limit() if self.static is None else self.static
-
-    def kinetic_limit(self):
-        return self.mu(jnp.zeros((), self.column.dtype))
 
     def mu(self, speed):
         at = _inside(self.speeds, jnp.asarray(speed))
