@@ -41,6 +41,12 @@ def test_a_growth_rate_loads_what_it_needs():
     }  # fmt: skip
 
 
+def test_a_growth_rate_with_memory_loads_no_integrator():
+    law = "fj.LuGre(0.4, 0.3, 0.1, 1e6, 3.0)"
+    asked = f"import fractaljax as fj; fj.growth_rate(fj.brake_scene().replace(friction={law}))"
+    assert {*HEAVY} & printed(f"{asked}; {LOADED}") <= {"scipy"}  # for linear algebra
+
+
 @pytest.mark.parametrize("package", [fj, fj.plot])
 def test_names_are_those_of_the_stub(package):
     """Also where a module has the name of a function in it, whichever is imported first."""

@@ -222,7 +222,8 @@ def limit_cycle(
     if segments is None:
         cycle = refine_cycle(cycle, arguments, count, static)
     if eps is not None:
-        from .smooth import smooth_cycle, without_jump
+        from .smooth import smooth_cycle
+        from .smooth_system import without_jump
 
         cycle = smooth_cycle(without_jump(mechanism), start, excitation, eps, cycle, *options)
     return raise_unless(CycleResult.converged, cycle) if throw else cycle

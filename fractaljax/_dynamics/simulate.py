@@ -306,7 +306,8 @@ def simulate(
     n = whole("max_steps", max_steps, 1)
     rtol = check_rtol(rtol, jnp.result_type(*jax.tree.leaves((mechanism, start, excitation))))
     if memory or regularisation is not None:
-        from .smooth import smooth_motion, without_jump
+        from .smooth import smooth_motion
+        from .smooth_system import without_jump
 
         eps = smoothing(regularisation, memory)
         mechanism = mechanism if memory else without_jump(mechanism)

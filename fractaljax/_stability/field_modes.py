@@ -43,7 +43,7 @@ def linearised_with_memory(mechanism: Mechanism, friction_slope: bool) -> Linear
     **Raises:** `ValueError` without the slope of friction, which its states decide.
     """
     # The field is that of motion, which scenes without memory do not load.
-    from .._dynamics.smooth import linearised_field
+    from .._dynamics.smooth_system import linearised_field
 
     if not friction_slope:
         raise ValueError("friction_slope must be True for friction with memory, got False")
