@@ -144,22 +144,23 @@ def verdict(
     for i, law in enumerate(laws):
         require_kind(f"laws[{i}]", law, Contact)
     cases = [("", f"as it is ({laws_in_use})", x), *_other_load(x, friction_slope)]
-    in_series = "K_t beside the friction", "tangential spring in series"
-    cases.append((*in_series, _with_springs_in_series(x)))
+    before = len(cases)
     by = [(type(law).__name__, with_contact_law(x, law)) for law in laws]
     if area is not None:
         by += [(kind.__name__, with_contacts(x, laws)) for kind, laws in _laws_of(x, area)]
     cases += [(laws_in_use, f"by {name}", other) for name, other in by]
     growth = _growth_rates(tuple(other for *_, other in cases), friction_slope)
-    rates = growth.rates.tolist()
+    rates, names = growth.rates.tolist(), [case[:2] for case in cases]
+    rates.insert(before, float(growth.in_series))
+    names.insert(before, ("K_t beside the friction", "tangential spring in series"))
     questions = [
         Question(assumed, name, growth_text(rate), rate < 0, not np.isfinite(rate))
-        for (assumed, name, _), rate in zip(cases, rates[: len(cases)], strict=True)
+        for (assumed, name), rate in zip(names, rates, strict=True)
     ]
     if (stiff := np.asarray(growth.stiff)).any():
         ratios, own_ratios = (np.asarray(r)[..., stiff] for r in (growth.ratios, growth.own_ratios))
         questions.append(
-            _stiffness_ratio_question(ratios, np.array(rates[len(cases) :]), own_ratios)
+            _stiffness_ratio_question(ratios, np.asarray(growth.at_ratios), own_ratios)
         )
     if tolerance is not None:
         questions.append(_scatter_question(x, tolerance, envelope, friction_slope, seed))
@@ -242,7 +243,9 @@ def _with_springs_in_series(x: Mechanism) -> Mechanism:
 class _GrowthRates(NamedTuple):
     """What `_growth_rates` returns, of the j joints whose contacts have a material."""
 
-    rates: Array  # (m + k,) [1/s], of the mechanisms and then at the ratios
+    rates: Array  # (m,) [1/s], of the mechanisms
+    in_series: Array  # that of the first one with its tangential springs in series [1/s]
+    at_ratios: Array  # (k,) [1/s], at the ratios
     ratios: Array  # (k, j) of K_t to K_n
     own_ratios: Array  # (j,)
     stiff: Array  # (j,) whether K_n is above 0
@@ -251,11 +254,12 @@ class _GrowthRates(NamedTuple):
 
 @functools.partial(exported_jit, static_argnames="friction_slope")
 def _growth_rates(mechanisms: tuple[Any, ...], friction_slope: bool) -> _GrowthRates:
-    """Growth rates of m mechanisms, and of the first over K_t/K_n, in one program.
+    """Growth rates of m mechanisms, and of the first changed, in one program.
 
     The ratios of each joint lie between its own, the fractal law's and Mindlin's.
     """
     first, zero = mechanisms[0], FixedContact(0.0, 0.0, 1.0)
+    mechanisms = *mechanisms, _with_springs_in_series(first)
     stiffness, ends = {}, []
     for name, part in first.joints_by_name().items():
         contact, friction = part.contact, part.friction
@@ -288,8 +292,8 @@ def _growth_rates(mechanisms: tuple[Any, ...], friction_slope: bool) -> _GrowthR
         # One closed form for all: each use of it takes long to compile.
         systems = [two_directions(x, friction_slope).polynomial for x in mechanisms]
         own_systems = jax.tree.map(lambda *x: jnp.stack(x), *systems)
-        at_ratios = jax.vmap(lambda row: two_directions(at(row), friction_slope).polynomial)(ratios)
-        every = jax.tree.map(lambda *x: jnp.concatenate(x), own_systems, at_ratios)
+        changed = jax.vmap(lambda row: two_directions(at(row), friction_slope).polynomial)(ratios)
+        every = jax.tree.map(lambda *x: jnp.concatenate(x), own_systems, changed)
         rates = jax.vmap(rightmost_root)(every).real
         trace = -(systems[0].c_1 + systems[0].c_2)
     else:
@@ -298,9 +302,10 @@ def _growth_rates(mechanisms: tuple[Any, ...], friction_slope: bool) -> _GrowthR
         rates = jnp.concatenate([rates, at_ratios])
         trace = stability(first, friction_slope).eigenvalues.real.sum()
     stiff = [K_n > 0 for K_n, _ in stiffness.values()]
-    return _GrowthRates(
-        rates, ratios, own_ratio, jnp.stack(stiff) if stiff else jnp.zeros(0, bool), trace
-    )
+    stiff = jnp.stack(stiff) if stiff else jnp.zeros(0, bool)
+    m = len(mechanisms)
+    own, in_series, at_ratios = rates[: m - 1], rates[m - 1], rates[m:]
+    return _GrowthRates(own, in_series, at_ratios, ratios, own_ratio, stiff, trace)
 
 
 def _stiffness_ratio_question(
