@@ -77,7 +77,6 @@ from ._friction import (
     HyperbolicStribeck as HyperbolicStribeck,
     Stribeck as Stribeck,
 )
-from ._friction_laws import TabulatedFriction as TabulatedFriction
 from ._friction_memory import (
     Dahl as Dahl,
     Iwan as Iwan,
@@ -148,6 +147,7 @@ from ._surface.surface_scatter import SurfaceScatter as SurfaceScatter
 from ._surface.topography import topography as topography
 from ._sweep.result import Sweep as Sweep
 from ._sweep.sweep import sweep as sweep
+from ._tabulated_friction import TabulatedFriction as TabulatedFriction
 from ._validate.validate import (
     Validation as Validation,
     validate as validate,

@@ -12,11 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from ._base.laws import is_built_in, make_arrays, refuse, register
-from ._base.parts import Numbers, Part, concrete, number, ordered, quantity, require_kind
+from ._base.laws import Law, refuse
+from ._base.parts import Numbers, concrete, number, ordered, quantity, require_kind
 from ._base.singular import safe_divide
-
-LAWS: dict[str, type["Friction"]] = {}  # by their names in files
 
 # Speeds [m/s] among which the least value of a law is sought.
 SPEEDS = np.concatenate([[0.0], np.geomspace(1e-6, 100.0, 161)])
@@ -37,7 +35,7 @@ class _FromLaw:
         return self.function(law)
 
 
-class Friction(Part):
+class Friction(Law):
     """A friction law mu(speed), at speeds of at least 0 [m/s].
 
     A custom law declares its numbers as fields and defines `mu`, differentiable at 0 from above:
@@ -93,15 +91,7 @@ class Friction(Part):
     mu_s = _FromLaw(lambda law: law.mu(jnp.zeros((), _dtype(law))))
     mu_m = _FromLaw(lambda law: _least_coefficient(law))
 
-    def __init_subclass__(cls, law: str | None = None, **options: Any) -> None:
-        super().__init_subclass__(**options)
-        if law is not None:
-            register(law, cls, LAWS)
-
-    def __check_init__(self):
-        if is_built_in(self, __name__):
-            return
-        make_arrays(self)
+    def check_as_defined(self):
         kinetic = concrete(number("mu(0)", self.mu(jnp.zeros((), _dtype(self))), above=0))
         static = concrete(jnp.asarray(self.mu_s))
         if kinetic is None or static is None:
@@ -113,7 +103,7 @@ class Friction(Part):
     @property
     def has_jump(self) -> bool:
         """True if mu_s may lie above mu(0), which is decided when a program is traced."""
-        if is_built_in(self, __name__):
+        if self.built_in:
             return False
         # As a field, or as a property.
         field = any(field.name == "mu_s" for field in dataclasses.fields(self))

@@ -9,7 +9,7 @@ import pytest
 from mpmath import mp, mpf
 
 import fractaljax as fj
-from fractaljax._friction import LAWS, Scaled
+from fractaljax._friction import Scaled
 from fractaljax._mechanism.quantities import replaced, require_independent, substituted, value_of
 from tools import both_modes, refusals
 
@@ -254,7 +254,7 @@ def registered():
         pass
 
     yield Named
-    del LAWS["named"]
+    del fj.Friction.named["named"]
 
 
 def test_files_of_every_law(registered, tmp_path):
@@ -284,7 +284,7 @@ def test_names_of_laws(registered):
         class Other(fj.Friction, law="stribeck"):
             pass
 
-    assert LAWS["stribeck"] is fj.Stribeck
+    assert fj.Friction.named["stribeck"] is fj.Stribeck
 
     def define():
         class Again(Cubic, law="again"):
@@ -294,7 +294,7 @@ def test_names_of_laws(registered):
 
     define()
     second = define()
-    assert LAWS.pop("again") is second
+    assert fj.Friction.named.pop("again") is second
     with pytest.raises(ValueError, match=r"a file holds as friction one of Coulomb, .*got Cubic"):
         BRAKE.replace(friction=CUBIC).to_toml()
 

@@ -35,9 +35,7 @@ def test_a_growth_rate_loads_what_it_needs():
     assert not {*HEAVY, "SurfaceTopography"} & printed(f"{asked}; {LOADED}")
     packages = {name.split(".")[1] for name in printed(f"{asked}; {OWN}")}
     assert packages == {
-        "_base", "_contact", "_friction", "_friction_laws", "_friction_memory", "_mechanism",
-        "_stability", "_surface",
-        "_tabulated_friction", "_version"
+        "_base", "_contact", "_friction", "_mechanism", "_stability", "_surface", "_version"
     }  # fmt: skip
 
 

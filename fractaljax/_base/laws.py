@@ -1,7 +1,8 @@
-"""User-defined laws: their names in files, their numbers as arrays, and their refusal."""
+"""Laws, of the package and of users: names in files, numbers as arrays, and their refusal."""
 
 import dataclasses
-from typing import Any
+import importlib
+from typing import Any, ClassVar
 
 import jax
 import numpy as np
@@ -10,21 +11,50 @@ from jaxtyping import Array, Bool
 from .parts import Part, nan_where, number, quantity_name
 
 
-def register(law: str, kind: type[Part], laws: dict[str, Any]) -> None:
-    """Register `law` as the name of this kind in TOML files.
+class Law(Part):
+    """The base of contact laws, friction laws and spectra, of which users define their own.
 
-    **Raises:** `ValueError` if another kind has that name.
+    A class statement with `law="name"` gives the class a name in files.
+
+    **Raises:** `ValueError` for a name that another class has.
     """
-    registered = laws.get(law, kind)
-    # A notebook cell that is run again creates its class anew.
-    if (registered.__module__, registered.__qualname__) != (kind.__module__, kind.__qualname__):
-        raise ValueError(f"the law {law!r} is {registered.__name__} already")
-    laws[law] = kind
+
+    named: ClassVar[dict[str, type["Law"]]]  # the classes of one kind by their names in files
+
+    def __init_subclass__(cls, law: str | None = None, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if Law in cls.__bases__:
+            cls.named = {}
+        if law is None:
+            return
+        other = (cls.named if _of_this_package(cls) else cls.by_name()).get(law, cls)
+        # A notebook cell that is run again creates its class anew.
+        if (other.__module__, other.__qualname__) != (cls.__module__, cls.__qualname__):
+            raise ValueError(f"the law {law!r} is {other.__name__} already")
+        cls.named[law] = cls
+
+    def __check_init__(self):
+        if not self.built_in:
+            make_arrays(self)
+            self.check_as_defined()
+
+    @classmethod
+    def by_name(cls) -> dict[str, type["Law"]]:
+        """The classes of this kind by their names in files: the package's and users' own."""
+        importlib.import_module(f"{__package__}.all_laws")  # each registers its name
+        return dict(sorted(cls.named.items()))
+
+    @property
+    def built_in(self) -> bool:
+        """True for a law of this package, whose `__init__` checks its numbers."""
+        return _of_this_package(type(self))
+
+    def check_as_defined(self) -> None:
+        """Check a user's law, whose numbers are arrays by now."""
 
 
-def is_built_in(law: Part, base: str) -> bool:
-    """True for a law of the package in which the module `base` defines its base class."""
-    return type(law).__module__.rpartition(".")[0] == base.rpartition(".")[0]
+def _of_this_package(kind: type) -> bool:
+    return kind.__module__.partition(".")[0] == __name__.partition(".")[0]
 
 
 def make_arrays(law: Part) -> None:

@@ -7,11 +7,10 @@ import json
 import os
 import tomllib
 from collections.abc import Collection, Iterator, Mapping
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
+from .laws import Law
 from .parts import Part, argument_name, brief, is_absent, quantity_name
-
-Laws = Mapping[str, Mapping[str, type[Part]]]  # by field, then by the name of the law
 
 
 class Noted(NamedTuple):
@@ -69,10 +68,10 @@ def _quoted(text: str) -> str:
     return json.dumps(text, ensure_ascii=False).replace("\x7f", r"\u007f")
 
 
-def part_table(part: Part, laws: Laws) -> dict[str, Any]:
+def part_table(part: Part) -> dict[str, Any]:
     """The table of a part: numbers with unit and meaning, and its sub-parts as nested tables.
 
-    **Raises:** `ValueError` for a part of a kind that `laws` lacks.
+    **Raises:** `ValueError` for a law without a name.
     """
     table = {}
     for field in dataclasses.fields(part):
@@ -80,8 +79,10 @@ def part_table(part: Part, laws: Laws) -> dict[str, Any]:
         if is_absent(field, value):
             continue
         if isinstance(value, Part):
-            one_kind = name not in laws or type(value) is field.type
-            table[name] = part_table(value, laws) if one_kind else law_table(name, value, laws)
+            if isinstance(value, Law) and type(value) is not field.type:
+                table[name] = law_table(name, value)
+            else:
+                table[name] = part_table(value)
         elif "unit" in field.metadata:
             table[name] = Noted(value, "{unit}: {meaning}".format(**field.metadata))
         else:
@@ -90,17 +91,15 @@ def part_table(part: Part, laws: Laws) -> dict[str, Any]:
     return table
 
 
-def law_table(name: str, part: Part, laws: Laws) -> dict[str, Any]:
-    """The table of a law, with the name of its kind; errors as `part_table`."""
-    return _law(name, type(part), laws[name]) | part_table(part, laws)
-
-
-def _law(name: str, kind: type[Part], kinds: Mapping[str, type[Part]]) -> dict[str, Any]:
+def law_table(name: str, part: Law) -> dict[str, Any]:
+    """The table of a law, with the name of its class; errors as `part_table`."""
+    kind, kinds = type(part), part.by_name()
     if kind not in kinds.values():
         choices = ", ".join(choice.__name__ for choice in kinds.values())
         raise ValueError(f"a file holds as {name} one of {choices}, got {kind.__name__}")
     law = next(law for law in kinds if kinds[law] is kind)
-    return {"law": Noted(law, "or " + ", ".join(f'"{other}"' for other in kinds if other != law))}
+    others = ", ".join(f'"{other}"' for other in kinds if other != law)
+    return {"law": Noted(law, f"or {others}")} | part_table(part)
 
 
 # --- reading ------------------------------------------------------------------------------
@@ -146,7 +145,7 @@ def refuse_unknown(where: str, keys: Collection[str], allowed: Collection[str]) 
             raise ValueError(f"{where} has the unknown key {key!r}; known are {', '.join(allowed)}")
 
 
-def read_part(kind: type[Part], table: Mapping[str, Any], laws: Laws, name: str = "") -> Any:
+def read_part(kind: type[Part], table: Mapping[str, Any], name: str = "") -> Any:
     """The part of this kind in the table `name` of a file, or in the whole file.
 
     **Raises:** `ValueError` or `TypeError` naming the table and the key that is unknown, missing
@@ -157,14 +156,13 @@ def read_part(kind: type[Part], table: Mapping[str, Any], laws: Laws, name: str 
     refuse_unknown(where, table, fields)
     arguments, parameters = dict(table), inspect.signature(kind.__init__).parameters
     for key, field in fields.items():
-        inner = field.type
-        if key in laws or (isinstance(inner, type) and issubclass(inner, Part)):
-            below = table_at(table, key, inside)
-            if key in laws:
-                below = _usual_law(field, laws[key]) | below
-                arguments[key] = read_law(key, below, laws, f"{inside}{key}")
+        inner = field.metadata.get("kind", field.type)
+        if isinstance(inner, type) and issubclass(inner, Part):
+            below, name_below = table_at(table, key, inside), f"{inside}{key}"
+            if issubclass(inner, Law):
+                arguments[key] = read_law(inner, _usual_law(field, inner) | below, name_below)
             else:
-                arguments[key] = read_part(cast(type[Part], inner), below, laws, f"{inside}{key}")
+                arguments[key] = read_part(inner, below, name_below)
         elif (
             key not in table and parameters[argument_name(field)].default is inspect.Parameter.empty
         ):
@@ -175,21 +173,18 @@ def read_part(kind: type[Part], table: Mapping[str, Any], laws: Laws, name: str 
         raise type(error)(f"{where} {error}" if name else str(error)) from None
 
 
-def read_law(key: str, table: Mapping[str, Any], laws: Laws, name: str) -> Any:
-    """The part whose `law_table` is in the table `name` of a file; errors as `read_part`."""
-    below = dict(table)
-    return read_part(_kind(name, below.pop("law", ""), laws[key]), below, laws, name)
-
-
-def _usual_law(field: dataclasses.Field, kinds: Mapping[str, type[Part]]) -> dict[str, str]:
-    """The law of a table that names none: that of the field's only kind, or its usual one."""
-    names = [law for law, kind in kinds.items() if kind is field.type]
-    usual = field.metadata.get("law", names[0] if names else None)
-    return {} if usual is None else {"law": usual}
-
-
-def _kind(name: str, law: Any, kinds: Mapping[str, type[Part]]) -> type[Part]:
+def read_law(base: type[Law], table: Mapping[str, Any], name: str) -> Any:
+    """The law whose `law_table` is in the table `name` of a file; errors as `read_part`."""
+    below, kinds = dict(table), base.by_name()
+    law = below.pop("law", "")
     if not isinstance(law, str) or law not in kinds:
         choices = " or ".join(f'"{choice}"' for choice in kinds)
         raise ValueError(f"[{name}] law must be {choices}, got {brief(law)}")
-    return kinds[law]
+    return read_part(kinds[law], below, name)
+
+
+def _usual_law(field: dataclasses.Field, kind: type[Law]) -> dict[str, str]:
+    """The law of a table that names none: that of the field's only kind, or its usual one."""
+    names = [law for law, each in kind.by_name().items() if each is kind]
+    usual = field.metadata.get("law", names[0] if names else None)
+    return {} if usual is None else {"law": usual}

@@ -46,7 +46,7 @@ class Sums(eqx.Module):
 
 
 @final
-class AsperityContact(Contact):
+class AsperityContact(Contact, law="asperity"):
     """The revised asperity law: elastic, then elastic-plastic, then plastic asperities.
 
     The bases of the asperities follow the island law of the source down to the shortest wavelength

@@ -9,14 +9,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, ScalarLike
 
-from .._base.laws import is_built_in, make_arrays, refuse, register
-from .._base.parts import Numbers, Part, Record, brief, concrete, number, substitute
+from .._base.laws import Law, refuse
+from .._base.parts import Numbers, Record, brief, concrete, number, substitute
 from .load_curve import LoadCurve, load_curve
 
 MU_M_MAX = 0.9  # Eq. 19 ends there
 
 
-class Contact(Part):
+class Contact(Law):
     """A contact law: the stiffness of a joint.
 
     A custom law declares its numbers as fields and defines a differentiable `stiffness`:
@@ -49,17 +49,7 @@ class Contact(Part):
     fractal: ClassVar[bool] = False  # the source's law: there is a `ContactState`
     yields: ClassVar[bool] = False  # friction lowers its pressure at yield: Eq. 19, to mu_m = 0.9
 
-    def __init_subclass__(cls, law: str | None = None, **options: Any) -> None:
-        super().__init_subclass__(**options)
-        if law is not None:
-            from .laws import CONTACTS  # the built-in laws, which are subclasses of this class
-
-            register(law, cls, CONTACTS)
-
-    def __check_init__(self):
-        if self.built_in:
-            return
-        make_arrays(self)
+    def check_as_defined(self):
         if (P := getattr(self, "P", None)) is not None:
             name = f"P of {type(self).__name__}"
             object.__setattr__(self, "P", number(name, P, above=0))
@@ -67,11 +57,6 @@ class Contact(Part):
             bad = refused_stiffness(self, 1.0, 1.0)
             if bad is not None:
                 refuse(self, bad)
-
-    @property
-    def built_in(self) -> bool:
-        """True for a built-in law, whose `__init__` checks its numbers."""
-        return is_built_in(self, __name__)
 
     @property
     def depends_on_friction(self) -> bool:

@@ -9,7 +9,7 @@ from .contact import Contact
 
 
 @final
-class FixedContact(Contact):
+class FixedContact(Contact, law="fixed"):
     """A joint of known stiffness: no contact law is evaluated. A preloaded joint needs its load P.
 
     **Raises:** `ValueError` unless K_n >= 0, K_t >= 0 and P > 0.

@@ -90,7 +90,7 @@ class _LoadBalance(NamedTuple):
 
 
 @final
-class FractalContact(Contact):
+class FractalContact(Contact, law="fractal"):
     """Stiffness from the surface: Eqs. 21, 26, 30, 33 and 36 under the normal load P.
 
     If `stiffness_ratio` is given, K_t = stiffness_ratio K_n and no tangential law is evaluated.

@@ -15,7 +15,7 @@ from .material import Material, mindlin_ratio
 
 
 @final
-class MeasuredContact(Contact):
+class MeasuredContact(Contact, law="measured"):
     """Measured stiffness: K_n(P) through the points of a table, and K_t = stiffness_ratio K_n.
 
     ln K_n is a monotone cubic of ln P between `loads` [N] (Fritsch and Carlson, SIAM J. Numer.

@@ -46,7 +46,7 @@ _NEGLIGIBLE = 40.0  # e^-40 is below rounding
 
 
 @final
-class PerssonContact(Contact):
+class PerssonContact(Contact, law="persson"):
     """A rough surface on an elastic half-space: K_n by Persson's theory, K_t by Mindlin's ratio.
 
     K_n follows P^(1/(1+H)) at small loads, then P, then rises to full contact. K_t = (2 - 2 nu)/

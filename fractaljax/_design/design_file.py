@@ -25,7 +25,7 @@ from .._base.toml import (
 )
 from .._base.versions import versions, versions_differ
 from .._base.warn import warn_user
-from .._mechanism.joint import JOINT_LAWS
+from .._contact.contact import Contact
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
@@ -65,7 +65,7 @@ def design_files(best: Any, path: Path) -> dict[Path, bytes]:
         options["objective"] = table if isinstance(objective, Constraint) else table["function"]
     options["constraints"] = [_constraint_table(each) for each in options["constraints"]]
     options["laws"] = {
-        f"{i}": law_table("contact", law, JOINT_LAWS) for i, law in enumerate(options["laws"], 1)
+        f"{i}": law_table("contact", law) for i, law in enumerate(options["laws"], 1)
     }
     if (envelope := options["envelope"]) is not None:
         options["envelope"] = {"ranges": envelope.ranges, "samples": envelope.samples}
@@ -177,9 +177,7 @@ def _options(table, functions) -> dict[str, Any]:
         options["risk"] = tuple(options["risk"])
     laws = table_at(options, "laws", "options.") if "laws" in options else {}
     options["laws"] = [
-        read_law(
-            "contact", table_at(laws, name, "options.laws."), JOINT_LAWS, f"options.laws.{name}"
-        )
+        read_law(Contact, table_at(laws, name, "options.laws."), f"options.laws.{name}")
         for name in laws
     ]
     constraints = options["constraints"]

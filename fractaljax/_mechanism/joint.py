@@ -23,21 +23,9 @@ from .._base.parts import (
     quantity,
     require_kind,
 )
-from .._base.toml import Laws
 from .._contact.contact import MU_M_MAX, Contact, refused_stiffness
-from .._contact.laws import CONTACTS
 from .._friction import Friction
-from .._friction_laws import LAWS
-from .._surface.spectra import SPECTRA
 from .oscillator import belt_velocity
-
-# Classes by their names in files.
-JOINT_LAWS: Laws = {
-    "contact": CONTACTS,
-    "friction": LAWS,
-    "of": LAWS,  # the law that a `Scaled` law scales
-    "surface": SPECTRA,
-}
 
 PRELOAD_NOTE = (
     'false: friction acts on K_n x, "linear": on P + K_n x, true: on the load curve of the law, '
@@ -151,7 +139,7 @@ class Joint(AnyJoint):
     friction that `Scene` refuses.
     """
 
-    contact: Any  # a Contact; its other attributes depend on its class
+    contact: Any = eqx.field(metadata={"kind": Contact})  # its attributes depend on its class
     friction: Friction  # friction law, evaluated at the sliding velocity of the joint
     tangential: Stored = eqx.field(static=True)
     normal: Stored | None = eqx.field(static=True)

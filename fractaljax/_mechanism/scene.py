@@ -18,7 +18,6 @@ from .._contact.material import Material
 from .._friction import Friction, Stribeck
 from .._surface.surface import Surface
 from .joint import (
-    JOINT_LAWS,
     PRELOAD_NOTE,
     AnyJoint,
     friction_for,
@@ -53,7 +52,7 @@ class Scene(Mechanism, AnyJoint):
     tangential: ClassVar[tuple[str]] = ("x1",)
     normal: ClassVar[tuple[str]] = ("x2",)
 
-    contact: Any  # a Contact; its other attributes depend on its class
+    contact: Any = eqx.field(metadata={"kind": Contact})  # its attributes depend on its class
     friction: Friction  # friction law at the belt
     oscillator: Oscillator  # the mass, its springs and the belt
     preload: bool | str = eqx.field(static=True, metadata={"note": PRELOAD_NOTE})
@@ -143,7 +142,7 @@ class Scene(Mechanism, AnyJoint):
 
     @classmethod
     def _from_document(cls, document, folder):
-        return read_part(cls, document, JOINT_LAWS)
+        return read_part(cls, document)
 
     @classmethod
     def from_toml(cls, text: str) -> "Scene":
@@ -156,7 +155,7 @@ class Scene(Mechanism, AnyJoint):
         **Raises:** `ValueError` if the scene holds arrays.
         """
         require_scalar(self)
-        return write_toml("A fractaljax scene, in SI units.", part_table(self, JOINT_LAWS))
+        return write_toml("A fractaljax scene, in SI units.", part_table(self))
 
     def save(self, path: str | os.PathLike) -> None:
         """Write the scene to a TOML file at `path`, whole or not at all.

@@ -16,7 +16,7 @@ from .._base.parts import brief, scalar
 from .._version import __version__
 from .coefficient import Expression
 from .damping import modal_damping, rayleigh_damping
-from .joint import JOINT_LAWS, Joint
+from .joint import Joint
 from .matrices import MatrixSum, is_sparse
 from .matrix_file import Matrices, read_matrices
 from .mesh import Mesh
@@ -207,7 +207,7 @@ def read_structure(document: dict[str, Any], folder: Path) -> dict[str, Any]:
         for which in ("tangential", "normal"):
             if isinstance(joint.get(which), dict):
                 joint[which] = {_dof(key, names or ()): x for key, x in joint[which].items()}
-        attached[name] = toml.read_part(Joint, joint, JOINT_LAWS, f"joints.{name}")
+        attached[name] = toml.read_part(Joint, joint, f"joints.{name}")
     arguments = {"C": None, **matrices, "F": F, "joints": attached, "names": names}
     arguments["mesh"] = source.mesh(table.get("mesh"))
     arguments["notes"] = tuple(dict.fromkeys(source.notes))  # a file may be read twice
@@ -323,7 +323,7 @@ def structure_text(structure: Any, matrices: str) -> str:
             which: _written(getattr(joint, which), structure.names or ())
             for which in ("tangential", "normal")
         }
-        joints[name] = toml.part_table(joint, JOINT_LAWS) | directions
+        joints[name] = toml.part_table(joint) | directions
     comment = f"A fractaljax structure, in SI units; written by fractaljax {__version__}."
     document = {"structure": table, "parameters": structure.parameters, "joints": joints}
     document = {name: x for name, x in document.items() if x or name != "parameters"}

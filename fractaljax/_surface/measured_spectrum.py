@@ -14,7 +14,7 @@ from .spectrum import Pieces, Spectrum, fit_roll_off
 
 
 @final
-class MeasuredSpectrum(Spectrum):
+class MeasuredSpectrum(Spectrum, law="measured"):
     """A surface by a table of its power spectrum, a power of q between the points.
 
     **Arguments:**

@@ -13,7 +13,7 @@ from .spectrum import Pieces, Spectrum, through_gradients
 
 
 @final
-class SelfAffine(Spectrum):
+class SelfAffine(Spectrum, law="self-affine"):
     """A self-affine surface: flat power spectrum above the roll-off wavelength, H below it.
 
     With q_r = 2 pi/rolloff, q_L = 2 pi/longest and q_s = 2 pi/shortest,

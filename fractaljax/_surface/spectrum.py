@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from .._base.laws import is_built_in, make_arrays, register
-from .._base.parts import Numbers, Part, number, ordered
+from .._base.laws import Law
+from .._base.parts import Numbers, number, ordered
 from .._base.singular import boxcox
 
 
@@ -48,7 +48,7 @@ class Pieces(NamedTuple):
         return jnp.sum(m * low**2 * boxcox(x, r), axis=-1)
 
 
-class Spectrum(Part):
+class Spectrum(Law):
     """A surface by the mean square height m(q) of its waves per ln q.
 
     A custom spectrum declares its numbers as fields, `longest` and `shortest` among them, and
@@ -72,17 +72,7 @@ class Spectrum(Part):
     has; `TypeError` for what is not a number.
     """
 
-    def __init_subclass__(cls, law: str | None = None, **options: Any) -> None:
-        super().__init_subclass__(**options)
-        if law is not None:
-            from .spectra import SPECTRA  # the built-in spectra are subclasses of this class
-
-            register(law, cls, SPECTRA)
-
-    def __check_init__(self):
-        if is_built_in(self, __name__):
-            return  # it checks its numbers itself
-        make_arrays(self)
+    def check_as_defined(self):
         name = type(self).__name__
         try:
             longest, shortest = self._ends()

@@ -12,7 +12,7 @@ from .spectrum import Pieces, Spectrum
 
 
 @final
-class Surface(Spectrum):
+class Surface(Spectrum, law="fractal"):
     """A fractal surface in the Yan-Komvopoulos form of the Weierstrass-Mandelbrot function.
 
     As a spectrum it is m = G^(2D-4) f^(2D-6)/2 at the frequency f = q/(2 pi), self-affine with

@@ -27,7 +27,6 @@ from .._base.toml import part_table, write_toml
 from .._contact.contact import Regime
 from .._dynamics.cycle import CycleResult
 from .._dynamics.limit_cycle import limit_cycle
-from .._mechanism.joint import JOINT_LAWS
 from .._mechanism.quantities import (
     axis_values,
     label,
@@ -288,7 +287,7 @@ def _scene_file(scene: Scene, names: Sequence[str]) -> tuple[list[Any], Any]:
 
     marked = jax.tree.unflatten(tree, map(marks, leaves, places))
     try:
-        text = write_toml("A fractaljax scene, in SI units.", part_table(marked, JOINT_LAWS))
+        text = write_toml("A fractaljax scene, in SI units.", part_table(marked))
     except ValueError:
         return [], written
     parts: list[Any] = re.split(r'"number (\d+)"', text)

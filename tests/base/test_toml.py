@@ -33,9 +33,9 @@ def test_every_value_is_read_back():
         ("D = 2.4", "D = inf", "[contact.surface] D must be above 2"),
         ("D = 2.4", "", "[contact.surface] lacks the key 'D'"),
         ("D = 2.4", "D = 2.4\nE = 1.0", "[contact.surface] has the unknown key 'E'; known are D"),
-        ('law = "fractal"', 'law = "hertz"', '[contact] law must be "fractal" or "asperity" or'),
-        ('law = "fractal"', "law = [1]", '[contact] law must be "fractal" or'),
-        ('law = "fractal"', "", '[contact] law must be "fractal" or'),
+        ('law = "fractal"', 'law = "hertz"', '[contact] law must be "asperity" or "fixed" or'),
+        ('law = "fractal"', "law = [1]", '[contact] law must be "asperity" or'),
+        ('law = "fractal"', "", '[contact] law must be "asperity" or'),
         (
             'law = "fractal"',
             'law = "fixed"',
@@ -67,6 +67,14 @@ def test_whole_numbers_defaults_and_parts_without_a_name():
     """Integers are numbers, and what has a default may be left out."""
     text = GOOD.replace("P = 1907.3", "P = 2000").replace("gamma = 1.5", "")
     assert fj.Scene.from_toml(text).replace(P=1907.3).to_toml() == GOOD
-    laws = {"contact": {"fixed": fj.FixedContact}}
-    with pytest.raises(ValueError, match="a file holds as contact one of FixedContact, got Frac"):
-        part_table(fj.brake_scene(), laws)
+
+
+def test_a_law_without_a_name():
+    class Linear(fj.Contact):
+        def stiffness(self, mu_s, mu_m):
+            return 1e8, 1e8
+
+    with pytest.raises(
+        ValueError, match=r"a file holds as contact one of Asp.*Contact, got Linear"
+    ):
+        part_table(fj.brake_scene().replace(contact=Linear()))

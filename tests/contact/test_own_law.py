@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
-from fractaljax._contact.laws import CONTACTS
 from fractaljax._mechanism.quantities import replaced, require_quantity
 from tools import both_gradients, refusals
 
@@ -34,7 +33,7 @@ def example() -> Any:
 def forgotten():
     """The example's name is gone from files after each test."""
     yield
-    CONTACTS.pop("hertz", None)
+    fj.Contact.named.pop("hertz", None)
 
 
 @pytest.fixture
@@ -159,7 +158,7 @@ def test_files_hold_it(Hertz, tmp_path):
     """Scenes and structures to the last bit, with unit and meaning; not without a name."""
     scene = BRAKE.replace(contact=Hertz(**NUMBERS | {"stiffness_ratio": 0.5}))
     text = scene.to_toml()
-    assert 'law = "hertz"  # or "fractal"' in text
+    assert 'law = "hertz"  # or "asperity"' in text
     assert "P_0 = 1900.0  # N: load at which it is k" in text
     joint = fj.Structure(
         np.eye(2), None, 2 * np.eye(2), fj.Joint(scene.contact, scene.friction, 0, 1, 0.2)
@@ -171,18 +170,19 @@ def test_files_hold_it(Hertz, tmp_path):
         assert all(map(np.array_equal, jax.tree.leaves(computed), jax.tree.leaves(expected)))
     with pytest.raises(ValueError, match=r"\[contact\] P of Hertz must be above 0, got -5"):
         fj.Scene.from_toml(text.replace("P = 1900.0", "P = -5.0"))
-    with pytest.raises(ValueError, match=r"a file holds as contact one of Fractal.*got Softened"):
+    with pytest.raises(ValueError, match=r"a file holds as contact one of Asperity.*got Softened"):
         BRAKE.replace(contact=Softened(1e8, 1e3)).to_toml()
 
 
 def test_names_of_laws(Hertz):
     """Those of the package are taken, whichever of its modules is imported; the class is anew."""
     for name in ("fractal", "measured"):
-        with pytest.raises(ValueError, match=f"the law '{name}' is {CONTACTS[name].__name__} alre"):
+        kind = fj.Contact.by_name()[name]
+        with pytest.raises(ValueError, match=f"the law '{name}' is {kind.__name__} already"):
             type("Other", (fj.Contact,), {}, law=name)
-    assert CONTACTS["fractal"] is fj.FractalContact
+    assert fj.Contact.named["fractal"] is fj.FractalContact
     again = example()
-    assert again is not Hertz and CONTACTS["hertz"] is again
+    assert again is not Hertz and fj.Contact.named["hertz"] is again
 
 
 def test_a_traced_law_is_not_a_number_where_it_is_wrong(Hertz):
