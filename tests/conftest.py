@@ -5,6 +5,7 @@ import itertools
 import os
 import sys
 import warnings
+import zlib
 from pathlib import Path
 
 # Read when NumPy and SciPy load. Two workers with two threads each wait for one another.
@@ -20,10 +21,18 @@ jax.config.update("jax_numpy_dtype_promotion", "standard")
 
 def pytest_addoption(parser):
     parser.addoption("--once", action="store_true", help="each test with its first parameters only")
+    thirds = "of the slow tests only those of this third: 0, 1 or 2"
+    parser.addoption("--third", type=int, choices=range(3), help=thirds)
 
 
 @pytest.hookimpl(trylast=True)  # of what `-m` has left
 def pytest_collection_modifyitems(config, items):
+    if (third := config.getoption("third")) is not None:
+        others = [
+            item for item in items if item.get_closest_marker("slow") and _third(item) != third
+        ]
+        config.hook.pytest_deselected(items=others)
+        items[:] = [item for item in items if item not in set(others)]
     if config.getoption("once"):
         first, others = {}, []
         for item in items:
@@ -31,6 +40,11 @@ def pytest_collection_modifyitems(config, items):
                 others.append(item)
         config.hook.pytest_deselected(items=others)
         items[:] = first.values()
+
+
+def _third(item) -> int:
+    """The third of a test: all of its parameters are in the same one."""
+    return zlib.crc32(item.nodeid.partition("[")[0].encode()) % 3
 
 
 def pytest_configure(config):

@@ -167,7 +167,7 @@ def limit_cycle(
 
     - `mechanism`: a scene, or a structure of n degrees of freedom whose joints all have a V;
       `jax.vmap` takes many, and a member that fails marks only itself. All wait for the slowest:
-      on a CPU `jax.lax.map(..., batch_size=32)` is quicker.
+      on a CPU `jax.lax.map` is quicker, with `batch_size=32` where all searches are as long.
     - `start`: (2n,), [x, v] in m and m/s; by default the sliding equilibrium, displaced by V/omega
       along t, where omega^2 is the sum of the squared eigenfrequencies for a scene, and the root
       of the sum of their fourth powers for a structure. If mu_s of the first joint lies above

@@ -55,7 +55,13 @@ def _batch(point: Program, mesh: Mesh, scene, axes, places) -> list[jax.Array]:
     def one(scene, axes, places):
         return point(scene, [axis[i] for axis, i in zip(axes, places, strict=True)])
 
-    program = jax.vmap(one, (None, None, 0))
+    def in_turn(scene, axes, places):
+        return jax.lax.map(functools.partial(one, scene, axes), places)
+
+    # Side by side every point would take both branches, and as many steps as the slowest one. A
+    # CPU gains little by that, an accelerator much.
+    cpu = mesh.devices.flat[0].platform == "cpu"
+    program = in_turn if cpu and point.branches else jax.vmap(one, (None, None, 0))
     if mesh.size > 1:
         whole, split = PartitionSpec(), PartitionSpec(_POINTS)
         # One program per device: if XLA split a single one, every loop would wait for the slowest.

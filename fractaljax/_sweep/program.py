@@ -9,6 +9,7 @@ times as long, and whether it holds the captured constants depends on a flag of 
 import contextlib
 import enum
 import hashlib
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -78,6 +79,11 @@ class Program:
         """Equal for equal programs, in every process; external calls of a program do not count."""
         return self._digest.digest
 
+    @property
+    def branches(self) -> bool:
+        """True for a program whose length depends on its numbers."""
+        return _branches(self._jaxpr.jaxpr)
+
     def _identity(self):
         return self._digest.digest, self._digest.outside
 
@@ -114,6 +120,19 @@ class Program:
                     " in the program"
                 )
         return digest.digest
+
+
+def _branches(jaxpr: Jaxpr) -> bool:
+    inner = (jax.tree.leaves(equation.params, is_leaf=_is_program) for equation in jaxpr.eqns)
+    return any(equation.primitive.name in ("while", "cond") for equation in jaxpr.eqns) or any(
+        _branches(x.jaxpr if isinstance(x, ClosedJaxpr) else x)
+        for x in itertools.chain.from_iterable(inner)
+        if _is_program(x)
+    )
+
+
+def _is_program(x: Any) -> bool:
+    return isinstance(x, (Jaxpr, ClosedJaxpr))
 
 
 def settings() -> dict[str, Any]:

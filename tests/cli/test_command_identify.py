@@ -177,8 +177,9 @@ def test_a_roll_off_takes_an_area_and_its_tolerance_a_design(capsys):
     )
     words = out.splitlines()[-1].removeprefix("next: fractaljax design ").split()
     options = ["--tolerance", "errors.toml", "--starts", 1, "--lattice", 2, "--quiet"]
-    status, out, err = run(capsys, "design", *words, *options)
-    assert err == "" and status in (0, 1) and "probability of squeal" in out and "Ra [m]" in out
+    # The growth rate that it has is allowed: a search for a quiet surface takes minutes.
+    status, out, err = run(capsys, "design", *words, *options, "--target", 2e4)
+    assert (status, err) == (0, "") and "probability of squeal" in out and "Ra [m]" in out
 
 
 @pytest.mark.parametrize(

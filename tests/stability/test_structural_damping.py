@@ -131,6 +131,7 @@ def test_growth_rate_and_its_slopes_in_40_digits():
             np.testing.assert_allclose(row, slopes, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_critical_friction_and_its_slopes():
     def growth(mu, eta, loss):
         return mp.re(rightmost_in_digits(mu, eta, loss))
@@ -155,6 +156,7 @@ def test_critical_friction_and_its_slopes():
         assert abs(fj.growth_rate(structure(mu, eta))) < 1e-9
 
 
+@pytest.mark.slow
 def test_what_does_not_oscillate_has_no_hysteresis():
     """Rigid bodies rest, static divergence is that of K, and heavy damping decays."""
     one, diag = np.eye(2), np.diag

@@ -50,6 +50,27 @@ def test_every_point_once_and_in_its_place(batch_size):
     np.testing.assert_array_equal(again, 2 * np.asarray(found))
 
 
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="an accelerator takes all together")
+def test_points_of_a_measure_that_branches_do_not_wait_for_one_another():
+    """A loop runs as often as each point needs, also where it is deep in the program."""
+    seen = []
+
+    def halvings(scene):
+        def halve(carry):
+            jax.debug.callback(lambda: seen.append(1))
+            return carry[0] / 2, carry[1] + 1
+
+        loop = jax.jit(lambda P: jax.lax.while_loop(lambda carry: carry[0] > 100, halve, (P, 0)))
+        return jax.lax.scan(lambda total, P: (total + loop(P)[1], None), 0, scene.contact.P[None])[
+            0
+        ]
+
+    P = 100 * 2.0 ** np.arange(6)
+    found = fj.sweep(halvings, SCENE, progress=False, P=P)
+    jax.effects_barrier()
+    assert found.values.tolist() == [0, 1, 2, 3, 4, 5] and len(seen) == 15
+
+
 def friction_at(mu, V):
     factor = mu / float(GIVEN.friction.mu(V))
     return GIVEN.replace(mu_s=0.4 * factor, mu_m=0.25 * factor, V=V)
