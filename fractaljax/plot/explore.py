@@ -87,8 +87,8 @@ def explore(
     The page shows what `stability` and `stiffness` give at every position of the sliders, to
     rounding: it runs the same program, translated. Numbers may be typed, and the scene with them
     saved as a TOML file. It also shows the mode in motion, a surface with its D and G, and limit
-    cycles from a small disturbance. Where the mechanism squeals between
-    those that are computed, the page shows the nearest and says so.
+    cycles from a small disturbance. Where the mechanism squeals between those that are computed,
+    the page shows the nearest and says so.
 
     **Arguments:**
 
@@ -103,10 +103,11 @@ def explore(
       mu. The first two span the map of growth rates.
 
     **Raises:** `TypeError` for what is not a `Scene`; `ValueError` for a scene that holds arrays,
-    one whose program has loops (as of `AsperityContact`, or on a load curve), an unknown quantity,
-    two that are not independent, less than two, a window outside its domain, that is no (low, high)
-    or that leaves out the value of the scene, and a path that does not end in .html; `OSError` if
-    the file cannot be written.
+    one whose program has loops or looks numbers up (as of `AsperityContact`, `TabulatedFriction` or
+    on a load curve), which `fj.explore` shows in a notebook, an unknown quantity, two that are not
+    independent, less than two, a window outside its domain, that is no (low, high) or that leaves
+    out the value of the scene, and a path that does not end in .html; `OSError` if the file cannot
+    be written.
     """
     if not os.fspath(path).endswith(".html"):
         raise ValueError(f"path must end in .html, got {os.fspath(path)!r}")
@@ -131,7 +132,13 @@ def page(
         return {name: values[name] for name in _SHADES}
 
     # Before the search for cycles, since it may refuse the law.
-    program = javascript(shade, len(axes), "shade")
+    try:
+        program = javascript(shade, len(axes), "shade")
+    except ValueError as error:
+        laws = f"{type(scene.contact).__name__} and {type(scene.friction).__name__}"
+        raise ValueError(
+            f"a page of {laws} cannot be written, {error}: fj.explore shows it in a notebook"
+        ) from None
     long = program.count("\n") > 1000  # lines: the map has fewer points to stay quick
     programs = javascript(numbers, len(axes), "point") + program
     shown: Any = jax.eval_shape(numbers, *[0.0] * len(axes))

@@ -2,6 +2,7 @@
 
 import html
 import io
+import itertools
 from collections.abc import Mapping
 from typing import Any
 
@@ -28,8 +29,9 @@ from .topography import topography as draw_topography
 def explore(scene: Scene, **windows: tuple[float, float]) -> Any:
     """Sliders over the quantities of a scene, for a notebook: a widget to end a cell with.
 
-    Beside the sliders are the numbers of `stability` and `stiffness`, the map of the first two
-    quantities with the point on it, the surface and the mode. A button finds the limit cycle.
+    A number may be typed under each slider. Beside them are the numbers of `stability` and
+    `stiffness`, the map of the first two quantities with the point on it, the surface and the mode.
+    A button finds the limit cycle.
 
     **Arguments:**
 
@@ -45,6 +47,7 @@ def explore(scene: Scene, **windows: tuple[float, float]) -> Any:
         raise ImportError("explore needs ipywidgets: python -m pip install ipywidgets") from None
     axes, scene = slider_axes(scene, windows)
     sliders = {axis.name: _slider(ipywidgets, axis) for axis in axes}
+    typed = {axis.name: _entry(ipywidgets, axis) for axis in axes}
     numbers, words = ipywidgets.HTML(), ipywidgets.HTML()
     pictures = {name: ipywidgets.Image(format="png") for name in ("map", "surface", "mode")}
     motion = ipywidgets.Image(format="png")
@@ -53,7 +56,7 @@ def explore(scene: Scene, **windows: tuple[float, float]) -> Any:
         del pictures["surface"]
 
     def values() -> dict[str, float]:
-        return {name: slider.value for name, slider in sliders.items()}
+        return {name: entry.value for name, entry in typed.items()}
 
     def update(_: Any = None) -> None:
         here = replaced(scene, values())
@@ -73,11 +76,13 @@ def explore(scene: Scene, **windows: tuple[float, float]) -> Any:
             words.value += f": peak to peak {size} m, {cycle.frequency:.5g} Hz"
             motion.value, motion.layout.display = _png(draw_cycle(cycle)), "block"
 
-    for slider in sliders.values():
-        slider.observe(update, names="value")
+    for name, entry in typed.items():
+        ipywidgets.dlink((sliders[name], "value"), (entry, "value"))
+        entry.observe(update, names="value")
     button.on_click(find)
     update()
-    left = ipywidgets.VBox([*sliders.values(), numbers, button, words])
+    pairs = itertools.chain.from_iterable(zip(sliders.values(), typed.values(), strict=True))
+    left = ipywidgets.VBox([*pairs, numbers, button, words])
     row = ipywidgets.Layout(flex_flow="row wrap")
     return ipywidgets.VBox([ipywidgets.Box([left, *pictures.values()], layout=row), motion])
 
@@ -90,6 +95,12 @@ def _slider(ipywidgets: Any, axis: Axis) -> Any:
         description=f"{axis.name}{unit}",
         continuous_update=False,  # a drag computes where it ends
     )
+
+
+def _entry(ipywidgets: Any, axis: Axis) -> Any:
+    low, high = float(axis.stops[0]), float(axis.stops[-1])
+    value = float(axis.stops[axis.start * axis.refine])
+    return ipywidgets.BoundedFloatText(value, min=low, max=high, step=None, description=axis.name)
 
 
 def _table(scene: Scene) -> str:

@@ -117,8 +117,14 @@ def test_what_has_no_counterpart_is_refused_in_parts_and_in_scenes(tmp_path):
         with pytest.raises(ValueError, match=word):
             javascript(function, 1, "f")
     law = fj.AsperityContact(LAW.surface, LAW.material, 1e3, L_s=1e-6)
-    with pytest.raises(ValueError, match="no JavaScript for the operation"):
-        fj.plot.explore(SCENE.replace(contact=law), tmp_path / "a.html")
+    friction = fj.TabulatedFriction([0.0, 0.1, 0.5], [0.4, 0.35, 0.3])
+    for changed, names in [
+        (SCENE.replace(contact=law), "AsperityContact and Stribeck"),
+        (SCENE.replace(friction=friction), "FractalContact and TabulatedFriction"),
+    ]:
+        said = f"^a page of {names} .*no JavaScript for the operation.*: fj.explore shows it"
+        with pytest.raises(ValueError, match=said):
+            fj.plot.explore(changed, tmp_path / "a.html")
     with pytest.raises(TypeError, match="scene must be a Scene"):
         fj.plot.explore(LAW, tmp_path / "a.html")  # pyright: ignore[reportArgumentType]
 
@@ -390,7 +396,7 @@ def test_widget_says_what_python_says():
     pytest.importorskip("ipywidgets")
     shown = fj.explore(SCENE, D=(2.35, 2.45), mu=(0.2, 0.4))
     (left, *pictures), motion = shown.children[0].children, shown.children[1]
-    D, _, numbers, button, _ = left.children
+    D, typed, _, _, numbers, button, _ = left.children
     assert (D.value, len(pictures)) == (2.4, 3)
     assert "+22.08 1/s" in numbers.value and "elastic-plastic" in numbers.value
     before = [picture.value for picture in pictures]
@@ -400,3 +406,8 @@ def test_widget_says_what_python_says():
     assert all(bytes(new.value).startswith(b"\x89PNG") for new in pictures)
     assert all(new.value != old for new, old in zip(pictures, before, strict=True))
     assert motion.layout.display == "none" and button.description == "Limit cycle"
+    assert typed.value == D.value
+    typed.value = 2.41234
+    assert f"{fj.growth_rate(SCENE.replace(D=2.41234)):+.5g} 1/s" in numbers.value
+    typed.value = 3.0
+    assert typed.value == 2.45  # the end of the slider
