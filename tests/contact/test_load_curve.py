@@ -111,6 +111,7 @@ def _persson_lanes(D, load):
     return curve(e), table(e), e / curve.opening
 
 
+@pytest.mark.slow
 def test_nothing_moves_at_rest():
     """N = P without approach, from the lightest loads to full contact of surfaces of any D."""
     D, load = np.meshgrid(np.linspace(2.02, 2.98, 9), 10.0 ** np.arange(7))
@@ -124,6 +125,7 @@ def test_nothing_moves_at_rest():
     assert (computed[:, 200] == 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("D", [2.05, 2.5, 2.8, 2.97])
 def test_mass_at_rest_stays(D):
     """Under a preload, with its own load curve: it once moved by 6.7 P/K_n."""

@@ -110,6 +110,7 @@ WORN = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row", WORN)
 def test_values_of_another_program(row):
     """From map to map Sq varies by .0025 and Ssk by .05, hence one that begins with the same Ssk.

@@ -59,6 +59,7 @@ def test_members_are_designs(count, asked):
         assert found.target[i] == best.target
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_designs_solved_again():
     """By what is held fixed, in both modes and mapped, where one requirement is active."""
 

@@ -66,6 +66,7 @@ def test_defaults_are_those_of_design():
     assert problem.residuals(problem.start).max() > 1  # it squeals
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["loss", "residuals"])
 def test_both_modes_agree_with_differences(name):
     """Under jit and vmap, on both sides of coalescence and at bounds of the regimes."""
@@ -101,6 +102,7 @@ def test_a_problem_may_be_made_of_traced_mechanisms():
     assert np.isnan(inside(2.9)) and np.isfinite(inside(2.5))
 
 
+@pytest.mark.slow
 def test_an_envelope_counts_by_its_worst():
     envelope = {"P": (1700.0, 2100.0)}
     problem = fj.DesignProblem(SCENE, BOUNDS, fj.growth_rate, envelope=envelope, K_n_min=4e8)
@@ -140,6 +142,7 @@ def test_an_optax_loop_of_ones_own_ends_at_the_same_design():
     assert not any(x.aval.weak_type for x in ends)
 
 
+@pytest.mark.slow
 def test_limits_of_cycles_are_those_of_the_cycle():
     """Loss and residual are measures of the cycle that `limit_cycle` finds."""
     amplitude = constraints.CycleAmplitude()

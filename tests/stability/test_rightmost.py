@@ -209,6 +209,7 @@ def even(matrices):
     return M, C - C.T, (K + K.T) / 2 + 0.02 * (K - K.T)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("matrices", [problem(), even(problem())], ids=["uneven", "even"])
 @pytest.mark.parametrize("at", [0.0, 0.37, 1.0])
 def test_the_short_cut_holds_at_the_ends_of_a_range_in_both_modes(matrices, at):

@@ -153,6 +153,7 @@ def crossing(z, steps, angle, level=0.2):
     return np.inf if first is None else brentq(correlation, lags[first - 1], lags[first])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stretch", [1, 3])
 def test_autocorrelation_lengths(stretch):
     """The fastest and the slowest decay of a random map, direction by direction."""
