@@ -74,11 +74,6 @@ def write_together(files: Mapping[Any, bytes], *, durable: bool = True) -> list[
     return replaced
 
 
-def is_partial_copy(target: Path, file: Path) -> bool:
-    """True if `file` is a partial copy of `target` that a killed `write_whole` left."""
-    return file.name.startswith(f".{target.name}-")
-
-
 def _neighbour(target: Path) -> Path:
     return target.with_name(f".{target.name}-{secrets.token_hex(4)}")
 

@@ -11,8 +11,11 @@ import textwrap
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import jax
 import numpy as np
 from jax.core import Tracer
+
+from .parts import enumeration_of
 
 Row = tuple[str, Any, str, str]  # quantity, value, unit and meaning
 
@@ -46,9 +49,9 @@ def shown(value: Any) -> str:
     """A value in few characters: an array of many numbers by its shape and its range."""
     if isinstance(value, Tracer):
         return "traced"
-    members = getattr(value, "_enumeration", None)
+    members: Any = enumeration_of(value)
     if members is not None:
-        return str(members[value]) if not np.ndim(value._value) else "of each member"
+        return str(members[value]) if np.ndim(jax.tree.leaves(value)[0]) == 0 else "of each member"
     if value is None or isinstance(value, (str, bool)):
         return "none" if value is None else str(value)
     if isinstance(value, Mapping):

@@ -164,16 +164,23 @@ def refused(tree: Any) -> Bool[Array, ""] | None:
     return functools.reduce(operator.or_, nans) if nans else None
 
 
+def enumeration_of(value: Any) -> type[eqx.Enumeration] | None:
+    """The enumeration that `value` is a member of, which has its text; None if of none."""
+    kinds = eqx.Enumeration.__subclasses__()
+    return next((kind for kind in kinds if isinstance(value, kind)), None)
+
+
 def raise_unless(expected: Any, outcome: Any) -> Any:
     """`outcome` if its `result` is the member `expected`; else `RuntimeError` with its message.
 
     The numbers of a traced outcome become NaN, and its `result` stays.
     """
     result = outcome.result
-    if concrete(result._value) is None:
+    if any(concrete(leaf) is None for leaf in jax.tree.leaves(result)):
         return nan_where(result != expected, outcome)
     if bool(result != expected):
-        raise RuntimeError(result._enumeration[result])
+        kind: Any = enumeration_of(result)
+        raise RuntimeError(kind[result])
     return outcome
 
 

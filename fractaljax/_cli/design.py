@@ -108,7 +108,7 @@ def add_design(commands) -> None:
     )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     allowed = {"repeat", "quiet", "out", "area", "json", "help"}  # beside --repeat
-    design_options = [action.dest for action in parser._actions if action.dest not in allowed]
+    design_options = [action.dest for action in parser.actions if action.dest not in allowed]
     parser.set_defaults(run=_run, design_options=design_options)
 
 

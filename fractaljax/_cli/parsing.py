@@ -6,6 +6,7 @@ import re
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any
 
@@ -38,14 +39,6 @@ class _Once(argparse.Action):
         setattr(namespace, self.dest, values)
 
 
-class _Help(argparse.HelpFormatter):
-    """Show a whole number as N and any other as X."""
-
-    def _get_default_metavar_for_optional(self, action):
-        default = super()._get_default_metavar_for_optional(action)
-        return {int: "N", float: "X"}.get(action.type, default)  # pyright: ignore[reportArgumentType]
-
-
 class Parser(argparse.ArgumentParser):
     """A parser that reports an error in one line and takes negative numbers of any form.
 
@@ -56,10 +49,17 @@ class Parser(argparse.ArgumentParser):
     pairs: Sequence[str] = ()
 
     def __init__(self, *arguments, **options):
-        super().__init__(*arguments, formatter_class=_Help, **options)
+        self.actions: list[argparse.Action] = []
+        super().__init__(*arguments, **options)
         self.register("action", None, _Once)
-        # Older Pythons take -1e-5 for an option.
-        self._negative_number_matcher = re.compile(r"-\.?\d")
+
+    def add_argument(self, *names, **options):
+        """As argparse does; a whole number is shown as N and any other as X."""
+        letter = {int: "N", float: "X"}.get(options.get("type"))
+        if letter and names[0].startswith("-"):
+            options.setdefault("metavar", letter)
+        self.actions.append(super().add_argument(*names, **options))
+        return self.actions[-1]
 
     def parse_known_args(self, args=None, namespace=None):
         """As argparse does, with LOW:HIGH of `pairs` in two, and options that are like others."""
@@ -70,13 +70,15 @@ class Parser(argparse.ArgumentParser):
                 words[k : k + 1] = [option, *value.split(":")]
             elif option in self.pairs and words[k + 1 : k + 2] and words[k + 1].count(":") == 1:
                 words[k + 1 : k + 2] = words[k + 1].split(":")
+        words = [_plain(word) for word in words]
         namespace, unknown = super().parse_known_args(words, namespace)
         options = [word.partition("=")[0] for word in unknown if word.startswith("--")]
         if options and not self.commands:
             name = options[0].lstrip("-")
-            near = did_you_mean(name, (x.lstrip("-") for x in self._option_string_actions))
+            known = [name for action in self.actions for name in action.option_strings]
+            near = did_you_mean(name, (x.lstrip("-") for x in known))
             near = near.replace("mean ", "mean --").replace(" or ", " or --")
-            if not near and "--bounds" in self._option_string_actions and name.isidentifier():
+            if not near and "--bounds" in known and name.isidentifier():
                 near = f": did you mean --bounds {name}=LOW:HIGH or --set {name}=VALUE?"
             self.error(f"unrecognized arguments: {' '.join(unknown)}{near or self._see}")
         return namespace, unknown
@@ -135,6 +137,14 @@ def reason(error: Exception) -> str | None:
         case ValueError() | TypeError():
             return text
     return f"not enough memory: {text}" if text.startswith("RESOURCE_EXHAUSTED") else None
+
+
+def _plain(word: str) -> str:
+    """A negative number without an exponent: argparse takes -1e-5 for an option."""
+    try:
+        return f"{Decimal(word):f}" if re.match(r"-\.?\d", word) else word
+    except InvalidOperation:
+        return word
 
 
 @contextlib.contextmanager

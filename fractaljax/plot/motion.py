@@ -188,7 +188,9 @@ def _picture(motion: _Motion, scale: float | None) -> tuple[Figure, Callable[[fl
     bar.set_label(f"largest displacement from the mean [{length}]")
     factor_of, unit = frequency_unit([1 / motion.period])
     ax.set_title(f"{factor_of / motion.period:.4g} {unit}, displacements times {factor:.3g}")
-    marks = ax.scatter(*np.full((mesh.points.shape[1], count), np.nan), s=60, ec="k", zorder=5)
+    nowhere = [[np.nan]] * mesh.points.shape[1]
+    look: Any = dict(marker="o", markersize=8, markeredgecolor="k", zorder=5)
+    marks = [ax.plot(*nowhere, **look)[0] for _ in range(count)]
     cursor = _lanes(figure.add_subplot(grid[1]), motion)
 
     def draw(share: float) -> Any:
@@ -198,12 +200,13 @@ def _picture(motion: _Motion, scale: float | None) -> tuple[Figure, Callable[[fl
         cursor.set_xdata([share, share])
         if motion.places is not None:
             at = motion.places @ (mesh.points + displacements)
-            if mesh.solid:
-                marks._offsets3d = tuple(at.T)
-            else:
-                marks.set_offsets(at)
-            marks.set_facecolor([find_state(state).colour for state in motion.states[k]])
-        return [cells, marks, cursor]
+            for mark, place, state in zip(marks, at, motion.states[k], strict=True):
+                mark.set_markerfacecolor(find_state(state).colour)
+                if mesh.solid:
+                    mark.set_data_3d(*place[:, None])
+                else:
+                    mark.set_data(*place[:, None])
+        return [cells, *marks, cursor]
 
     return figure, draw
 

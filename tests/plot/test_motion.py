@@ -31,17 +31,17 @@ def test_places_marks_and_lanes(at):
     figure: Any = plot.cycle_motion(cycle, structure, at=at, scale=0.5, **BLOCK)
     top, lanes = figure.axes[0], next(ax for ax in figure.axes if "period" in ax.get_xlabel())
     x = 0.5 * displaced(cycle, at)[0]
-    outline, drawn, marks = top.collections
+    (outline, drawn), (mark,) = top.collections, top.lines
     points = np.array(BLOCK["points"])
     np.testing.assert_allclose(outline.get_paths()[0].vertices[:4], points)
     shifted = points + np.array([[x, 0], [x, 0], [x, 0], [0, 0]])
     np.testing.assert_allclose(drawn.get_paths()[0].vertices[:4], shifted, rtol=1e-12, atol=1e-12)
     # The joint is at the mean place of the three nodes that it moves, in the colour of its state.
     assert_whole(figure)
-    np.testing.assert_allclose(marks.get_offsets(), [shifted[:3].mean(axis=0)], rtol=1e-12)
+    np.testing.assert_allclose(mark.get_xydata(), [shifted[:3].mean(axis=0)], rtol=1e-12)
     states = np.asarray(cycle.contact_states(256))[:, 0]
     colour = to_rgba(COLOURS[int(states[round(at * 256)])])
-    np.testing.assert_allclose(marks.get_facecolor()[0], colour)
+    np.testing.assert_allclose(to_rgba(mark.get_markerfacecolor()), colour)
     # The lane: as long in stick as the cycle says.
     lane = lanes.collections[0]
     ends = [(path.vertices[:, 0].min(), path.vertices[:, 0].max()) for path in lane.get_paths()]
@@ -103,10 +103,10 @@ def test_a_reduced_structure_moves_the_whole_mesh():
     cells = [[i, i + 1, N + i + 1, N + i] for i in range(N - 1)]
     mesh: dict[str, Any] = {"points": points, "dofs": dofs, "cells": cells}
     figure: Any = plot.cycle_motion(cycle, reduced, at=0.25, scale=0.2, **mesh)
-    _, drawn, marks = figure.axes[0].collections
+    (_, drawn), marks = figure.axes[0].collections, figure.axes[0].lines
     x = 0.2 * np.asarray(reduced.full(displaced(cycle, 0.25)))
     shifted = points + x[dofs]
     corner = drawn.get_paths()[-1].vertices[1]
     np.testing.assert_allclose(corner, shifted[N - 1], rtol=1e-12)
     tip = (shifted[TIPS[0]] + shifted[N + TIPS[0]]) / 2
-    np.testing.assert_allclose(marks.get_offsets()[0], tip, rtol=1e-12)
+    np.testing.assert_allclose(marks[0].get_xydata(), [tip], rtol=1e-12)
