@@ -132,6 +132,22 @@ def test_contact_laws_are_judged_as_the_page_says(monkeypatch):
     assert_whole(made.picture(seeds=2, n=64))
 
 
+@pytest.mark.slow  # starts Python four times, and compiles there
+@pytest.mark.filterwarnings("ignore")  # of Dask
+def test_a_cluster_is_measured_as_the_page_says():
+    """With fewer points: the page raises unless the values are those of one process."""
+    made = script("cluster")
+    text, figure = made.page(200, 2_000, 2, 2)
+    assert_whole(figure)
+    names = [
+        re.sub(r"[-+\d.e]+", "#", line).split("|")[1] for line in text.splitlines() if "|" in line
+    ]
+    committed = made.PAGE.read_text(encoding="utf-8")
+    assert len(names) == 10 and all(name in re.sub(r"[-+\d.e]+", "#", committed) for name in names)
+    computed = re.search(r"batches, computed by the workers \| 20, (\d+)", text)
+    assert computed is not None and 20 <= int(computed[1]) <= 24
+
+
 def kicks():
     """Rows of the committed page: surface, the numbers of its equilibrium, and shares by radius."""
     made = script("kicks")
