@@ -2,11 +2,12 @@
 
 import argparse
 import contextlib
+import math
 import re
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +71,11 @@ class Parser(argparse.ArgumentParser):
                 words[k : k + 1] = [option, *value.split(":")]
             elif option in self.pairs and words[k + 1 : k + 2] and words[k + 1].count(":") == 1:
                 words[k + 1 : k + 2] = words[k + 1].split(":")
+        # argparse takes for an option what begins as -0.1:0.2 and -1e-5 do.
+        single = {x for each in self.actions if each.nargs is None for x in each.option_strings}
+        for k in reversed(range(1, len(words))):
+            if re.match(r"-\.?\d", words[k]) and words[k - 1] in single:
+                words[k - 1 : k + 1] = [f"{words[k - 1]}={words[k]}"]
         words = [_plain(word) for word in words]
         namespace, unknown = super().parse_known_args(words, namespace)
         options = [word.partition("=")[0] for word in unknown if word.startswith("--")]
@@ -140,11 +146,12 @@ def reason(error: Exception) -> str | None:
 
 
 def _plain(word: str) -> str:
-    """A negative number without an exponent: argparse takes -1e-5 for an option."""
+    """A negative number as argparse knows it, without an exponent."""
     try:
-        return f"{Decimal(word):f}" if re.match(r"-\.?\d", word) else word
-    except InvalidOperation:
+        number = float(word) if re.match(r"-\.?\d.*[eE.]", word) else math.inf
+    except ValueError:
         return word
+    return f"{Decimal(repr(number)):f}" if math.isfinite(number) else word
 
 
 @contextlib.contextmanager

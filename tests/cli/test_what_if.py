@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import fractaljax as fj
+from fractaljax._cli.design import add_design
+from fractaljax._cli.parsing import Parser
 from tools import refused_command, run_command as run
 
 BRAKE = fj.brake_scene()
@@ -83,16 +85,30 @@ def test_what_was_meant(capsys, arguments, message):
     assert message in refused_command(capsys, *arguments)
 
 
+def parsed(words):
+    parser = Parser()
+    add_design(parser.add_subparsers(parser_class=Parser))
+    return parser.parse_args(words)
+
+
 def test_bounds_as_one_word():
-    """--D 2.3:2.8 is --D 2.3 2.8, also after an equals sign; negative numbers are no options."""
-    import argparse
-
-    from fractaljax._cli.design import add_design
-    from fractaljax._cli.parsing import Parser
-
+    """--D 2.3:2.8 is --D 2.3 2.8, also after an equals sign."""
     for words in (["--D", "2.3:2.8"], ["--D=2.3:2.8"], ["--D", "2.3", "2.8"]):
-        parser = Parser()
-        add_design(parser.add_subparsers(parser_class=Parser))
-        read = parser.parse_args(["design", *words, "--G", "1e-11:1e-9", "--quiet"])
-        assert isinstance(read, argparse.Namespace)
+        read = parsed(["design", *words, "--G", "1e-11:1e-9", "--quiet"])
         assert (read.D, read.G, read.quiet) == ([2.3, 2.8], [1e-11, 1e-9], True)
+
+
+@pytest.mark.parametrize(
+    ("words", "name", "wanted"),
+    [
+        ("--damping-ratio -0.1:0.2", "damping_ratio", "-0.1:0.2"),
+        ("--damping-ratio -1e-3:", "damping_ratio", "-1e-3:"),
+        ("--quiet-within -1e-3,2", "quiet_within", "-1e-3,2"),
+        ("--target -1e-5", "target", -1e-5),
+        ("--target -.5", "target", -0.5),
+        ("--sq-lengths -1E3 -2.5e-7", "sq_lengths", [-1e3, -2.5e-7]),
+    ],
+)
+def test_negative_numbers_are_values(words, name, wanted):
+    read = parsed(["design", *words.split(), "--quiet"])
+    assert getattr(read, name) == wanted and read.quiet
