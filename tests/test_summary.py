@@ -3,6 +3,7 @@
 import re
 
 import equinox as eqx
+import jax
 import numpy as np
 import pytest
 
@@ -14,6 +15,7 @@ from fractaljax._stability.summary import (
     friction_remark,
     scene_rows,
     stability_table,
+    verdict,
 )
 from tools import motionless_scene, reference_cycle, reference_scene
 
@@ -168,6 +170,25 @@ def test_remarks_on_friction_beyond_its_law_and_a_growth_rate_of_zero():
     # Without damping rounding would decide.
     scene = fj.brake_scene().replace(xi_1=0.0, xi_2=0.0, mu_s=0.01, mu_m=0.01)
     assert "+0  (0 to rounding: it neither grows nor dies out)" in stability_table(scene)
+
+
+@pytest.mark.parametrize(
+    ("growth", "margin", "words"),
+    [
+        (1e-11, 0.0, "0 to rounding: it neither grows nor dies out"),
+        (-1e-11, 0.0, "0 to rounding: it neither grows nor dies out"),
+        (1e-11, 0.1, "0 to rounding; by its margin stable against small disturbances"),
+        (-1e-11, -0.1, "0 to rounding; by its margin it squeals"),
+        (1e-8, -0.1, "it squeals"),
+        (-1e-8, 0.1, "stable against small disturbances"),
+    ],
+)
+def test_a_growth_rate_within_rounding_of_the_eigenvalues_has_no_sign(growth, margin, words):
+    """They are some 1e4 1/s."""
+    modes = fj.stability(BRAKE)
+    numbers = jax.numpy.array([growth, margin])
+    modes = eqx.tree_at(lambda m: (m.growth_rate, m.margin), modes, tuple(numbers))
+    assert verdict(modes)["growth rate [1/s]"].endswith(f"({words})")
 
 
 @pytest.mark.parametrize(
