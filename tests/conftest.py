@@ -21,15 +21,15 @@ jax.config.update("jax_numpy_dtype_promotion", "standard")
 
 def pytest_addoption(parser):
     parser.addoption("--once", action="store_true", help="each test with its first parameters only")
-    fifths = "of the slow tests only those of this fifth, 0 to 4"
-    parser.addoption("--fifth", type=int, choices=range(5), help=fifths)
+    tenths = "of the slow tests only those of this tenth, 0 to 9"
+    parser.addoption("--tenth", type=int, choices=range(10), help=tenths)
 
 
 @pytest.hookimpl(trylast=True)  # of what `-m` has left
 def pytest_collection_modifyitems(config, items):
-    if (fifth := config.getoption("fifth")) is not None:
+    if (tenth := config.getoption("tenth")) is not None:
         others = [
-            item for item in items if item.get_closest_marker("slow") and _fifth(item) != fifth
+            item for item in items if item.get_closest_marker("slow") and _tenth(item) != tenth
         ]
         config.hook.pytest_deselected(items=others)
         items[:] = [item for item in items if item not in set(others)]
@@ -42,9 +42,9 @@ def pytest_collection_modifyitems(config, items):
         items[:] = first.values()
 
 
-def _fifth(item) -> int:
-    """The fifth of a test: all of its parameters are in the same one."""
-    return zlib.crc32(item.nodeid.partition("[")[0].encode()) % 5
+def _tenth(item) -> int:
+    """The tenth of a test: all of its parameters are in the same one."""
+    return zlib.crc32(item.nodeid.partition("[")[0].encode()) % 10
 
 
 def pytest_configure(config):
