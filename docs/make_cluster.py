@@ -22,7 +22,6 @@ PAGE = Path(__file__).with_name("cluster.md")
 PICTURE = Path(__file__).with_name("cluster.png")
 SIDE, BATCH, WORKERS = 10_000, 500_000, 2
 CYCLES = 256
-SCENE = fj.brake_scene()
 
 INTRODUCTION = """# A sweep that outgrows the machine
 
@@ -35,8 +34,13 @@ from dask.distributed import Client
 
 client = Client("tcp://scheduler:8786")  # or Client(n_workers=2, threads_per_worker=1) here
 found = fj.sweep(
-    fj.growth_rate, fj.brake_scene(), {batch}, executor=client.get_executor(), out="run.zarr",
-    D=np.linspace(2.2, 2.6, {side}), G=np.geomspace(1e-11, 1e-9, {side}),
+    fj.growth_rate,
+    fj.brake_scene(),
+    {batch},
+    executor=client.get_executor(),
+    out="run.zarr",
+    D=np.linspace(2.2, 2.6, {side}),
+    G=np.geomspace(1e-11, 1e-9, {side}),
 )
 ```
 """
@@ -108,7 +112,7 @@ def axes(side: int) -> dict[str, np.ndarray]:
 def here(side: int, batch: int) -> tuple[np.ndarray, float]:
     """The sweep in this process: its values and its time [s], with compiling."""
     begin = time.perf_counter()
-    found = fj.sweep(fj.growth_rate, SCENE, batch, False, **axes(side))
+    found = fj.sweep(fj.growth_rate, fj.brake_scene(), batch, False, **axes(side))
     return np.asarray(found.values), time.perf_counter() - begin
 
 
@@ -134,7 +138,7 @@ def on_cluster(side: int, batch: int, workers: int) -> Measured:
         begin = time.time()
         with get_task_stream(client) as stream, sampler.sample("all", measure="process"):
             found = fj.sweep(
-                fj.growth_rate, SCENE, batch, False, Path(folder) / "run.zarr", executor,
+                fj.growth_rate, fj.brake_scene(), batch, False, Path(folder) / "run.zarr", executor,
                 **axes(side),
             )  # fmt: skip
         seconds = time.time() - begin
@@ -152,7 +156,7 @@ def branching(count: int) -> tuple[float, float]:
     """The seconds of limit cycles side by side and in turn, without compiling."""
 
     def one(D):
-        return fj.limit_cycle(SCENE.replace(D=D), throw=False).period
+        return fj.limit_cycle(fj.brake_scene().replace(D=D), throw=False).period
 
     times, values = [], jnp.linspace(2.30, 2.39, count)
     for every in (jax.vmap(one), lambda values: jax.lax.map(one, values)):

@@ -28,11 +28,12 @@ def pytest_addoption(parser):
 @pytest.hookimpl(trylast=True)  # of what `-m` has left
 def pytest_collection_modifyitems(config, items):
     if (tenth := config.getoption("tenth")) is not None:
-        others = [
-            item for item in items if item.get_closest_marker("slow") and _tenth(item) != tenth
-        ]
+        kept, others = [], []
+        for item in items:
+            left_out = item.get_closest_marker("slow") and _tenth(item) != tenth
+            (others if left_out else kept).append(item)
         config.hook.pytest_deselected(items=others)
-        items[:] = [item for item in items if item not in set(others)]
+        items[:] = kept
     if config.getoption("once"):
         first, others = {}, []
         for item in items:
