@@ -13,6 +13,7 @@ import numpy as np
 
 from .._base.batches import in_batches
 from .._base.programs import exported_jit
+from .._mechanism.quantities import has_memory
 from .._mechanism.structure import ParametricStructure
 from .._stability.linearise import assembled
 from .._stability.quadratic import solve
@@ -30,7 +31,7 @@ def project_on_modes(problem: DesignProblem, us: np.ndarray) -> DesignProblem | 
     needs_all = (problem.objective is not None and not problem.least_growth) or problem.constraints
     if not problem.modes or x.band is not None or needs_all or problem.cycles:
         return None
-    if x.n < 60:  # eigenvalues take little time
+    if x.n < 60 or has_memory(x):  # eigenvalues take little time, or are those of a field
         return None
     vectors, size = in_batches(functools.partial(_growing_modes, problem), 1, us)
     vectors = vectors[np.isfinite(vectors).all(axis=(1, 2))]

@@ -1,16 +1,18 @@
-"""The number of modes of a structure that may grow; each has a growth rate to keep low."""
+"""The modes that may grow, where there is no closed form; each has a growth rate to keep low."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from .._base.programs import exported_jit
 from .._base.ranges import low_discrepancy
 from .._mechanism.mechanism import Mechanism
-from .._stability.linearise import assembled
-from .._stability.quadratic import leading
+from .._mechanism.quantities import has_memory
+from .._stability.linearise import linearised
+from .._stability.quadratic import Leading
 from .joints import with_contact_law
 from .rows import paired, rows_in_batches
 
@@ -18,9 +20,21 @@ if TYPE_CHECKING:
     from .problem import DesignProblem
 
 
+def needs_modes(x: Mechanism) -> bool:
+    """True for what has no closed form: a structure, or friction with memory."""
+    return not x.uncoupled or has_memory(x)
+
+
 def largest_mode_count(x: Mechanism) -> int:
-    """The largest number of modes of a structure that requirements can include."""
+    """The largest number of modes that requirements can include."""
     return min(16, x.n)
+
+
+def leading_modes(x: Any, friction_slope: bool, count: int) -> tuple[Leading, Float[Array, " k"]]:
+    """The modes that grow most, and their growth rates, NaN where there is no steady sliding."""
+    system: Any = linearised(x, friction_slope, refuse=False)  # LAPACK gets numbers even so
+    modes = system.leading(count)
+    return modes, jnp.where(system.lost, jnp.nan, modes.s.real)
 
 
 def modes_to_keep(problem: "DesignProblem") -> int:
@@ -42,9 +56,7 @@ def _rates(problem: "DesignProblem", us, conditions):
         x = problem.mechanism_at(u, condition)
         rates = []
         for each in (problem.stiffened(x)[1], *(with_contact_law(x, law) for law in problem.laws)):
-            attached = assembled(each, problem.friction_slope, refuse=False)
-            modes = leading(*attached.matrices, problem.modes, x.band)
-            rates.append(jnp.where(attached.lost, jnp.nan, modes.s.real))
+            rates.append(leading_modes(each, problem.friction_slope, problem.modes)[1])
         return jnp.stack(rates)
 
     return jax.vmap(one)(us, conditions)

@@ -17,7 +17,7 @@ from .._mechanism.quantities import replaced, require_one, separate_quantities, 
 from .._sweep.program import Program
 from .._sweep.sweep import run
 from .constraints import CycleConstraint
-from .growing_modes import largest_mode_count
+from .growing_modes import largest_mode_count, needs_modes
 from .optimum import Optimum, optimum
 from .problem import DesignProblem
 from .result import DesignResult, is_met
@@ -173,7 +173,7 @@ def design_many(
     first, stacked, shape = _members(xs)
     if not is_traced(stacked):
         # What is wrong with the arguments is said of a member that is there.
-        most = None if first.uncoupled else largest_mode_count(first)
+        most = largest_mode_count(first) if needs_modes(first) else None
         lowest: Any = 0.0 if K_n_min is None else K_n_min  # its own would take a program
         checked = DesignProblem(
             first, bounds, modes=modes or most, **{**request, "K_n_min": lowest}
@@ -198,7 +198,7 @@ def design_many(
             return _at(first, [leaf[values[_MEMBER]] for leaf in leaves])
 
         program = Program(designed, (_MEMBER,), stacked, [*grid.values()], place)
-        each = 256 if first.uncoupled else 16
+        each = 16 if needs_modes(first) else 256
         if checked.scatter is not None:  # each design is as many as its quadrature has nodes
             each = max(1, each // len(checked.scatter.weights))
         how: dict[str, Any] = dict(each=each, batch_size=batch_size, progress=progress)

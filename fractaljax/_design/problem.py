@@ -21,15 +21,13 @@ from .._base.programs import exported_jit
 from .._contact.contact import Contact
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import substituted, value_of, with_stiffness
-from .._stability.linearise import assembled
-from .._stability.quadratic import leading
 from .._stability.stability import growth_rate
 from .coalescence import neighbour_residuals, scene_residuals
 from .constraints import Constraint, CycleConstraint
 from .cuts import Cuts
 from .envelope import Envelope
 from .followed import FollowedCycles
-from .growing_modes import largest_mode_count, modes_to_keep
+from .growing_modes import largest_mode_count, leading_modes, modes_to_keep, needs_modes
 from .joints import (
     is_fractal,
     joint_prefix,
@@ -139,7 +137,7 @@ class DesignProblem(eqx.Module):
         for name, value in fields.items():
             setattr(self, name, value)
         self.modes, self.smooth, self.cuts = 0, False, None
-        if not x.uncoupled:
+        if needs_modes(x):
             most = largest_mode_count(x)
             if modes is not None:
                 self.modes = whole("modes", modes, 1, most)
@@ -227,16 +225,12 @@ class DesignProblem(eqx.Module):
         smooth, rates = [], []
         for each in (stiff_x, *(with_contact_law(x, law) for law in self.laws)):
             if self.modes:
-                # The rates are NaN where there is no steady sliding; LAPACK gets numbers even so.
-                attached = assembled(each, self.friction_slope, refuse=False)
-                leading_modes = leading(*attached.matrices, self.modes, x.band)
-                rates += list(jnp.where(attached.lost, jnp.nan, leading_modes.s.real))
+                modes, growing = leading_modes(each, self.friction_slope, self.modes)
+                rates += list(growing)
                 if not self.least_growth:
-                    smooth += list(
-                        neighbour_residuals(leading_modes, self.target, self.growth_scale)
-                    )
+                    smooth += list(neighbour_residuals(modes, self.target, self.growth_scale))
                 elif each is stiff_x:
-                    smooth += list(jnp.arcsinh(leading_modes.s.real / self.growth_scale))
+                    smooth += list(jnp.arcsinh(modes.s.real / self.growth_scale))
             else:
                 rates.append(growth_rate(each, self.friction_slope))
                 smooth += scene_residuals(

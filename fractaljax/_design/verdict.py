@@ -19,7 +19,7 @@ from .._contact.fractal import FractalContact
 from .._contact.material import mindlin_ratio
 from .._contact.persson import PerssonContact
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import quantity_names, require_one, unit, value_of
+from .._mechanism.quantities import has_memory, quantity_names, require_one, unit, value_of
 from .._mechanism.scene import Scene
 from .._stability.quartic import rightmost_root
 from .._stability.stability import growth_rate, stability
@@ -151,8 +151,9 @@ def verdict(
     cases += [(laws_in_use, f"by {name}", other) for name, other in by]
     growth = _growth_rates(tuple(other for *_, other in cases), friction_slope)
     rates, names = growth.rates.tolist(), [case[:2] for case in cases]
-    rates.insert(before, float(growth.in_series))
-    names.insert(before, ("K_t beside the friction", "tangential spring in series"))
+    if not all(part.friction.in_series for part in parts.values()):
+        rates.insert(before, float(growth.in_series))
+        names.insert(before, ("K_t beside the friction", "tangential spring in series"))
     questions = [
         Question(assumed, name, growth_text(rate), rate < 0, not np.isfinite(rate))
         for (assumed, name), rate in zip(names, rates, strict=True)
@@ -233,6 +234,9 @@ def _with_springs_in_series(x: Mechanism) -> Mechanism:
     """
     contacts = {}
     for name, part in x.joints_by_name().items():
+        if part.friction.in_series:
+            contacts[name] = part.contact
+            continue
         K_n, _ = part.contact.stiffness(part.friction.mu_s, part.friction.mu_m)
         load = getattr(part.contact, "P", None)
         contact = FixedContact(1.0, 0.0, None if load is None else 1.0)
@@ -288,7 +292,7 @@ def _growth_rates(mechanisms: tuple[Any, ...], friction_slope: bool) -> _GrowthR
             contacts[name] = substitute(zero, {"K_n": K_n, "K_t": K_t, "P": P})
         return with_contacts(first, contacts)
 
-    if first.uncoupled:
+    if first.uncoupled and not has_memory(first):
         # One closed form for all: each use of it takes long to compile.
         systems = [two_directions(x, friction_slope).polynomial for x in mechanisms]
         own_systems = jax.tree.map(lambda *x: jnp.stack(x), *systems)

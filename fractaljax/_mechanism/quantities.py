@@ -60,8 +60,8 @@ def require_no_memory(x: Mechanism) -> None:
     for joint in x.joints_by_name().values():
         if joint.friction.state_size:
             raise ValueError(
-                "friction must be without memory here, for its internal states are followed by "
-                "growth_rate, stability, margin, simulate and limit_cycle alone, got "
+                "friction must be without memory here, for its internal states are followed in "
+                "stability, designs, simulate and limit_cycle alone, got "
                 f"{type(joint.friction).__name__}"
             )
 

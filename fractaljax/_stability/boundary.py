@@ -20,6 +20,7 @@ from .._contact.contact import Regime
 from .._continuation import Continuation, Curve, CurveEnd, trace
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import (
+    has_memory,
     require_independent,
     require_inside,
     require_one,
@@ -111,7 +112,7 @@ def hopf_boundary(
     whole line, the Hopf test function does not change sign smoothly: such crossings are counted as
     `untraced`.
 
-    For a structure, the boundary is flutter or static divergence (`BoundaryBranch.divergence`). A
+    For a structure, or friction with memory, the boundary is flutter or static divergence (`BoundaryBranch.divergence`). A
     branch ends at a corner, where a second mode loses its damping too; the next branch begins
     there. Points lie on it within 1e-10 of the window, or eps over the damping ratio.
 
@@ -148,7 +149,9 @@ def hopf_boundary(
     low, high = jnp.asarray(ends.T, jax.tree.leaves(scene)[0].dtype)
     scene = with_optional(scene, names)
     rigid = None
-    if not scene.uncoupled:
+    if has_memory(scene):
+        rigid = jnp.zeros((), int)
+    elif not scene.uncoupled:
         with_equilibrium(scene, friction_slope)
         rigid = _rigid(scene, friction_slope)
     field = _Field(_Plane(scene, low, high, rigid, names, logarithmic, friction_slope))
@@ -216,7 +219,7 @@ class _Plane(eqx.Module):
     scene: Any
     low: Float[Array, "2"]  # of each quantity, or of its logarithm
     high: Float[Array, "2"]
-    rigid: Any  # number of rigid-body eigenvalues of a structure
+    rigid: Any  # number of rigid-body eigenvalues, None of a scene in closed form
     names: tuple[str, str] = eqx.field(static=True)
     logarithmic: tuple[bool, ...] = eqx.field(static=True)
     friction_slope: bool = eqx.field(static=True)

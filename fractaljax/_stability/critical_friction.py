@@ -23,9 +23,15 @@ from .._contact.contact import MU_M_MAX
 from .._mechanism.joint import Joint
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.oscillator import dimensionless, linearise, static_normal_force
-from .._mechanism.quantities import require_one, require_sliding, with_friction_times
+from .._mechanism.quantities import (
+    has_memory,
+    require_one,
+    require_sliding,
+    with_friction_times,
+)
 from .._mechanism.scene import Scene, stiffness
 from .critical_pair import least_test
+from .field_modes import linearised_with_memory
 from .linearise import assembled, linearised
 from .two_directions import critical_coupling
 
@@ -48,7 +54,8 @@ def critical_friction(
     Squeal begins by flutter or by static divergence (a real eigenvalue). The factor is the root of
     the Hopf test function of n degrees of freedom (`critical_pair.py`) between two of 512 factors
     f, evenly spaced in f/(1 + f): an interval of squeal narrower than that can be missed. Each
-    takes a full eigenvalue solution.
+    takes a full eigenvalue solution. Friction with memory takes that way too, in a scene as well,
+    with the eigenvalues of the Jacobian of its field.
 
     The derivative is that of the root, and 0 where it is 0 or infinite.
 
@@ -104,15 +111,19 @@ _sliding = jax.jit(Joint.coefficient)
 
 @functools.partial(exported_jit, static_argnames="friction_slope")
 def _factor_of_structure(structure, friction_slope):
+    factor, _ = _first_factor(structure, friction_slope)
+    if has_memory(structure):
+        return factor
     # Beyond a static divergence there is an equilibrium again: look for it before.
     least = assembled(with_friction_times(structure, 1e-3), friction_slope)
-    return _first_factor(structure, friction_slope)[0] + 0 * least.C[0, 0]
+    return factor + 0 * least.C[0, 0]
 
 
 @functools.partial(exported_jit, static_argnames="friction_slope")
 def _critical_friction_of_scene(scene: Scene, friction_slope: bool) -> Float[Array, ""]:
     sloping = friction_slope and scene.friction.velocity_dependent
-    if scene.contact.depends_on_friction or sloping or scene.follows_load_curve:
+    closed = not (sloping or scene.follows_load_curve or has_memory(scene))
+    if scene.contact.depends_on_friction or not closed:
         factor, _ = _first_factor(scene, friction_slope)
         return jnp.where(factor == jnp.inf, jnp.inf, scene.coefficient() * _finite(factor))
     K_n, K_t = stiffness(scene)
@@ -154,6 +165,14 @@ def _signs(x, factors, friction_slope, rigid):
     One for each factor (k,). A number is 0 where rounding decides the sign. Rigid-body modes are
     those at the first factor, the least; later ones mean divergence.
     """
+    if has_memory(x):
+
+        def value_at(factor):
+            scaled = with_friction_times(x, factor)
+            return linearised_with_memory(scaled, friction_slope).least_test()
+
+        values = jax.vmap(value_at)(factors)
+        return values, jnp.isnan(values), rigid
     if x.uncoupled:
         values = jax.vmap(lambda f: _test(x, f, friction_slope, None))(factors)
         return values, jnp.isnan(values), None

@@ -10,10 +10,13 @@ of the stiffness however light the damping, and is analytic through coalescence.
 with its nearest neighbour; the least of them decides. Near coalescence sigma and delta are means
 over a circle around both eigenvalues, which lose no digits there:
 
-    sum_i f(s_i) = 1/(2 pi i) oint f(z) tr[Q^-1(z) Q'(z)] dz,   Q(z) = z^2 M + z C + K.
+    sum_i f(s_i) = 1/(2 pi i) oint f(z) tr[Q^-1(z) Q'(z)] dz,   Q(z) = z^2 M + z C + K,
+
+or Q(z) = z I - J of a field with the Jacobian J.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +34,26 @@ class CriticalPair(NamedTuple):
     frequency: Float[Array, ""]  # [Hz], where T = 0
     growth_rate: Float[Array, ""]  # [1/s]
     damping: Float[Array, "2"]  # the two least damping ratios
+
+
+class _Kind(NamedTuple):
+    """What kind of problem has these eigenvalues."""
+
+    conservative: jax.Array  # whether nothing damps
+    hysteretic: bool  # whether damping is structural
+
+    @classmethod
+    def of(cls, C, K) -> "_Kind":
+        """That of matrices."""
+        conservative, hysteretic = ~(C != 0).any(), jnp.iscomplexobj(K)
+        if hysteretic:
+            conservative &= ~(K.imag != 0).any()
+        return cls(conservative, hysteretic)
+
+    @classmethod
+    def of_field(cls) -> "_Kind":
+        """That of a Jacobian."""
+        return cls(jnp.zeros((), bool), False)
 
 
 class _Choice(NamedTuple):
@@ -56,12 +79,42 @@ def critical_pair(
     Rigid-body eigenvalues are 0 at any friction; another one that is 0 means divergence. With a
     `band` only modes in it count.
     """
+    unit = jax.lax.stop_gradient(1 / jnp.sqrt(jnp.diagonal(M)))
+    scaled = [X * unit[:, None] * unit[None] for X in (M, C, K)]
+
+    def trace(z):
+        M, C, K = scaled
+        return jnp.trace(jnp.linalg.solve(z**2 * M + z * C + K, 2 * z * M + C))
+
     s = solve(M, C, K, C_error).s
+    return critical_among(s, trace, rigid, _Kind.of(C, K), band)
+
+
+def critical_pair_of_field(
+    J: Float[Array, "k k"], s: Complex[Array, " k"], band: tuple[float, float] | None = None
+) -> CriticalPair:
+    """As `critical_pair`, for the eigenvalues s of the Jacobian J [1/s] of a field."""
+
+    def trace(z):
+        one = jnp.eye(len(J), dtype=z.dtype)
+        return jnp.trace(jnp.linalg.solve(z * one - J, one))
+
+    return critical_among(s, trace, jnp.zeros((), int), _Kind.of_field(), band)
+
+
+def critical_among(
+    s: Complex[Array, " k"],
+    trace: Callable[[Any], Array],
+    rigid: Int[Array, ""],
+    kind: "_Kind",
+    band: tuple[float, float] | None,
+) -> CriticalPair:
+    """T of the mode of least T, with tr[Q^-1(z) Q'(z)] as a function of z."""
     fixed = jax.lax.stop_gradient(s)
-    chosen = _choice(fixed, rigid, C, K, band)
+    chosen = _choice(fixed, rigid, kind, band)
     i = jnp.argmin(chosen.test)
     j, alone, undamped = (x[i] for x in (chosen.partner, chosen.alone, chosen.undamped))
-    sigma, delta = _mean_and_spread(M, C, K, s, i, j)
+    sigma, delta = _mean_and_spread(trace, s, i, j)
     test = jnp.where(alone, _alone(s[i].real, jnp.abs(fixed[i])), hopf_test(sigma, delta, undamped))
     splitting = _quotient(delta.imag, 2 * -sigma.real, undamped)
     imaginary = jnp.where(alone, fixed[i].imag, sigma.imag + splitting)
@@ -87,16 +140,24 @@ def least_test(
     band: tuple[float, float] | None = None,
 ) -> Float[Array, ""]:
     """T [1/s^2] as in `critical_pair`, without derivatives; 0 if rounding may decide its sign."""
-    test = _choice(modes.s, rigid, C, K, band).test
-    unresolved = jnp.abs(modes.s.real) <= modes.error
-    test = jnp.where(unresolved, jnp.maximum(test, 0), test).min()
-    return jnp.where(jnp.isnan(modes.s).any(), jnp.nan, test)
+    return _least_test(modes.s, modes.error, rigid, _Kind.of(C, K), band)
 
 
-def _choice(s: Complex[Array, " k"], rigid, C, K, band) -> _Choice:
-    conservative, hysteretic = ~(C != 0).any(), jnp.iscomplexobj(K)
-    if hysteretic:
-        conservative &= ~(K.imag != 0).any()
+def least_test_of_field(
+    s: Complex[Array, " k"], error: Float[Array, " k"], band: tuple[float, float] | None = None
+) -> Float[Array, ""]:
+    """As `least_test`, for the eigenvalues of a Jacobian and their rounding errors."""
+    return _least_test(s, error, jnp.zeros((), int), _Kind.of_field(), band)
+
+
+def _least_test(s, error, rigid, kind, band):
+    test = _choice(s, rigid, kind, band).test
+    test = jnp.where(jnp.abs(s.real) <= error, jnp.maximum(test, 0), test).min()
+    return jnp.where(jnp.isnan(s).any(), jnp.nan, test)
+
+
+def _choice(s: Complex[Array, " k"], rigid, kind: _Kind, band) -> _Choice:
+    conservative = kind.conservative
     place, size = jnp.arange(len(s)), jnp.abs(s)
     smaller = (size[None] < size[:, None]) | (
         (size[None] == size[:, None]) & (place[None] < place[:, None])
@@ -110,7 +171,7 @@ def _choice(s: Complex[Array, " k"], rigid, C, K, band) -> _Choice:
     coalesced, single = jnp.finfo(size.dtype).eps ** 0.5, _resolution(size.dtype)
     undamped = jnp.abs(sigma.real) <= jnp.where(conservative, coalesced, single) * size
     alone = (s.imag > 0) & (s[partner] == s.conj()) & ~(undamped & conservative)
-    if hysteretic:  # static divergence, of the problem without K_loss
+    if kind.hysteretic:  # static divergence, of the problem without K_loss
         alone |= (s.imag == 0) & (s.real > 0)
     test = jnp.where(alone, _alone(s.real, size), hopf_test(sigma, delta, undamped))
     counted &= in_band(s, band)
@@ -144,7 +205,7 @@ def _quotient(x, y, none):
     return jnp.where(none, 0, x / jnp.where(none, 1, y))
 
 
-def _mean_and_spread(M, C, K, s, i, j):
+def _mean_and_spread(trace, s, i, j):
     """sigma and delta of the modes i and j."""
     fixed = jax.lax.stop_gradient(s)
     place, middle = jnp.arange(len(s)), (fixed[i] + fixed[j]) / 2
@@ -157,22 +218,16 @@ def _mean_and_spread(M, C, K, s, i, j):
     nearest = jnp.where(place == i, jnp.inf, jnp.abs(fixed - fixed[i])).min()
     least = jnp.sqrt(jnp.finfo(half.dtype).eps) * jnp.abs(fixed).max()
     radius = jnp.maximum(jnp.where(coalescing, others, nearest) / 4, least)
-    first, second = _moments(M, C, K, jnp.where(coalescing, middle, fixed[i]), radius)
+    first, second = _moments(trace, jnp.where(coalescing, middle, fixed[i]), radius)
     alone = fixed[i] + first
     sigma = jnp.where(coalescing, middle + first / 2, (alone + s[j]) / 2)
     spread = jnp.where(coalescing, second / 2 - first**2 / 4, ((alone - s[j]) / 2) ** 2)
     return sigma, spread
 
 
-def _moments(M, C, K, centre, radius):
+def _moments(trace, centre, radius):
     """Sums of z and of z^2 of the eigenvalues in a circle, z being relative to its centre."""
-    unit = jax.lax.stop_gradient(1 / jnp.sqrt(jnp.diagonal(M)))
-    M, C, K = (X * unit[:, None] * unit[None] for X in (M, C, K))
     nodes = 32
     step = radius * jnp.asarray(np.exp(2j * np.pi * (np.arange(nodes) + 0.5) / nodes), centre.dtype)
-
-    def traced(z):
-        return jnp.trace(jnp.linalg.solve(z**2 * M + z * C + K, 2 * z * M + C))
-
-    trace = jax.vmap(traced)(centre + step)
-    return tuple((trace * step**k).mean() for k in (2, 3))
+    traces = jax.vmap(trace)(centre + step)
+    return tuple((traces * step**k).mean() for k in (2, 3))

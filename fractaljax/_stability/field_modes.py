@@ -1,6 +1,6 @@
 """Stability where friction has memory: the eigenvalues of the Jacobian of the field of motion."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,14 +10,18 @@ from .._base.lapack import one_by_one, solve
 from .._base.rounding import rounding_error
 from .._mechanism.mechanism import Mechanism
 from .band import among, in_band, leading
+from .critical_pair import CriticalPair, critical_pair_of_field, least_test_of_field
 from .margin import least_damping_ratio
+from .quadratic import Leading, leading_among
 from .two_directions import Eigensolution
 
 
 class LinearisedField(NamedTuple):
     """The modes of n degrees of freedom with k - 2n states of laws; the face is that of others."""
 
+    J: Float[Array, "k k"]  # [1/s], of the field in units of its own
     s: Complex[Array, " k"]  # [1/s], the largest real part first
+    vectors: Complex[Array, "k k"]  # right ones, in rows, of any length
     x: Complex[Array, "k n"]  # displacements, of any length
     error: Float[Array, " k"]  # how far rounding of the Jacobian can move s [1/s]
     normal_force: Float[Array, " m"] | None  # as `Stability` has it
@@ -35,6 +39,33 @@ class LinearisedField(NamedTuple):
         """All modes."""
         counted = in_band(self.s, self.band)
         return Eigensolution(self.s, self.x, self.error, self.margin(), counted)
+
+    def leading(self, count: int) -> Leading:
+        """As `quadratic.leading`."""
+        fixed = jax.lax.stop_gradient(self.s)
+        return leading_among(fixed, lambda places: self.s[places], count, self.band)
+
+    @property
+    def open(self) -> Array:
+        """False: where a joint is open, all results are NaN."""
+        return jnp.zeros((), bool)
+
+    @property
+    def lost(self) -> Array:
+        """True where a joint is open or there is no steady sliding."""
+        return jnp.isnan(self.J).any()
+
+    def least_test(self) -> Float[Array, ""]:
+        """As `critical_pair.least_test`."""
+        return least_test_of_field(self.s, self.error, self.band)
+
+    def hopf_test(self, rigid: Any = None) -> Float[Array, ""]:
+        """The Hopf test function; there are no `rigid` bodies."""
+        return self.critical().test
+
+    def critical(self, rigid: Any = None) -> CriticalPair:
+        """The critical mode, as `critical_pair`."""
+        return critical_pair_of_field(self.J, self.s, self.band)
 
 
 def linearised_with_memory(mechanism: Mechanism, friction_slope: bool) -> LinearisedField:
@@ -58,8 +89,9 @@ def linearised_with_memory(mechanism: Mechanism, friction_slope: bool) -> Linear
     pressed = [joint.normal_load is not None for joint in mechanism.joints_by_name().values()]
     forces = jnp.where(jnp.array(pressed), loads, jnp.nan) if any(pressed) else None
     s, band = s * hybrid.omega, mechanism.band
-    order = leading(s, band)
-    return LinearisedField(s[order], x[order], error[order] * hybrid.omega, forces, band)
+    order, J = leading(s, band), J * hybrid.omega
+    rows, error = vectors.T[order], error[order] * hybrid.omega
+    return LinearisedField(J, s[order], rows, x[order], error, forces, band)
 
 
 @one_by_one

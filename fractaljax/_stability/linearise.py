@@ -17,6 +17,7 @@ from .._contact.load_curve import loaded_equilibrium
 from .._mechanism.quantities import has_memory, require_no_memory, require_one
 from .._mechanism.reduced import CoarseSpace
 from .._mechanism.structure import Structure, require_single
+from . import quadratic
 from .band import among, in_band, leading
 from .critical_pair import CriticalPair, critical_pair
 from .field_modes import linearised_with_memory
@@ -62,6 +63,10 @@ class Assembled(eqx.Module):
         """(M, C, K)."""
         return self.M, self.C, self.K
 
+    def leading(self, count: int) -> quadratic.Leading:
+        """The modes that grow most, as `quadratic.leading`."""
+        return quadratic.leading(*self.matrices, count, self.band)
+
     def solve(self) -> Modes:
         """All modes, with the rounding errors of their eigenvalues."""
         return solve(*self.matrices, self.C_error)
@@ -96,12 +101,10 @@ class Assembled(eqx.Module):
 def linearised(x: Any, friction_slope: bool, refuse: bool = True) -> TwoDirections | Assembled:
     """The linearised equations of a mechanism, in closed form where there is one.
 
-    `refuse` as in `assembled`.
+    `refuse` as in `assembled`; with memory what is lost is always NaN.
     """
     require_one("scene", x)
     if has_memory(x):
-        if not refuse:  # onsets are sought, which the Jacobian alone does not tell
-            require_no_memory(x)
         field: Any = linearised_with_memory(x, friction_slope)
         return field
     if x.uncoupled:
@@ -326,7 +329,7 @@ def require_equilibrium(x: Any, friction_slope: bool, result: Array) -> None:
 
     **Raises:** `ValueError` as `with_equilibrium`.
     """
-    values = None if x.uncoupled else concrete(result)
+    values = None if x.uncoupled or has_memory(x) else concrete(result)
     if values is not None and values.ndim == 0 and math.isnan(values):
         with_equilibrium(x, friction_slope)
 

@@ -8,6 +8,7 @@ are ds = -y (s^2 dM + s dC + dK) x for distinct eigenvalues, and those of the ve
 derivatives of every order right.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -88,13 +89,6 @@ def leading(
     """
     fixed = jax.tree.map(jax.lax.stop_gradient, (M, C, K))
     modes = jax.tree.map(jax.lax.stop_gradient, solve(*fixed))
-    sought = (modes.s.imag >= 0) & in_band(modes.s, band)
-    order = jnp.argsort(jnp.where(sought, -modes.s.real, jnp.inf))
-    places, rank = order[:count], jnp.argsort(order)
-    others = (sought & (modes.s.imag > 0))[None] & (rank[None] != rank[places][:, None])
-    distance = jnp.where(others, jnp.abs(modes.s[places][:, None] - modes.s[None]), jnp.inf)
-    nearest = jnp.argmin(distance, axis=1)
-    paired = (distance.min(axis=1) < jnp.inf) & (modes.s[places].imag > 0)
     dM, dC, dK = (X - at for X, at in zip((M, C, K), fixed, strict=True))  # 0, with derivatives
 
     def eigenvalues(places):
@@ -104,6 +98,23 @@ def leading(
             return moved
         return jnp.where(s.imag == 0, moved.real, moved)  # K_loss keeps what is real so
 
+    return leading_among(modes.s, eigenvalues, count, band)
+
+
+def leading_among(
+    fixed: Complex[Array, " k"],
+    eigenvalues: Callable[[Array], Array],
+    count: int,
+    band: tuple[float, float] | None,
+) -> Leading:
+    """As `leading`, of eigenvalues without derivatives, and a function of places that has them."""
+    sought = (fixed.imag >= 0) & in_band(fixed, band)
+    order = jnp.argsort(jnp.where(sought, -fixed.real, jnp.inf))
+    places, rank = order[:count], jnp.argsort(order)
+    others = (sought & (fixed.imag > 0))[None] & (rank[None] != rank[places][:, None])
+    distance = jnp.where(others, jnp.abs(fixed[places][:, None] - fixed[None]), jnp.inf)
+    nearest = jnp.argmin(distance, axis=1)
+    paired = (distance.min(axis=1) < jnp.inf) & (fixed[places].imag > 0)
     s = jnp.where(sought[places], eigenvalues(places), -1 if band is None else -band[1])
     neighbour = jnp.where(paired & sought[places], eigenvalues(nearest), s)
     return Leading(s, neighbour, jnp.where(paired, rank[nearest] > rank[places], True))

@@ -21,7 +21,7 @@ from jaxtyping import Complex, Float
 from .._base.parts import Record, flag, require_kind
 from .._base.table import aligned
 from .._mechanism.coefficient import evaluated
-from .._mechanism.quantities import require_one
+from .._mechanism.quantities import require_no_memory, require_one
 from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
 from .snapshots import joint_numbers
@@ -91,6 +91,7 @@ def energy_shares(
     """
     require_one("x", x)
     flag("friction_slope", friction_slope)
+    require_no_memory(x)
     modes = stability(x, friction_slope) if modes is None else modes
     require_kind("modes", modes, Stability)
     structure = x.as_structure()

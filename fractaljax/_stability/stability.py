@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Complex, Float, ScalarLike
 from .._base.parts import Record
 from .._base.programs import exported_jit
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import require_sliding
+from .._mechanism.quantities import has_memory, require_sliding
 from .linearise import linearised, require_equilibrium
 from .margin import damping_ratios
 from .two_directions import two_directions
@@ -246,6 +246,11 @@ def require_computable(
     if force is not None and force[0] <= 0:
         raise ValueError(
             f"the joint is open at its equilibrium: the normal force is {force[0]:.6g} N"
+        )
+    if has_memory(scene):
+        raise ValueError(
+            f"stability cannot be computed in {modes.margin.dtype}: the scene does not slide "
+            "steadily, or its numbers are out of range"
         )
     system = two_directions(scene, friction_slope)
     lin = system.polynomial

@@ -14,15 +14,15 @@ from .._contact.contact import Regime
 from .._contact.fixed import FixedContact
 from .._mechanism.joint import AnyJoint, Joint
 from .._mechanism.mechanism import Mechanism
+from .._mechanism.quantities import has_memory
 from .._mechanism.scene import Scene, stiffness
 from .._mechanism.structure import Structure
 from .._surface.roughness import roughness
 from .._surface.spectrum import Spectrum
 from .critical_friction import critical_friction
-from .linearise import Assembled, with_equilibrium
+from .linearise import Assembled, linearised, with_equilibrium
 from .margin import damping_ratios
 from .stability import Stability, require_computable, stability
-from .two_directions import two_directions
 
 ABSENT = "-"
 _STABLE = "stable against small disturbances"  # all that a growth rate can say
@@ -43,7 +43,7 @@ class _Critical(NamedTuple):
 @functools.partial(exported_jit, static_argnames="friction_slope")
 def _critical(scene: Scene, friction_slope: bool, wavelengths):
     """Critical mode, stiffness, contact state, and the roughness over wavelengths unless None."""
-    system = two_directions(scene, friction_slope)
+    system = linearised(scene, friction_slope)
     s = system.rightmost()
     frequency = jnp.abs(s.imag) / (2 * jnp.pi)
     mode = _Critical(s.real, frequency, damping_ratios(s), system.normal_force)
@@ -208,18 +208,7 @@ def _structure_table(structure: Structure, friction_slope: bool) -> str:
     **Raises:** `ValueError` as `assemble`, if the structure has no equilibrium under F or a joint
     is open there, and if its numbers leave the range of floating-point numbers.
     """
-    attached = with_equilibrium(structure, friction_slope)
-    for name, force in zip(structure.joint_names, _forces(attached), strict=False):
-        if force <= 0:
-            raise ValueError(
-                f"joint {name} is open at the equilibrium: its normal force is {force:.6g} N"
-            )
-    for name, X in zip("MCK", attached.matrices, strict=True):
-        if not np.isfinite(np.asarray(X)).all():
-            raise ValueError(f"{name} with the joints attached must be finite")
-    modes = stability(structure, friction_slope)
-    if not np.isfinite(np.asarray(modes.eigenvalues)).all():
-        raise ValueError(f"M, C and K have no eigenvalues in the range of {modes.margin.dtype}")
+    modes = _computable_modes(structure, friction_slope)
     unstable, unresolved = modes.unstable(), modes.unresolved()
     lacking = stiffness_remarks(structure)
     meaning = _structure_verdict(modes, unstable, unresolved, lacking)
@@ -249,6 +238,34 @@ def _structure_table(structure: Structure, friction_slope: bool) -> str:
         cells = zip(*(_mode_cells(*item) for item in listed), strict=True)
         tables.append(table(columns, [dict(zip(titles, c, strict=True)) for c in cells]))
     return "\n\n".join([*["\n".join(lacking)] * bool(lacking), *tables])
+
+
+def _computable_modes(structure: Structure, friction_slope: bool) -> Stability:
+    """Its `stability`, where all of it can be computed."""
+    with_memory = has_memory(structure)
+    attached = None if with_memory else with_equilibrium(structure, friction_slope)
+    if attached is not None:
+        _require_closed(structure, attached)
+        for name, X in zip("MCK", attached.matrices, strict=True):
+            if not np.isfinite(np.asarray(X)).all():
+                raise ValueError(f"{name} with the joints attached must be finite")
+    modes = stability(structure, friction_slope)
+    if with_memory:
+        _require_closed(structure, modes)
+    if not np.isfinite(np.asarray(modes.eigenvalues)).all():
+        why = "the structure does not slide steadily under F, or " if with_memory else ""
+        raise ValueError(
+            f"{why}M, C and K have no eigenvalues in the range of {modes.margin.dtype}"
+        )
+    return modes
+
+
+def _require_closed(structure: Structure, system: Assembled | Stability) -> None:
+    for name, force in zip(structure.joint_names, _forces(system), strict=False):
+        if force <= 0:
+            raise ValueError(
+                f"joint {name} is open at the equilibrium: its normal force is {force:.6g} N"
+            )
 
 
 def _forces(x: Assembled | Stability) -> list[float]:

@@ -26,6 +26,7 @@ from jaxtyping import ArrayLike, Complex, Float
 from .._base.parts import Record, flag
 from .._mechanism.quantities import (
     axis_values,
+    has_memory,
     require_inside,
     require_one,
     substituted,
@@ -34,6 +35,7 @@ from .._mechanism.quantities import (
 from .._mechanism.scene import Scene
 from .._mechanism.structure import Structure
 from .band import in_band
+from .field_modes import linearised_with_memory
 from .linearise import assembled
 
 _NONE = complex(np.nan, np.nan)
@@ -195,9 +197,10 @@ def track_modes(
     columns = np.argsort(np.where(there.any(axis=0), s[first].imag, np.inf), kind="stable")
     columns = columns[: there.any(axis=0).sum()]
     s, there = s[:, columns], there[:, columns]
-    n = modes[0].right.shape[1] // 2
-    shapes = np.stack([each.right[columns, :n] for each in modes])
-    shapes = np.where(there[..., None], shapes, 1)
+    shapes = np.stack([each.right[columns, : x.n] for each in modes])
+    # Where the states of a friction law move alone, any shape will do.
+    moves = there[..., None] & (shapes != 0).any(axis=2, keepdims=True)
+    shapes = np.where(moves, shapes, 1)
     largest = np.abs(shapes).argmax(axis=2)[..., None]
     shapes = shapes / np.take_along_axis(shapes, largest, axis=2)
     return ModeTracks(
@@ -225,6 +228,11 @@ def _modes_of(x: Scene | Structure, name: str, friction_slope: bool) -> Callable
 def _states(x: Scene | Structure, name: str, value: Any, friction_slope: bool):
     """Eigenvalues, right and left states, and which are counted, at a value of the quantity."""
     x = substituted(x, {name: value})
+    if has_memory(x):
+        field = linearised_with_memory(x, friction_slope)
+        right = field.vectors
+        left = jnp.linalg.inv(right).T
+        return field.s, right, left, in_band(field.s, x.band)
     system = assembled(x.as_structure(), friction_slope)
     (M, C, _), modes = system.matrices, system.solve()
     s, Y = modes.s[:, None], modes.y
@@ -237,13 +245,13 @@ def _states(x: Scene | Structure, name: str, value: Any, friction_slope: bool):
 
 
 class _Modes(NamedTuple):
-    """All 2n states at a value, in the order of the tracks."""
+    """All states at a value, in the order of the tracks."""
 
     value: Any
-    s: Any  # (2n,)
-    right: np.ndarray  # (2n, 2n), one a row
-    left: np.ndarray  # (2n, 2n) likewise; left @ right.T is the identity
-    counted: np.ndarray  # (2n,)
+    s: Any  # (k,), k = 2n without friction with memory
+    right: np.ndarray  # (k, k), one a row, the displacements first
+    left: np.ndarray  # (k, k) likewise; left @ right.T is the identity
+    counted: np.ndarray  # (k,)
 
     def ordered(self, order: np.ndarray) -> "_Modes":
         return _Modes(self.value, *(each[order] for each in self[1:]))

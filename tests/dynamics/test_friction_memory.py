@@ -366,12 +366,8 @@ def test_a_users_law_is_the_shipped_one():
     np.testing.assert_allclose(fj.growth_rate(mine), fj.growth_rate(dahl), rtol=1e-9)
     np.testing.assert_allclose(value_of(dahl.replace(sigma_0=2e6), "sigma_0"), 2e6)
     memory = "friction must be without memory here.* limit_cycle alone, got Dahl"
-    window: Any = {"x": ("D", 2.3, 2.5), "y": ("V", 0.1, 0.2)}
     for call in (
-        lambda: fj.critical_friction(dahl),
         lambda: fj.basin(dahl, radius=1.0, starts=2, progress=False),
-        lambda: fj.hopf_boundary(dahl, **window),
-        lambda: fj.verdict(dahl),
         lambda: fj.continue_cycle(dahl, "V", (0.1, 0.2), "hopf"),
     ):
         with pytest.raises(ValueError, match=memory):
