@@ -112,9 +112,10 @@ def hopf_boundary(
     whole line, the Hopf test function does not change sign smoothly: such crossings are counted as
     `untraced`.
 
-    For a structure, or friction with memory, the boundary is flutter or static divergence (`BoundaryBranch.divergence`). A
-    branch ends at a corner, where a second mode loses its damping too; the next branch begins
-    there. Points lie on it within 1e-10 of the window, or eps over the damping ratio.
+    For a structure, or friction with memory, the boundary is flutter or static divergence
+    (`BoundaryBranch.divergence`). A branch ends at a corner, where a second mode loses its damping
+    too; the next branch begins there. Points lie on it within 1e-10 of the window, or eps over the
+    damping ratio.
 
     Not differentiable, and not for use under `jit`; see `critical_friction` for that.
 

@@ -1,5 +1,7 @@
 """Designs and verdicts of mechanisms whose friction has memory: near those of dry friction."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +22,7 @@ def test_problem():
     assert "growth_rate of mode 2 <= target" in problem.residual_names
     u = jnp.array([0.3, 0.4])
     first = problem.residual_names.index("growth_rate <= target")
-    s = np.asarray(fj.stability(problem.mechanism(u)).eigenvalues)
+    s: Any = np.asarray(fj.stability(problem.mechanism(u)).eigenvalues)
     rates = np.sinh(problem.residuals(u)[first : first + 2]) * problem.growth_scale + problem.target
     np.testing.assert_allclose(rates, np.sort(s[s.imag > 0].real)[::-1], rtol=1e-9)
 
