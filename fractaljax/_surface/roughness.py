@@ -51,7 +51,7 @@ def roughness(
     **Raises:** `ValueError` unless 0 < L_s <= L, for a `Surface` without them, and for another
     spectrum with them.
     """
-    return _roughness(surface, *wavelengths_of(surface, L, L_s))
+    return _roughness(surface, *_band_of_one(surface, L, L_s))
 
 
 @jax.jit
@@ -79,7 +79,7 @@ def spectral_moments(
 
     **Raises:** as `roughness`.
     """
-    return _moments(surface, *wavelengths_of(surface, L, L_s))
+    return _moments(surface, *_band_of_one(surface, L, L_s))
 
 
 @jax.jit
@@ -93,20 +93,30 @@ def _moments(surface, L, L_s):
     return SpectralMoments(m0, m2, m4, m0 * (m4 / m2**2))
 
 
+def _band_of_one(surface, L, L_s) -> tuple[Numbers | None, Numbers | None]:
+    """As `wavelengths_of`, for one spectrum, or surfaces of any shape.
+
+    **Raises:** `ValueError` for an array of other spectra: use `jax.vmap`.
+    """
+    band = wavelengths_of(surface, L, L_s)
+    if not isinstance(surface, Surface):
+        require_scalar(surface)
+    return band
+
+
 def wavelengths_of(
     surface: Spectrum, L: ArrayLike | None, L_s: ArrayLike | None
 ) -> tuple[Numbers | None, Numbers | None]:
     """L and L_s, checked: a `Surface` needs them, any other spectrum has its own.
 
     **Raises:** `TypeError` for what is no spectrum; `ValueError` unless 0 < L_s <= L, or both are
-    None, and for an array of spectra but surfaces: use `jax.vmap`.
+    None.
     """
     require_kind("surface", surface, Spectrum)
     if not isinstance(surface, Surface):
         if L is not None or L_s is not None:
             kind = type(surface).__name__
             raise ValueError(f"L and L_s are for a Surface; a {kind} has wavelengths of its own")
-        require_scalar(surface)
         return None, None
     if L is None or L_s is None:
         raise ValueError("a Surface needs L and L_s, its longest and its shortest wavelength in m")

@@ -60,7 +60,7 @@ class SelfAffine(Spectrum, law="self-affine"):
         lay: ArrayLike | None = None,
     ):
         self.Sq = number("Sq", Sq, above=0)
-        self.H = number("H", H, above=0, at_most=1)
+        self.H = number("H (hurst)", H, above=0, at_most=1)
         self.shortest = number("shortest", shortest, above=0)
         rolloff = number("rolloff", rolloff, above=0)
         self.rolloff = ordered("rolloff", rolloff, "shortest", self.shortest)

@@ -218,3 +218,57 @@ def test_without_waves_longer_than_the_roll_off():
         middle, P, area, 1e-4, 0.8, 1e-6, lambda x, n: x ** (1 / n), math.exp, math.sqrt
     )
     assert float(K_n(surface, P, area)) == pytest.approx(expected, rel=1e-7)
+
+
+@pytest.mark.parametrize("lay", [None, 2.0])
+def test_sweeps_over_each_number(lay):
+    """Each value of a sweep is that of the replaced scene; what is outside the domain is named."""
+    surface = fj.SelfAffine(1e-6, 0.8, 1e-4, 4e-6, longest=1e-3, lay=lay)
+    contact = fj.PerssonContact(surface, MATERIAL, 400.0, 1e-5)
+    scene = fj.brake_scene().replace(contact=contact)
+    for name, values in {
+        "Sq": [1e-7, 1e-6],
+        "hurst": [0.6, 0.9],
+        "rolloff": [5e-5, 2e-4],
+        "shortest": [2e-6, 1e-5],
+        "longest": [5e-4, 2e-3],
+        **({} if lay is None else {"lay": [0.5, 3.0]}),
+    }.items():
+        swept = fj.sweep(fj.growth_rate, scene, progress=False, **{name: values}).values
+        singly = [float(fj.growth_rate(scene.replace(**{name: value}))) for value in values]
+        np.testing.assert_allclose(swept, singly, rtol=1e-9)
+        assert singly[0] != singly[1]
+    with pytest.raises(ValueError, match=r"H \(hurst\) must be above 0 and at most 1, got 1.2"):
+        fj.sweep(fj.growth_rate, scene, progress=False, hurst=[0.5, 1.2])
+    with pytest.raises(ValueError, match="rolloff must be at least shortest = 4e-06, got 1e-06"):
+        fj.sweep(fj.growth_rate, scene, progress=False, rolloff=[1e-6, 1e-4], P=[300.0, 400.0])
+    # `jax.vmap` takes many scenes; what takes one says so.
+    many = scene.replace(Sq=np.array([1e-7, 1e-6]))
+    with pytest.raises(ValueError, match=r"Sq must be a scalar, got shape \(2,\)"):
+        fj.stiffness(many)
+    with pytest.raises(ValueError, match=r"Sq must be a scalar, got shape \(2,\)"):
+        fj.roughness(many.contact.surface)
+
+
+@pytest.mark.slow
+def test_boundaries_and_envelopes_over_its_numbers():
+    """Growth rates vanish on the boundary; an envelope of H counts the worst."""
+    contact = fj.PerssonContact(fj.SelfAffine(1e-6, 0.8, 1e-4, 4e-6), MATERIAL, 400.0, 1e-5)
+    scene = fj.brake_scene().replace(contact=contact)
+    found = fj.hopf_boundary(scene, ("Sq", 5e-7, 1e-5), ("P", 1.0, 100.0), lines=9)
+    assert found.branches
+    for branch in found.branches:
+        for Sq, P in zip(branch.x[::9], branch.y[::9], strict=True):
+            rate = float(fj.growth_rate(scene.replace(Sq=Sq, P=P)))
+            assert abs(rate) < 1e-5
+    at = scene.replace(Sq=float(found.branches[0].x[9]), P=float(found.branches[0].y[9]))
+    alone, over, *ends = (
+        fj.squeal_probability(x, {"ln Sq": 0.1}, envelope=envelope).value
+        for x, envelope in (
+            (at, None),
+            (at, {"hurst": (0.7, 0.9)}),
+            (at.replace(hurst=0.7), None),
+            (at.replace(hurst=0.9), None),
+        )
+    )
+    assert 0.2 < alone < 0.8 and min(ends) < over < max(ends) != min(ends)

@@ -221,7 +221,7 @@ SURFACE = fj.Surface(2.4, 1e-10)
 test_refused = refusals(
     [
         (lambda: self_affine(Sq=0.0), r"^Sq must be above 0, got 0\.0$"),
-        (lambda: self_affine(H=1.2), r"^H must be above 0 and at most 1, got 1\.2$"),
+        (lambda: self_affine(H=1.2), r"^H \(hurst\) must be above 0 and at most 1, got 1\.2$"),
         (lambda: self_affine(rolloff=1e-6), r"^rolloff must be at least shortest = 1e-05"),
         (lambda: self_affine(longest=5e-5), r"^longest must be at least rolloff = 0\.0001"),
         (lambda: self_affine(lay=0.0), r"^lay must be above 0, got 0\.0$"),
