@@ -31,7 +31,7 @@ from .joints import with_contact_law, with_contacts
 from .quiet import Kicks
 from .summary import growth_text
 from .tolerance import Tolerance, squeal_probability
-from .wear import check_depths, worn_growth
+from .wear import WornGrowth, check_depths, worn_growth
 
 
 class Question(NamedTuple):
@@ -55,6 +55,7 @@ class Verdict(Record):
     questions: tuple[Question, ...]  # assumptions that were changed, with the answers
     incurable: bool  # whether the slope of the friction feeds in more than all damping takes out
     omitted: tuple[str, ...] = ()  # what `verdict` would ask with other arguments, in brackets
+    wear: WornGrowth | None = None  # growth `rates` [1/s] over `depths` [Sq], where asked
 
     @property
     def rests_on(self) -> tuple[str, ...]:
@@ -171,8 +172,10 @@ def verdict(
         words = f"comes to rest from {survived:.3g} of {size:.3g}"
         name = f"kicks within {quiet_within}"
         questions.append(Question("smaller kicks", name, words, survived >= size))
+    worn = None
     if depths is not None:
-        questions.append(_wear_question(x, depths, area, friction_slope, seed))
+        worn = worn_growth(x, depths, area, friction_slope, seed)
+        questions.append(_wear_question(depths, worn))
     # A reduced structure does not have all eigenvalues.
     incurable = bool(growth.trace > 0) and getattr(x, "band", None) is None
     others = "area" if any(part.contact.has_surface for part in parts.values()) else "laws"
@@ -181,7 +184,7 @@ def verdict(
     if any(isinstance(getattr(part.contact, "surface", None), Spectrum) for part in parts.values()):
         options["wear (run_in)"] = depths is not None
     omitted = tuple(name for name, was in options.items() if not was)
-    return Verdict(tuple(questions), incurable, omitted)
+    return Verdict(tuple(questions), incurable, omitted, worn)
 
 
 def _other_load(x: Mechanism, friction_slope: bool) -> list[tuple[str, str, Mechanism]]:
@@ -348,9 +351,8 @@ def _scatter_question(
     return Question(exact, f"{names} scatter{over}", words, quiet, undetermined)
 
 
-def _wear_question(x, depths, area, friction_slope, seed) -> Question:
-    """The growth rate while the surfaces run in, and where it begins to squeal."""
-    worn = worn_growth(x, depths, area, friction_slope, seed)
+def _wear_question(depths: tuple[float, float], worn: WornGrowth) -> Question:
+    """The worst growth rate while the surfaces run in, and where it begins to squeal."""
     worst = int(np.argmax(worn.rates))
     words = f"{growth_text(worn.rates[worst])} at {worn.depths[worst]:.3g} Sq"
     if worn.onset is not None:

@@ -6,10 +6,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from .._base.parts import scalar, substitute
+from .._base.parts import scalar
 from .._contact.boundary_element import boundary_element
-from .._contact.fixed import FixedContact
+from .._contact.contact import Contact
 from .._contact.run_in import run_in
 from .._mechanism.mechanism import Mechanism
 from .._stability.stability import growth_rate
@@ -17,6 +18,30 @@ from .._surface.spectrum import Spectrum
 from .._surface.surface import Surface
 from .._surface.topography import topography
 from .joints import with_contacts
+
+
+class Worn(Contact):
+    """A contact law whose stiffness under every load has grown by one factor."""
+
+    of: Contact
+    factor: Float[Array, ""]
+
+    @property
+    def P(self) -> Any:
+        """The load of the law [N]."""
+        law: Any = self.of
+        return law.P
+
+    @property
+    def opening_exponent(self):
+        return self.of.opening_exponent
+
+    def stiffness(self, mu_s, mu_m):
+        K_n, K_t = self.of.stiffness(mu_s, mu_m)
+        return self.factor * K_n, self.factor * K_t
+
+    def load_curve(self, mu_s, mu_m):
+        return self.of.load_curve(mu_s, mu_m)  # N/P over K_n u/P, in which the factor cancels
 
 
 class WornGrowth(NamedTuple):
@@ -62,36 +87,31 @@ def worn_growth(
     """Growth rates while the joints with a spectrum wear, each by the same multiple of its Sq.
 
     Boundary elements say by what factor a worn map is stiffer under the load of the joint; the
-    stiffness of its own law is multiplied by it. The maps have `n` points a side: shorter waves
-    are left out.
+    stiffness of its own law is multiplied by it under every load. The maps have `n` points a side:
+    shorter waves are left out.
     """
     low, high = depths
     # The first wear stiffens most: it takes off the few summits that touch.
     coarse = np.unique([0.0, low, *np.geomspace(max(low, 1e-3 * high), high, points)])
     ends = coarse[coarse >= low]
     fine = np.interp(np.linspace(0, len(ends) - 1, 65), np.arange(len(ends)), ends)
-    pairs, logs = {}, {}
+    laws, logs = {}, {}
     for name, part in x.joints_by_name().items():
         contact = part.contact
         if not isinstance(getattr(contact, "surface", None), Spectrum):
             continue
-        K_n, K_t = contact.stiffness(part.friction.mu_s, part.friction.mu_m)
-        pairs[name] = K_n, K_t, contact.P
+        laws[name] = contact
         A = _nominal_area(name, contact, area)
         keys = jax.random.split(jax.random.key(seed), maps)
         stiffer = np.mean([_stiffening(contact, A, coarse, key, n) for key in keys], axis=0)
         logs[name] = np.interp(fine, coarse, stiffer)
-    if not pairs:
+    if not laws:
         raise ValueError("run_in needs a joint whose contact has a surface")
 
     @jax.jit
     def rates(logs):
         def at(logs):
-            contacts = {}
-            for name, (K_n, K_t, P) in pairs.items():
-                factor = jnp.exp(logs[name])
-                changes = {"K_n": K_n * factor, "K_t": K_t * factor, "P": P}
-                contacts[name] = substitute(FixedContact(0.0, 0.0, 1.0), changes)
+            contacts = {name: Worn(law, jnp.exp(logs[name])) for name, law in laws.items()}
             return growth_rate(with_contacts(x, contacts), friction_slope)
 
         return jax.lax.map(at, logs)

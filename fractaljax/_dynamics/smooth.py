@@ -16,6 +16,7 @@ import numpy as np
 import optimistix
 from jaxtyping import Array, Float
 
+from .._base.lapack import solve as solve_linear
 from .._mechanism.mechanism import Mechanism
 from .contact_state import OPEN, STICK
 from .cycle import CycleResult, Fractions, LimitCycle, Ranges, repels
@@ -24,6 +25,7 @@ from .hybrid import HybridSystem
 from .simulate import SimulationResult, Trajectory
 from .smooth_system import SmoothSystem, smooth_system
 
+_SETTLED = 1e-4  # distance after a period, relative to the motion, from which on it is near a cycle
 DENSE = diffrax.SaveAt(t0=True, steps=True, dense=True)
 
 
@@ -160,6 +162,9 @@ def _settle(
         reached = solution.result == diffrax.RESULTS.successful
         return y, (y, h.excitation_period, reached)
 
+    equilibrium = system.equilibrium()
+    # Without a belt a friction law with memory has no equilibrium of its own.
+    equilibrium = jnp.where(jnp.isnan(equilibrium), 0, equilibrium)
     steps, settling = periods * max_steps, periods * slowest
     if h.excited:
         settling = jnp.ceil(settling / h.excitation_period) * h.excitation_period
@@ -169,21 +174,21 @@ def _settle(
         settled = run(y, settling, rtol=max(rtol, 1e-7), max_steps=steps)
         y, (ends, times, within) = jax.lax.scan(next_return, settled.ys[0], length=1 + longest)
         gaps = jnp.max(jnp.abs(ends[1:] - ends[:1]), axis=1)
-        # States that are 1e-5 from each other repeat, however near the nearest are.
-        returns = 1 + jnp.argmax(gaps <= 2 * jnp.min(gaps) + 1e-5)
+        # States as near to each other as a settled motion's repeat, however near the nearest are.
+        near = _SETTLED * jnp.max(jnp.abs(ends[0] - equilibrium))
+        returns = 1 + jnp.argmax(gaps <= 2 * jnp.min(gaps) + jnp.maximum(near, 1e-5))
         followed = (settled.result == diffrax.RESULTS.successful) & jnp.all(within)
         guess = ends[0], jnp.cumsum(times[1:])[returns - 1]
         return guess, returns, followed, jnp.min(gaps)
 
     if most <= periods:
         return settle(y)[:3]
-    equilibrium = system.equilibrium()
 
     def again(carry):
         (y, _), _, followed, gap, k = carry
         size = jnp.max(jnp.abs(y - equilibrium))
         # Small beside the motion, which itself is not lost in rounding.
-        unsettled = (gap > 1e-4 * size) & ~(size < 1e-6)
+        unsettled = (gap > _SETTLED * size) & ~(size < 1e-6)
         return unsettled & followed & (k * periods < most)
 
     def once_more(carry):
@@ -221,6 +226,21 @@ def share_below_zero(times, values, rates) -> Float[Array, ""]:
     return jnp.sum(below * h) / times[-1]
 
 
+def _further_step(system: SmoothSystem, monodromy, rate, gap, y, period) -> Float[Array, ""]:
+    """How far one more step of Newton's method would go, relative to the state and the period."""
+    if system.hybrid.excited:
+        M = system.mechanism_state(system.mechanism_state(monodromy).T).T
+        gap, y = system.mechanism_state(gap), system.mechanism_state(y)
+        step, relative = solve_linear(jnp.eye(len(y)) - M, gap), jnp.zeros_like(period)
+    else:
+        section = jax.grad(system.section)(y)
+        top = jnp.concatenate([jnp.eye(len(y)) - monodromy, -rate[:, None]], axis=1)
+        bordered = jnp.concatenate([top, jnp.append(section, 0.0)[None]])
+        step = solve_linear(bordered, jnp.append(gap, -system.section(y)))
+        step, relative = step[:-1], jnp.abs(step[-1]) / period
+    return jnp.maximum(jnp.max(jnp.abs(step)) / jnp.max(jnp.abs(y)), relative)
+
+
 @eqx.filter_jit
 def smooth_cycle(
     mechanism: Mechanism,
@@ -240,41 +260,55 @@ def smooth_cycle(
     """
     system = smooth_system(mechanism, excitation, eps)
     h = system.hybrid
-    options = {"solver": solver, "max_steps": max_steps}
-    looser, error = 10 * rtol, rtol
-    if any(h.opens):
-        # The field has a kink where a joint opens, which makes the gap rougher still.
-        looser = error = 100 * rtol
+    looser = 10 * rtol
+    if any(h.opens) or eps is None:
+        # The field has a kink where a joint opens, and where a bristle or a slider turns round,
+        # which makes the gap rougher still.
+        looser = 100 * rtol
         rtol = max(rtol / 100, 4096 * float(jnp.finfo(h.F.dtype).eps))
+        max_steps *= 4  # by the order 5 of Kvaerno5 2.5 times as many, and more beside a kink
+    options = {"solver": solver, "max_steps": max_steps}
     frozen = jax.lax.stop_gradient((system, system.start(start)))
     most = 0 if exact is not None else max_returns
     guess, returns, followed = _settle(*frozen, solver, rtol, max_steps, most)
 
+    def after(system, y, period):
+        end = solve(system, y, period, rtol=rtol, **options).ys[0]
+        return jnp.where(jnp.isfinite(end), end, y)  # where the steps did not suffice
+
     def gap(unknown, system):
         y, period = unknown
-        return solve(system, y, period, rtol=rtol, **options).ys[0] - y, system.section(y)
+        return after(system, y, period) - y, system.section(y)
 
     def excited_gap(y, system):
         full, period = system.with_excitation(y, 0.0), returns * system.hybrid.excitation_period
-        return system.mechanism_state(solve(system, full, period, rtol=rtol, **options).ys[0]) - y
+        return system.mechanism_state(after(system, full, period)) - y
 
     # Looser than the integration, whose adaptive steps make the gap rough.
     newton = optimistix.Newton(rtol=looser, atol=looser)
     function, unknown = gap, guess
     if h.excited:
         function, unknown = excited_gap, system.mechanism_state(guess[0])
-    root = optimistix.root_find(function, newton, unknown, system, max_steps=16, throw=False)
+
+    def root(unknown):
+        found = optimistix.root_find(function, newton, unknown, system, max_steps=16, throw=False)
+        return found.value
+
+    # From a motion that was not followed Newton's method may go where nothing is finite.
+    unknown = jax.lax.cond(followed, root, lambda unknown: unknown, unknown)
     if h.excited:
-        y = system.with_excitation(root.value, 0.0)
+        y = system.with_excitation(unknown, 0.0)
         period = returns * h.excitation_period
     else:
-        y, period = root.value
+        y, period = unknown
     near = jnp.max(jnp.abs(y - guess[0])) < 0.2 * (1 + jnp.max(jnp.abs(guess[0])))
     # An equilibrium is periodic as well, with any period.
     moves = jnp.max(jnp.abs(system.field(y))) > 1e-4
-    exists = (root.result == optimistix.RESULTS.successful) & near & (period > 0) & moves
+    exists = near & (period > 0) & moves
 
     solution = solve(system, y, period, rtol=rtol, saveat=DENSE, **options)
+    followed &= solution.result == diffrax.RESULTS.successful
+    exists &= followed
     times, states = nodes(solution)
     rates = jax.vmap(system.field)(states)
     n = h.n
@@ -307,9 +341,13 @@ def smooth_cycle(
     monodromy = jax.jacfwd(end)(y)
     amplitude = (ranges[1] - ranges[0])[: ranges.shape[1] // 2]
     numbers = jnp.stack([period / h.omega, *amplitude])
-    error = jnp.asarray(error, y.dtype)
+    fixed = jax.lax.stop_gradient((system, monodromy, rates[-1], states[-1] - y, y, period))
+    error = jnp.maximum(looser / 10, _further_step(*fixed))
+    # Steps of Newton's method that go on much farther than the integration's error lead nowhere.
+    exists &= error <= max(looser, _SETTLED)
     unstable = repels(*jax.lax.stop_gradient((monodromy, rates[0])), error)
     status = CycleResult.where(unstable, CycleResult.unstable, CycleResult.converged)
+    status = CycleResult.where(error <= looser, status, CycleResult.inaccurate)
     difference = jnp.zeros_like(error)
     lost = CycleResult.not_periodic
     if exact is not None:

@@ -1,11 +1,12 @@
 """The growth rate while surfaces run in, against maps worn and pressed by hand."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import fractaljax as fj
-from fractaljax._design.wear import check_depths, worn_growth
+from fractaljax._design.wear import Worn, check_depths, worn_growth
 from tools import refusals
 
 BRAKE = fj.brake_scene()
@@ -49,9 +50,24 @@ def test_onset(worn):
     assert worn._replace(rates=worn.rates + 1e9).onset is None
 
 
+def test_load_curve_of_a_worn_map():
+    """A preloaded joint keeps its load curve: unworn it is as it was, worn its law is as stiff."""
+    o = fj.Oscillator(1.0, 50.0, 40.0, 0.01, 0.02, 0.5, 0.15)
+    soft = fj.Scene(pressed().contact, BRAKE.friction, o, preload=True)
+    found = worn_growth(soft, (0, 0.3), None, True, seed=3, n=32, maps=1, points=2)
+    assert found.rates[0] == pytest.approx(float(fj.growth_rate(soft)), rel=1e-9)
+    linear = fj.Scene(soft.contact, BRAKE.friction, o, preload="linear")
+    assert abs(found.rates[0] / float(fj.growth_rate(linear)) - 1) > 1e-3
+
+    law, approach = soft.contact, np.array([-2e-7, -1e-8, 0.0, 1e-7])
+    twice = Worn(law, jnp.array(2.0))
+    np.testing.assert_allclose(twice.load(approach), law.load(2 * approach), rtol=1e-12)
+
+
 @pytest.mark.slow
 def test_verdict():
     found = fj.verdict(pressed(), run_in=(0, 0.3))
+    assert found.wear is not None and found.wear.depths[-1] == 0.3
     question = found.questions[-1]
     assert question.name == "worn by 0 to 0.3 Sq" and not question.quiet
     assert "squeals from" in question.answer and found.rests_on[-1] == "surfaces without wear"
