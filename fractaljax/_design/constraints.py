@@ -25,8 +25,8 @@ from .._stability.stability import stability
 from .._surface.areal_parameters import areal_parameters
 from .._surface.profile_parameters import profile_parameters
 from .._surface.roughness import root_mean_square
-from .._surface.spectrum import Spectrum
 from .._surface.surface import Surface
+from .joints import joint_with_surface
 
 Limit = Any  # a scalar, or None where there is none
 
@@ -221,13 +221,15 @@ class _DrawingLimit(_LogConstraint):
     """A roughness parameter to expect of the surface of a contact, a `Spectrum`, within limits.
 
     Gaussian filters leave the waves from `shortest` to `cutoff` [m], as in `profile_parameters`.
-    `below` is another name of `at_most`.
+    `below` is another name of `at_most`, and `joint` the name of a joint of a structure, which may
+    be left out where only one has a surface.
     """
 
     cutoff: Limit  # longest wavelength that the filter leaves [m], or None
     shortest: Limit  # shortest wavelength that the filter leaves [m], or None
     L: Float[Array, ""]  # longest wavelength of a `Surface` [m]
     L_s: Float[Array, ""]  # shortest wavelength of a `Surface` [m]
+    joint: str | None = eqx.field(static=True)  # of a structure
 
     unit: ClassVar[str] = "m"
 
@@ -240,7 +242,9 @@ class _DrawingLimit(_LogConstraint):
         L: ArrayLike,
         L_s: ArrayLike,
         below: ArrayLike | None,
+        joint: str | None,
     ):
+        self.joint = joint
         if below is not None and at_most is not None:
             raise ValueError(f"{self.symbol} takes below or at_most, which are one limit")
         super().__init__(at_least, at_most if below is None else below)
@@ -253,10 +257,7 @@ class _DrawingLimit(_LogConstraint):
 
     def expected(self, scene: Mechanism, parameters: Callable[..., Any]) -> Any:
         """The `profile_parameters` or `areal_parameters` of the surface behind the filters."""
-        joint = scene.sole_joint
-        surface = None if joint is None else getattr(joint.contact, "surface", None)
-        if not isinstance(surface, Spectrum):
-            raise ValueError(f"{self.symbol} needs a scene whose contact has a surface")
+        _, surface = joint_with_surface(scene, self.joint, self.symbol)
         band = dict(L=self.L, L_s=self.L_s) if isinstance(surface, Surface) else {}
         return parameters(surface, cutoff=self.cutoff, shortest=self.shortest, **band)
 
@@ -264,7 +265,8 @@ class _DrawingLimit(_LogConstraint):
 class Ra(_DrawingLimit):
     """Arithmetic mean height Ra [m] of the profile within limits; see `profile_parameters`.
 
-    `cutoff` and `shortest` are the lengths of its filters [m]; L and L_s count for a `Surface`.
+    `cutoff` and `shortest` are the lengths of its filters [m]; L and L_s count for a `Surface`;
+    `joint` names one of a structure.
     """
 
     symbol: ClassVar[str] = "Ra"
@@ -279,8 +281,9 @@ class Ra(_DrawingLimit):
         L: ArrayLike = 1e-3,
         L_s: ArrayLike = 1e-6,
         below: ArrayLike | None = None,
+        joint: str | None = None,
     ):
-        super().__init__(at_least, at_most, cutoff, shortest, L, L_s, below)
+        super().__init__(at_least, at_most, cutoff, shortest, L, L_s, below, joint)
 
     def measure(self, scene):
         return self.expected(scene, profile_parameters).Ra
@@ -290,7 +293,8 @@ class Rz(_DrawingLimit):
     """Maximum height Rz [m] of the profile within limits; see `profile_parameters`.
 
     `cutoff`, the length of a section, and `shortest` are the lengths of its filters [m]; L and L_s
-    count for a `Surface`. The limit is on an Rz up to 12 % above the mean of measured ones.
+    count for a `Surface`; `joint` names one of a structure. The limit is on an Rz up to 12 % above
+    the mean of measured ones.
     """
 
     symbol: ClassVar[str] = "Rz"
@@ -305,8 +309,9 @@ class Rz(_DrawingLimit):
         L: ArrayLike = 1e-3,
         L_s: ArrayLike = 1e-6,
         below: ArrayLike | None = None,
+        joint: str | None = None,
     ):
-        super().__init__(at_least, at_most, cutoff, shortest, L, L_s, below)
+        super().__init__(at_least, at_most, cutoff, shortest, L, L_s, below, joint)
 
     def measure(self, scene):
         return self.expected(scene, profile_parameters).Rz
@@ -316,7 +321,7 @@ class Sq(_DrawingLimit):
     """Root mean square height Sq [m] of the map within limits; see `areal_parameters`.
 
     `cutoff` and `shortest` are the lengths of its filters [m], None for none; L and L_s count for a
-    `Surface`.
+    `Surface`; `joint` names one of a structure.
     """
 
     symbol: ClassVar[str] = "Sq"
@@ -331,8 +336,9 @@ class Sq(_DrawingLimit):
         L: ArrayLike = 1e-3,
         L_s: ArrayLike = 1e-6,
         below: ArrayLike | None = None,
+        joint: str | None = None,
     ):
-        super().__init__(at_least, at_most, cutoff, shortest, L, L_s, below)
+        super().__init__(at_least, at_most, cutoff, shortest, L, L_s, below, joint)
 
     def measure(self, scene):
         return self.expected(scene, areal_parameters).Sq

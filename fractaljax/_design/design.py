@@ -38,6 +38,7 @@ from .drawing import Drawing, compare_drawings
 from .envelope import Envelope, condition_text
 from .evaluator import Evaluation, make_evaluator
 from .few_modes import project_on_modes
+from .joints import joint_with_surface
 from .limit import LeastGrowth, least_growth
 from .problem import DesignProblem
 from .quiet import Kicks, quiet
@@ -145,7 +146,13 @@ class Design(Record):
             L, L_s = longest if L is None else L, shortest if L_s is None else L_s
         return roughness(before, L, L_s), roughness(after, L, L_s)
 
-    def drawing(self, cutoff: ScalarLike = 8e-4, shortest: ScalarLike = 2.5e-6) -> Drawing:
+    def drawing(
+        self,
+        cutoff: ScalarLike = 8e-4,
+        shortest: ScalarLike = 2.5e-6,
+        *,
+        joint: str | None = None,
+    ) -> Drawing:
         """Ra, Rz [m] of a profile, Sq [m] and Sdq of a map, of both surfaces behind the filters.
 
         They are those to expect of the spectrum, as `profile_parameters` says, and printed are a
@@ -156,12 +163,14 @@ class Design(Record):
         **Arguments:**
 
         - `cutoff`, `shortest`: nesting indices of the filters [m], 0.8 mm and 2.5 um by default.
+        - `joint`: name of the joint of a structure; by default the only one with a surface.
 
-        **Raises:** as `profile_parameters`; `ValueError` without a surface.
+        **Raises:** as `profile_parameters`; `ValueError` without a surface, or with several.
         """
-        scene: Any = self.scene
+        name, before = joint_with_surface(self.initial, joint, "a drawing")
+        _, after = joint_with_surface(self.scene, name, "a drawing")
         bands = cutoff, shortest, self.wavelengths
-        return compare_drawings(scene, self._surfaces()[0], *bands, self.friction_slope)
+        return compare_drawings(self.scene, name, before, after, *bands, self.friction_slope)
 
     def topographies(self, n: int = 1024, *, L=None, L_s=None, M=10, key=None) -> Topographies:
         """Both surfaces on a grid of n x n points with the same phases, to see the difference.
@@ -197,9 +206,7 @@ class Design(Record):
     def _surfaces(self) -> tuple[Spectrum, Spectrum]:
         spectra = self._spectra()
         if spectra is None:
-            raise ValueError(
-                "a drawing, roughness and topographies need a scene whose contact has a surface"
-            )
+            raise ValueError("roughness and topographies need a scene whose contact has a surface")
         return spectra
 
     def save(self, path: str | os.PathLike) -> None:
@@ -235,6 +242,8 @@ class Design(Record):
             lines.append(f"Sq and Sdq: wavelengths from {L:g} to {L_s:g} m")
         elif self._spectra() is not None:
             lines += ["", *repr(self.drawing()).splitlines(), ""]
+        else:
+            lines += self._drawing_lines()
         for name, (before, after) in (self.cycles or {}).items():
             lines.append(f"{name}: {before:.6g}, then {after:.6g}")
         lines += self._condition_lines() + self._kick_lines()
@@ -252,6 +261,15 @@ class Design(Record):
             promise = "stable against small disturbances; a larger kick may still end in squeal"
             promise = "no promise: see above" if after else promise
         return "\n".join([*lines, self.outcome, promise])
+
+    def _drawing_lines(self) -> list[str]:
+        """Which joints of a structure have a drawing, which takes many eigenvalue solutions."""
+        moved = {name.rpartition(".")[0] for name in self.bounds}
+        return [
+            f'drawing(joint="{name}") gives Ra, Rz and where the design stays quiet'
+            for name, part in self.scene.joints_by_name().items()
+            if name in moved and isinstance(getattr(part.contact, "surface", None), Spectrum)
+        ]
 
     def _kick_lines(self) -> list[str]:
         """The largest kick survived, and the confidence in it."""

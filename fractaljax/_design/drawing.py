@@ -11,12 +11,13 @@ from jaxtyping import ScalarLike
 
 from .._base.parts import Record
 from .._base.table import table
-from .._mechanism.scene import Scene
+from .._mechanism.mechanism import Mechanism
 from .._stability.stability import growth_rate
 from .._surface.areal_parameters import areal_parameters
 from .._surface.profile_parameters import profile_parameters
 from .._surface.spectrum import Spectrum
 from .._surface.surface import Surface
+from .growing_modes import needs_modes
 
 
 class Drawing(Record):
@@ -41,25 +42,29 @@ class Drawing(Record):
         return "\n".join(lines)
 
 
-@functools.partial(jax.jit, static_argnames="friction_slope")
-def _growth_rates(scene: Scene, factors, friction_slope: bool):
-    """Growth rates [1/s] of a scene with the heights of its surface times each of the factors."""
+@functools.partial(jax.jit, static_argnames=("friction_slope", "joint"))
+def _growth_rates(x: Mechanism, factors, friction_slope: bool, joint: str):
+    """Growth rates [1/s] with the heights of a joint's surface times each of the factors."""
+    parts = x.joints_by_name()
 
     def at(factor):
-        surface = scene.contact.surface.times(factor)
-        other = eqx.tree_at(lambda x: x.contact.surface, scene, surface)
-        return growth_rate(other, friction_slope)
+        surface = parts[joint].contact.surface.times(factor)
+        changed = eqx.tree_at(lambda part: part.contact.surface, parts[joint], surface)
+        return growth_rate(x.with_joints({**parts, joint: changed}), friction_slope)
 
-    return jax.vmap(at)(factors)
+    return jax.lax.map(at, factors) if needs_modes(x) else jax.vmap(at)(factors)
 
 
-def quiet_factors(scene: Scene, friction_slope: bool) -> tuple[float, float] | None:
-    """Between which factors of all heights, from 0.1 to 10, the scene stays quiet.
+def quiet_factors(
+    x: Mechanism, friction_slope: bool, joint: str = ""
+) -> tuple[float, float] | None:
+    """Between which factors of all heights of a joint, from 0.1 to 10, the mechanism stays quiet.
 
     None unless it is quiet as it is.
     """
-    logs = np.linspace(-np.log(10), np.log(10), 257)
-    rates = np.asarray(_growth_rates(scene, jnp.exp(jnp.asarray(logs)), friction_slope))
+    count = 33 if needs_modes(x) else 257  # eigenvalues of a structure take long
+    logs = np.linspace(-np.log(10), np.log(10), count)
+    rates = np.asarray(_growth_rates(x, jnp.exp(jnp.asarray(logs)), friction_slope, joint))
     middle, loud = len(logs) // 2, ~(rates < 0)
     if loud[middle]:
         return None
@@ -79,18 +84,19 @@ def quiet_factors(scene: Scene, friction_slope: bool) -> tuple[float, float] | N
 
 
 def compare_drawings(
-    scene: Scene,
+    x: Mechanism,
+    joint: str,
     before: Spectrum,
+    after: Spectrum,
     cutoff: ScalarLike,
     shortest: ScalarLike,
     wavelengths: tuple[float, float],
     friction_slope: bool,
 ) -> Drawing:
-    """What to expect of the surface `before` and that of a designed scene behind the filters.
+    """What to expect of a joint's surfaces before and `after` the design x, behind the filters.
 
     A `Surface` has these wavelengths.
     """
-    after = scene.contact.surface
     filters: dict[str, Any] = dict(cutoff=cutoff, shortest=shortest)
     if isinstance(before, Surface):
         filters |= dict(zip(("L", "L_s"), wavelengths, strict=True))
@@ -100,7 +106,7 @@ def compare_drawings(
     def both(pair, name) -> tuple[float, float]:
         return float(getattr(pair[0], name)), float(getattr(pair[1], name))
 
-    Ra, factors = both(profiles, "Ra"), quiet_factors(scene, friction_slope)
+    Ra, factors = both(profiles, "Ra"), quiet_factors(x, friction_slope, joint)
     return Drawing(
         Ra,
         both(profiles, "Rz"),

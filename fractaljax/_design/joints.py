@@ -14,6 +14,7 @@ from .._contact.fixed import FixedContact
 from .._mechanism.mechanism import Mechanism
 from .._mechanism.quantities import target_quantities
 from .._stability.band import in_band
+from .._surface.spectrum import Spectrum
 
 
 def joint_prefix(name: str) -> str:
@@ -141,3 +142,25 @@ def least_damping(x) -> tuple[Any, Any]:
     inside = inside | ~inside.any()
     damping = -xp.where(inside, s.real, -xp.inf).max()
     return xp.maximum(damping, 0.0), xp.where(inside, abs(s), xp.inf).min()
+
+
+def joint_with_surface(x: Mechanism, name: str | None, what: str) -> tuple[str, Spectrum]:
+    """A joint whose contact has a surface, a `Spectrum`, and it: the only one, or that of a name.
+
+    **Raises:** `ValueError` in the name of `what` needs it, if there is none or several.
+    """
+    surfaces = {
+        joint: surface
+        for joint, part in x.joints_by_name().items()
+        if isinstance(surface := getattr(part.contact, "surface", None), Spectrum)
+    }
+    if not surfaces:
+        raise ValueError(f"{what} needs a scene whose contact has a surface, or a joint with one")
+    if name is None and len(surfaces) == 1:
+        return next(iter(surfaces.items()))
+    if name not in surfaces:
+        raise ValueError(
+            f"{what} needs joint=, the name of a joint with a surface: "
+            f"{', '.join(surfaces)}; got {name!r}"
+        )
+    return name, surfaces[name]

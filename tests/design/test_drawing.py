@@ -114,7 +114,7 @@ def test_drawing(best):
     p = fj.profile_parameters(surface, L=1e-3, L_s=1e-6, **FILTERS)
     assert fractal.drawing().Rz == (p.Rz, p.Rz)
     fixed = fj.brake_scene().replace(contact=fj.FixedContact(1e8, 1e8))
-    with pytest.raises(ValueError, match="a drawing, roughness and topographies need"):
+    with pytest.raises(ValueError, match="a drawing needs a scene whose contact has a surface"):
         dataclasses.replace(best, scene=fixed).drawing()
 
 
@@ -163,3 +163,60 @@ def test_heights_that_stay_quiet(name):
     for inside in np.geomspace(*factors, 7)[1:-1]:
         assert growth(inside) < 0
     assert quiet_factors(pressed(), True) is None
+
+
+# --- joints of a structure ------------------------------------------------------------------------
+
+
+def two_joints() -> fj.Structure:
+    """Two pads on one disc of two degrees of freedom; quiet where the left one is rough."""
+    material = fj.brake_scene().contact.material
+    surfaces = GROUND, fj.SelfAffine(3e-7, 0.7, 5e-5, 2e-6)
+    joints = {
+        name: fj.Joint(
+            fj.PerssonContact(surface, material, P, area=1e-3), fj.Coulomb(0.1), 0, 1, V=1.0
+        )
+        for name, surface, P in zip(("left", "right"), surfaces, (900.0, 9.0), strict=True)
+    }
+    return fj.Structure(np.eye(2), np.diag([300.0, 200.0]), np.diag([2e9, 8e8]), joints)
+
+
+def test_a_limit_on_one_joint_of_a_structure():
+    """It is that of its surface; without a name it says which there are."""
+    x = two_joints()
+    for joint, part in x.joints_by_name().items():
+        surface: Any = part.contact
+        expected = fj.profile_parameters(surface.surface, **FILTERS).Ra
+        limit = Ra(below=5e-7, joint=joint, **FILTERS)
+        np.testing.assert_allclose(limit(x), np.log(expected / 5e-7), rtol=1e-12)
+    with pytest.raises(ValueError, match=r"Ra needs joint=, .*: left, right; got None"):
+        Ra(below=5e-7, **FILTERS)(x)
+    with pytest.raises(ValueError, match=r"Ra needs joint=, .*: left, right; got 'top'"):
+        Ra(below=5e-7, joint="top", **FILTERS)(x)
+
+
+@pytest.mark.slow
+def test_drawing_of_a_structure():
+    """Ra before and after, and an interval at whose ends the growth rate changes its sign."""
+    x = two_joints().replace(**{"left.Sq": 2e-7})
+    limit = Ra(at_least=2e-7, joint="left", **FILTERS)
+    assert fj.growth_rate(x) > 0 and limit(x) > 0
+    best = fj.design(x, {"left.Sq": (1e-7, 5e-6)}, constraints=[limit], K_n_min=0, progress=False)
+    assert 'drawing(joint="left") gives Ra, Rz' in repr(best) and "right" not in repr(best.bounds)
+    drawing = best.drawing(joint="left")
+    surfaces = (each.joints_by_name()["left"].contact.surface for each in (x, best.scene))
+    expected = [float(fj.profile_parameters(surface, **FILTERS).Ra) for surface in surfaces]
+    np.testing.assert_allclose(drawing.Ra, expected, rtol=1e-12)
+    assert drawing.Ra[1] >= 2e-7 * (1 - 1e-6)
+    Sq = float(best.scene["left.Sq"])
+
+    def growth(factor):
+        return float(fj.growth_rate(best.scene.replace(**{"left.Sq": Sq * factor})))
+
+    low, high = (end / drawing.Ra[1] for end in drawing.quiet_Ra)
+    for factor in np.linspace(low * 1.02, high * 0.98, 9):
+        assert growth(factor) < 0
+    assert low == pytest.approx(0.1) or growth(low * 0.97) > 0
+    assert high == pytest.approx(10) or growth(high * 1.03) > 0
+    with pytest.raises(ValueError, match="a drawing needs joint="):
+        best.drawing()
