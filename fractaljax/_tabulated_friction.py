@@ -315,13 +315,31 @@ def _rows(text: str) -> list[tuple[float, ...]]:
             raise ValueError(f"line {at} must be a speed and a coefficient, got {brief(line)}")
         rows.append(pair)
     if len(rows) < 2:
-        raise ValueError(f"it must hold two lines of a speed and a coefficient, got {len(rows)}")
+        few = f"it must hold two lines of a speed and a coefficient, got {len(rows)}"
+        wide = [line for line in text.splitlines() if _columns(line) > 2]
+        if wide:
+            few += (
+                f", and {brief(wide[0])} has more columns: temperatures and pressures are "
+                "arguments of TabulatedFriction"
+            )
+        raise ValueError(few)
     return rows
 
 
+def _columns(line: str) -> int:
+    """How many numbers a line has."""
+    cells = re.split(r"[;,\s]+", line.strip())
+    try:
+        return len([float(cell) for cell in cells if cell])
+    except ValueError:
+        return 0
+
+
 def _pair(line: str, separator: str | None) -> tuple[float, ...] | None:
-    """The two numbers of a line, or None."""
+    """The two numbers of a line, or None; spreadsheets may write separators behind them."""
     cells = line.strip().split(separator)
+    while separator is not None and len(cells) > 2 and not cells[-1].strip():
+        cells.pop()
     if separator != ",":
         cells = [cell.replace(",", ".") for cell in cells]
     try:

@@ -135,6 +135,7 @@ def read(text, tmp_path):
         ("v,mu\n0,0.4\n1;0.3\n", r"line 3 must be a speed and a coefficient, got '1;0.3'$"),
         ("v [rpm],mu\n0,0.4\n1,0.3\n", r"the unit of the speeds must be a length per s.*got rpm$"),
         ("v,mu\n", r"it must hold two lines of a speed and a coefficient, got 0$"),
+        ("v,mu,T\n0,0.4,20\n1,0.3,20\n", r"it must hold two lines .*'0,0.4,20' has more columns"),
         ("0,0.4\n0,0.3\n", r"speeds must rise, got 0 before 0$"),
         ("0,0.4\n1,-0.3\n", r"coefficients must be above 0, got -0.3$"),
     ],
@@ -142,6 +143,11 @@ def read(text, tmp_path):
 def test_bad_files(text, message, tmp_path):
     with pytest.raises(ValueError, match=r"table\.csv: " + message):
         read(text, tmp_path)
+
+
+def test_separators_behind_the_numbers(tmp_path):
+    found = read("v;mu;\n0;0,4;\n1;0,3;;\n", tmp_path)
+    np.testing.assert_array_equal(found.coefficients, [0.4, 0.3])
 
 
 BAD: Any = [[0.4, 0.3], [0.2]]

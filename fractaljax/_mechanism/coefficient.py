@@ -56,6 +56,11 @@ def check_coefficient(name: str, coefficient: Any, parameters: Parameters) -> Ca
     except (OverflowError, ZeroDivisionError):
         shown = f", got {brief(coefficient.text)}" if isinstance(coefficient, Expression) else ""
         raise ValueError(f"{name} must be a finite number of these parameters{shown}") from None
+    if jnp.iscomplexobj(value):
+        raise TypeError(
+            f"{name} must be real where it is a function: give the imaginary part as a term of "
+            "K_loss"
+        )
     value = scalar(name, value)
     return coefficient if watched.read else value
 

@@ -399,6 +399,10 @@ class Structure(Mechanism):
             name: number(name, changes[name]) for name in self.parameters if name in changes
         }
         matrices = {name: changes[name] for name in ("M", "C", "K", "K_loss") if name in changes}
+        if "K" in matrices and "K_loss" not in matrices:
+            # A complex K has its own loss; another K keeps the one that is there.
+            _, loss = separated(matrices["K"], None)
+            matrices |= {} if loss is None else {"K_loss": None}
         if matrices or "F" in changes:
             return self._with_terms(matrices, joints, changes.get("F", self.F), parameters)
         # The matrices are unchanged and need no new check or factorisation.

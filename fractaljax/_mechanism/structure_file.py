@@ -68,7 +68,10 @@ class _Source:
         if value in self.held or value in self.unread:
             self.used.add(value)
             return self.held[value]
-        read = self._read(self.folder / value)
+        path = self.folder / value
+        if self.held and not path.suffix and not path.exists():
+            raise ValueError(f"{self.file} has no {value!r}; it holds {', '.join(self.held)}")
+        read = self._read(path)
         matrices = read.matrices
         if len(matrices) == 1 and key not in read.unread:
             return next(iter(matrices.values()))
@@ -168,7 +171,8 @@ def read_structure(document: dict[str, Any], folder: Path) -> dict[str, Any]:
     source = _Source(table, folder)
     matrices: dict[str, Any] = {}
     for name in (*_MATRICES, "F"):
-        if name in table and name in source.held and not _is_stored(table[name], source.held):
+        given = name in table and name in source.held
+        if given and not _is_stored(name, table[name], source.held):
             raise ValueError(f"[structure] gives {name} twice: in matrices and as {name}")
         if name not in table and (name in source.held or name in source.unread):
             matrices[name] = source.held[name]
@@ -245,10 +249,13 @@ def _expanded(model: Matrices, names: Sequence[str]) -> Matrices:
     return model
 
 
-def _is_stored(value: Any, held: Mapping[str, Any]) -> bool:
-    """True if the file of matrices contains a matrix, or all of its terms."""
+def _is_stored(name: str, value: Any, held: Mapping[str, Any]) -> bool:
+    """True if what the table gives as `name` is of the file of matrices, or adds to its `name`."""
     terms = value if isinstance(value, list) else [{"matrix": value}]
-    return all(isinstance(term, dict) and term.get("matrix") in held for term in terms)
+    terms = [term if isinstance(term, dict) else {} for term in terms]
+    if name in (term.get("matrix") for term in terms if "file" not in term):
+        return True
+    return all("file" not in term and term.get("matrix") in [*held] for term in terms)
 
 
 def _one(name: str, matrices: Mapping[str, Any]) -> Any:

@@ -114,6 +114,14 @@ def test_matrices_from_every_kind_of_file(files, text):
     equal(found, expected)
 
 
+def test_terms_add_to_the_matrix_of_the_file(files):
+    """The file of matrices holds K, and the table adds a part of another file to it."""
+    scipy.io.mmwrite(files / "part.mtx", np.diag([1e6, 0.0, 2e6]))
+    text = 'matrices = "all.npz"\nK = [{matrix = "K"}, {matrix = "part", file = "part.mtx"}]'
+    found = fj.load(written(files, text))
+    np.testing.assert_allclose(found.K, K + np.diag([1e6, 0.0, 2e6]), rtol=1e-15)
+
+
 @pytest.mark.parametrize(
     ("names", "F", "expected"),
     [
@@ -241,6 +249,8 @@ BAD = [
     ('M = "M.mtx"', "[structure] lacks the matrix K"),
     ('matrices = "all.npz"\nK = "K.mtx"', "[structure] gives K twice"),
     ('matrices = "all.npz"\nF = [1, 2, 3]', "[structure] gives F twice"),
+    (TWO + 'C = "damping"', "two.npz has no 'damping'; it holds"),
+    ('matrices = "all.npz"\nK = [{matrix = "K", file = "K.mtx"}]', "[structure] gives K twice"),
     ('matrices = "all.npz"\ndamping_ratio = 0.01', "gives damping twice: C and damping_ratio"),
     (TWO + "rayleigh = [1, 0]\ndamping_ratio = 0.01", "gives damping twice"),
     (TWO + "rayleigh = 3", "rayleigh must be [alpha, beta], got 3"),

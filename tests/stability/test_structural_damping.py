@@ -270,6 +270,13 @@ def test_complex_terms_are_structural_damping():
     np.testing.assert_allclose(x.K_loss, PART)
     assert fj.Structure(M, C, K).K_loss is None
     assert fj.Structure(M, C, K).replace(K_loss=PART).K_loss is not None
+    # A complex K replaces both; a real one keeps the loss that is there.
+    for other in (x.complex_K, 2 * x.complex_K):
+        again = x.replace(K=other)
+        np.testing.assert_allclose(again.complex_K, other, rtol=1e-15)
+    np.testing.assert_allclose(x.replace(K=2 * K).complex_K, 2 * K + 1j * PART, rtol=1e-15)
+    with pytest.raises(TypeError, match=r"must be real where it is a function: .* K_loss"):
+        fj.ParametricStructure(M, C, [(lambda p: 1 + 1j * p["a"], K)], parameters={"a": 0.1})
     for name in "MC":
         with pytest.raises(TypeError, match=f"{name} must be an array of real numbers"):
             fj.Structure(1j * M if name == "M" else M, 1j * C if name == "C" else C, K)
