@@ -55,8 +55,9 @@ def _run(arguments) -> int:
     """K_n, K_t, d ln K_n/d ln P and the real area of a scene's joint by every contact law.
 
     Beside them boundary elements on surfaces of the same D and G. Writes contact.png, contact.csv.
-    With a measured map: its stiffness by boundary elements, and by its spectrum. Writes scene.toml,
-    a scene with the measured law, and contact.csv.
+    With a measured map: its stiffness by boundary elements, and by its spectrum, both of as many
+    copies of the map as go into the area of the joint. Writes scene.toml, a scene with the measured
+    law, and contact.csv.
     """
     if arguments.scene is not None and arguments.scene.suffix != ".toml":
         from .contact_map import run_map
@@ -94,15 +95,22 @@ def _run(arguments) -> int:
         raise ValueError(f"--points must be at least 2, got {arguments.points}")
     loads = np.geomspace(ends[0], ends[1], arguments.points)
     with output(arguments.out) as write:
-        comparison = compare_laws(
-            law.surface,
-            law.material,
-            loads,
-            mu_s=friction.mu_s,
-            mu_m=friction.mu_m,
-            **options,
-            progress=not arguments.quiet,
-        )
+        try:
+            comparison = compare_laws(
+                law.surface,
+                law.material,
+                loads,
+                mu_s=friction.mu_s,
+                mu_m=friction.mu_m,
+                **options,
+                progress=not arguments.quiet,
+            )
+        except RuntimeError as error:
+            if not str(error).startswith("boundary elements did not converge"):
+                raise
+            raise ValueError(
+                "boundary elements did not converge: --seeds 0 leaves them out"
+            ) from None
         files = {"contact.png": picture(plot.laws(comparison))}
         written = write(files | {"contact.csv": csv_text(*comparison.rows()).encode()})
     names = [*files, "contact.csv"]
