@@ -3,6 +3,7 @@
 import csv
 import importlib
 import itertools
+import json
 from pathlib import Path
 
 import jax
@@ -39,6 +40,24 @@ def test_scene_with_a_nominal_area(capsys):
     words = [line.split() for line in out.splitlines()]
     ends = [float(row[row.index("Persson") + 1]) for row in words if "Persson" in row]
     assert len(ends) == 2 and ends[0] < K_n < ends[1]
+
+
+def test_scene_with_another_spectrum(capsys):
+    """The laws that need D and G are left out, and a line says so."""
+    ground = fj.SelfAffine(1e-6, 0.8, 1e-3, 2e-4)
+    law = fj.PerssonContact(ground, fj.brake_scene().contact.material, 1e3, 4e-6)
+    fj.brake_scene().replace(contact=law).save("ground.toml")
+    status, out, err = run(capsys, "contact", "ground.toml", *QUICK, "--quiet")
+    assert (status, err) == (0, "")
+    expected = fj.compare_laws(
+        ground, law.material, [100, 1e4], area=4e-6, n=32, seeds=2, progress=False
+    )
+    assert out.startswith(f"{expected!r}\n") and "left out: fractal and asperity, which" in out
+    assert Path("fractaljax-contact/contact.png").read_bytes().startswith(b"\x89PNG")
+    status, out, err = run(capsys, "contact", "ground.toml", *QUICK, "--quiet", "--json")
+    assert json.loads(out)["left_out"] == ["fractal", "asperity"]
+    few = ("--n", 8, "--seeds", 1, "--points", 2, "--quiet")
+    assert "hold" in run(capsys, "contact", "ground.toml", *few)[2]
 
 
 @pytest.fixture
@@ -144,10 +163,7 @@ def test_refuses_a_map(capsys, plateau, arguments, said):
         (("--area", 1e-4, "--loads", "2:1"), "--loads must be LOW:HIGH with 0 < LOW < HIGH"),
         (("--area", 1e-4, "--points", 1), "--points must be at least 2, got 1"),
         (("fixed.toml", "--area", 1e-4), "fixed.toml: the law of its contact takes no surface"),
-        (
-            ("ground.toml", "--area", 1e-4),
-            "laws are compared on a fractal surface, not a SelfAffine",
-        ),
+        (("ground.toml", "--L-s", 1e-6), "L_s is for a Surface; a SelfAffine has a shortest"),
     ],
 )
 def test_refuses(capsys, arguments, said):
