@@ -24,7 +24,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, ScalarLike
 
-from .._base.parts import Record, concrete, flag, number, raise_unless, require_kind, scalar, whole
+from .._base.parts import Record, concrete, flag, raise_unless, require_kind, scalar, whole
+from .._surface.heights import height_numbers
 from .material import Material
 
 
@@ -129,7 +130,7 @@ def boundary_element(
 
 def check_map(name: str, heights, material: Material, *others: Array) -> Array:
     """Heights (nx, ny) in the widest of all precisions."""
-    heights = number(name, heights)
+    heights = height_numbers(name, heights)
     if heights.ndim != 2 or min(heights.shape) < 2:
         raise ValueError(f"{name} must have shape (nx, ny), got {heights.shape}")
     require_kind("material", material, Material)

@@ -1,6 +1,7 @@
 """Boundary elements beside closed forms and dense matrices; derivatives, limits, refusals."""
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -358,6 +359,22 @@ def test_a_flat_surface(plastic):
     np.testing.assert_allclose(s.pressure, 1 / (72 * DX**2), rtol=1e-14)
 
 
+def test_lists_are_heights():
+    P = load(ROUGH, 0.2)
+    listed, array = (fj.boundary_element(z, DX, MATERIAL, P) for z in (ROUGH.tolist(), ROUGH))
+    assert float(listed.K_n) == float(array.K_n)
+
+    # Also of traced numbers.
+    def of_one(x):
+        rows: Any = [[x, 0.0], [0.0, 0.0]]
+        return fj.boundary_element(rows, DX, MATERIAL, 1e-3).mean_gap
+
+    traced = jax.jit(of_one)
+    spike = np.array([[1e-6, 0.0], [0.0, 0.0]])
+    gap = fj.boundary_element(spike, DX, MATERIAL, 1e-3).mean_gap
+    assert float(traced(1e-6)) == pytest.approx(float(gap), rel=1e-9)
+
+
 @pytest.mark.parametrize("plastic", [False, True])
 @pytest.mark.parametrize("unit", [1e-9, 1e6])
 def test_any_units(unit, plastic):
@@ -399,6 +416,14 @@ test_refusals = refusals(
     [
         ({"heights": np.zeros(8)}, r"^heights must have shape \(nx, ny\), got \(8,\)$"),
         ({"heights": np.zeros((1, 8))}, r"^heights must have shape \(nx, ny\).*\(1, 8\)$"),
+        (
+            {"heights": np.where(ROUGH > 1e-7, np.nan, ROUGH)},
+            r"^heights must be finite, got \d+ NaN",
+        ),
+        (
+            {"heights": [[1.0], [1.0, 2.0]]},
+            r"^heights must be rows of as many numbers, got \[\[1.0",
+        ),
         ({"dx": 0}, r"^dx must be above 0, got 0\.0$"),
         ({"P": -1.0}, r"^P must be above 0, got -1\.0$"),
         ({"P": np.ones(2)}, r"^P must be a single number, got shape \(2,\)$"),
