@@ -104,6 +104,7 @@ from ._mechanism.structure import (
     ParametricStructure as ParametricStructure,
     Structure as Structure,
     load as load,
+    save as save,
 )
 from ._stability.boundary import (
     Boundary as Boundary,
