@@ -90,6 +90,7 @@ from ._identify.identify import Identification as Identification, identify as id
 from ._identify.measurement import Measurement as Measurement
 from ._identify.pool import pool_surfaces as pool_surfaces
 from ._identify.preparation import Preprocessing as Preprocessing
+from ._identify.prepare_measurement import prepare_measurement as prepare_measurement
 from ._identify.spectrum_of import spectrum_of as spectrum_of
 from ._identify.warnings import WarningThresholds as WarningThresholds
 from ._mechanism.damping import modal_damping as modal_damping, rayleigh_damping as rayleigh_damping
@@ -103,6 +104,7 @@ from ._mechanism.structure import (
     ParametricStructure as ParametricStructure,
     Structure as Structure,
     load as load,
+    save as save,
 )
 from ._stability.boundary import (
     Boundary as Boundary,

@@ -26,7 +26,7 @@ from tools import ROOT
 pytestmark = pytest.mark.optimised
 
 # What computes nothing, or only draws, reads and stores.
-NO_NUMBERS = {"quantity", "read_measurement", "read_matrices", "load"}
+NO_NUMBERS = {"quantity", "read_measurement", "read_matrices", "load", "save"}
 NO_NUMBERS |= {"brake_scene", "explore", "repeat_design"}
 QUIET: dict[str, Any] = {"progress": False}
 NEAR = {"D": (2.39, 2.41)}
@@ -115,6 +115,7 @@ CALLS: dict[str, Callable[[], Any]] = {
             **QUIET,
         ).first
     ),
+    "prepare_measurement": lambda: fj.prepare_measurement(rough((48, 40)), 1e-6).z[::9, ::9],
     "profile_parameters": lambda: fj.profile_parameters(
         rough((600, 2))[:, 0], 1e-6, cutoff=1e-4, shortest=4e-6
     ),

@@ -78,6 +78,22 @@ def _floating(name: str, value: Any) -> Numbers:
         raise TypeError(f"{name} must be a real number, got {brief(value)}") from None
 
 
+def array_like(name: str, value: Any) -> Any:
+    """`value` as an array if it is a list or a tuple, of numbers or of rows of them; else itself.
+
+    **Raises:** `TypeError` for a list of something else, and for rows that differ in length.
+    """
+    if not isinstance(value, (list, tuple)):
+        return value
+    try:
+        array: Any = jnp.asarray(value) if is_traced(value) else np.asarray(value)
+    except (TypeError, ValueError):
+        raise TypeError(f"{name} must be rows of as many numbers, got {brief(value)}") from None
+    if array.dtype.kind not in "fiu":
+        raise TypeError(f"{name} must be real numbers, got {brief(value)}")
+    return array
+
+
 def scalar(name: str, value: ArrayLike, **domain: float) -> Float[Array, ""]:
     """As `number`, for a single number."""
     array = number(name, value, **domain)

@@ -5,7 +5,7 @@ from typing import Any
 
 from .json_text import comparison_content, files as paths, show
 from .output import csv_text, output, picture
-from .parsing import add_out, add_set, load_mechanism, numbers
+from .parsing import add_out, add_set, load_mechanism, numbers, remarks
 
 _OPTIONS: dict[str, dict[str, Any]] = {
     "--area": {"type": float, "help": "nominal area of the joint [m^2], if not in the scene"},
@@ -14,8 +14,12 @@ _OPTIONS: dict[str, dict[str, Any]] = {
         "help": "normal loads [N]; default a tenth to ten times that of the scene",
     },
     "--points": {"type": int, "default": 9, "help": "how many loads; default 9"},
-    "--L": {"type": float, "help": "longest wavelength [m]; default the side of the area"},
-    "--L-s": {"type": float, "help": "shortest wavelength [m]; default 4 L/n"},
+    "--L": {
+        "type": float,
+        "help": "longest wavelength [m], or side of the surfaces of a spectrum without D and G; "
+        "default the side of the area, or less",
+    },
+    "--L-s": {"type": float, "help": "shortest wavelength [m] of a fractal surface; default 4 L/n"},
     "--n": {"type": int, "help": "points of a boundary-element surface along a side; default 128"},
     "--seeds": {"type": int, "help": "how many such surfaces, 0 for none; default 4"},
     "--scene": {
@@ -54,9 +58,11 @@ def add_contact(commands) -> None:
 def _run(arguments) -> int:
     """K_n, K_t, d ln K_n/d ln P and the real area of a scene's joint by every contact law.
 
-    Beside them boundary elements on surfaces of the same D and G. Writes contact.png, contact.csv.
-    With a measured map: its stiffness by boundary elements, and by its spectrum. Writes scene.toml,
-    a scene with the measured law, and contact.csv.
+    Beside them boundary elements on surfaces of the same spectrum. Laws that need D and G are left
+    out where the surface has none. Writes contact.png, contact.csv.
+    With a measured map: its stiffness by boundary elements, and by its spectrum, both of as many
+    copies of the map as go into the area of the joint. Writes scene.toml, a scene with the measured
+    law, and contact.csv.
     """
     if arguments.scene is not None and arguments.scene.suffix != ".toml":
         from .contact_map import run_map
@@ -66,15 +72,11 @@ def _run(arguments) -> int:
 
     from .. import plot
     from .._contact.compare import compare_laws
+    from .._surface.spectrum import Spectrum
 
     scene = load_mechanism(arguments.scene, changes=arguments.set)
     law, friction = scene.contact, scene.friction
-    if not law.has_surface:
-        if hasattr(law, "surface"):
-            kind = type(law.surface).__name__
-            raise ValueError(
-                f"{arguments.scene}: laws are compared on a fractal surface, not a {kind}"
-            )
+    if not isinstance(getattr(law, "surface", None), Spectrum):
         raise ValueError(f"{arguments.scene}: the law of its contact takes no surface")
     options: dict[str, Any] = {}
     for name in ("area", "L", "L_s"):
@@ -94,15 +96,23 @@ def _run(arguments) -> int:
         raise ValueError(f"--points must be at least 2, got {arguments.points}")
     loads = np.geomspace(ends[0], ends[1], arguments.points)
     with output(arguments.out) as write:
-        comparison = compare_laws(
-            law.surface,
-            law.material,
-            loads,
-            mu_s=friction.mu_s,
-            mu_m=friction.mu_m,
-            **options,
-            progress=not arguments.quiet,
-        )
+        try:
+            with remarks():
+                comparison = compare_laws(
+                    law.surface,
+                    law.material,
+                    loads,
+                    mu_s=friction.mu_s,
+                    mu_m=friction.mu_m,
+                    **options,
+                    progress=not arguments.quiet,
+                )
+        except RuntimeError as error:
+            if not str(error).startswith("boundary elements did not converge"):
+                raise
+            raise ValueError(
+                "boundary elements did not converge: --seeds 0 leaves them out"
+            ) from None
         files = {"contact.png": picture(plot.laws(comparison))}
         written = write(files | {"contact.csv": csv_text(*comparison.rows()).encode()})
     names = [*files, "contact.csv"]

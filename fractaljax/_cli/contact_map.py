@@ -16,12 +16,10 @@ def run_map(arguments) -> int:
     from .._contact.measured import MeasuredContact
     from .._contact.persson import PerssonContact
     from .._identify.files import read_measurement
-    from .._identify.preparation import prepare_heights
-    from .._identify.spectrum import remove_plane
     from .._identify.spectrum_of import spectrum_of
 
     scene = load_mechanism(arguments.joint, changes=arguments.set)
-    contact, friction = scene.contact, scene.friction
+    contact, coefficients = scene.contact, (scene.friction.mu_s, scene.friction.mu_m)
     material, P = getattr(contact, "material", None), getattr(contact, "P", None)
     if material is None or P is None:
         raise ValueError(f"{arguments.joint}: a map needs the material and the load of its contact")
@@ -32,20 +30,22 @@ def run_map(arguments) -> int:
     read = read_measurement(arguments.scene, **{name: getattr(arguments, name) for name in names})
     if read.dy is None:
         raise ValueError(f"{arguments.scene}: a profile cannot be pressed, a map is needed")
-    if abs(read.dy / read.dx - 1) > 1e-3:
-        raise ValueError(
-            f"{arguments.scene}: dx and dy must agree, got {read.dx:g} and {read.dy:g} m: resample"
-        )
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        spectrum = spectrum_of(read)
-    heights = remove_plane(prepare_heights(read.z).segments[0])
     with output(arguments.out) as write:
-        law = MeasuredContact.from_heights(heights, read.dx, material, P, area)
-        persson = PerssonContact(spectrum, material, P, area)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            spectrum = spectrum_of(read)
+            try:
+                law = MeasuredContact.from_heights(read, None, material, P, area)
+            except (RuntimeError, ValueError) as error:
+                raise ValueError(f"{arguments.scene}: {error}") from None
         loads = np.asarray(law.loads)
+        # Of the map's own area, as often as it is in that of the joint: hills carry small loads,
+        # and on a larger area a spectrum has higher ones than the repeated map.
+        own = read.dx * read.dy * read.z.size
+        copies = area / own
+        persson = PerssonContact(spectrum, material, P, own)
         by_spectrum = [
-            float(rebuild(persson, {"P": load}).stiffness(friction.mu_s, friction.mu_m)[0])
+            float(copies * rebuild(persson, {"P": load / copies}).stiffness(*coefficients)[0])
             for load in loads
         ]
         titles = ["load [N]", "K_n [N/m]", "by its spectrum [N/m]", "ratio"]

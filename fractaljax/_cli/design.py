@@ -22,6 +22,8 @@ from .parsing import (
 _UNITS = {"G": "m", "growth_rate": "1/s", "K_n": "N/m", "K_t": "N/m"}  # of the history
 _LIMITS = {  # option: class of `fractaljax.constraints`, and its meaning
     "sq": ("Roughness", "Sq of the surface [m]"),
+    "ra": ("Ra", "Ra of a profile of the surface [m], behind the filters of --cutoff"),
+    "rz": ("Rz", "Rz of a profile of the surface [m], behind the filters of --cutoff"),
     "elastic-share": ("ElasticShare", "share of the load on elastic contacts"),
     "real-area": ("RealContactArea", "real contact area [m^2]"),
     "damping-ratio": ("DampingRatio", "least damping ratio"),
@@ -92,7 +94,16 @@ def add_design(commands) -> None:
         type=float,
         nargs=2,
         metavar=("L", "L_S"),
-        help="longest and shortest wavelength that --sq counts [m]; default 1e-3 1e-6",
+        help="longest and shortest wavelength [m] that --sq counts, and --ra and --rz of a fractal "
+        "surface; default 1e-3 1e-6",
+    )
+    parser.add_argument(
+        "--cutoff",
+        type=float,
+        nargs=2,
+        metavar=("LAMBDA_C", "LAMBDA_S"),
+        help="longest and shortest wavelength [m] that the filters of --ra and --rz leave; default "
+        "8e-4 2.5e-6",
     )
     parser.add_argument(
         "--quiet-within",
@@ -227,9 +238,13 @@ def _tolerance(texts: list[str]) -> Any:
 def _constraints(arguments) -> list:
     from .._design import constraints
 
-    if arguments.sq_lengths is not None and arguments.sq is None:
-        raise ValueError("--sq-lengths needs --sq")
+    drawn = arguments.ra, arguments.rz
+    if arguments.sq_lengths is not None and not any((arguments.sq, *drawn)):
+        raise ValueError("--sq-lengths needs --sq, --ra or --rz")
+    if arguments.cutoff is not None and not any(drawn):
+        raise ValueError("--cutoff needs --ra or --rz")
     more: dict = dict(zip(("L", "L_s"), arguments.sq_lengths or (1e-3, 1e-6), strict=True))
+    more |= zip(("cutoff", "shortest"), arguments.cutoff or (8e-4, 2.5e-6), strict=True)
     more["friction_slope"] = not arguments.constant_friction
     limits = []
     for name, (kind, _) in _LIMITS.items():

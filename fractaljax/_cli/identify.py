@@ -67,6 +67,11 @@ def add_identify(commands) -> None:
         parser.add_argument(name, **options)
     add_set(parser)
     add_out(parser, "fractaljax-identification")
+    parser.add_argument(
+        "--quiet",
+        action="store_true",
+        help="no progress bar: there is none, and scripts may say it to every command",
+    )
     parser.set_defaults(run=_run)
 
 

@@ -157,7 +157,8 @@ def comparison_content(comparison: Any) -> dict[str, Any]:
         law: {name: getattr(curve, name) for name in names}
         for law, curve in comparison.curves.items()
     }
-    return {"loads": comparison.loads, "area": comparison.area, "laws": curves}
+    content = {"loads": comparison.loads, "area": comparison.area, "laws": curves}
+    return content | {"left_out": comparison.left_out}
 
 
 def table_content(titles: list[str], rows: list[list[str]]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Contact laws side by side, and boundary elements on surfaces of the same D and G."""
+"""Contact laws side by side, and boundary elements on surfaces of the same spectrum."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -21,6 +21,8 @@ from .._base.parts import (
     whole,
 )
 from .._base.table import aligned
+from .._base.warn import warn_user
+from .._surface.spectrum import Spectrum
 from .._surface.surface import Surface
 from .._surface.topography import topography
 from .asperity import AsperityContact
@@ -46,13 +48,14 @@ class LawCurve(Record):
 class LawComparison(Record):
     """Contact laws at the same loads, as `compare_laws` returns them; printed as a table."""
 
-    surface: Surface  # surface of all laws
+    surface: Spectrum  # surface of all laws
     material: Material  # material of all laws
     loads: Float[Array, " k"]  # [N]
     area: Float[Array, ""]  # nominal [m^2]
     L: Float[Array, ""]  # longest and
     L_s: Float[Array, ""]  # shortest wavelength [m]
     curves: dict[str, LawCurve]  # by the name of the law
+    left_out: tuple[str, ...] = eqx.field(static=True, default=())  # laws that need D and G
 
     def rows(self) -> tuple[list[str], list[list[str]]]:
         """The titles and the rows of the table, one row for each load and law."""
@@ -72,11 +75,20 @@ class LawComparison(Record):
     def __repr__(self) -> str:
         titles, rows = self.rows()
         laws = len(self.curves)  # the load only beside the first
-        return aligned([titles, *(["" if k % laws else P, *x] for k, (P, *x) in enumerate(rows))])
+        table = aligned([titles, *(["" if k % laws else P, *x] for k, (P, *x) in enumerate(rows))])
+        return "\n".join([table, *self.remarks()])
+
+    def remarks(self) -> list[str]:
+        """A line that says which laws are left out, and why; none if all are there."""
+        if not self.left_out:
+            return []
+        kind = type(self.surface).__name__
+        words = " and ".join(self.left_out)
+        return [f"left out: {words}, which need the D and G of a Surface, not a {kind}"]
 
 
 def compare_laws(
-    surface: Surface,
+    surface: Spectrum,
     material: Material,
     loads: Float[ArrayLike, " k"] | Sequence[float],
     *,
@@ -99,13 +111,20 @@ def compare_laws(
     of that K_n from load to load. They are elastic and frictionless. On an area larger than L^2
     surfaces lie side by side.
 
+    Of a spectrum without D and G, `FractalContact` and `AsperityContact` are left out, and a line
+    below the table says so. Boundary elements press its `topography` of side L, without the waves
+    that are longer; a warning says if these hold more than a tenth of Sq.
+
     **Arguments:**
 
-    - `surface`, `material`: those of the joint, as in `FractalContact`.
+    - `surface`: that of the joint, a `Surface` or another `Spectrum`, as in `PerssonContact`.
+    - `material`: that of the joint.
     - `loads`: (k,), rising normal loads [N].
     - `area`: nominal area [m^2].
     - `L`: longest wavelength [m], by default the side of the area; no wave is longer than the side.
-    - `L_s`: shortest wavelength [m], by default 4 L/n.
+      Of another spectrum, the side of the surfaces that are pressed, by default as long as gives
+      its shortest wave four points.
+    - `L_s`: shortest wavelength [m] of a `Surface`, by default 4 L/n.
     - `mu_s`, `mu_m`: static and smallest friction coefficient for laws with yield, by default 0.4
       and 0.25, the reference brake's.
     - `laws`: {name: contact law}, more laws to compare; by default none.
@@ -117,10 +136,10 @@ def compare_laws(
     **Returns:** a `LawComparison`.
 
     **Raises:** `ValueError` unless loads increase and are above 0, area > 0, 2 L/n <= L_s <= L, n
-    >= 8, seeds >= 0, mu_s > 0 and 0 <= mu_m <= 0.9; `RuntimeError` if boundary elements do not
-    converge.
+    >= 8, seeds >= 0, mu_s > 0 and 0 <= mu_m <= 0.9, and for L_s beside another spectrum than a
+    `Surface`; `RuntimeError` if boundary elements do not converge.
     """
-    require_kind("surface", surface, Surface)
+    require_kind("surface", surface, Spectrum)
     require_kind("material", material, Material)
     for part in (surface, material):
         require_scalar(part)
@@ -129,18 +148,28 @@ def compare_laws(
         raise ValueError(f"loads must be a row of rising numbers, got {np.asarray(loads)}")
     area, n, seeds = scalar("area", area, above=0), whole("n", n, 8), whole("seeds", seeds, 0)
     side = jnp.sqrt(area)
-    L = side if L is None else jnp.minimum(scalar("L", L, above=0), side)
-    L_s = 4 * L / n if L_s is None else scalar("L_s", L_s, above=0)
+    fractal = isinstance(surface, Surface)
+    if fractal:
+        L = side if L is None else jnp.minimum(scalar("L", L, above=0), side)
+        L_s = 4 * L / n if L_s is None else scalar("L_s", L_s, above=0)
+    elif L_s is not None:
+        kind = type(surface).__name__
+        raise ValueError(f"L_s is for a Surface; a {kind} has a shortest wavelength of its own")
+    else:
+        L_s = 2 * math.pi / surface.pieces().q[-1]
+        L = n * L_s / 4 if L is None else scalar("L", L, above=0)
+        L = jnp.minimum(L, side)
     L = ordered("L", L, "L_s", L_s)
     if seeds:
         ordered("L_s", L_s * (1 + 1e-9), "2 L/n", 2 * L / n)
     mu_m = scalar("mu_m", mu_m, at_least=0, at_most=MU_M_MAX)
     mu_s = ordered("mu_s", scalar("mu_s", mu_s, above=0), "mu_m", mu_m)
-    all_laws: dict[str, Contact] = {
-        "fractal": FractalContact(surface, material, loads[0]),
-        "asperity": AsperityContact(surface, material, loads[0], L_s),
-        "Persson": PerssonContact(surface, material, loads[0], area, L, L_s),
-    }
+    all_laws: dict[str, Contact] = {}
+    if isinstance(surface, Surface):
+        all_laws["fractal"] = FractalContact(surface, material, loads[0])
+        all_laws["asperity"] = AsperityContact(surface, material, loads[0], L_s)
+    ends = (L, L_s) if fractal else ()
+    all_laws["Persson"] = PerssonContact(surface, material, loads[0], area, *ends)
     for name, law in (laws or {}).items():
         require_kind(f"laws[{name!r}]", law, Contact)
         all_laws[name] = law
@@ -149,17 +178,31 @@ def compare_laws(
         from tqdm import tqdm
 
         keys = jax.random.split(jax.random.key(0) if key is None else key, seeds)
+        band: dict = {"L_s": L_s} if fractal else {}
+        if not fractal:
+            _warn_of_long_waves(surface, L, side)
         cells, total, quiet = area / L**2, seeds * len(loads), not flag("progress", progress)
         samples = []
         with tqdm(total=total, desc=BOUNDARY_ELEMENTS, unit="load", disable=quiet) as bar:
             for each in keys:
-                heights = topography(surface, L, n, key=each, L_s=L_s, periodic=True)
+                heights = topography(surface, L, n, key=each, periodic=True, **band)
                 for P in loads / cells:
                     pressed = boundary_element(heights, L / n, material, P)
                     samples.append((pressed.K_n * cells, pressed.area * cells))
                     bar.update()
         curves[BOUNDARY_ELEMENTS] = _average_seeds(np.reshape(samples, (seeds, -1, 2)), loads)
-    return LawComparison(surface, material, loads, area, L, L_s, curves)
+    left_out = () if fractal else ("fractal", "asperity")
+    return LawComparison(surface, material, loads, area, L, L_s, curves, left_out)
+
+
+def _warn_of_long_waves(surface: Spectrum, L, side, most: float = 0.1) -> None:
+    """Warn if the waves between L and the side of the area hold more than `most` of Sq."""
+    held, whole = (math.sqrt(surface.pieces(longest).moment(0)) for longest in (L, side))
+    if held < (1 - most) * whole:
+        warn_user(
+            f"boundary elements of side L = {float(L):.3g} m hold {held / whole:.0%} of Sq: the "
+            "longer waves need a larger L, and as many more points n"
+        )
 
 
 def _shown(values, i, form):

@@ -17,6 +17,7 @@ from .._base.files import read_bounded, write_together
 from .._base.parts import (
     Numbers,
     Quantity,
+    Record,
     brief,
     concrete,
     nan_where,
@@ -599,6 +600,26 @@ def load(path: str | os.PathLike) -> Scene | Structure:
         document = read_toml(read_bounded(path))
         kind = Structure if "structure" in document else Scene
         return kind._from_document(document, Path(path).parent)
+
+
+def save(x: Any, path: str | os.PathLike) -> None:
+    """Write a scene, a structure, a design or anything else that has a method `save`, by it.
+
+    `load` reads a scene or a structure back, `repeat_design` a design.
+
+    **Arguments:**
+
+    - `x`: a `Scene`, a `Structure`, a `Design`, or a part of your own with a method `save(path)`.
+    - `path`: the file.
+
+    **Raises:** as the method; `TypeError` for what has none.
+    """
+    method = getattr(x, "save", None) if isinstance(x, Record) else None
+    if method is None:
+        raise TypeError(
+            f"x must be a Scene, a Structure, a Design or have a method save, got {brief(x)}"
+        )
+    method(path)
 
 
 def require_single(structure: Structure) -> None:

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._base.parts import Numbers, concrete, number
+from .._base.parts import Numbers, array_like, concrete, number
 
 
 class HeightStatistics(NamedTuple):
@@ -18,23 +18,34 @@ class HeightStatistics(NamedTuple):
     kurtosis: Array
 
 
-def check_heights(z, axes: str) -> Numbers:
-    """Heights z as floating-point numbers with axes "n" or "n m", at least 8 points along each.
+def height_numbers(name: str, z) -> Numbers:
+    """Heights as floating-point numbers of any shape; lists of numbers or of rows are taken.
 
-    **Raises:** `TypeError` unless z is real and numeric; `ValueError` for another shape, and where
-    a height is not finite.
+    **Raises:** `TypeError` unless z is real and numeric; `ValueError` where a height is not finite
+    or masked.
     """
+    z = array_like(name, z)
     if isinstance(z, np.ma.MaskedArray):
         z = np.ma.filled(z.astype(float), np.nan)
     try:
-        heights = number("z", z)
+        return number(name, z)
     except ValueError:
-        missing = int(np.isnan(concrete(jnp.asarray(z))).sum())
-        if not missing:
+        values = np.asarray(concrete(jnp.asarray(z)))
+        missing = int(np.isnan(values).sum())
+        if not 0 < missing < values.size:  # infinite, or there is nothing to fill them from
             raise
         raise ValueError(
-            f"z must be finite, got {missing} NaN: fill them in, or cut out a part without any"
+            f"{name} must be finite, got {missing} NaN: fill them in, or cut out a part without "
+            "any; fractaljax.prepare_measurement(z, dx).z has them filled"
         ) from None
+
+
+def check_heights(z, axes: str) -> Numbers:
+    """Heights z as floating-point numbers with axes "n" or "n m", at least 8 points along each.
+
+    **Raises:** as `height_numbers`; `ValueError` for another shape.
+    """
+    heights = height_numbers("z", z)
     ndim = len(axes.split())
     if heights.ndim != ndim or min(heights.shape) < 8:
         shape = f"({', '.join(axes.split())}{',' if ndim == 1 else ''})"

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from .._contact.compare import BOUNDARY_ELEMENTS, LawComparison
+from .._surface.surface import Surface
 from .axes import Axes, ensure_axes, line_colours, new_figure
 from .panels import Panels
 
@@ -48,7 +49,8 @@ def law_curves(result: LawComparison, ax: Axes | None = None, *, show: str = "K_
         else:
             ax.plot(loads, values, **style)
     if show == "alpha":
-        H = 3 - float(result.surface.D)
+        surface = result.surface
+        H = 3 - float(surface.D) if isinstance(surface, Surface) else float(surface.roll_off()[1])
         grey: dict[str, Any] = {"color": "0.55", "lw": 1, "zorder": 1}
         ax.axhspan(0.5, 0.77, color="0.92", zorder=0, label="Pohrt and Popov 2012, D = 2 to 3")
         ax.axhline(1 / (1 + H), ls="dotted", label="1/(1+H): Pastewka et al. 2013", **grey)

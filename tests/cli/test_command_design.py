@@ -141,6 +141,38 @@ def test_robust_design_and_its_repetition(capsys):
         assert Path("first", name).read_bytes() == Path("again", name).read_bytes()
 
 
+def test_limits_of_a_drawing(capsys, monkeypatch):
+    """--ra and --rz are `constraints.Ra` and `Rz` of the same filters and wavelengths."""
+    found = []
+
+    def design(_, constraints, **__):
+        found.append(constraints)
+        raise ValueError("seen")
+
+    monkeypatch.setattr("fractaljax._design.design.design", design)
+    limits = ["--ra", "1e-7:4e-7", "--rz", ":3e-6"]
+    for more in ([], ["--cutoff", 2.5e-4, 8e-6, "--sq-lengths", 1e-2, 1e-5]):
+        refused_command(capsys, "design", *limits, *more, "--quiet")
+    filters, lengths = dict(cutoff=8e-4, shortest=2.5e-6), dict(L=1e-3, L_s=1e-6)
+    others, wide = dict(cutoff=2.5e-4, shortest=8e-6), dict(L=1e-2, L_s=1e-5)
+    for constraints, options in zip(found, (filters | lengths, others | wide), strict=True):
+        Ra, Rz = fj.constraints.Ra(1e-7, 4e-7, **options), fj.constraints.Rz(None, 3e-6, **options)
+        for one, other in zip(constraints, (Ra, Rz), strict=True):
+            assert type(one) is type(other) and vars(one) == vars(other)
+
+
+def test_design_within_a_drawing(capsys):
+    """The design has the Ra that is allowed, and the file of the run has the limit."""
+    options = ["--ra", ":2.5e-7", "--starts", 2, "--lattice", 4, "--quiet", "--out", "drawn"]
+    status, out, _ = run(capsys, "design", *options)
+    assert status == 0 and "Ra <= 2.5e-07 m" in out
+    text = Path("drawn/run.toml").read_text()
+    assert "at_most = 2.5e-07" in text and "cutoff = 0.0008" in text
+    surface = fj.Scene.load("drawn/design.toml").contact.surface
+    p = fj.profile_parameters(surface, cutoff=8e-4, shortest=2.5e-6, L=1e-3, L_s=1e-6)
+    assert float(p.Ra) == pytest.approx(2.5e-7, rel=1e-5)  # 3.4e-7 without the limit
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -161,6 +193,9 @@ def test_robust_design_and_its_repetition(capsys):
         (["--quiet-within", "x"], "--quiet-within must be numbers, got 'x'"),
         (["--risk", "cvar:x"], "--risk must be numbers, got 'x'"),
         (["--sq-lengths", 1, 2], "--sq-lengths needs --sq"),
+        (["--cutoff", 8e-4, 2.5e-6], "--cutoff needs --ra or --rz"),
+        (["--ra", ":1e-6", "--cutoff", 1e-6, 1e-3], "cutoff must be at least shortest"),
+        (["--rz", "2:1"], "at_most"),
         (["--damping-ratio", "0:1"], "--damping-ratio has a lower limit only: LOW:"),
         (["--cycle-amplitude", "1:"], "--cycle-amplitude has an upper limit only: :HIGH"),
         (["--repeat", "nowhere.toml"], "no such file: nowhere.toml"),
@@ -181,7 +216,14 @@ def test_random_arguments(capsys, tmp_path, monkeypatch):
     random, accepted = np.random.default_rng(12), 0
     values = "nan inf -inf 0 -1 1e20 1e400 x : 1: 1:1 2:1 2.5 P=1 P=nan:2 P=1:2 D=-1 =1 cvar:1 "
     values = (values + "smooth:0 1_ é 10 1e-9").split()
-    options = {"--D": 2, "--G": 2, "--sq-lengths": 2, "--envelope": 1, "--tolerance": 1}
+    options = {
+        "--D": 2,
+        "--G": 2,
+        "--sq-lengths": 2,
+        "--cutoff": 2,
+        "--envelope": 1,
+        "--tolerance": 1,
+    }
     options |= {
         f"--{name.replace('_', '-')}": 1 for name in (*_OPTIONS, *_LIMITS, "risk", "quiet-within")
     }

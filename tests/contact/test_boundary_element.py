@@ -1,6 +1,7 @@
 """Boundary elements beside closed forms and dense matrices; derivatives, limits, refusals."""
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -95,7 +96,7 @@ def test_full_contact_is_linear(shape):
 # --- dense matrices ------------------------------------------------------------------------
 
 
-def dense(shape):
+def dense(shape, aspect=1.0):
     """S [m/Pa], wave by wave, of the displacement at a point under the pressure at another."""
     x, y = (part.ravel() for part in np.indices(shape))
     S = np.zeros((x.size, x.size))
@@ -107,7 +108,7 @@ def dense(shape):
             )
             if k or m:
                 phase = qx * np.subtract.outer(x, x) + qy * np.subtract.outer(y, y)
-                S += 2 / np.hypot(qx, qy) * np.cos(phase) / x.size
+                S += 2 / np.hypot(qx, qy / aspect) * np.cos(phase) / x.size
     return S * DX / E
 
 
@@ -134,26 +135,44 @@ def by_active_set(S, h, total):
     raise AssertionError("the active set does not settle")
 
 
-@pytest.mark.parametrize("shape", [(12, 12), (7, 16)])
+@pytest.mark.parametrize("shape, aspect", [((12, 12), 1.0), ((7, 16), 1.0), ((7, 16), 0.3)])
 @pytest.mark.parametrize("fraction", [0.02, 0.3, 0.8])
-def test_dense_active_set(shape, fraction):
-    h = rough(shape)
-    S, P = dense(shape), load(h, fraction)
-    s = tight(h, DX, MATERIAL, P)
+def test_dense_active_set(shape, aspect, fraction):
+    h, cell = rough(shape), aspect * DX**2
+    S, P = dense(shape, aspect), load(h, fraction) * aspect
+    s = tight(h, DX, MATERIAL, P, aspect=aspect)
     flat = (h - h.mean()).ravel()
-    p, g = by_active_set(S, flat, P / DX**2)
+    p, g = by_active_set(S, flat, P / cell)
     np.testing.assert_allclose(s.pressure.ravel(), p, rtol=1e-9, atol=1e-9 * p.max())
     assert float(s.mean_gap) == pytest.approx(g, rel=1e-9)
     gap = np.where(p > 0, 0, S @ p + g - flat)
     np.testing.assert_allclose(s.gap.ravel(), gap, atol=1e-9 * h.std())
     assert 0 < (p > 0).mean() < 1
-    _, sinks = bordered(S, p > 0, np.zeros(h.size), 1 / DX**2)
+    _, sinks = bordered(S, p > 0, np.zeros(h.size), 1 / cell)
     assert float(s.K_n) == pytest.approx(-1 / sinks, rel=1e-8)
-    assert float(s.area) == pytest.approx((p > 0).sum() * DX**2)
+    assert float(s.area) == pytest.approx((p > 0).sum() * cell)
     # The conditions, and the mean gap is the mean of the gap.
     assert (s.pressure >= 0).all() and (s.gap >= 0).all() and not (s.pressure * s.gap).any()
-    assert float(s.pressure.sum()) * DX**2 == pytest.approx(P, rel=1e-13)
+    assert float(s.pressure.sum()) * cell == pytest.approx(P, rel=1e-13)
     assert float(s.gap.mean()) == pytest.approx(float(s.mean_gap), rel=1e-9)
+
+
+@pytest.mark.parametrize("plastic", [False, True])
+def test_rectangular_cells_on_either_side(plastic):
+    """x and y change places: the same contact, with its derivatives."""
+    aspect, P = 2.5, load(ROUGH, 0.3) * 2.5
+    s = tight(ROUGH, DX, MATERIAL, P, plastic=plastic, aspect=aspect)
+    other = (ROUGH.T, DX * aspect, MATERIAL)
+    turned = tight(*other, P, plastic=plastic, aspect=1 / aspect)
+    np.testing.assert_allclose(turned.pressure.T, s.pressure, rtol=1e-8, atol=1e-9 * H)
+    for name in ("K_n", "mean_gap", "area"):
+        assert float(getattr(turned, name)) == pytest.approx(float(getattr(s, name)), rel=1e-8)
+    assert float(s.K_n) != pytest.approx(float(tight(ROUGH, DX, MATERIAL, P).K_n), rel=0.1)
+    if plastic:
+        return
+    slope = jax.grad(lambda P: tight(ROUGH, DX, MATERIAL, P, aspect=aspect).K_n)(P)
+    turned_slope = jax.grad(lambda P: tight(*other, P, aspect=1 / aspect).K_n)(P)
+    assert float(turned_slope) == pytest.approx(float(slope), rel=1e-6)
 
 
 # --- yielding ------------------------------------------------------------------------------
@@ -340,6 +359,22 @@ def test_a_flat_surface(plastic):
     np.testing.assert_allclose(s.pressure, 1 / (72 * DX**2), rtol=1e-14)
 
 
+def test_lists_are_heights():
+    P = load(ROUGH, 0.2)
+    listed, array = (fj.boundary_element(z, DX, MATERIAL, P) for z in (ROUGH.tolist(), ROUGH))
+    assert float(listed.K_n) == float(array.K_n)
+
+    # Also of traced numbers.
+    def of_one(x):
+        rows: Any = [[x, 0.0], [0.0, 0.0]]
+        return fj.boundary_element(rows, DX, MATERIAL, 1e-3).mean_gap
+
+    traced = jax.jit(of_one)
+    spike = np.array([[1e-6, 0.0], [0.0, 0.0]])
+    gap = fj.boundary_element(spike, DX, MATERIAL, 1e-3).mean_gap
+    assert float(traced(1e-6)) == pytest.approx(float(gap), rel=1e-9)
+
+
 @pytest.mark.parametrize("plastic", [False, True])
 @pytest.mark.parametrize("unit", [1e-9, 1e6])
 def test_any_units(unit, plastic):
@@ -381,12 +416,21 @@ test_refusals = refusals(
     [
         ({"heights": np.zeros(8)}, r"^heights must have shape \(nx, ny\), got \(8,\)$"),
         ({"heights": np.zeros((1, 8))}, r"^heights must have shape \(nx, ny\).*\(1, 8\)$"),
+        (
+            {"heights": np.where(ROUGH > 1e-7, np.nan, ROUGH)},
+            r"^heights must be finite, got \d+ NaN",
+        ),
+        (
+            {"heights": [[1.0], [1.0, 2.0]]},
+            r"^heights must be rows of as many numbers, got \[\[1.0",
+        ),
         ({"dx": 0}, r"^dx must be above 0, got 0\.0$"),
         ({"P": -1.0}, r"^P must be above 0, got -1\.0$"),
         ({"P": np.ones(2)}, r"^P must be a single number, got shape \(2,\)$"),
         ({"rtol": 0}, r"^rtol must be above 0 and below 1, got 0\.0$"),
         ({"max_steps": 0}, r"^max_steps must be a whole number of at least 1, got 0$"),
         ({"plastic": 1}, "^plastic must be True or False, got 1$"),
+        ({"aspect": 0.0}, r"^aspect must be above 0, got 0\.0$"),
     ],
     lambda change: fj.boundary_element(
         **(dict(heights=ROUGH, dx=DX, material=MATERIAL, P=1.0) | change)

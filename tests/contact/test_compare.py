@@ -164,6 +164,51 @@ def test_persson_s_law_is_near_boundary_elements_on_surfaces_of_another_program(
     assert min(shares) < 0.04 and 0.85 < max(shares) < 0.98
 
 
+GROUND = fj.SelfAffine(1e-6, 0.8, 2.5e-4, 1e-4)
+
+
+@pytest.mark.parametrize("measured", [False, True])
+def test_another_spectrum_has_the_laws_that_take_it(measured):
+    """Persson's law as by itself, and boundary elements on its topographies."""
+    surface: fj.Spectrum = GROUND
+    if measured:
+        q = np.geomspace(2 * np.pi / 1e-3, 2 * np.pi / 1e-4 * 0.999, 12)
+        surface = fj.MeasuredSpectrum(q, np.asarray(GROUND.C(q)))
+    options: dict[str, Any] = {"area": 4e-6, "L": 1e-3, "n": 32, "progress": False}
+    compared = fj.compare_laws(
+        surface, MATERIAL, LOADS, seeds=2, laws={"measured": MEASURED}, **options
+    )
+    assert list(compared.curves) == ["Persson", "measured", "boundary elements"]
+    curve: Any = compared.curves["Persson"]
+    for i, P in enumerate(LOADS):
+        law = fj.PerssonContact(surface, MATERIAL, P, 4e-6)
+        for stiffness, alone in zip((curve.K_n, curve.K_t), law.stiffness(0.4, 0.25), strict=True):
+            assert float(stiffness[i]) == pytest.approx(float(alone), rel=1e-12)
+    stiff = []
+    for key in jax.random.split(jax.random.key(0), 2):
+        z = fj.topography(surface, 1e-3, 32, key=key, periodic=True)
+        pressed = [fj.boundary_element(z, 1e-3 / 32, MATERIAL, P / 4) for P in LOADS]
+        stiff.append([float(4 * one.K_n) for one in pressed])
+    found: Any = compared.curves["boundary elements"].K_n
+    np.testing.assert_allclose(found, np.exp(np.log(stiff).mean(0)), rtol=1e-9)
+    kind = type(surface).__name__
+    last = f"left out: fractal and asperity, which need the D and G of a Surface, not a {kind}"
+    lines = repr(compared).splitlines()
+    assert lines[-1] == last and len(lines) == 1 + 3 * 3 + 1
+    assert_whole(fj.plot.laws(compared))
+    assert fj.compare_laws(SURFACE, MATERIAL, [1e3], area=1e-4, seeds=0).left_out == ()
+
+
+def test_waves_that_are_too_long_for_boundary_elements():
+    """By default four points of the shortest wave; a warning where much of Sq is beyond."""
+    few: dict[str, Any] = {"area": 1e-4, "seeds": 1, "progress": False}
+    above = [(x**-1.6 - 2.5**-1.6) / 1.6 for x in (1.25, 1.0)]  # of L and of the roll-off
+    held = np.sqrt(above[0] / (above[1] + (1 - (2.5e-4 / 1e-2) ** 2) / 2))
+    with pytest.warns(UserWarning, match=rf"L = 0.0002 m hold {held:.0%} of Sq: the longer waves"):
+        compared = fj.compare_laws(GROUND, MATERIAL, [1e3], n=8, **few)
+    assert float(compared.L) == pytest.approx(8 * 1e-4 / 4) and float(compared.L_s) == 1e-4
+
+
 test_refuses = refusals(
     [
         ({"loads": [2.0, 1.0]}, "loads must be a row of rising numbers, got [2. 1.]"),
@@ -181,6 +226,19 @@ test_refuses = refusals(
     ),
     plain=True,
 )
+
+
+def test_refuses_lengths_of_another_spectrum():
+    few: dict[str, Any] = {"loads": [1.0], "area": 1e-4, "progress": False}
+    with pytest.raises(ValueError, match="L_s is for a Surface; a SelfAffine has a shortest wave"):
+        fj.compare_laws(GROUND, MATERIAL, L_s=1e-5, **few)
+    with pytest.raises(ValueError, match="L_s must be at least 2 L/n"):
+        fj.compare_laws(GROUND, MATERIAL, L=1e-2, n=64, **few)
+    with pytest.raises(ValueError, match="L must be at least L_s"):
+        fj.compare_laws(GROUND, MATERIAL, L=1e-5, **few)
+    with pytest.raises(TypeError, match="surface must be a Spectrum, got 3"):
+        wrong: Any = 3
+        fj.compare_laws(wrong, MATERIAL, **few)
 
 
 def test_refuses_what_is_no_law():

@@ -1,6 +1,10 @@
 """A measured contact law: SciPy's monotone cubic of the logarithms, power laws beyond the table."""
 
+import importlib
+import itertools
 import math
+import warnings
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -94,7 +98,7 @@ def test_law_of_a_map_is_that_of_boundary_elements(heights):
     """Also with a plateau; a joint of four times the area is four maps side by side."""
     dx = 1e-3 / 64
     z = np.minimum(np.asarray(heights), 5e-7)
-    law = fj.MeasuredContact.from_heights(z, dx, MATERIAL, 2e3, 4e-6)
+    law = fj.MeasuredContact.from_heights(z, dx, MATERIAL, 2e3, 4e-6, prepare=False)
     for P in (law.loads[0], law.loads[5], 1e3):
         K_n, K_t = law_at(law, P)
         pressed = fj.boundary_element(z, dx, MATERIAL, P / 4)
@@ -121,3 +125,155 @@ def test_loads_of_a_map_end_before_it_is_flat(heights):
         fj.MeasuredContact.from_heights(
             heights, 1e-3 / 64, MATERIAL, 1e3, 1e-6, pressures=pressures[1:]
         )
+
+
+DX, P, AREA = 1e-3 / 64, 2e3, 4e-6
+
+
+def of_map(z, dx: Any = DX, P: Any = P, area=AREA, **options):
+    """The law of a map, of which nothing is to be said."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return fj.MeasuredContact.from_heights(z, dx, MATERIAL, P, area, **options)
+
+
+def same(law, other, rtol=1e-6):
+    np.testing.assert_allclose(law.loads, other.loads, rtol=rtol)
+    np.testing.assert_allclose(law.stiffnesses, other.stiffnesses, rtol=rtol)
+
+
+def test_a_tilted_map_is_that_without_tilt(heights):
+    z = np.asarray(heights)
+    i, j = np.indices(z.shape)
+    same(of_map(z + 1e-7 * i - 3e-7 * j + 1e-5), of_map(z))
+
+
+def test_gaps_are_filled_and_spikes_told(heights):
+    z = np.array(heights)
+    expected = of_map(z)
+    z[np.random.default_rng(0).uniform(size=z.shape) < 0.01] = np.nan
+    same(of_map(z), expected, rtol=0.02)
+    same(of_map(np.ma.masked_invalid(z)), of_map(z))
+    z[30, 31] = 1e-4
+    with pytest.warns(UserWarning, match="1 of 4096 heights were taken for spikes and filled"):
+        spiked = fj.MeasuredContact.from_heights(z, DX, MATERIAL, P, AREA)
+    same(spiked, expected, rtol=0.02)
+
+
+def test_takes_lists_measurements_files_and_topographies(heights, tmp_path):
+    z = np.asarray(heights)
+    expected = of_map(z)
+    same(of_map(z.tolist()), expected)
+    same(of_map(fj.Measurement(z, DX, DX, "mine"), None), expected)
+    np.savez(tmp_path / "map.npz", z=z, dx=DX)
+    same(of_map(tmp_path / "map.npz", None), expected)
+    same(of_map(str(tmp_path / "map.npz"), DX), expected)
+    topography = SimpleNamespace(heights=lambda: z * 1e6, unit="um", pixel_size=(DX * 1e6,) * 2)
+    same(of_map(topography, None), expected)
+
+
+def test_steps_that_differ(heights):
+    """Every other line along y, of heights that it resolves: the contact is nearly the same."""
+    surface = fj.SelfAffine(1e-6, 0.8, 2.5e-4, 1.2e-4)
+    z = np.asarray(fj.topography(surface, 1e-3, 64, key=jax.random.key(1), periodic=True))
+    options: Any = {"prepare": False, "pressures": [1e8, 5e8, 1e9, 2e9]}
+    whole, half = of_map(z, **options), of_map(z[:, ::2], dy=2 * DX, **options)
+    np.testing.assert_allclose(half.stiffnesses, whole.stiffnesses, rtol=0.03)
+    squared = of_map(z[:, ::2], **options)  # as if dy were dx
+    assert squared.stiffnesses[-1] < 0.7 * whole.stiffnesses[-1]
+    turned = of_map(z[:, ::2].T, 2 * DX, dy=DX, **options)
+    same(turned, half)
+    same(of_map(fj.Measurement(z[:, ::2], DX, 2 * DX, "mine"), None), of_map(z[:, ::2], dy=2 * DX))
+
+
+def test_a_yielding_table_ends_at_the_hardness(heights):
+    law = of_map(heights, plastic=True)
+    elastic = of_map(heights)
+    H = float(MATERIAL.H)
+    assert len(law.loads) < len(elastic.loads) and law.loads[-1] < H * AREA < elastic.loads[-1]
+    assert law.loads == elastic.loads[: len(law.loads)]
+    with pytest.raises(ValueError, match="leave gaps between the surfaces and are below the hard"):
+        of_map(heights, plastic=True, pressures=[1.1 * H, 1.2 * H])
+
+
+def test_the_table_reaches_down_to_the_load_of_the_joint(heights):
+    """As far as two points touch: below, and above the table, there is a warning."""
+    usual = of_map(heights)
+    low = of_map(heights, P=usual.loads[0] / 20)
+    assert low.loads[0] == pytest.approx(usual.loads[0] / 20, rel=1e-12)
+    assert low.loads[-12:] == usual.loads and 1 < usual.loads[0] / low.loads[-13] < 4.001
+    z = fj.prepare_measurement(np.asarray(heights), DX).z
+    own = DX**2 * z.size
+    pressed = fj.boundary_element(z, DX, MATERIAL, low.loads[0] * own / AREA)
+    assert float(law_at(low, low.P)[0]) == pytest.approx(float(pressed.K_n) * AREA / own, rel=1e-6)
+    both = of_map(heights, P=np.array([usual.loads[0] / 20, P]))
+    same(both, low)
+    for load, words in ((1e-6, "is below the table, from"), (1e6, "is above the table, up to")):
+        with pytest.warns(UserWarning, match=words):
+            fj.MeasuredContact.from_heights(heights, DX, MATERIAL, load, AREA)
+
+
+def test_loads_without_a_solution_are_left_out(heights, monkeypatch):
+    module = importlib.import_module("fractaljax._contact.measured")
+    press, usual = module.boundary_element, of_map(heights)
+
+    def fails_at(*numbers):
+        calls = itertools.count()
+
+        def pressed(*arguments, **options):
+            options |= {"max_steps": 1} if next(calls) in numbers else {}
+            return press(*arguments, **options)
+
+        monkeypatch.setattr(module, "boundary_element", pressed)
+
+    fails_at(3, 5)
+    with pytest.warns(UserWarning, match="did not converge at .*, .* Pa: the table leaves out"):
+        law = fj.MeasuredContact.from_heights(heights, DX, MATERIAL, P, AREA)
+    assert law.loads == tuple(x for i, x in enumerate(usual.loads) if i not in (3, 5))
+    fails_at(*range(11))
+    with pytest.raises(RuntimeError, match=r"converged at 1 of 12 pressures and two are needed"):
+        of_map(heights)
+
+
+def test_derivative_in_the_load_of_the_joint(heights):
+    """The table is structure, P is a quantity: also where it decides how far the table reaches."""
+    K_n = jax.grad(lambda P: jnp.log(of_map(heights, P=P).stiffness(0.4, 0.25)[0]))(1e3)
+    law = of_map(heights)
+    both = [math.log(float(law_at(law, x)[0])) for x in (1e3 * (1 - 1e-5), 1e3 * (1 + 1e-5))]
+    assert float(K_n) * 1e3 == pytest.approx((both[1] - both[0]) / 2e-5, rel=1e-4)
+
+
+MAP = np.random.default_rng(0).normal(size=(20, 20)) * 1e-7
+
+test_refuses_what_is_no_map = refusals(
+    [
+        ({"z": MAP[0]}, "z is too short: a profile needs 32 points, got shape (20,)"),
+        ({"z": MAP.ravel()}, "z must be a map (n, m), got a profile of shape (400,), which cannot"),
+        ({"z": MAP * 0}, "z has no roughness: it is constant"),
+        ({"z": MAP * 0, "prepare": False}, "z has no roughness: it is constant"),
+        ({"z": [[1.0, 2.0], [3.0]]}, "z must be rows of as many numbers, got [[1.0, 2.0], [3.0]]"),
+        ({"z": [["a"]]}, "z must be real numbers, got [['a']]"),
+        ({"z": MAP[:9]}, "z is too short: each side of a map needs 16 points, got shape (9, 20)"),
+        ({"z": np.where(MAP > 2e-7, np.nan, MAP), "prepare": False}, "z must be finite with prepa"),
+        ({"dx": None}, "dx is needed beside heights: the step between them in m, such as dx=1e-6"),
+        ({"dy": -1.0}, "dy must be above 0 and finite, in m, got -1.0"),
+        ({"P": 0.0}, "P must be above 0, got 0.0"),
+        ({"area": 0.0}, "area must be above 0, got 0.0"),
+        ({"material": 1.0}, "material must be a Material, got 1.0"),
+        ({"prepare": 1}, "prepare must be True or False, got 1"),
+        ({"plastic": 1}, "plastic must be True or False, got 1"),
+        ({"pressures": [1.0, -1.0]}, "pressures[1] must be above 0, got -1.0"),
+        ({"pressures": [2.0, 1.0]}, "pressures must rise, got (2.0, 1.0)"),
+        ({"stiffness_ratio": -1.0}, "stiffness_ratio must be at least 0, got -1.0"),
+    ],
+    lambda wrong: fj.MeasuredContact.from_heights(
+        **dict(z=MAP, dx=1e-6, material=MATERIAL, P=1.0, area=1e-6) | wrong
+    ),
+    kind=(ValueError, TypeError),
+    plain=True,
+)
+
+
+def test_refuses_a_traced_map():
+    with pytest.raises(TypeError, match="z, steps, material and area must be known when a prog"):
+        jax.jit(lambda z: fj.MeasuredContact.from_heights(z, DX, MATERIAL, P, AREA).P)(MAP)

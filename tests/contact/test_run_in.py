@@ -268,3 +268,10 @@ test_refusals = refusals(
     ),
     kind=(ValueError, TypeError),
 )
+
+
+def test_lists_are_heights():
+    listed, array = (
+        fj.run_in(z, DX, MATERIAL, PRESSURE, 0.1 * SQ, steps=2) for z in (ROUGH.tolist(), ROUGH)
+    )
+    np.testing.assert_array_equal(listed.heights, array.heights)

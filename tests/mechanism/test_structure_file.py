@@ -356,3 +356,24 @@ STIFF = fj.Joint(fj.FixedContact(1.5e308, 1e5), fj.Coulomb(0.3), 0, 1)
 def test_the_command_refuses_in_one_line(tmp_path, capsys, structure, message):
     structure.save(tmp_path / "s.toml")
     assert message in refused_command(capsys, "stability", tmp_path / "s.toml")
+
+
+def test_save_writes_what_load_reads(tmp_path):
+    """A scene and a structure come back; files are those of the method."""
+    scene, structure = fj.brake_scene(), fj.Structure.from_scene(fj.brake_scene())
+    for name, x in (("scene", scene), ("structure", structure)):
+        (tmp_path / "own").mkdir(exist_ok=True)
+        fj.save(x, tmp_path / f"{name}.toml")
+        x.save(tmp_path / "own" / f"{name}.toml")
+        text = (tmp_path / f"{name}.toml").read_bytes()
+        assert text == (tmp_path / "own" / f"{name}.toml").read_bytes()
+        back = fj.load(tmp_path / f"{name}.toml")
+        assert type(back) is type(x) and float(fj.growth_rate(back)) == float(fj.growth_rate(x))
+
+
+@pytest.mark.parametrize("x", [None, 3, np, np.ones(2), fj.Scene, fj.brake_scene().contact])
+def test_save_refuses_what_cannot_be_saved(x, tmp_path):
+    wanted = "^x must be a Scene, a Structure, a Design or have a method save, got "
+    with pytest.raises(TypeError, match=wanted) as refused:
+        fj.save(x, tmp_path / "x.toml")
+    assert "\n" not in str(refused.value) and not list(tmp_path.iterdir())

@@ -227,6 +227,22 @@ def test_flat_heights_and_not_a_number():
     assert all(np.isnan(getattr(bad, name)) for name in NAMES)
 
 
+def test_lists_are_heights():
+    listed, array = (fj.areal_parameters(z, **GRID) for z in (MAP.tolist(), MAP))
+    assert all(float(getattr(listed, x)) == float(getattr(array, x)) for x in ("Sa", "Sz", "Sdq"))
+
+
+def test_refusal_of_gaps_says_what_fills_them():
+    z = MAP.copy()
+    z[3, 5] = np.nan
+    with pytest.raises(
+        ValueError, match=r"got 1 NaN: .*prepare_measurement\(z, dx\).z has them fil"
+    ):
+        fj.areal_parameters(z, **GRID)
+    filled = fj.prepare_measurement(z, GRID["dx"], GRID["dy"], level=False).z
+    assert float(fj.areal_parameters(filled, **GRID).Sa) > 0
+
+
 test_refusals = refusals(
     [
         ({"z": np.ones(9)}, r"^z must have shape \(n, m\) with 8 points or more .*, got \(9,\)$"),

@@ -317,6 +317,21 @@ def test_flat_heights():
 
 
 Z = noise(1300)
+
+
+def test_lists_are_heights():
+    listed, array = (fj.profile_parameters(z, 1e-6) for z in (Z.tolist(), Z))
+    assert all(float(getattr(listed, x)) == float(getattr(array, x)) for x in ("Ra", "Rz", "RSm"))
+
+
+def test_refusal_of_gaps_says_what_fills_them():
+    z = np.where(Z > 1.5e-6, np.nan, Z)
+    with pytest.raises(ValueError, match=r"fractaljax.prepare_measurement\(z, dx\).z has them fil"):
+        fj.profile_parameters(z, 1e-6)
+    found = fj.profile_parameters(fj.prepare_measurement(z, 1e-6).z, 1e-6)
+    assert 0.3 * Z.std() < float(found.Ra) < Z.std()
+
+
 test_refusals = refusals(
     [
         (
@@ -328,6 +343,8 @@ test_refusals = refusals(
         ({"z": np.ma.masked_less(Z, -1e-6)}, r"^z must be finite, got \d+ NaN: fill them in, or"),
         ({"z": np.where(Z > 5e-7, np.inf, Z)}, r"^z must be finite, got inf$"),
         ({"z": "high"}, r"^z must be a number, got 'high'$"),
+        ({"z": ["high"]}, r"^z must be real numbers, got \['high'\]$"),
+        ({"z": [[1.0], [1.0, 2.0]]}, r"^z must be rows of as many numbers, got \[\[1.0\], "),
         ({"dx": 0}, r"^dx must be above 0, got 0\.0$"),
         ({"dx": np.ones(2)}, r"^dx must be a single number, got shape \(2,\)$"),
         ({"cutoff": -1}, r"^cutoff must be above 0, got -1\.0$"),
