@@ -20,7 +20,7 @@ from .._mechanism.structure import Structure
 from .hybrid import HybridSystem
 from .joint_force import JointForce, TwoSidedSpring, joint_force
 from .lanes import log_spectral_radius
-from .law_scales import law_scales
+from .law_scales import law_knots, law_scales
 
 
 def require_drive(mechanism: Mechanism, excitation: Any) -> None:
@@ -97,7 +97,7 @@ def hybrid_system(
         for law, joints in laws
     )
     system = replace(system, laws=prepared)
-    return replace(system, scales=law_scales(system))
+    return replace(system, scales=law_scales(system), knots=law_knots(system))
 
 
 def _require_memory(mechanism: Mechanism) -> None:
