@@ -103,8 +103,11 @@ def _taken(x, places, axis: int = 0) -> Array:
     )
 
 
-def _find(system: "HybridSystem", segments: Segments, count: int) -> _Crossings:
-    """The first `count` crossings along segments (N, g)."""
+def _find(system: "HybridSystem", segments: Segments, count: int, each: bool = True) -> _Crossings:
+    """The first `count` crossings along segments (N, g), sorted by segment.
+
+    Without `each`, only the first in which a speed rises and the first in which it falls.
+    """
     assert system.knots is not None
     y, h, s = segments.y, segments.duration, segments.s
     N, lanes = h.shape
@@ -116,6 +119,7 @@ def _find(system: "HybridSystem", segments: Segments, count: int) -> _Crossings:
         return jnp.moveaxis(x, 2, 0).reshape(shape)
 
     passed = flat(jnp.where(segments.used, jnp.abs(speeds.rises), 0))
+    passed = passed if each else jnp.minimum(passed, 1)
     until = cumulative(passed.T).T
     number = jnp.arange(count)[:, None]
     exists = number < until[-1:]
@@ -158,6 +162,15 @@ def _find(system: "HybridSystem", segments: Segments, count: int) -> _Crossings:
     time = jax.lax.fori_loop(0, 3, newton, (left + right) / 2 * duration)
     time = jnp.where(exists, time, 0)
     return _Crossings(exists, segment, time, flow(system, start, time, contact))
+
+
+def until_knot(system: "HybridSystem", y, s, h) -> Array:
+    """The time, at most h, until a face passes a knot in contact state s, for one state (2n,)."""
+    one = Segments(*(x[..., None, None] for x in (y, h, s, jnp.full_like(h, NONE, int))))
+    found = _find(system, one, (_PLACES - 1) * len(s), each=False)
+    # A step of zero length would be repeated forever.
+    times = jnp.maximum(found.time, 1e-12 * h)
+    return jnp.minimum(jnp.min(jnp.where(found.exists, times, jnp.inf)), h)
 
 
 def with_nodes(system: "HybridSystem", segments: Segments) -> Segments:
@@ -210,6 +223,14 @@ def within(system: "HybridSystem", speeds) -> "HybridSystem":
     slack = 4 * np.finfo(speeds.dtype).eps
     below = jnp.where(low > 0, low * (1 + slack), -jnp.inf)
     return replace(system, piece=jax.lax.stop_gradient((below, high * (1 - slack))))
+
+
+def within_step(system: "HybridSystem", y, h, s) -> "HybridSystem":
+    """`between_knots` for a step from one state, which passes none."""
+    if system.knots is None:
+        return system
+    middle = y + h / 2 * system.field(y, s)
+    return within(system, jax.lax.stop_gradient(jnp.abs(system.sliding(middle[system.n :]))))
 
 
 def within_segments(system: "HybridSystem", segments: Segments) -> "HybridSystem":
