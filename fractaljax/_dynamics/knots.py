@@ -62,7 +62,7 @@ def _speeds(system: "HybridSystem", y, h, s) -> _Speeds:
     values, rates = map(
         jnp.stack, zip(*(_speeds_and_rates(system, y, s) for y in states), strict=True)
     )
-    slopes = h * rates
+    slopes = h[None, None] * rates
     turns = []
     for first in (0, 1):
         last = first + 1
@@ -72,9 +72,9 @@ def _speeds(system: "HybridSystem", y, h, s) -> _Speeds:
         turns.append((first + jnp.where(dips, lowest, jnp.where(peaks, highest, 1))) / 2)
     zero = jnp.zeros_like(turns[0])
     places = jnp.stack([zero, turns[0], zero + 0.5, turns[1], zero + 1])
-    at = quintic(values, slopes, places)
+    at = jax.vmap(lambda x: quintic(values, slopes, x))(places)
     # A speed that starts on a knot has passed it, if it moves on.
-    ahead = jnp.sign(at[1:] - at[:-1]) * rounding(y)
+    ahead = jnp.sign(at[1:] - at[:-1]) * rounding(y)[None, None]
     first, last = (jnp.stack([_below(system, v) for v in x + ahead]) for x in (at[:-1], at[1:]))
     return _Speeds(values, slopes, places, first, last - first)
 
@@ -82,7 +82,7 @@ def _speeds(system: "HybridSystem", y, h, s) -> _Speeds:
 def crossings(system: "HybridSystem", segments: Segments) -> Int[Array, "..."]:
     """How many knots the faces pass along the segments."""
     speeds = _speeds(system, segments.y, segments.duration, segments.s)
-    passed = jnp.where(segments.used, jnp.abs(speeds.rises), 0)
+    passed = jnp.where(segments.used[None, None], jnp.abs(speeds.rises), 0)
     return jnp.sum(passed, axis=(0, 1, 2))
 
 
@@ -118,7 +118,7 @@ def _find(system: "HybridSystem", segments: Segments, count: int, each: bool = T
     def flat(x):  # (piece, f, N, g) in the order of segments
         return jnp.moveaxis(x, 2, 0).reshape(shape)
 
-    passed = flat(jnp.where(segments.used, jnp.abs(speeds.rises), 0))
+    passed = flat(jnp.where(segments.used[None, None], jnp.abs(speeds.rises), 0))
     passed = passed if each else jnp.minimum(passed, 1)
     until = cumulative(passed.T).T
     number = jnp.arange(count)[:, None]
@@ -159,7 +159,7 @@ def _find(system: "HybridSystem", segments: Segments, count: int, each: bool = T
         off, rate = (jnp.sum(jnp.where(of_face, x, 0), axis=0) for x in (speed - knot[None], rate))
         return jnp.clip(t - off / jnp.where(rate == 0, jnp.inf, rate), low, high)
 
-    time = jax.lax.fori_loop(0, 3, newton, (left + right) / 2 * duration)
+    time = jax.lax.fori_loop(0, 5, newton, (left + right) / 2 * duration)
     time = jnp.where(exists, time, 0)
     return _Crossings(exists, segment, time, flow(system, start, time, contact))
 
@@ -179,7 +179,8 @@ def with_nodes(system: "HybridSystem", segments: Segments) -> Segments:
     N = len(h)
     found = _find(system, segments, N)
     # Nodes are dropped rather than segments.
-    exists = found.exists & (jnp.arange(N)[:, None] < N - jnp.sum(used, axis=0))
+    room = N - jnp.sum(used, axis=0, keepdims=True)
+    exists = found.exists & (jnp.arange(N)[:, None] < room)
     parent = jnp.concatenate([jnp.broadcast_to(jnp.arange(N)[:, None], h.shape), found.segment])
     parent = jnp.where(jnp.concatenate([jnp.ones_like(used), exists]), parent, N)
     after = jnp.concatenate([jnp.zeros_like(h), found.time])

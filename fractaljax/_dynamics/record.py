@@ -1,7 +1,6 @@
 """The last steps of many coarse runs, and the cutting of a stretch of them into segments."""
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -219,7 +218,7 @@ def cut(
     h,
     length: int,
     most_phases: int = 256,
-    reserved: Any = 0,
+    reserved: Int[Array, " g"] | None = None,
 ) -> Segments:
     """The steps after `first` (g,) up to `last` (g,) in `length` segments less `reserved` (g,).
 
@@ -229,7 +228,8 @@ def cut(
     n = 2 * system.n
     phases = Phases.between(steps, first, last, min(length, most_phases))
     # The number of segments of each phase.
-    free = jnp.maximum(length - jnp.sum(phases.exists, axis=-1) - reserved, 1)
+    free = length - jnp.sum(phases.exists, axis=-1)
+    free = jnp.maximum(free if reserved is None else free - reserved, 1)
     h = jnp.maximum(h, jnp.sum(phases.weight, axis=-1) / free)[:, None]
     count = jnp.ceil(jnp.maximum(phases.weight / h - 1e-6, 1))
     count = jnp.where(phases.exists, count, 0).astype(int)
