@@ -72,6 +72,21 @@ class Friction(Law):
     100 m/s, and at least 0; the source means the minimum of its Eq. 38. A field or a property of
     either name replaces it.
 
+    Motions and cycles reach their `rtol` where mu is smooth. A law that is continuous, but not
+    smooth at some speeds, states them [m/s] as `knots`, a property or a constant of the class;
+    their number may not depend on the numbers of the law. Steps then end there:
+
+        class Bent(fj.Friction):
+            mu_0: jax.Array = fj.quantity("-", "friction coefficient up to a speed")
+            v_1: jax.Array = fj.quantity("m/s", "speed from which on it falls")
+
+            @property
+            def knots(self):
+                return jnp.stack([self.v_1])
+
+            def mu(self, speed):
+                return self.mu_0 / (1 + jnp.maximum(speed / self.v_1 - 1, 0))
+
     A field mu_s may lie above mu(0), the limit of mu at vanishing speed. The law then has a jump:
     in stick the friction force is at most mu_s times the normal force, and where it reaches that
     limit it falls to mu(0) times the normal force as sliding begins.
@@ -85,6 +100,8 @@ class Friction(Law):
     # Internal states of one face: where there are any, `rate` and `force` say how it rubs.
     state_size: ClassVar[int] = 0
     in_series: ClassVar[bool] = False  # whether the contact's K_t acts in it alone, in series
+    # Speeds (k,) [m/s] at which mu is continuous, but not smooth.
+    knots: ClassVar[Any] = ()
     # Fields that scale the law as a whole; a law without them is wrapped in `Scaled`.
     amplitudes: ClassVar[tuple[str, ...]] = ()
 
@@ -408,6 +425,10 @@ class Scaled(Friction, law="scaled"):
     @property
     def in_series(self):
         return self.of.in_series
+
+    @property
+    def knots(self):
+        return self.of.knots
 
     def mu(self, speed):
         return self.factor * self.of.mu(speed)

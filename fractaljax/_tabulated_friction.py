@@ -132,6 +132,11 @@ class TabulatedFriction(WithStatic, law="tabulated"):
             return cls(speeds * _speed_unit(text), coefficients, mu_s)
 
     @property
+    def knots(self):
+        """The speeds of the table, where one cubic follows another."""
+        return self.speeds
+
+    @property
     def mu_m(self):
         """The least friction coefficient of the table, at its pressure and temperature."""
         if not self._conditions:
@@ -176,6 +181,10 @@ class _Cubics(WithStatic):
     column: Float[Array, " n"]
     slopes: Float[Array, " n"]
     static: Numbers | None
+
+    @property
+    def knots(self):
+        return self.speeds
 
     def mu(self, speed):
         at = _inside(self.speeds, jnp.asarray(speed))

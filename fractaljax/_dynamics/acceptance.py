@@ -6,22 +6,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .events import Cubic
+from .events import Cubic, quintic
 from .guard import SECTION
 from .hybrid import HybridSystem
 from .lanes import log_spectral_radius, product
 from .orbit import PeriodicOrbit, block_diagonal
 from .segments import Segments, cumulative, next_start
 from .transition import switch
-
-
-def _quintic(y, d, x):
-    """Quintic interpolant at x, of values y (3, ...) and slopes d (3, ...) at 0, 1/2 and 1."""
-    u, v, w = x, x - 0.5, x - 1
-    # Lagrange weights squared, each with the correction of its own slope.
-    at_0, at_m, at_1 = 4 * (v * w) ** 2, 16 * (u * w) ** 2, 4 * (u * v) ** 2
-    first, last = y[0] + u * (d[0] + 6 * y[0]), y[2] + w * (d[2] - 6 * y[2])
-    return at_0 * first + at_m * (y[1] + v * d[1]) + at_1 * last
 
 
 def admissible(system: HybridSystem, segments: Segments, middle) -> Bool[Array, " g"]:
@@ -38,14 +29,14 @@ def admissible(system: HybridSystem, segments: Segments, middle) -> Bool[Array, 
     # On each half of a segment a cubic through samples of a guard tells where it is lowest. The
     # guard itself is evaluated there.
     places = jnp.arange(7) / 6
-    inside = jax.vmap(lambda x: _quintic(at, d, x))(places)
+    inside = jax.vmap(lambda x: quintic(at, d, x))(places)
     g = guards(inside)
     cubics = Cubic.at_thirds(jnp.stack([g[:4], g[3:]], axis=1))
     theta, _ = cubics.minimum()
     lowest = jnp.argmin(cubics(theta), axis=1)[:, None]
     theta = jnp.take_along_axis(theta, lowest, axis=1)
     half = jnp.arange(2).reshape(2, *(1,) * (theta.ndim - 1))
-    lowest = jax.vmap(lambda x: _quintic(at, d, x))((half + theta) / 2)
+    lowest = jax.vmap(lambda x: quintic(at, d, x))((half + theta) / 2)
     g = jnp.concatenate([g, guards(lowest)])
     # The quintic has this accuracy on a segment of the default length.
     holds = jnp.all(g > -1e-8 * scale[None], axis=(0, 1)) & (h > -1e-10)

@@ -30,7 +30,7 @@ from .excitation import Excitation, compiled_system
 from .guard import NONE, SECTION
 from .hybrid import HybridSystem
 from .limit_cycle import limit_cycle
-from .scaled import check_rtol, degrees_of_freedom
+from .scaled import check_rtol, degrees_of_freedom, require_drive
 from .segments import next_start
 from .starts import starts_of
 from .transition import first_contact_state
@@ -377,6 +377,7 @@ def basin(
     for box, ball or starts given twice or not at all, and what `limit_cycle` raises.
     """
     n = degrees_of_freedom(mechanism)
+    require_drive(mechanism, excitation)
     if any(concrete(jnp.asarray(x)) is None for x in jax.tree.leaves((mechanism, excitation))):
         raise ValueError("basin runs many programs: call it outside of jit, vmap and grad")
     system = compiled_system(mechanism, excitation)

@@ -84,6 +84,15 @@ class Cubic(eqx.Module):
         return x
 
 
+def quintic(y, d, x):
+    """Quintic interpolant at x, of values y (3, ...) and slopes d (3, ...) at 0, 1/2 and 1."""
+    u, v, w = x, x - 0.5, x - 1
+    # Lagrange weights squared, each with the correction of its own slope.
+    at_0, at_m, at_1 = 4 * (v * w) ** 2, 16 * (u * w) ** 2, 4 * (u * v) ** 2
+    first, last = y[0] + u * (d[0] + 6 * y[0]), y[2] + w * (d[2] - 6 * y[2])
+    return at_0 * first + at_m * (y[1] + v * d[1]) + at_1 * last
+
+
 def without_start(cubic: Cubic, rising) -> Cubic:
     """The cubic less its value at 0, divided by x, where `rising`; elsewhere the cubic itself.
 

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from .events import Cubic, guards_and_rates, without_start
 from .guard import NONE
 from .hybrid import HybridSystem
+from .knots import until_knot
 from .segments import flow
 from .step_length import step_length
 from .transition import switch
@@ -93,6 +94,8 @@ def _event(system: HybridSystem, y, s, h, g_0, g_1, d_0, d_1):
 def _smooth_step(system: HybridSystem, y, s, longest, left, rtol):
     """A step in contact state s, as long as rtol allows: the state at its end, and its length."""
     h = jnp.minimum(step_length(system, y, s, system.field(y, s), longest, longest), left)
+    if system.knots is not None:
+        h = until_knot(system, y, s, h)
     allowed = rtol * (1 + jnp.max(jnp.abs(y)))
 
     def step(h):

@@ -81,6 +81,10 @@ class HybridSystem(eqx.Module):
     fastest: Float[Array, ""] | None = None
     products: Products | None = None  # of a structure
     scales: LawScales | None = None  # None: no law depends on the velocity
+    # Sliding velocities at which the law of each face is not smooth, in order; None: there are none
+    knots: Float[Array, "f k"] | None = None
+    # Velocities (f, ...) between which laws are as they are; beyond they go on smoothly. knots.py
+    piece: tuple[Array, Array] | None = None
 
     def with_products(self) -> "HybridSystem":
         """The system with `products`, if it has T and B; K and C are matrices then."""
@@ -320,9 +324,24 @@ class HybridSystem(eqx.Module):
         if self.scales is not None:
             side = jnp.sign(signs)
             w = side * jnp.maximum(side * w, -self.over_lanes(self.scales.below, w.ndim - 1))
+        if self.piece is not None:
+            return self._friction_of_piece(self.piece, w, loads, signs)
         return self.at_each_face(
             lambda law, w, load, sign: law.branch(self.speed * w, sign) * load, w, loads, signs
         )
+
+    def _friction_of_piece(self, piece, w, loads, signs) -> Array:
+        """`friction` by laws that are parabolas beyond the ends of a piece."""
+        side = jnp.sign(signs)
+        inside = jnp.clip(side * w, *piece)
+
+        def force(law, w, inside, load, sign, side):
+            at, beyond = self.speed * inside, self.speed * (side * w - inside)
+            slope, bend = jax.jvp(law.slope, (at,), (jnp.ones_like(at),))
+            mu = law.branch(side * at, sign) + side * beyond * (slope + beyond / 2 * bend)
+            return mu * load
+
+        return self.at_each_face(force, w, inside, loads, signs, side)
 
     def spring_release(self, linear) -> Array:
         """Forces (f, ...) that cancel the springs of an open joint, which K contains."""

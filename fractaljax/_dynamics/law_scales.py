@@ -1,4 +1,4 @@
-"""Bounds on velocity-dependent friction, which limit the steps."""
+"""Bounds on velocity-dependent friction and its knots, which limit the steps."""
 
 from typing import TYPE_CHECKING
 
@@ -21,6 +21,31 @@ class LawScales(eqx.Module):
     # Its steepest slope up to each of `SPEEDS`: by how much a unit of load changes dw/dt with w.
     steepest: Float[Array, "f v"]
     falls_until: Float[Array, " f"]  # velocity at which it is least, up to 100 m/s
+
+
+def law_knots(system: "HybridSystem") -> Float[Array, "f k"] | None:
+    """The knots of the law of each face, in order and followed by infinite ones, if any has some.
+
+    They have no derivatives: what a motion does depends on the law, not on where it is cut.
+    """
+
+    def of(law):
+        return jnp.asarray(law.knots, system.V.dtype)
+
+    # The same for every number in the laws, hence known when a program is traced.
+    many = 0
+    for law, joints in zip(system.laws, system.sharing, strict=True):
+        knots = jax.eval_shape(of if len(joints) == 1 else jax.vmap(of), law)
+        many = max(many, knots.shape[-1])
+    if not many:
+        return None
+
+    def padded(law, one):
+        knots = jnp.sort(of(law) / system.speed)
+        return jnp.pad(knots, (0, many - len(knots)), constant_values=jnp.inf) + 0 * one
+
+    knots = system.at_each_face(padded, jnp.zeros_like(system.P))
+    return jax.lax.stop_gradient(knots)
 
 
 def law_scales(system: "HybridSystem") -> LawScales | None:

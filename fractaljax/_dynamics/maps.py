@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from .guard import UNUSED
 from .hybrid import HybridSystem
+from .knots import between_knots
 from .lanes import product
 from .runge_kutta import runge_kutta, stability_polynomial
 from .segments import Segments, chosen_guard, next_start, tableau
@@ -28,7 +29,9 @@ def exact_maps(system: HybridSystem, segments: Segments) -> Maps:
     """Derivatives of the segments, as exact as their steps are."""
     # The stages of many degrees of freedom fill the cache: one segment at a time.
     size = len(segments.duration) if system.fastest is None else 1
-    _, A, b = in_blocks(functools.partial(_maps, system), identity_maps, size, segments)
+    # With knots, the end of a segment tells between which it lies.
+    more = () if system.knots is None else (next_start(segments.y),)
+    _, A, b = in_blocks(functools.partial(_maps, system), identity_maps, size, segments, *more)
     return Maps(A, b, _guard_slopes(system, segments))
 
 
@@ -83,9 +86,14 @@ def in_blocks(function: Callable, unused: Callable, size: int, segments: Segment
     return jax.tree.map(joined, jax.lax.map(block, jax.tree.map(split, (segments, *more))))
 
 
-def _maps(system: HybridSystem, segments: Segments) -> tuple[Array, Array, Array]:
-    """The ends of segments that need not be neighbours, and their derivatives A and b."""
+def _maps(system: HybridSystem, segments: Segments, target=None) -> tuple[Array, Array, Array]:
+    """The ends of segments that need not be neighbours, and their derivatives A and b.
+
+    `target` is about where they end, for a system with knots.
+    """
     y, s = segments.y, segments.s
+    if target is not None:
+        system = between_knots(system, y, segments.duration, target, s)
 
     def field(columns):
         # The state and its tangents side by side: one array, one compiled loop per stage.
@@ -105,6 +113,7 @@ def _polynomial_maps(system: HybridSystem, segments: Segments, ends):
     Exact if the field is affine. (In powers of its fourth power, by Paterson and Stockmeyer.)
     """
     y, h, s = segments.y, segments.duration, segments.s
+    system = between_knots(system, y, h, ends, s)
     b = system.field(ends, s)
     state = (y + ends) / 2 + h[None] / 12 * (system.field(y, s) - b)  # its mean in time
     _, slope = jax.linearize(lambda y: system.field(y, s), state)

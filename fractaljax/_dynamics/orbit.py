@@ -18,6 +18,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from .guard import NONE
 from .hybrid import HybridSystem
+from .knots import within_segments
 from .lanes import chosen, product, solve
 from .maps import Maps, axis_of, coarse_maps, exact_maps, in_blocks, segments_together
 from .segments import Segments, chosen_guard, flow, next_start
@@ -275,6 +276,7 @@ def _orbit_tangent(
 
     def equations(system):
         end = next_start(segments.y)
+        system = within_segments(system, segments)
         ends = flow(system, segments.y, segments.duration, segments.s)
         return ends, chosen_guard(system, end, segments.s, segments.guard)
 

@@ -211,9 +211,16 @@ class Phases(eqx.Module):
 
 
 def cut(
-    system: HybridSystem, steps: Stretch, first, last, h, length: int, most_phases: int = 256
+    system: HybridSystem,
+    steps: Stretch,
+    first,
+    last,
+    h,
+    length: int,
+    most_phases: int = 256,
+    reserved: Int[Array, " g"] | None = None,
 ) -> Segments:
-    """The steps after `first` (g,) up to `last` (g,) in at most `length` segments.
+    """The steps after `first` (g,) up to `last` (g,) in `length` segments less `reserved` (g,).
 
     Segments of a phase have equal weight, at most h (g,) where so few suffice. Unused segments have
     no duration. Phases beyond `most_phases` are left out, so that no orbit closes.
@@ -221,7 +228,8 @@ def cut(
     n = 2 * system.n
     phases = Phases.between(steps, first, last, min(length, most_phases))
     # The number of segments of each phase.
-    free = jnp.maximum(length - jnp.sum(phases.exists, axis=-1), 1)
+    free = length - jnp.sum(phases.exists, axis=-1)
+    free = jnp.maximum(free if reserved is None else free - reserved, 1)
     h = jnp.maximum(h, jnp.sum(phases.weight, axis=-1) / free)[:, None]
     count = jnp.ceil(jnp.maximum(phases.weight / h - 1e-6, 1))
     count = jnp.where(phases.exists, count, 0).astype(int)

@@ -20,7 +20,7 @@ from .._mechanism.structure import Structure
 from .hybrid import HybridSystem
 from .joint_force import JointForce, TwoSidedSpring, joint_force
 from .lanes import log_spectral_radius
-from .law_scales import law_scales
+from .law_scales import law_knots, law_scales
 
 
 def require_drive(mechanism: Mechanism, excitation: Any) -> None:
@@ -29,7 +29,18 @@ def require_drive(mechanism: Mechanism, excitation: Any) -> None:
     **Raises:** `ValueError` naming the joint.
     """
     if excitation is None:
-        require_sliding(mechanism, "without an excitation, which simulate and limit_cycle take")
+        where = "without an excitation, which simulate and limit_cycle take"
+        require_sliding(mechanism, where, "nothing drives the joint")
+
+
+def moves_without_drive(mechanism: Mechanism, start: Any) -> bool:
+    """True for a known V = 0 and a start, or a constant force, that is not known to be 0."""
+    speeds = [concrete(j.V) for j in mechanism.joints_by_name().values() if j.V is not None]
+    if start is None or not any(V is not None and (V == 0).any() for V in speeds):
+        return False
+    force = mechanism.F
+    known = [concrete(x) for x in (start, force) if x is not None]
+    return any(x is None or x.any() for x in known)
 
 
 def steps_follow_motion(n: int) -> bool:
@@ -97,7 +108,7 @@ def hybrid_system(
         for law, joints in laws
     )
     system = replace(system, laws=prepared)
-    return replace(system, scales=law_scales(system))
+    return replace(system, scales=law_scales(system), knots=law_knots(system))
 
 
 def _require_memory(mechanism: Mechanism) -> None:

@@ -21,6 +21,7 @@ from .assessment import Candidates, Problem, Progress, assess, conclude_round, c
 from .cycle_search import CycleSearch
 from .guard import UNUSED
 from .hybrid import HybridSystem
+from .knots import crossings, with_nodes
 from .lanes import chosen
 from .orbit import PeriodicOrbit, solve_periodic_orbits
 from .record import Record, Steps, Stretch, cut
@@ -71,7 +72,16 @@ def _solve_candidates(
         steps = Stretch(record, lane, Steps.along(system, orbit, h), of_run)
         first = jnp.where(of_run, candidates.first, 0)
         last = jnp.where(of_run, candidates.last, jnp.sum(orbit.used, axis=0))
-        return cut(system, steps, first, last, h, length)
+        if system.knots is None:
+            return cut(system, steps, first, last, h, length)
+
+        def with_room(_, segments):
+            room = jnp.minimum(crossings(system, segments), length // 2)
+            return cut(system, steps, first, last, h, length, reserved=room)
+
+        # Where knots are passed is seen on a first mesh.
+        none = _no_segments(candidates.y, len(record.s), length)
+        return with_nodes(system, jax.lax.fori_loop(0, 2, with_room, none))
 
     def solve(carry):
         orbits, h, tries = carry

@@ -33,10 +33,13 @@ from .exact_step import step_to_switch
 from .excitation import Excitation, excited_system
 from .guard import NONE
 from .hybrid import HybridSystem
+from .knots import within_step
 from .scaled import (
     check_rtol,
     degrees_of_freedom,
     displaced_equilibrium,
+    hybrid_system,
+    moves_without_drive,
     require_drive,
     smoothing,
     start_state,
@@ -203,7 +206,7 @@ def _repeat(system: HybridSystem, y, t0, end, steps: _Steps) -> Trajectory:
         k, dt, s, s_new, guard = step
         # The last step ends at the end, wherever the switches before it move.
         dt = jnp.where(k == last, end - t, dt)
-        y_1 = flow(system, y, dt, s)
+        y_1 = flow(within_step(system, y, dt, s), y, dt, s)
         rate = system.field(y_1, s)
         value, slope = jax.jvp(lambda y: chosen_guard(system, y, s, guard), (y_1,), (rate,))
         # Zero, with minus the derivative of the time at which the guard is zero.
@@ -272,7 +275,8 @@ def simulate(
     **Arguments:**
 
     - `mechanism`: a scene, or a structure of n degrees of freedom whose joints all have a V;
-      `jax.vmap` takes many.
+      `jax.vmap` takes many. With the exact law V may be 0 without an excitation: the motion from a
+      `start`, which is then needed, decays until the joints stick.
     - `start`: (2n,), [x, v] in m and m/s; by default as in `limit_cycle`, near the sliding
       equilibrium. With friction that has memory its states are those of steady sliding, or follow
       as (2n + s,), as `internal` has them.
@@ -298,7 +302,10 @@ def simulate(
     memory = has_memory(mechanism)
     n = degrees_of_freedom(mechanism)
     start = None if start is None else start_state(start, n, memory)
-    require_drive(mechanism, excitation)
+    exact = not memory and regularisation is None
+    decays = excitation is None and exact and moves_without_drive(mechanism, start)
+    if not decays:
+        require_drive(mechanism, excitation)
     t0, t1 = _times(t0, t1)
     if t1 is None:
         t1 = _default_end(mechanism, excitation, t0, memory)
@@ -314,7 +321,7 @@ def simulate(
         times, options = (t0, t1, saveat), (eps, solver, rtol, n)
         trajectory = smooth_motion(mechanism, excitation, start, *times, *options)
     else:
-        system, y, t0, end = _scaled(mechanism, excitation, start, t0, t1)
+        system, y, t0, end = _scaled(mechanism, excitation, start, t0, t1, decays=decays)
         h = jnp.asarray(min(0.25 * (rtol / 1e-9) ** 0.125, 0.5), y.dtype)
         frozen = jax.lax.stop_gradient((system, y, end))
         steps = _find_steps(*frozen, h, rtol, max_steps=n)
@@ -336,10 +343,25 @@ def _default_end(mechanism, excitation, t0, memory):
     return t0 + 100 * jnp.pi / excited_system(mechanism, excitation, memory).omega
 
 
-@exported_jit
-def _scaled(mechanism, excitation, start, t0, t1):
-    """The system, its state at t0, t0, and the duration in scaled time."""
-    system = excited_system(mechanism, excitation)
+def _unit_of_decay(mechanism, start, V, omega):
+    """V, or where it is 0 the velocity that the start or the constant force may lead to."""
+    by_force = hybrid_system(mechanism, lambda V, _: jnp.ones_like(V)).largest_force
+    x, v = jnp.split(jnp.abs(start), 2)
+    largest = jnp.max(jnp.append(jnp.maximum(omega * x, v), by_force))
+    largest = jnp.where(largest > 0, largest, 1)
+    return jax.lax.stop_gradient(jnp.where(V > 0, V, largest))
+
+
+@functools.partial(exported_jit, static_argnames="decays")
+def _scaled(mechanism, excitation, start, t0, t1, *, decays):
+    """The system, its state at t0, t0, and the duration in scaled time.
+
+    Where the motion `decays`, as joints have V = 0, its start and the constant force are its unit.
+    """
+    if decays:
+        system = hybrid_system(mechanism, functools.partial(_unit_of_decay, mechanism, start))
+    else:
+        system = excited_system(mechanism, excitation)
     y = displaced_equilibrium(system) if start is None else start / system.units
     y = system.with_excitation(y, t0 * system.omega)
     return system, y, *(jnp.asarray(t, y.dtype) for t in (t0, (t1 - t0) * system.omega))

@@ -33,7 +33,7 @@ def require_one(name: str, x: Any) -> None:
     x.require_one()
 
 
-def require_sliding(x: Any, where: str) -> Any:
+def require_sliding(x: Any, where: str, why: str = "the joint only sticks") -> Any:
     """`x`, whose joints must have V above 0 `where` that is needed, or no V.
 
     **Raises:** `ValueError` naming the joint, as far as V is known.
@@ -44,7 +44,7 @@ def require_sliding(x: Any, where: str) -> Any:
         stored = None if joint.V is None else concrete(joint.V)
         if stored is not None and (stored == 0).any():
             of = f" of joint {name}" if name else ""
-            raise ValueError(f"V{of} must be above 0 {where}, got 0.0: the joint only sticks")
+            raise ValueError(f"V{of} must be above 0 {where}, got 0.0: {why}")
     return x
 
 

@@ -99,6 +99,41 @@ def test_stops(x):
         np.testing.assert_allclose(own[:, 1], slope, rtol=1e-5)
 
 
+def decay(x):
+    """Where the block comes to rest that starts at x with friction f F, with no excitation."""
+    start, f = x
+    step = 2 * f * F / K  # amplitudes fall by it in half a period
+    swings = jnp.ceil(start / step - 0.5)
+    return (-1.0) ** swings * (start - swings * step)
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-6])
+def test_free_decay(size):
+    """Without an excitation amplitudes fall by 2 mu N/k in each half period; then it sticks."""
+    at = jnp.array([1.05, 1 / 1.2])
+
+    @jax.jit
+    def both(x):
+        def end(x):
+            structure, _ = damper(1.0, x[1])
+            structure = structure.replace(P=size * x[1] * F / MU)
+            start = size * x[0] * jnp.array([1.0, 0.0])
+            found = fj.simulate(structure, start, 40.0, max_steps=256, throw=False)
+            return found.end[:1] / size, found
+
+        return both_modes(end, x, has_aux=True)
+
+    value, *slopes, found = both(at)
+    truth, *slopes_of_truth = both_modes(lambda x: decay(x)[None], at)
+    assert found.result == fj.SimulationResult.reached
+    np.testing.assert_allclose(value, truth, rtol=1e-8)
+    for slope in slopes:
+        np.testing.assert_allclose(slope, slopes_of_truth[0], rtol=1e-7)
+    np.testing.assert_array_equal(found.contact_states[-1], [0])
+    reversals = np.asarray(found.contact_states[1:] != found.contact_states[:-1]).sum()
+    assert reversals == int(jnp.ceil(1.05 / (2 * F / 1.2 / K) - 0.5))
+
+
 X, EXCITATION = damper(0.8, 0.2)
 test_refusals = refusals(
     [
@@ -109,6 +144,14 @@ test_refusals = refusals(
         ),
         (lambda: fj.margin(X), "^V of joint joint_1 must be above 0 for steady sliding, got 0"),
         (lambda: fj.limit_cycle(X), "^V of joint joint_1 must be above 0 without an excitation"),
+        (
+            lambda: fj.basin(X, starts=8, radius=1.0),
+            "^V of joint joint_1 must be above 0 without an excitation",
+        ),
+        (
+            lambda: fj.simulate(X, t1=1.0),
+            "^V of joint joint_1 must be above 0 without an excitation",
+        ),
         (
             lambda: fj.simulate(X, [0, 0], 1.0),
             "^V of joint joint_1 must be above 0 without an excitation",
