@@ -127,7 +127,7 @@ class Identification(Record):
             if beyond <= 3 and not words and plain and is_level[0]:
                 with contextlib.suppress(ValueError):  # D at 2: a Hurst exponent of 1
                     return self.power_law_scatter
-            if fit.fits and is_level[1]:
+            if fit.fits and is_level[1] and self._has_gradient_of(fit.surface_scatter.surface):
                 return fit.surface_scatter
         measured = self.measured_spectrum
         if measured is None:
@@ -138,6 +138,13 @@ class Identification(Record):
             )
         error = np.array([[self.level_error**2]])
         return SurfaceScatter(measured, ("ln height_factor",), error)
+
+    def _has_gradient_of(self, surface: Spectrum) -> bool:
+        """True unless the Sdq of a surface and of the map differ by more than is allowed."""
+        if self.measured_spectrum is None:
+            return True
+        squares = [float(each.moments()[1]) for each in (surface, self.measured_spectrum)]
+        return max(squares) <= self.analysis.gradient**2 * min(squares)
 
     @property
     def power_law_scatter(self) -> SurfaceScatter:
@@ -299,7 +306,8 @@ def identify(
     else:
         of_map = map_heights(heights.segments[0], dx, dy, heights.gaps[0])
         level = _level_of_map(spectrum, of_map, wide[1])
-        table = spectrum_table(spectrum, of_map, min(top, noise.crossing), per_bin=1.4)
+        reached = min(top, noise.crossing) if band is None else chosen.high
+        table = spectrum_table(spectrum, of_map, reached, per_bin=1.4)
         if table is not None:
             measured = MeasuredSpectrum(table.q, table.C, table.error, height_factor=1.0)
             level_error = math.hypot(math.sqrt(table.variance) / 2, height_error / 2)
