@@ -3,6 +3,9 @@
 import difflib
 from collections.abc import Iterable
 
+# By what a table of a spectrum has instead of the number of a law.
+_INSTEAD = {"sq": "height_factor"}
+
 
 def close(word: str, words: Iterable[str]) -> list[str]:
     """The words most like `word`, a few, whatever the case of their letters."""
@@ -13,7 +16,8 @@ def close(word: str, words: Iterable[str]) -> list[str]:
     inside = [x for x in spellings if min(len(low), len(x)) > 1 and (low in x or x in low)]
     # Below this share of equal letters words have little in common: nonsense and scene.
     near = difflib.get_close_matches(low, spellings, cutoff=0.65)
-    near = list(dict.fromkeys([*near, *inside]))
+    instead = [x for x in (_INSTEAD.get(low),) if x in spellings and low not in spellings]
+    near = list(dict.fromkeys([*instead, *near, *inside]))
     same = sorted(near, key=lambda each: each != low)  # only the case differs
     # Beside a function comes the class of what it returns: first the one in the case of the word.
     return [

@@ -101,7 +101,7 @@ def choose_band(
         high = min(high, max(noise.crossing, 3 * low))
         warnings.append(f"noise floor of {noise.floor:.3g} m^3: the band ends at {high:.3g} 1/m")
     kind, corner = _bend(spectrum, (low, high), ratio, noise, analysis.sigmas)
-    if kind is _plateau:
+    if kind in (_plateau, _plateau_of_map):
         low = min(3 * corner, high / 3)
         warnings.append(f"plateau below {corner:.3g} 1/m: the band begins at {low:.3g} 1/m")
     elif kind is _roll_off:
@@ -172,6 +172,12 @@ def _plateau(f, corner):
     return 0.0, -np.log1p((corner / f) ** 2) / 2
 
 
+def _plateau_of_map(f, corner):
+    """As `_plateau`, of a spectrum over |f|, which rises as f where that over the plane is flat."""
+    share = -np.log1p((corner / f) ** 2) / 2
+    return share, share
+
+
 def _roll_off(f, corner):
     """Factor of `fit` for a Gaussian filter, which halves amplitudes at its cut-off."""
     return np.maximum(-((f / corner) ** 2) * math.log(4), math.log(1e-6)), 0.0
@@ -183,7 +189,8 @@ def _bend(spectrum, band, ratio, noise, sigmas):
     fit_law = functools.partial(noise.fit, spectrum, band, ratio, tol=1e-4)
     straight = fit_law()
     best, bend = sigmas**2, (None, 0.0)
-    for kind, first, last in ((_roll_off, 4 * low, 1.5 * high), (_plateau, 1.2 * low, high / 4)):
+    flat = _plateau if spectrum.kind == "profile" else _plateau_of_map
+    for kind, first, last in ((_roll_off, 4 * low, 1.5 * high), (flat, 1.2 * low, high / 4)):
         corners = np.geomspace(first, last, 12)
         if straight.scatter < 0.25:  # otherwise the law is too poor to locate a bend by its slopes
             gains = [_gain(straight, *kind(straight.f, c)) for c in corners]

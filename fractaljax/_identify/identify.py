@@ -23,11 +23,19 @@ from .fit import PowerLaw
 from .gaps import correct_for_gaps
 from .measurement import Measurement
 from .patches import patch_covariance
-from .preparation import Preprocessing, prepare_heights, spacing
+from .preparation import Heights, Preprocessing, prepare_heights, spacing
 from .quantisation import quantisation_limit
-from .self_affine_fit import SelfAffineFit, fit_self_affine, map_cells, profile_cells
+from .self_affine_fit import Level, SelfAffineFit, fit_self_affine, map_cells, profile_cells
 from .source import read_heights
-from .spectrum import PowerSpectrum, log_mean_cosine_power, map_spectra, profile_spectrum
+from .spectrum import (
+    MapHeights,
+    PowerSpectrum,
+    log_mean_cosine_power,
+    map_heights,
+    map_spectra,
+    profile_spectrum,
+    remove_plane,
+)
 from .spectrum_of import gaussian_warnings, spectrum_table
 from .structure_function import StructureFunction, structure_function
 from .stylus import tip_limit
@@ -45,9 +53,11 @@ class Identification(Record):
     """The surface of a measurement, with standard errors.
 
     D and G are those of the power law, G that of Eq. 13, which the contact law uses. `surface` is a
-    `Surface` where the spectrum is such a law and D is at most three standard errors outside (2,
-    3); otherwise a `SelfAffine` with the roll-off and the lay of the measurement; and the
-    `MeasuredSpectrum` of a map that neither describes. `scatter` has their errors, as a tolerance.
+    `Surface` where the spectrum is such a law without a lay and D is at most three standard errors
+    outside (2, 3); otherwise a `SelfAffine` with the roll-off and the lay of the measurement; and
+    the `MeasuredSpectrum` of a map that neither describes. A law does not describe a map if its Sq
+    is not that of the heights, see `SpectralAnalysis.level`, or if the error of D or H is half of
+    their domain or more. `scatter` has their errors, as a tolerance.
     """
 
     D: float  # fractal dimension
@@ -68,8 +78,12 @@ class Identification(Record):
     spectrum: PowerSpectrum  # what is fitted
     structure_function: StructureFunction  # an independent estimate
     self_affine: SelfAffineFit  # a self-affine surface with roll-off and lay
+    Sq: float  # m: root mean square of the heights about their plane or line
+    level: float  # standard errors by which the Sq of the power law is beyond that of the heights
+    measured_spectrum: MeasuredSpectrum | None  # the spectrum of a map as it is; None of a profile
     end: float  # 1/m: up to which the spectrum is that of the surface
     level_error: float  # standard error of the logarithm of the heights as a whole
+    analysis: SpectralAnalysis = eqx.field(static=True)  # as it was given
     missing: int  # number of missing heights
     outliers: int  # number of heights taken out as spikes
     unused: int  # number of heights in segments that are too short
@@ -100,12 +114,21 @@ class Identification(Record):
         if any(word.startswith("too few levels") for word in words):
             raise ValueError(f"{words[0]}: measure with finer steps of height")
         beyond = max(2 - self.D, self.D - 3) / max(self.D_standard_error, 1e-300)
-        fit = self.self_affine
-        if beyond <= 3 and not words and not (fit.fits and fit.has_rolloff):
-            with contextlib.suppress(ValueError):  # D at 2: a Hurst exponent of 1
-                return self.power_law_scatter
-        if fit.fits:
-            return fit.surface_scatter
+        fit, limit = self.self_affine, self.analysis.level
+        errors = self.D_standard_error, fit.H_standard_error
+        # A profile has nothing else: the simplest law is handed on then with its own Sq.
+        for strict in (True, False) if self.measured_spectrum is None else (True,):
+            # The domains of D and H are 1 wide: with such an error they may be anywhere in it.
+            is_level = [
+                not strict or (abs(by) <= limit and error < 1 / 2)
+                for by, error in zip((self.level, fit.level), errors, strict=True)
+            ]
+            plain = fit.lay == 1 and not (fit.fits and fit.has_rolloff)
+            if beyond <= 3 and not words and plain and is_level[0]:
+                with contextlib.suppress(ValueError):  # D at 2: a Hurst exponent of 1
+                    return self.power_law_scatter
+            if fit.fits and is_level[1] and self._has_gradient_of(fit.surface_scatter.surface):
+                return fit.surface_scatter
         measured = self.measured_spectrum
         if measured is None:
             raise ValueError(
@@ -116,6 +139,13 @@ class Identification(Record):
         error = np.array([[self.level_error**2]])
         return SurfaceScatter(measured, ("ln height_factor",), error)
 
+    def _has_gradient_of(self, surface: Spectrum) -> bool:
+        """True unless the Sdq of a surface and of the map differ by more than is allowed."""
+        if self.measured_spectrum is None:
+            return True
+        squares = [float(each.moments()[1]) for each in (surface, self.measured_spectrum)]
+        return max(squares) <= self.analysis.gradient**2 * min(squares)
+
     @property
     def power_law_scatter(self) -> SurfaceScatter:
         """The `Surface` of the power law with its errors, whatever the warnings say.
@@ -124,14 +154,6 @@ class Identification(Record):
         """
         covariance = np.diag([self.D_standard_error, self.log_height_error]) ** 2
         return fractal_scatter(self.D, self.log_height, self.q, covariance, self.gamma)
-
-    @functools.cached_property
-    def measured_spectrum(self) -> MeasuredSpectrum | None:
-        """The spectrum of a map as it is, up to `end`; None of a profile."""
-        if self.spectrum.kind == "profile":
-            return None
-        table = spectrum_table(self.spectrum, 0.0, self.end, per_bin=1.4)
-        return None if table is None else MeasuredSpectrum(*table, height_factor=1.0)
 
     def __repr__(self) -> str:
         other, (low, high) = self.structure_function, self.band
@@ -277,8 +299,21 @@ def identify(
         change = np.log(spectrum.power / raw[0].power)
         by = np.interp(np.log(cells.f), np.log(spectrum.f), change)
         cells = cells._replace(height=cells.height * np.exp(by))
-    fit = fit_self_affine(cells, wide, length, sigmas=analysis.sigmas, law=law, between=between)
     log_height, height_error, q = _height(law)
+    measured, level_error = None, height_error / 2
+    if z.ndim == 1:
+        level = _level_of_profile(lines, dx, spectrum, wide[1])
+    else:
+        of_map = map_heights(heights.segments[0], dx, dy, heights.gaps[0])
+        level = _level_of_map(spectrum, of_map, wide[1])
+        reached = min(top, noise.crossing) if band is None else chosen.high
+        table = spectrum_table(spectrum, of_map, reached, per_bin=1.4)
+        if table is not None:
+            measured = MeasuredSpectrum(table.q, table.C, table.error, height_factor=1.0)
+            level_error = math.hypot(math.sqrt(table.variance) / 2, height_error / 2)
+    fit = fit_self_affine(
+        cells, wide, length, sigmas=analysis.sigmas, law=law, between=between, level=level
+    )
     other = structure_function(
         lines,
         dx,
@@ -316,8 +351,12 @@ def identify(
         spectrum=spectrum,
         structure_function=other,
         self_affine=fit,
+        Sq=_root_mean_square(heights),
+        level=0.0 if level is None else _beyond_level(law, level, wide[1]),
+        measured_spectrum=measured,
         end=end,
-        level_error=_level_error(spectrum, end, height_error),
+        level_error=level_error,
+        analysis=analysis,
         missing=heights.missing,
         outliers=heights.outliers,
         unused=heights.unused,
@@ -358,10 +397,54 @@ def _height(law: PowerLaw) -> tuple[float, float, float]:
     return float(height), math.sqrt(max(left, 0)), 2 * math.pi * math.exp(log_f)
 
 
-def _level_error(spectrum: PowerSpectrum, end: float, height_error: float) -> float:
-    """Standard error of ln Sq: of the waves that are measured, and half that of ln m(q)."""
-    inside = spectrum.f <= end * (1 + 1e-9)
-    # Shares in the mean square: the ordinates of a map are evenly spaced in f until merged.
-    share = (spectrum.power * spectrum.weight * spectrum.f)[inside]
-    chance = np.sum(share**2 / spectrum.count[inside]) / np.sum(share) ** 2
-    return float(np.hypot(math.sqrt(chance) / 2, height_error / 2))
+def _root_mean_square(heights: Heights) -> float:
+    """Root mean square [m] of measured heights about the plane of a map, the lines of segments."""
+    parts = [
+        (_without_line(z) if z.ndim == 1 else remove_plane(z))[~gap]
+        for z, gap in zip(heights.segments, heights.gaps, strict=True)
+    ]
+    return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
+
+
+def _without_line(z):
+    """A segment minus its least-squares line."""
+    x = np.arange(z.size) - (z.size - 1) / 2
+    z = z - z.mean()
+    return z - (x @ z) / (x @ x) * x
+
+
+def _level_of_map(spectrum: PowerSpectrum, heights: MapHeights, high: float) -> Level | None:
+    """That of the waves of a map up to `high` [1/m]."""
+    table = spectrum_table(spectrum, heights, high)
+    if table is None:
+        return None
+    return Level(table.mean_square, min(heights.longest, high), table.variance)
+
+
+def _level_of_profile(
+    segments: list[np.ndarray], dx: float, spectrum: PowerSpectrum, high: float
+) -> Level:
+    """That of the waves of a profile up to `high` [1/m]."""
+    squares = np.concatenate([_without_line(z) ** 2 for z in segments])
+    # The mean square of an ordinate: they are evenly spaced in f until merged.
+    waves = spectrum.power * spectrum.weight * spectrum.f
+    inside = spectrum.f <= high * (1 + 1e-9)
+    share = waves[inside] / np.sum(waves[inside])
+    return Level(
+        float(np.mean(squares) * np.sum(waves[inside]) / np.sum(waves)),
+        1 / (dx * max(z.size for z in segments)),
+        float(np.sum(share**2 / spectrum.count[inside])),
+    )
+
+
+def _beyond_level(law: PowerLaw, level: Level, high: float) -> float:
+    """Standard errors by which a power law up to `high` [1/m] has a larger Sq than the heights."""
+    # The integral of A (f/f_N)^-p from the longest wave on, and its slopes by ln A and p.
+    low, high = (math.log(f / law.nyquist) for f in (level.low, high))
+    x, weight = np.polynomial.legendre.leggauss(32)
+    x = low + (x + 1) / 2 * (high - low)
+    waves = weight * (high - low) / 2 * np.exp((1 - law.p) * x)
+    slope = np.array([1.0, -np.sum(waves * x) / np.sum(waves)])
+    log_square = law.log_A + math.log(law.nyquist * np.sum(waves))
+    variance = level.variance + law.scatter + slope @ law.covariance[:2, :2] @ slope
+    return (log_square - math.log(level.mean_square)) / math.sqrt(variance)

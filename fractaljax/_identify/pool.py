@@ -16,6 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from .._base.parts import require_kind
+from .._surface.measured_spectrum import MeasuredSpectrum
 from .._surface.surface import Surface
 from .._surface.surface_scatter import SurfaceScatter, fractal_scatter
 from .identify import Identification
@@ -28,7 +29,9 @@ def pool_surfaces(identifications: Sequence[Identification]) -> SurfaceScatter:
     beyond their own errors, by restricted maximum likelihood; a measurement counts in the mean by
     the inverse of that scatter and its own error together. The result is the scatter of the next
     surface, with the error of the mean. From fewer than five measurements it is itself poorly
-    known. All are pooled as a `Surface`, by D and ln m(q), if each is one; else as a `SelfAffine`.
+    known. All are pooled as a `Surface`, by D and ln m(q), if each is one; as a `SelfAffine`, if
+    each is one of the two; else, of maps, as a `MeasuredSpectrum` of the waves that all have: the
+    mean of their spectra at the same Sq, whose heights scatter by a common factor.
 
     **Arguments:**
 
@@ -36,8 +39,8 @@ def pool_surfaces(identifications: Sequence[Identification]) -> SurfaceScatter:
 
     **Returns:** a `SurfaceScatter`, a tolerance of `design` and `squeal_probability`.
 
-    **Raises:** `ValueError` for fewer than two, and where one is neither a `Surface` nor a
-    `SelfAffine`.
+    **Raises:** `ValueError` for fewer than two, where a profile is beside what is neither a
+    `Surface` nor a `SelfAffine`, and for maps without wavelengths in common.
     """
     every = list(identifications)
     for i, each in enumerate(every):
@@ -46,13 +49,40 @@ def pool_surfaces(identifications: Sequence[Identification]) -> SurfaceScatter:
         raise ValueError(f"identifications must be two or more, got {len(every)}")
     if all(isinstance(each.surface, Surface) for each in every):
         return _pool_fractal(every)
-    for i, each in enumerate(every):
-        if not each.self_affine.fits:
-            raise ValueError(
-                f"identifications[{i}] must be a Surface or a SelfAffine, got a "
-                f"{type(each.surface).__name__}: leave it out"
-            )
-    return _pool_self_affine(every)
+    laws = [each.self_affine.fits for each in every]
+    if all(laws) and not any(isinstance(each.surface, MeasuredSpectrum) for each in every):
+        return _pool_self_affine(every)
+    spectra = [each.measured_spectrum for each in every]
+    tables = [table for table in spectra if table is not None]
+    if len(tables) < len(every):
+        i = next(i for i, table in enumerate(spectra) if table is None)
+        raise ValueError(
+            f"identifications[{i}] is of a profile, and not all are a Surface or a SelfAffine: "
+            "leave the profiles out, the spectra of maps are pooled with a scatter of height_factor"
+        )
+    return _pool_measured(tables, [each.level_error for each in every])
+
+
+def _pool_measured(tables: list[MeasuredSpectrum], level_errors: list[float]) -> SurfaceScatter:
+    low, high = max(table.q[0] for table in tables), min(table.q[-1] for table in tables)
+    if not low < high:
+        raise ValueError(
+            f"identifications must have wavelengths in common: the longest is {2 * math.pi / low:g}"
+            f" m of one and the shortest {2 * math.pi / high:g} m of another"
+        )
+    q = np.array([low, *(x for x in tables[0].q if low < x < high), high])
+    log_C, errors = [], []
+    for table in tables:
+        x, C = np.log(table.q), np.asarray(table.C_table)
+        log_C.append(np.interp(np.log(q), x, np.log(C)))
+        errors.append(np.interp(np.log(q), x, np.asarray(table.ln_C_error)))
+    squares = np.array([float(MeasuredSpectrum(q, np.exp(each)).moments()[0]) for each in log_C])
+    variances = np.square(level_errors)[:, None, None]
+    mean, between, of_mean = random_effects(np.log(squares)[:, None] / 2, variances)
+    shape = np.mean(np.exp(log_C) / squares[:, None], axis=0)
+    C, error = math.exp(2 * mean[0]) * shape, np.sqrt(np.sum(np.square(errors), axis=0))
+    surface = MeasuredSpectrum(q, C, error / len(tables), height_factor=1.0)
+    return SurfaceScatter(surface, ("ln height_factor",), between + of_mean)
 
 
 def _pool_fractal(every: list[Identification]) -> SurfaceScatter:

@@ -25,9 +25,7 @@ from .._base.parts import Record
 from .._surface.self_affine import SelfAffine
 from .._surface.surface_scatter import SurfaceScatter, truncated_mean
 from .fit import PowerLaw, residual_scatter
-from .spectrum import PowerSpectrum, map_power
-
-_HANN = (35 / 18) ** 2  # variance of a mean over modes, Hann's window along both axes
+from .spectrum import HANN_INFLATION, PowerSpectrum, map_power
 
 
 class Cells(NamedTuple):
@@ -39,11 +37,19 @@ class Cells(NamedTuple):
     count: np.ndarray  # independent waves
 
 
+class Level(NamedTuple):
+    """The mean square of all heights: much of it is of waves that are too long for the cells."""
+
+    mean_square: float  # m^2, about the plane, or the line of a profile, up to the end of the band
+    low: float  # 1/m: frequency of the longest wave
+    variance: float  # of ln(mean_square) about that of the process
+
+
 class SelfAffineFit(Record):
     """A self-affine surface as fitted, and how far it is from the data.
 
-    A roll-off that the measurement does not show is its length, with an infinite error, and a lay
-    within its error of 1 is 1.
+    A roll-off that the measurement does not show is its length, with an infinite error, and no
+    waves are longer. A lay within its error of 1 is 1.
     """
 
     Sq: float  # m, of all waves down to `shortest`
@@ -57,6 +63,7 @@ class SelfAffineFit(Record):
     shortest: float  # m: the shortest wavelength of the band
     scatter: float  # relative scatter of the data about the law, beyond chance
     rings: int  # how many bins of frequency the scatter is from
+    level: float  # standard errors by which its Sq is beyond that of the heights
     covariance: Float[np.ndarray, "4 4"]  # of (ln Sq, H, ln rolloff, ln lay)
 
     @property
@@ -80,7 +87,8 @@ class SelfAffineFit(Record):
         Sq = self.Sq * math.exp(share[0])
         names = np.array(["ln Sq", "hurst", "ln rolloff", "ln lay"])[used]
         lay = self.lay if has_lay else None
-        surface = SelfAffine(Sq, H, self.rolloff, self.shortest, lay=lay)
+        longest = None if self.has_rolloff else self.rolloff
+        surface = SelfAffine(Sq, H, self.rolloff, self.shortest, longest, lay)
         return SurfaceScatter(surface, tuple(names.tolist()), C[np.ix_(used, used)])
 
     def pooled(
@@ -145,7 +153,7 @@ def map_cells(
     at = np.exp(mean(np.log(f)))
     # The product with f^3.5 is nearly flat.
     height = 2 * np.pi * mean(power * f**3.5) / at**1.5
-    return Cells(at, mean(angle), height, total / _HANN)
+    return Cells(at, mean(angle), height, total / HANN_INFLATION)
 
 
 def profile_cells(spectrum: PowerSpectrum, band: tuple[float, float]) -> Cells:
@@ -162,17 +170,28 @@ def _log_radial(log_k, log_Sq, H, log_rolloff, log_shortest):
     """
     x, span = log_k + log_rolloff, log_rolloff - log_shortest
     above = x > 0
-    with np.errstate(over="ignore"):
-        decay = np.exp(-2 * H * span)
-    short = abs(H) * span < 1e-4  # series at H = 0
-    part = span * (1 - H * span) if short else (1 - decay) / (2 * H)
-    by_H = -(span**2) if short else (span * decay - part) / H
+    part, by_H, decay = _above(H, span)
     total = 0.5 + part
     value = 2 * log_Sq - math.log(total) + np.where(above, -2 * H * x, 2 * x)
     slope = np.where(above, -2 * H, 2.0)
     ones = np.ones_like(x)
     by_rolloff = -decay / total * ones + slope
     return value, [2 * ones, -by_H / total + np.where(above, -2 * x, 0.0), by_rolloff], slope
+
+
+def _above(H, span):
+    """The integral of e^(-2 H x) over x from 0 to `span`, its slope by H, and e^(-2 H span)."""
+    with np.errstate(over="ignore"):
+        decay = np.exp(-2 * H * span)
+    short = abs(H) * span < 1e-4  # series at H = 0
+    part = span * (1 - H * span) if short else (1 - decay) / (2 * H)
+    return part, -(span**2) if short else (span * decay - part) / H, decay
+
+
+def _share_above(H, span):
+    """Share of the mean square in waves shorter than the roll-off, and the slope of its ln by H."""
+    part, by_H, _ = _above(H, span)
+    return part / (0.5 + part), 0.5 * by_H / (part * (0.5 + part))
 
 
 class _Law:
@@ -218,6 +237,27 @@ class _Law:
         return value, np.stack([*slopes, *((slope - 2) * each for each in by_lay)], axis=1)
 
 
+class _Leveled:
+    """The law of cells, and last that of the mean square of all waves in a band from `low` on."""
+
+    def __init__(self, law: _Law, low: float, high: float, count: int = 48, sectors: int = 12):
+        angles = 1 if law.cells.angle is None else sectors
+        log_f = math.log(low) + math.log(high / low) * (np.arange(count) + 0.5) / count
+        f = np.repeat(np.exp(log_f), angles)
+        angle = None
+        if law.cells.angle is not None:
+            angle = np.tile((np.arange(angles) + 0.5) / angles * math.pi, count)
+        self.law, self.all = law, _Law(Cells(f, angle, f, f), math.exp(law.log_shortest))
+        self.weight = math.log(high / low) / f.size
+
+    def __call__(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        value, slope = self.law(at)
+        each, slopes = self.all(at)
+        share = np.exp(each - each.max())
+        total = each.max() + math.log(self.weight * share.sum())
+        return np.append(value, total), np.vstack([slope, share @ slopes / share.sum()])
+
+
 def _half_line(count: int = 64):
     """Nodes t > 0 and weights for functions that are smooth in t and decay as 1/cosh t."""
     x, weight = np.polynomial.legendre.leggauss(count)
@@ -235,15 +275,22 @@ def fit_self_affine(
     starts: int = 8,
     law: PowerLaw | None = None,
     between: np.ndarray | None = None,
+    level: Level | None = None,
 ) -> SelfAffineFit:
     """Fit the cells of a `band` [1/m]; `longest` [m] is the length of the measurement.
 
-    A scatter common to bins of the ratio `ring`, or to sixths of them, is estimated and makes all
-    count less. The roll-off is sought from `starts` on; it must lower the deviance by the square of
-    `sigmas`, as the lay must exceed `sigmas` of its errors. `between` is the covariance (2, 2) from
-    place to place of (ln A, p) of the power `law`.
+    The mean square of all heights, `level`, is one more cell. A scatter common to bins of the ratio
+    `ring`, or to sixths of them, is estimated and makes all count less. The roll-off is sought from
+    `starts` on; it must lower the deviance by the square of `sigmas`, as the lay must exceed
+    `sigmas` of its errors. `between` is the covariance (2, 2) from place to place of (ln A, p) of
+    the power `law`.
     """
-    model = _Law(cells, 1 / band[1])
+    model, n = _Law(cells, 1 / band[1]), cells.f.size
+    heights, count = cells.height, cells.count
+    if level is not None:
+        model = _Leveled(model, level.low, band[1])
+        heights = np.append(heights, level.mean_square)
+        count = np.append(count, 1 / level.variance)
     rings = np.floor(np.log(cells.f / band[0]) / math.log(ring)).astype(int)
     groups = rings
     if cells.angle is not None:
@@ -258,37 +305,46 @@ def fit_self_affine(
         for corner in corners:
             at = np.zeros(free.size)
             at[1], at[2] = 0.7, corner
-            at[0] = 0.5 * np.average(np.log(cells.height) - model(at)[0], weights=weight)
-            ends.append(_fisher(model, cells, weight, at, used, (low, high)))
+            at[0] = 0.5 * np.average(np.log(heights) - model(at)[0], weights=weight)
+            ends.append(_fisher(model, heights, weight, at, used, (low, high)))
         return min(ends, key=lambda end: end[1])
 
-    weight, corners = cells.count, np.linspace(low + 0.5, high - 0.2, starts)
+    weight, corners = count, np.linspace(low + 0.5, high - 0.2, starts)
     at, _ = solve(weight, corners, free)
     scatter, used_rings = 0.0, 0
     for _ in range(3):
-        ratio = cells.height / np.exp(model(at)[0])
+        ratio = cells.height / np.exp(model(at)[0][:n])
         scatter, weight, used_rings = _weights(cells, ratio, rings, groups, free.size)
+        if level is not None:
+            weight = np.append(weight, 1 / (level.variance + scatter**2))
         at, _ = solve(weight, [*corners[::3], at[2]], free)
     at, deviance = solve(weight, [*corners, at[2]], free)
     without, deviance_without = solve(weight, [high], fixed)
     is_reached = deviance_without - deviance > sigmas**2 and at[2] < high - 1e-6
     used = free if is_reached else fixed
     at = at if is_reached else without
-    _, slope = model(at)
+    value, slope = model(at)
     covariance = np.zeros((free.size, free.size))
     some = slope[:, used]
     covariance[np.ix_(used, used)] = np.linalg.pinv(some.T @ (weight[:, None] * some))
-    return _conclude(
+    fit = _conclude(
         at, covariance, is_reached, 1 / band[1], scatter, used_rings, sigmas, law, between
     )
+    if level is None:
+        return fit
+    # What is left of a difference has the variance of the datum less that of the fit to it.
+    places = 4 * (fit.covariance[0, 0] - covariance[0, 0]) if is_reached else 0.0
+    left = 1 / weight[-1] - slope[-1] @ covariance @ slope[-1] + max(places, 0.0)
+    error = math.sqrt(max(left, np.finfo(float).eps / weight[-1]))
+    return dataclasses.replace(fit, level=float(value[-1] - math.log(level.mean_square)) / error)
 
 
-def _fisher(model, cells, weight, at, used, ends, steps: int = 40):
+def _fisher(model, heights, weight, at, used, ends, steps: int = 40):
     """The parameters `used` at the least deviance, from a start on, and the deviance."""
 
     def deviance(at):
         value, slope = model(at)
-        ratio = cells.height / np.exp(np.clip(value, -700, 700))
+        ratio = heights / np.exp(np.clip(value, -700, 700))
         return 2 * np.sum(weight * (ratio - 1 - np.log(ratio))), ratio, slope
 
     least, ratio, slope = deviance(at)
@@ -349,6 +405,11 @@ def _conclude(at, covariance, is_reached, shortest, scatter, rings, sigmas, law,
     if between is not None and law is not None:
         slope = _by_power_law(law, H, log_rolloff, math.log(shortest))
         C[:2, :2] += slope @ between @ slope.T
+    if not is_reached:  # no waves are longer
+        part, by_H = _share_above(H, log_rolloff - math.log(shortest))
+        to = np.eye(4)
+        to[0, 1] = by_H / 2
+        C, log_Sq = to @ C @ to.T, log_Sq + math.log(part) / 2
     log_lay = log_lay if has_lay else 0.0
     return SelfAffineFit(
         Sq=math.exp(log_Sq),
@@ -362,6 +423,7 @@ def _conclude(at, covariance, is_reached, shortest, scatter, rings, sigmas, law,
         shortest=shortest * math.exp(-log_lay / 2),
         scatter=scatter,
         rings=rings,
+        level=0.0,
         covariance=C,
     )
 

@@ -10,6 +10,7 @@ both one-sided: the variance is their integral over f > 0, f in 1/m.
 """
 
 import math
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -19,6 +20,8 @@ from numpy.typing import ArrayLike
 from .._base.parts import Record
 from .._surface.surface import Surface
 from .analysis import SpectralAnalysis
+
+HANN_INFLATION = (35 / 18) ** 2  # variance of a mean over modes, Hann's window along both axes
 
 
 def log_mean_cosine_power(p):
@@ -110,6 +113,27 @@ def remove_plane(z):
     return z - along_x * x[:, None] - along_y * y
 
 
+class MapHeights(NamedTuple):
+    """What a window hides of a map."""
+
+    mean_square: float  # m^2, about the plane, of the waves up to the Nyquist frequency
+    longest: float  # 1/m, of a wave as long as the square root of the area
+    step: float  # 1/m, between the ordinates of its spectrum
+
+
+def map_heights(z: np.ndarray, dx: float, dy: float, gap: np.ndarray) -> MapHeights:
+    """The mean square of a map without its filled gaps, and its frequencies."""
+    fx, fy, power, count = map_power(z, dx, dy)
+    heights = power * count
+    heights[0, 0] = 0
+    beyond = np.hypot(fx[:, None], fy) > 0.5 / max(dx, dy)
+    # In the corners of the plane of frequencies, where not all directions are.
+    corners = float(np.sum(heights[beyond]) / np.sum(heights))
+    mean_square = float(np.var(remove_plane(z)[~gap])) * (1 - corners)
+    lengths = z.shape[0] * dx, z.shape[1] * dy
+    return MapHeights(mean_square, 1 / math.sqrt(lengths[0] * lengths[1]), 1 / min(lengths))
+
+
 def map_spectra(z: np.ndarray, dx: float, dy: float) -> tuple[PowerSpectrum, ...]:
     """Spectra of a map without gaps: of all waves, of waves nearer to x, and nearer to y.
 
@@ -123,7 +147,6 @@ def map_spectra(z: np.ndarray, dx: float, dy: float) -> tuple[PowerSpectrum, ...
     index = np.rint(f / step).astype(int).ravel()
     area = np.pi * np.arange(1, bins + 1) * step**2 * lengths[0] * lengths[1]
     width = np.mean([1 / (3 * length**2) for length in lengths])
-    inflation = (35 / 18) ** 2  # variance of a mean over modes, Hann's window along both axes
 
     def radial(chosen, share):
         weight = (count * chosen).ravel()
@@ -133,7 +156,9 @@ def map_spectra(z: np.ndarray, dx: float, dy: float) -> tuple[PowerSpectrum, ...
         )
         at, power_at = frequencies / modes, 2 * np.pi * powers / (share * area)
         spread = np.full(bins, width)
-        return _merge_ordinates(at, power_at, modes / inflation, 1 / at, spread, "map", nyquist)
+        return _merge_ordinates(
+            at, power_at, modes / HANN_INFLATION, 1 / at, spread, "map", nyquist
+        )
 
     near_x = np.abs(fx[:, None]) > fy
     return radial(np.ones_like(near_x), 1.0), radial(near_x, 0.5), radial(~near_x, 0.5)

@@ -114,6 +114,8 @@ test_bad_options_are_refused = refusals(
         (fj.Preprocessing, {"spike": True}, "spike must be a number"),
         (fj.SpectralAnalysis, {"tapers": 0}, "tapers must be a whole number"),
         (fj.SpectralAnalysis, {"fewest_periods": 0.5}, "fewest_periods must be at least 1"),
+        (fj.SpectralAnalysis, {"level": -1.0}, "level must be at least 0"),
+        (fj.SpectralAnalysis, {"gradient": 0.5}, "gradient must be at least 1"),
         (fj.SpectralAnalysis, {"resolutions": 0.0}, "resolutions must be at least 1"),
         (fj.SpectralAnalysis, {"sigmas": -1.0}, "sigmas must be at least 0"),
         (fj.WarningThresholds, {"jump": -1.0}, "jump must be at least 0"),

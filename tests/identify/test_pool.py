@@ -1,6 +1,7 @@
 """Scatter from one surface to the next, of a prescribed size, out of that and errors together."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -77,6 +78,53 @@ def test_self_affine_profiles():
     assert pooled.names == ("ln Sq", "hurst", "ln rolloff")
     ends = sorted(float(each.self_affine.rolloff) for each in found)
     assert ends[0] <= float(pooled.surface.rolloff) <= ends[1]
+
+
+def smooth_maps(factors, n=128, side=1e-3):
+    """Maps without waves below four steps, which no law describes, and their step."""
+    surface = fj.SelfAffine(1e-6, 0.8, side / 8, side / 32)
+    z = [np.asarray(fj.topography(surface, side, n, seed=k)) for k in range(len(factors))]
+    return [factor * each for factor, each in zip(factors, z, strict=True)], side / n
+
+
+def test_measured_spectra_scatter_by_their_heights():
+    factors = np.exp([0.0, 0.4, -0.4, 0.2, -0.2])
+    maps, dx = smooth_maps(factors)
+    found = [fj.identify(z, dx) for z in maps]
+    assert any(isinstance(each.surface, fj.MeasuredSpectrum) for each in found)
+    pooled: Any = fj.pool_surfaces(found)
+    first: Any = found[0].measured_spectrum
+    assert isinstance(pooled.surface, fj.MeasuredSpectrum)
+    assert pooled.names == ("ln height_factor",)
+    logs = np.log([z.std() for z in maps])
+    assert pooled.standard_deviations["ln height_factor"] == pytest.approx(
+        np.std(logs, ddof=1) * math.sqrt(1 + 1 / 5), rel=0.2
+    )
+    Sq = float(fj.roughness(pooled.surface).Sq)
+    assert math.log(Sq) == pytest.approx(np.mean(logs), abs=0.05)
+    # The errors of the mean of five are below those of each.
+    surface: Any = pooled.surface
+    assert np.max(surface.ln_C_error) < 0.6 * np.max(first.ln_C_error)
+
+
+def test_maps_and_profiles_without_a_law_are_not_pooled():
+    maps, dx = smooth_maps([1.0])
+    found = fj.identify(maps[0], dx)
+    profile = fj.identify(gaussian_profile(np.random.default_rng(0)), 1e-6)
+    with pytest.raises(ValueError, match=r"^identifications\[1\] is of a profile.*height_factor"):
+        fj.pool_surfaces([found, profile])
+    small = fj.identify(1e-6 * maps[0], 1e-6 * dx)
+    with pytest.raises(ValueError, match=r"^identifications must have wavelengths in common"):
+        fj.pool_surfaces([found, small])
+
+
+def test_the_height_of_a_table_is_its_factor():
+    """Bounds on Sq name what a `MeasuredSpectrum` has in place of it."""
+    scene, table = fj.brake_scene(), fj.MeasuredSpectrum([1e4, 1e5], [1e-21, 1e-24])
+    contact = fj.PerssonContact(table, scene.contact.material, 400.0, 1e-5)
+    scene = fj.Scene(contact, scene.friction, scene.oscillator).replace(height_factor=1.0)
+    with pytest.raises(ValueError, match=r"bounds on 'Sq'.*did you mean height_factor"):
+        fj.design(scene, {"Sq": (1e-7, 1e-5)}, progress=False)
 
 
 test_refused = refusals(

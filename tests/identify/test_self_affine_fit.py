@@ -69,6 +69,22 @@ def test_a_lay_at_any_angle():
     assert fits[0].lay == pytest.approx(fits[1].lay, rel=0.02)
 
 
+@pytest.mark.parametrize("seed", [0, 2])
+def test_a_lay_across_the_first_axis_is_seen_as_well_as_one_along_it(seed):
+    """With the long waves along y the plateau reaches far into the band: it is no filter."""
+    surface = fj.SelfAffine(2e-6, 0.8, 1e-4, 4e-6, lay=0.5)
+    z = np.asarray(fj.topography(surface, 1.2e-3, 400, seed=seed))
+    found, turned = (fj.identify(each, 3e-6) for each in (z, z.T))
+    assert not any(line.startswith("roll-off") for line in found.warnings)
+    fit, other = found.self_affine, turned.self_affine
+    assert abs(fit.H - 0.8) < 0.05 and fit.lay == pytest.approx(2, rel=0.05)
+    # Along the lay, 1e-4 m; across it half of that.
+    assert fit.rolloff == pytest.approx(5e-5, rel=0.15) and fit.shortest < 1e-5
+    assert abs(abs(fit.lay_direction) - 90) < 3 and abs(other.lay_direction) < 3
+    for name in ("Sq", "H", "rolloff", "lay", "shortest"):
+        assert getattr(fit, name) == pytest.approx(getattr(other, name), rel=5e-3)
+
+
 def test_no_roll_off_is_invented():
     """A power law stays a `Surface`, with what it says beside it."""
     found = fj.identify(gaussian_map(np.random.default_rng(2), 2.4), 1e-6)
