@@ -76,7 +76,7 @@ class MeasuredContact(Contact, law="measured"):
         stiffness_ratio: ArrayLike | None = None,
         *,
         dy: ScalarLike | None = None,
-        prepare: bool = True,
+        prepare: bool | None = None,
         pressures: Sequence[float] | None = None,
         plastic: bool = False,
     ) -> "MeasuredContact":
@@ -100,10 +100,11 @@ class MeasuredContact(Contact, law="measured"):
         - `area`: nominal area of the joint [m^2].
         - `stiffness_ratio`: K_t/K_n, by default Mindlin's (2 - 2 nu)/(2 - nu).
         - `dy`: grid spacing [m] along the second axis, by default what z says, else dx.
-        - `prepare`: True, the default, takes out spikes, gaps and the least-squares plane, as
-          `prepare_measurement` does. False presses the heights as they are: those of
-          `topography` with periodic=True, and a map levelled by its plateau, which the plane of all
-          heights, grooves included, may leave askew.
+        - `prepare`: True takes out spikes, gaps and the least-squares plane, as
+          `prepare_measurement` does; False presses the heights as they are. By default an array
+          without gaps is pressed as it is, with a warning if most of it is a tilt, and everything
+          else is prepared. The plane of all heights, grooves included, may leave a plateau askew:
+          level such a map by its plateau.
         - `pressures`: rising nominal pressures [Pa] of the table. By default 12 from 1e-3 to .5
           E Sdq, and below them, each at least a quarter of the next, down to the P of the joint, as
           long as two points touch.
@@ -114,7 +115,7 @@ class MeasuredContact(Contact, law="measured"):
         gaps; `RuntimeError` if boundary elements converge at fewer than two; `OSError` if a file
         cannot be read.
         """
-        from .._identify.prepare_measurement import prepared, read_map
+        from .._identify.prepare_measurement import prepared, read_map, tilt_share
 
         require_kind("material", material, Material)
         P, area = number("P", P, above=0), scalar("area", area, above=0)
@@ -122,8 +123,16 @@ class MeasuredContact(Contact, law="measured"):
         ratio = number("stiffness_ratio", ratio, at_least=0)
         if is_traced((z, dx, dy, material, area)):
             raise TypeError("z, steps, material and area must be known when a program is traced")
-        prepare, plastic = flag("prepare", prepare), flag("plastic", plastic)
-        read = read_map(array_like("z", z), dx, dy)
+        prepare = None if prepare is None else flag("prepare", prepare)
+        z, plastic = array_like("z", z), flag("plastic", plastic)
+        read = read_map(z, dx, dy)
+        if prepare is None:
+            prepare = bool(read.missing) or not hasattr(z, "dtype")
+            if not prepare and (share := tilt_share(read)) > 0.5:
+                warn_user(
+                    f"a plane is {share:.0%} of the mean square of z, and makes it softer: "
+                    "from_heights(..., prepare=True) takes it out"
+                )
         if prepare:
             read, spikes = prepared(read)
             if spikes:

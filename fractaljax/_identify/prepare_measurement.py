@@ -87,6 +87,12 @@ def prepared(
     return result, found.outliers
 
 
+def tilt_share(read: Measurement) -> float:
+    """The share of the least-squares plane in the mean square height of a map without gaps."""
+    total = float(np.var(read.z))
+    return 1 - float(np.var(remove_plane(read.z))) / total if total > 0 else 0.0
+
+
 def _remove_line(z: np.ndarray) -> np.ndarray:
     """A profile minus its least-squares line."""
     x, z = np.arange(z.size) - (z.size - 1) / 2, z - z.mean()

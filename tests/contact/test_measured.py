@@ -98,7 +98,7 @@ def test_law_of_a_map_is_that_of_boundary_elements(heights):
     """Also with a plateau; a joint of four times the area is four maps side by side."""
     dx = 1e-3 / 64
     z = np.minimum(np.asarray(heights), 5e-7)
-    law = fj.MeasuredContact.from_heights(z, dx, MATERIAL, 2e3, 4e-6, prepare=False)
+    law = fj.MeasuredContact.from_heights(z, dx, MATERIAL, 2e3, 4e-6)
     for P in (law.loads[0], law.loads[5], 1e3):
         K_n, K_t = law_at(law, P)
         pressed = fj.boundary_element(z, dx, MATERIAL, P / 4)
@@ -145,12 +145,18 @@ def same(law, other, rtol=1e-6):
 def test_a_tilted_map_is_that_without_tilt(heights):
     z = np.asarray(heights)
     i, j = np.indices(z.shape)
-    same(of_map(z + 1e-7 * i - 3e-7 * j + 1e-5), of_map(z))
+    tilted = z + 1e-7 * i - 3e-7 * j + 1e-5
+    same(of_map(tilted, prepare=True), of_map(z, prepare=True))
+    with pytest.warns(
+        UserWarning, match=r"a plane is 9\d% of the mean square of z, and makes it so"
+    ):
+        askew = fj.MeasuredContact.from_heights(tilted, DX, MATERIAL, P, AREA)
+    assert askew.stiffnesses[3] < 0.8 * of_map(z).stiffnesses[3]
 
 
 def test_gaps_are_filled_and_spikes_told(heights):
     z = np.array(heights)
-    expected = of_map(z)
+    expected = of_map(z, prepare=True)
     z[np.random.default_rng(0).uniform(size=z.shape) < 0.01] = np.nan
     same(of_map(z), expected, rtol=0.02)
     same(of_map(np.ma.masked_invalid(z)), of_map(z))
@@ -162,8 +168,8 @@ def test_gaps_are_filled_and_spikes_told(heights):
 
 def test_takes_lists_measurements_files_and_topographies(heights, tmp_path):
     z = np.asarray(heights)
-    expected = of_map(z)
-    same(of_map(z.tolist()), expected)
+    same(of_map(z.tolist()), of_map(z))
+    expected = of_map(z, prepare=True)
     same(of_map(fj.Measurement(z, DX, DX, "mine"), None), expected)
     np.savez(tmp_path / "map.npz", z=z, dx=DX)
     same(of_map(tmp_path / "map.npz", None), expected)
@@ -183,7 +189,8 @@ def test_steps_that_differ(heights):
     assert squared.stiffnesses[-1] < 0.7 * whole.stiffnesses[-1]
     turned = of_map(z[:, ::2].T, 2 * DX, dy=DX, **options)
     same(turned, half)
-    same(of_map(fj.Measurement(z[:, ::2], DX, 2 * DX, "mine"), None), of_map(z[:, ::2], dy=2 * DX))
+    read = fj.Measurement(z[:, ::2], DX, 2 * DX, "mine")
+    same(of_map(read, None), of_map(z[:, ::2], dy=2 * DX, prepare=True))
 
 
 def test_a_yielding_table_ends_at_the_hardness(heights):
@@ -202,9 +209,8 @@ def test_the_table_reaches_down_to_the_load_of_the_joint(heights):
     low = of_map(heights, P=usual.loads[0] / 20)
     assert low.loads[0] == pytest.approx(usual.loads[0] / 20, rel=1e-12)
     assert low.loads[-12:] == usual.loads and 1 < usual.loads[0] / low.loads[-13] < 4.001
-    z = fj.prepare_measurement(np.asarray(heights), DX).z
-    own = DX**2 * z.size
-    pressed = fj.boundary_element(z, DX, MATERIAL, low.loads[0] * own / AREA)
+    own = DX**2 * heights.size
+    pressed = fj.boundary_element(heights, DX, MATERIAL, low.loads[0] * own / AREA)
     assert float(law_at(low, low.P)[0]) == pytest.approx(float(pressed.K_n) * AREA / own, rel=1e-6)
     both = of_map(heights, P=np.array([usual.loads[0] / 20, P]))
     same(both, low)
