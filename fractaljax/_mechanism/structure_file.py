@@ -255,7 +255,7 @@ def _is_stored(name: str, value: Any, held: Mapping[str, Any]) -> bool:
     terms = [term if isinstance(term, dict) else {} for term in terms]
     if name in (term.get("matrix") for term in terms if "file" not in term):
         return True
-    return all("file" not in term and term.get("matrix") in [*held] for term in terms)
+    return all(term.get("matrix") in [*held] for term in terms)
 
 
 def _one(name: str, matrices: Mapping[str, Any]) -> Any:

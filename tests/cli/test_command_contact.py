@@ -109,7 +109,8 @@ def test_map_whose_steps_differ(capsys, plateau):
     assert run(capsys, "contact", "map.npz", "--area", 1e-4, "--dy", 2e-5)[0] == 0
     contact = fj.brake_scene().contact
     z = np.load("map.npz")["z"]
-    law = fj.MeasuredContact.from_heights(z, 1e-3 / 64, contact.material, contact.P, 1e-4, dy=2e-5)
+    joint = contact.material, contact.P, 1e-4
+    law = fj.MeasuredContact.from_heights(z, 1e-3 / 64, *joint, dy=2e-5, prepare=True)
     written = fj.Scene.load("fractaljax-contact/scene.toml").contact
     np.testing.assert_allclose(written.stiffnesses, law.stiffnesses, rtol=1e-9)
 

@@ -250,7 +250,6 @@ BAD = [
     ('matrices = "all.npz"\nK = "K.mtx"', "[structure] gives K twice"),
     ('matrices = "all.npz"\nF = [1, 2, 3]', "[structure] gives F twice"),
     (TWO + 'C = "damping"', "two.npz has no 'damping'; it holds"),
-    ('matrices = "all.npz"\nK = [{matrix = "K", file = "K.mtx"}]', "[structure] gives K twice"),
     ('matrices = "all.npz"\ndamping_ratio = 0.01', "gives damping twice: C and damping_ratio"),
     (TWO + "rayleigh = [1, 0]\ndamping_ratio = 0.01", "gives damping twice"),
     (TWO + "rayleigh = 3", "rayleigh must be [alpha, beta], got 3"),
