@@ -32,7 +32,10 @@ class CycleResult(eqx.Enumeration):
         "a limit cycle of the regularised law, which still differs from the exact law's: "
         "choose a smaller regularisation"
     )
-    inaccurate = "a limit cycle was found, but not to rtol: ask for more segments"
+    inaccurate = (
+        "a limit cycle was found, but not to rtol: ask for more segments, for more meshes by "
+        "search=CycleSearch(meshes=12), or for a larger rtol"
+    )
     unstable = "a limit cycle was found, but it repels: nearby motions leave it"
     equilibrium = "the motion dies out: the sliding equilibrium attracts it"
     diverged = "the motion grows beyond all bounds"

@@ -110,7 +110,7 @@ def decay(x):
 @pytest.mark.parametrize("size", [1.0, 1e-6])
 def test_free_decay(size):
     """Without an excitation amplitudes fall by 2 mu N/k in each half period; then it sticks."""
-    at = jnp.array([1.05, 1 / 1.2])
+    at = jnp.array([1.03, 1 / 1.2])
 
     @jax.jit
     def both(x):
@@ -118,7 +118,7 @@ def test_free_decay(size):
             structure, _ = damper(1.0, x[1])
             structure = structure.replace(P=size * x[1] * F / MU)
             start = size * x[0] * jnp.array([1.0, 0.0])
-            found = fj.simulate(structure, start, 40.0, max_steps=256, throw=False)
+            found = fj.simulate(structure, start, 10.0, max_steps=256, throw=False)
             return found.end[:1] / size, found
 
         return both_modes(end, x, has_aux=True)
@@ -131,7 +131,7 @@ def test_free_decay(size):
         np.testing.assert_allclose(slope, slopes_of_truth[0], rtol=1e-7)
     np.testing.assert_array_equal(found.contact_states[-1], [0])
     reversals = np.asarray(found.contact_states[1:] != found.contact_states[:-1]).sum()
-    assert reversals == int(jnp.ceil(1.05 / (2 * F / 1.2 / K) - 0.5))
+    assert reversals == int(jnp.ceil(1.03 / (2 * F / 1.2 / K) - 0.5))
 
 
 X, EXCITATION = damper(0.8, 0.2)
