@@ -188,7 +188,16 @@ class _Cubics(WithStatic):
 
     def mu(self, speed):
         at = _inside(self.speeds, jnp.asarray(speed))
-        return cubics_at(self.speeds, self.column, self.slopes, at)
+        table = self.speeds, self.column, self.slopes
+        if self.speeds.ndim == 1:
+            return cubics_at(*table, at)
+        # In a motion of many lanes they are the last axis of all, perhaps after those of segments.
+        shape = jnp.broadcast_shapes(at.shape, self.speeds.shape[1:])
+        missing = (1,) * (len(shape) + 1 - self.speeds.ndim)
+        table = (jnp.reshape(x, (len(x), *missing, *x.shape[1:])) for x in table)
+        table = (jnp.broadcast_to(x, (len(x), *shape)).reshape(len(x), -1) for x in table)
+        at = jnp.broadcast_to(at, shape).reshape(-1)
+        return jax.vmap(cubics_at, (1, 1, 1, 0))(*table, at).reshape(shape)
 
 
 def _inside(speeds: Float[Array, " n"], speed: Array) -> Array:

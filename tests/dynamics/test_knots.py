@@ -198,3 +198,24 @@ def test_motion():
     assert len(passed) >= 2
     for knot in passed:
         assert abs(w - knot).min() < 1e-9
+
+
+@pytest.mark.slow
+def test_many_cycles_of_tables():
+    """Side by side under `vmap`, and in a sweep, with the mesh of each at its own knots."""
+
+    law = fj.TabulatedFriction(SPEEDS, FALLING, 0.33)
+
+    def cycle(V) -> fj.LimitCycle:
+        return fj.limit_cycle(block(law, V, 5.0), throw=False)
+
+    velocities = np.array([0.01, 0.02, 0.04])
+    together = jax.jit(jax.vmap(cycle))(velocities)
+    swept = fj.sweep(lambda x: fj.limit_cycle(x, throw=False).period, block(law, 0.02, 5.0),
+                     V=velocities, progress=False)  # fmt: skip
+    for i, V in enumerate(velocities):
+        alone = cycle(V)
+        assert alone.result == fj.CycleResult.converged
+        np.testing.assert_allclose(together.period[i], alone.period, rtol=1e-9)
+        np.testing.assert_allclose(together.amplitude[i], alone.amplitude, rtol=1e-8)
+        np.testing.assert_allclose(swept.values[i], alone.period, rtol=1e-9)
