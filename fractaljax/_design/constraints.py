@@ -19,7 +19,7 @@ from .._contact.contact import ContactState
 from .._dynamics.cycle import VELOCITY_REFERENCE, CycleResult
 from .._dynamics.limit_cycle import limit_cycle
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.scene import Scene, stiffness
+from .._mechanism.scene import stiffness
 from .._stability.margin import least_damping_ratio
 from .._stability.stability import stability
 from .._surface.areal_parameters import areal_parameters
@@ -60,7 +60,7 @@ class Constraint(Record):
             )
 
     @abc.abstractmethod
-    def measure(self, scene: Scene) -> Array:
+    def measure(self, scene: Any) -> Array:
         """The quantity itself of a `scene`, in SI units."""
 
     def below(self, value: Array) -> Array:
@@ -71,7 +71,7 @@ class Constraint(Record):
         """The residual of `at_most` at a `value` of the quantity."""
         return value / self.at_most - 1
 
-    def __call__(self, scene: Scene) -> Float[Array, ""]:
+    def __call__(self, scene: Any) -> Float[Array, ""]:
         value, sides = self.measure(scene), []
         if self.at_least is not None:
             lacking: Any = 0.0

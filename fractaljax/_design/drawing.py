@@ -71,14 +71,14 @@ def quiet_factors(
     ends = []
     for step in (-1, 1):
         side = slice(middle, None, step)
-        x, y, stop = logs[side], rates[side], loud[side]
+        at, rate, stop = logs[side], rates[side], loud[side]
         k = int(np.argmax(stop))
         if not stop.any():
-            ends.append(x[-1])
-        elif np.isnan(y[k]):
-            ends.append(x[k - 1])
+            ends.append(at[-1])
+        elif np.isnan(rate[k]):
+            ends.append(at[k - 1])
         else:
-            ends.append(np.interp(0.0, y[k - 1 : k + 1], x[k - 1 : k + 1]))
+            ends.append(np.interp(0.0, rate[k - 1 : k + 1], at[k - 1 : k + 1]))
     low, high = np.exp(ends)
     return float(low), float(high)
 

@@ -48,8 +48,8 @@ class CycleResult(eqx.Enumeration):
         "default (a longer period, or none)"
     )
     too_stiff = (
-        "the regularised law takes more than max_steps steps: allow more, choose a solver such as "
-        "diffrax.Kvaerno5, or leave the regularisation out"
+        "the regularised law, or one with memory, takes more than max_steps steps: allow more, or "
+        "choose a solver such as diffrax.Kvaerno5"
     )
     jumps = (
         "a joint with K_t opens, where friction that is smooth jumps: "

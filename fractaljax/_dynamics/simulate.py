@@ -292,7 +292,8 @@ def simulate(
       bristles Tsit5 is quicker.
     - `rtol`: relative tolerance of a step, 1e-9 by default and at least 9.1e-13; in float32 both
       are 4.9e-4. Errors grow with the distance between nearby motions.
-    - `max_steps`: most steps; one oscillation takes about 30.
+    - `max_steps`: most steps; one oscillation takes about 30, with memory some hundreds, for a
+      spring in series with a slider has a kink at each end of slip.
     - `throw`: raise unless the end is reached; otherwise `result` says why.
 
     **Raises:** `ValueError` for a start of another shape, an argument outside its domain or an

@@ -3,6 +3,7 @@
 import csv
 import warnings
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -153,8 +154,10 @@ def test_limits_of_a_drawing(capsys, monkeypatch):
     limits = ["--ra", "1e-7:4e-7", "--rz", ":3e-6"]
     for more in ([], ["--cutoff", 2.5e-4, 8e-6, "--sq-lengths", 1e-2, 1e-5]):
         refused_command(capsys, "design", *limits, *more, "--quiet")
-    filters, lengths = dict(cutoff=8e-4, shortest=2.5e-6), dict(L=1e-3, L_s=1e-6)
+    filters: Any = dict(cutoff=8e-4, shortest=2.5e-6)
+    lengths: Any = dict(L=1e-3, L_s=1e-6)
     others, wide = dict(cutoff=2.5e-4, shortest=8e-6), dict(L=1e-2, L_s=1e-5)
+    options: Any
     for constraints, options in zip(found, (filters | lengths, others | wide), strict=True):
         Ra, Rz = fj.constraints.Ra(1e-7, 4e-7, **options), fj.constraints.Rz(None, 3e-6, **options)
         for one, other in zip(constraints, (Ra, Rz), strict=True):

@@ -3,6 +3,7 @@
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -234,7 +235,8 @@ def test_sweeps_over_each_number(lay):
         "longest": [5e-4, 2e-3],
         **({} if lay is None else {"lay": [0.5, 3.0]}),
     }.items():
-        swept = fj.sweep(fj.growth_rate, scene, progress=False, **{name: values}).values
+        axis: Any = {name: values}
+        swept = fj.sweep(fj.growth_rate, scene, progress=False, **axis).values
         singly = [float(fj.growth_rate(scene.replace(**{name: value}))) for value in values]
         np.testing.assert_allclose(swept, singly, rtol=1e-9)
         assert singly[0] != singly[1]

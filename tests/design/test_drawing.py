@@ -213,6 +213,7 @@ def test_drawing_of_a_structure():
     def growth(factor):
         return float(fj.growth_rate(best.scene.replace(**{"left.Sq": Sq * factor})))
 
+    assert drawing.quiet_Ra is not None
     low, high = (end / drawing.Ra[1] for end in drawing.quiet_Ra)
     for factor in np.linspace(low * 1.02, high * 0.98, 9):
         assert growth(factor) < 0
