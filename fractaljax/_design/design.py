@@ -38,7 +38,7 @@ from .drawing import Drawing, compare_drawings
 from .envelope import Envelope, condition_text
 from .evaluator import Evaluation, make_evaluator
 from .few_modes import project_on_modes
-from .joints import joint_with_surface
+from .joints import joint_surfaces, joint_with_surface
 from .limit import LeastGrowth, least_growth
 from .problem import DesignProblem
 from .quiet import Kicks, quiet
@@ -267,8 +267,8 @@ class Design(Record):
         moved = {name.rpartition(".")[0] for name in self.bounds}
         return [
             f'drawing(joint="{name}") gives Ra, Rz and where the design stays quiet'
-            for name, part in self.scene.joints_by_name().items()
-            if name in moved and isinstance(getattr(part.contact, "surface", None), Spectrum)
+            for name in joint_surfaces(self.scene)
+            if name in moved
         ]
 
     def _kick_lines(self) -> list[str]:

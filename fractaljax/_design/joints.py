@@ -144,16 +144,21 @@ def least_damping(x) -> tuple[Any, Any]:
     return xp.maximum(damping, 0.0), xp.where(inside, abs(s), xp.inf).min()
 
 
+def joint_surfaces(x: Mechanism) -> dict[str, Spectrum]:
+    """The surfaces of the joints whose contact has one, a `Spectrum`, by the joint's name."""
+    return {
+        joint: surface
+        for joint, part in x.joints_by_name().items()
+        if isinstance(surface := getattr(part.contact, "surface", None), Spectrum)
+    }
+
+
 def joint_with_surface(x: Mechanism, name: str | None, what: str) -> tuple[str, Spectrum]:
     """A joint whose contact has a surface, a `Spectrum`, and it: the only one, or that of a name.
 
     **Raises:** `ValueError` in the name of `what` needs it, if there is none or several.
     """
-    surfaces = {
-        joint: surface
-        for joint, part in x.joints_by_name().items()
-        if isinstance(surface := getattr(part.contact, "surface", None), Spectrum)
-    }
+    surfaces = joint_surfaces(x)
     if not surfaces:
         raise ValueError(f"{what} needs a scene whose contact has a surface, or a joint with one")
     if name is None and len(surfaces) == 1:

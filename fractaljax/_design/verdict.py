@@ -19,7 +19,7 @@ from .._contact.fractal import FractalContact
 from .._contact.material import mindlin_ratio
 from .._contact.persson import PerssonContact
 from .._mechanism.mechanism import Mechanism
-from .._mechanism.quantities import has_memory, quantity_names, require_one, unit, value_of
+from .._mechanism.quantities import quantity_names, require_one, unit, value_of
 from .._mechanism.scene import Scene
 from .._stability.quartic import rightmost_root
 from .._stability.stability import growth_rate, stability
@@ -27,6 +27,7 @@ from .._stability.two_directions import two_directions
 from .._surface.spectrum import Spectrum
 from .design import DesignResult, design
 from .envelope import Envelope
+from .growing_modes import needs_modes
 from .joints import with_contact_law, with_contacts
 from .quiet import Kicks
 from .summary import growth_text
@@ -295,7 +296,7 @@ def _growth_rates(mechanisms: tuple[Any, ...], friction_slope: bool) -> _GrowthR
             contacts[name] = substitute(zero, {"K_n": K_n, "K_t": K_t, "P": P})
         return with_contacts(first, contacts)
 
-    if first.uncoupled and not has_memory(first):
+    if not needs_modes(first):
         # One closed form for all: each use of it takes long to compile.
         systems = [two_directions(x, friction_slope).polynomial for x in mechanisms]
         own_systems = jax.tree.map(lambda *x: jnp.stack(x), *systems)

@@ -87,7 +87,7 @@ def critical_pair(
         return jnp.trace(jnp.linalg.solve(z**2 * M + z * C + K, 2 * z * M + C))
 
     s = solve(M, C, K, C_error).s
-    return critical_among(s, trace, rigid, _Kind.of(C, K), band)
+    return _critical_among(s, trace, rigid, _Kind.of(C, K), band)
 
 
 def critical_pair_of_field(
@@ -99,10 +99,10 @@ def critical_pair_of_field(
         one = jnp.eye(len(J), dtype=z.dtype)
         return jnp.trace(jnp.linalg.solve(z * one - J, one))
 
-    return critical_among(s, trace, jnp.zeros((), int), _Kind.of_field(), band)
+    return _critical_among(s, trace, jnp.zeros((), int), _Kind.of_field(), band)
 
 
-def critical_among(
+def _critical_among(
     s: Complex[Array, " k"],
     trace: Callable[[Any], Array],
     rigid: Int[Array, ""],
